@@ -16,9 +16,9 @@ from typing import Annotated
 import typer
 
 from application_manager.commands.options import (
-    bytes_of,
     detectors_of,
     lease_of,
+    option_bytes,
     policy_of,
     seconds_of,
     serving_of,
@@ -227,7 +227,7 @@ def run(
         import asyncio
 
         from application_manager.charts.chartcache import default_folder
-        from application_manager.charts.helm import Helm
+        from application_manager.charts.helm import HelmRunner
         from application_manager.headroom import container_limit
         from application_manager.options import Options
         from application_manager.service import serve
@@ -243,11 +243,11 @@ def run(
         stalled_after=seconds_of("--stalled-after", stalled_after),
         watch_timeout=seconds_of("--watch-timeout", watch_timeout),
         metrics_port=metrics_port,
-        memory_limit=bytes_of("--memory-limit", memory_limit) if memory_limit else container_limit(),
+        memory_limit=option_bytes("--memory-limit", memory_limit) if memory_limit else container_limit(),
         metrics_certificates=metrics_certificates,
         cpu_time=seconds_of("--expression-cpu-time", expression_cpu_time),
         zenoh=settings(zenoh) if zenoh else None,
-        helm=Helm(helm),
+        helm=HelmRunner(helm),
         chart_cache=chart_cache or default_folder(),
         chart_folder=chart_folder,
         admission=serving_of(admission_port, admission_certificates, admission_service, admission_webhooks),
@@ -283,12 +283,12 @@ def render(
     What waits, is held at a bound or is refused is printed on stderr; where something is refused, the exit code is 1.
     """
     with importing():
-        from application_manager.charts.helm import Helm
+        from application_manager.charts.helm import HelmRunner
         from application_manager.commands.offline import charts_at_once, render_files
 
     policy = policy_of(allowed_kinds, service_accounts)
     result = render_files(
-        [*templates, *tasks], policy, max_instances, charts_at_once(Helm(helm), chart_cache, chart_folder)
+        [*templates, *tasks], policy, max_instances, charts_at_once(HelmRunner(helm), chart_cache, chart_folder)
     )
     sys.stdout.write(result.text)
     for line in (*result.notes, *result.refusals):
@@ -316,10 +316,10 @@ def check(
         from application_manager.commands.checking import check_files
         from application_manager.core.findings.checks import CHECKS
         from wayside.api.documents import DocumentError
-        from wayside.findings import UNREADABLE_FILE, ignorable, listed
+        from wayside.findings import UNREADABLE_FILE, check_lines, ignorable
 
     if listing:
-        typer.echo("\n".join(listed(CHECKS)))
+        typer.echo("\n".join(check_lines(CHECKS)))
         raise typer.Exit
     if not files:
         commandline.refuse("give YAML files or folders, or --list")
@@ -356,14 +356,14 @@ def explain(
     with importing():
         import asyncio
 
-        from application_manager.commands.explanationtext import text
+        from application_manager.commands.explanationtext import explanation_text
         from application_manager.commands.inquiry import inquire
 
     explanation = asyncio.run(inquire(subject, namespace))
     if output is Output.JSON:
         sys.stdout.write(f"{json.dumps(explanation.to_json(), indent=2, ensure_ascii=False)}\n")
     else:
-        sys.stdout.write(text(explanation))
+        sys.stdout.write(explanation_text(explanation))
 
 
 app.command()(webhooks)

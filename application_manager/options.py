@@ -9,7 +9,7 @@ import zenoh
 
 from application_manager.admission.reviewing import Serving
 from application_manager.charts.chartcache import default_folder
-from application_manager.charts.helm import Helm
+from application_manager.charts.helm import HelmRunner
 from application_manager.cluster.leadership import LeaseKey
 from application_manager.core.holders.policies import TaskPolicy
 from application_manager.core.objects.poddefaults import PodDefaults
@@ -53,7 +53,7 @@ class Options:
     metrics_port: int | None = None
     metrics_certificates: Path | None = None
     zenoh: zenoh.Config | None = None
-    helm: Helm = field(default_factory=Helm)
+    helm: HelmRunner = field(default_factory=HelmRunner)
     chart_cache: Path = field(default_factory=default_folder)
     chart_folder: Path = Path("/charts")
     admission: Serving | None = None

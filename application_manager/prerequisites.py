@@ -10,12 +10,12 @@ from functools import partial
 from application_manager.cache.cluster_cache import OWN_KINDS, POD, TASK
 from application_manager.cluster.client import Client, Resource
 from application_manager.cluster.connection import ConfigurationError
-from application_manager.cluster.entitlement import judge, missing_rights
+from application_manager.cluster.entitlement import missing_rights, report_missing
 from application_manager.cluster.errors import ApiError
 from application_manager.cluster.leadership import LeaseKey
 from application_manager.cluster.repeating import until_answered
 from application_manager.core.objects.policy import KindKey, Policy, kind_text
-from application_manager.core.objects.rights import lease_rights, reading, rights
+from application_manager.core.objects.rights import lease_rights, read_only, rights
 
 log = logging.getLogger(__name__)
 
@@ -89,7 +89,7 @@ async def entitled(
     plurals = {kind: resources[kind].plural for kind in policy.kinds if kind in resources}
     needed_there = rights(plurals, detectors=detectors)
     for needed, where in (
-        (needed_there if namespaces else reading(needed_there), namespaces),
+        (needed_there if namespaces else read_only(needed_there), namespaces),
         (lease_rights(lease.name), (lease.namespace,)),
     ):
-        judge(await until_answered(partial(missing_rights, client, needed, where)))
+        report_missing(await until_answered(partial(missing_rights, client, needed, where)))

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from application_manager.core.objects.policy import DEFAULT_KINDS, PLURALS, KindKey, kind_text
-from application_manager.core.objects.rights import certificate_rights, lease_rights, merged, node_rights, rights
+from application_manager.core.objects.rights import certificate_rights, lease_rights, merged_rules, node_rights, rights
 from wayside.api.__main__ import crd_files
 from wayside.manifests import to_yaml
 
@@ -35,23 +35,23 @@ def _rights() -> dict[str, Any]:
     secret, webhooks = certificate_rights(SECRET_NAME, WEBHOOKS)
     without_pods, pods = rights({}), rights({_POD: "pods"})
     return {
-        "always": merged(each for each in without_pods if each in pods),
-        "withoutPods": merged(each for each in without_pods if each not in pods),
-        "detectors": merged(each for each in rights({}, detectors=True) if each not in without_pods),
-        "cluster": merged(node_rights()),
+        "always": merged_rules(each for each in without_pods if each in pods),
+        "withoutPods": merged_rules(each for each in without_pods if each not in pods),
+        "detectors": merged_rules(each for each in rights({}, detectors=True) if each not in without_pods),
+        "cluster": merged_rules(node_rights()),
         "kinds": {kind_text(kind): _added(kind, plural) for kind, plural in sorted(PLURALS.items())},
         "defaultKinds": sorted(map(kind_text, DEFAULT_KINDS)),
         "otherKindVerbs": _added(_ANY, "examples")[0]["verbs"],
-        "lease": merged(lease_rights(LEASE)),
-        "secret": merged(secret),
-        "webhooks": merged(webhooks),
+        "lease": merged_rules(lease_rights(LEASE)),
+        "secret": merged_rules(secret),
+        "webhooks": merged_rules(webhooks),
     }
 
 
 def _added(kind: KindKey, plural: str) -> list[dict[str, Any]]:
     others = {} if kind == _POD else {_POD: "pods"}
     before = rights(others)
-    return merged(each for each in rights(others | {kind: plural}) if each not in before)
+    return merged_rules(each for each in rights(others | {kind: plural}) if each not in before)
 
 
 def main() -> None:

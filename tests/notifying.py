@@ -13,7 +13,7 @@ from detector.actions import Completion, Episode, Outcome, OutcomeState, Setting
 from detector.actions.notify import Notify
 from detector.streams.codecs.ros import standard
 from tests.driving import SECOND, START, a_detector, a_rule
-from wayside.api.actions.notify import Notify as Parameters
+from wayside.api.actions.notify import NotifyAction as Parameters
 from wayside.times import format_time
 
 WAIT = 60.0

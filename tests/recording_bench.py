@@ -18,7 +18,7 @@ from detector.assembly import inlets
 from tests.driving import SECOND, a_detector, a_rule, a_stream, at
 from tests.ros_messages import cdr, make, pose_stamped
 from wayside.api import Detector
-from wayside.api.actions.record import Record as Parameters
+from wayside.api.actions.record import RecordAction as Parameters
 
 STREAMS = (
     a_stream("pose", encoding="cdr", type="geometry_msgs/msg/PoseStamped"),

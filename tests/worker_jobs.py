@@ -8,7 +8,7 @@ import signal
 from dataclasses import dataclass
 from pathlib import Path
 
-from wayside.expressions import Environment, Kind
+from wayside.expressions import CelType, Environment
 
 BOMB = 'l.filter(x, s.matches("([ab]*a[ab]{50}){3}z")).size()'
 """Takes some 15 ms for each item of `l`, where `s` has 4 KiB, in C++ and with the interpreter's lock held."""
@@ -24,7 +24,7 @@ class Evaluation:
 
     def run(self) -> object:
         """The number of items that match."""
-        expression = Environment({"l": Kind.LIST, "s": Kind.STRING}).compile(BOMB)
+        expression = Environment({"l": CelType.LIST, "s": CelType.STRING}).compile(BOMB)
         return expression.evaluate({"l": [0.0] * self.items, "s": TEXT})
 
 

@@ -79,6 +79,6 @@ def ignored_by(annotations: Mapping[str, str]) -> frozenset[str]:
     return frozenset(each.strip() for each in annotations.get(IGNORE_ANNOTATION, "").split(","))
 
 
-def listed(checks: Iterable[Check]) -> Iterator[str]:
+def check_lines(checks: Iterable[Check]) -> Iterator[str]:
     """A line for each check: its name, severity and meaning, separated by tabs."""
     return (f"{each.name}\t{each.severity}\t{each.meaning}" for each in checks)

@@ -40,7 +40,7 @@ def degrees(latitude: float) -> tuple[float, float]:
     return math.radians(meridian), math.radians(normal * math.cos(math.radians(latitude)))
 
 
-def distance(latitude_1: float, longitude_1: float, latitude_2: float, longitude_2: float) -> float:
+def surface_distance(latitude_1: float, longitude_1: float, latitude_2: float, longitude_2: float) -> float:
     """The way along the surface between two places, in metres; of the heights nothing is known.
 
     Vincenty's inverse formula ("Direct and inverse solutions of geodesics on the ellipsoid", Survey Review 176, 1975),

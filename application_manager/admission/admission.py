@@ -26,7 +26,7 @@ from application_manager.core.objects.detectors import deployment_to_try
 from application_manager.core.objects.poddefaults import PodDefaults
 from application_manager.core.objects.policy import KindKey
 from application_manager.measures import Measures
-from application_manager.workers.jobs import DetectorJob, RuleJob, Surroundings, TemplateJob
+from application_manager.workers.jobs import DetectorJob, RuleContext, RuleJob, TemplateJob
 from application_manager.workers.pool import ExceededError, Runs
 from application_manager.workers.process import Job
 from wayside.api import ApplicationTemplate, Detector, EventRule
@@ -118,7 +118,7 @@ class Admission:
         findings = await self._judged(rule)
         if not findings.all:
             return findings
-        if (await self._run(rule.namespace, RuleJob(rule, Surroundings()))).problems:
+        if (await self._run(rule.namespace, RuleJob(rule, RuleContext()))).problems:
             return findings  # it has them by itself
         try:
             async with asyncio.timeout(LOOKING_UP):

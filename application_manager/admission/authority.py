@@ -30,11 +30,11 @@ def make_certificates(folder: Path, hosts: Sequence[str]) -> bytes:
     Raises ConfigurationError where the folder cannot be written to.
     """
     files = issued(hosts)
-    written(folder, files)
+    write_whole(folder, files)
     return files[AUTHORITY]
 
 
-def written(folder: Path, files: Mapping[str, bytes]) -> None:
+def write_whole(folder: Path, files: Mapping[str, bytes]) -> None:
     """Write the files whole or not at all. Raises ConfigurationError where the folder cannot be written to."""
     try:
         folder.mkdir(parents=True, exist_ok=True)

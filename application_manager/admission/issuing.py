@@ -20,13 +20,13 @@ from typing import Any
 from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding
 
-from application_manager.admission.authority import AUTHORITY, VALID, issued, written
+from application_manager.admission.authority import AUTHORITY, VALID, issued, write_whole
 from application_manager.admission.reviewing import Serving
 from application_manager.cluster.client import Client, Object, Resource
 from application_manager.cluster.connection import ConfigurationError
 from application_manager.cluster.errors import ApiError
 from application_manager.cluster.repeating import repeatedly, until_answered
-from application_manager.core.findings.webhooks import Place
+from application_manager.core.findings.webhooks import WebhookClientConfig
 from wayside.servingcertificate import CERTIFICATE, KEY
 
 EVERY = 10.0  # s between two looks at the Secret
@@ -80,7 +80,7 @@ class Issuing:
             raise ConfigurationError(f"there is no Secret {namespace}/{name} for the webhook's certificate: create it")
         files = {key: base64.b64decode(value) for key, value in (secret.get("data") or {}).items()}
         if _due(files, now := datetime.datetime.now(datetime.UTC)):
-            files = issued(Place.of_service(self.service).hosts)
+            files = issued(WebhookClientConfig.of_service(self.service).hosts)
             files[AUTHORITY] += _trusted(secret, now)
             data = {key: base64.b64encode(content).decode() for key, content in files.items()}
             try:
@@ -91,7 +91,7 @@ class Issuing:
                 raise
             log.info("made a certificate for the webhook, valid for %d days", VALID.days)
         await self._trust(base64.b64encode(files[AUTHORITY]).decode())
-        written(self.folder, {each: files[each] for each in (AUTHORITY, CERTIFICATE, KEY)})
+        write_whole(self.folder, {each: files[each] for each in (AUTHORITY, CERTIFICATE, KEY)})
 
     async def _trust(self, bundle: str) -> None:
         """Write the authority into those of the configurations that there are."""

@@ -5,16 +5,16 @@ from __future__ import annotations
 from typing import Any
 
 from application_manager.cache.cluster_cache import DETECTOR, EVENT_RULE, TEMPLATE, ClusterCache
-from application_manager.workers.jobs import Surroundings
+from application_manager.workers.jobs import RuleContext
 from wayside.api import ApplicationTemplate, Detector, EventRule
 from wayside.rules import depends
 
 
-def surroundings(cache: ClusterCache, rule: EventRule) -> Surroundings:
+def surroundings(cache: ClusterCache, rule: EventRule) -> RuleContext:
     """As far as they matter to the rule: other rules where it names any, templates where it deploys."""
     namespace = rule.namespace
     deploys = any(each.deploy is not None for each in rule.spec.actions)
-    return Surroundings(
+    return RuleContext(
         detectors=cache.models(DETECTOR, Detector, namespace),
         invalid_detectors=cache.invalid(DETECTOR, namespace),
         rules=cache.models(EVENT_RULE, EventRule, namespace) if depends(rule) else [],

@@ -16,7 +16,7 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-from application_manager.charts.helm import Helm, HelmError
+from application_manager.charts.helm import HelmError, HelmRunner
 from application_manager.core.objects.charts import ChartSource
 
 KEPT = 64  # archives
@@ -31,7 +31,7 @@ class ChartCache:
         local: the folder with the charts of the image, in which all that templates name by a path must be.
     """
 
-    helm: Helm
+    helm: HelmRunner
     folder: Path
     local: Path
 

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from application_manager.charts.chartcache import ChartCache
-from application_manager.charts.helm import Helm, HelmError
+from application_manager.charts.helm import HelmError, HelmRunner
 from application_manager.charts.rendering import failed, rendered, unavailable
 from application_manager.core.objects.charts import (
     FAILED,
@@ -78,7 +78,7 @@ class _Rendering:
 class ChartDesk:
     """Takes requests. Only the event loop's thread uses it."""
 
-    def __init__(self, helm: Helm, cache: ChartCache, again: Callable[[Name, float], None]) -> None:
+    def __init__(self, helm: HelmRunner, cache: ChartCache, again: Callable[[Name, float], None]) -> None:
         """`again` enqueues an instance at a time, in seconds since 1970."""
         self._helm = helm
         self._cache = cache

@@ -45,7 +45,7 @@ class HelmError(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Helm:
+class HelmRunner:
     """Runs helm.
 
     Attributes:

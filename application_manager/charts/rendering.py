@@ -6,7 +6,7 @@ import asyncio
 from pathlib import Path
 
 from application_manager.charts.chartcache import ChartCache
-from application_manager.charts.helm import Helm, HelmError
+from application_manager.charts.helm import HelmError, HelmRunner
 from application_manager.core.objects.charts import (
     FAILED,
     UNAVAILABLE,
@@ -14,11 +14,11 @@ from application_manager.core.objects.charts import (
     ChartOutcome,
     ChartRequest,
     ChartSource,
-    parse,
+    parse_chart,
 )
 
 
-async def rendered(helm: Helm, request: ChartRequest, path: Path) -> ChartOutcome:
+async def rendered(helm: HelmRunner, request: ChartRequest, path: Path) -> ChartOutcome:
     """The objects of the chart at the path, or why they cannot be used.
 
     It is rendered twice: what differs each time would be applied again and again.
@@ -33,10 +33,10 @@ async def rendered(helm: Helm, request: ChartRequest, path: Path) -> ChartOutcom
             f"spec.helm: chart {request.source} gives other objects each time (by randAlphaNum, genCA, now or the "
             "like), so the application would restart for nothing: give these values in spec.helm.values",
         )
-    return await asyncio.to_thread(parse, request.source, text)
+    return await asyncio.to_thread(parse_chart, request.source, text)
 
 
-async def rendered_at_once(helm: Helm, cache: ChartCache, request: ChartRequest) -> ChartOutcome:
+async def rendered_at_once(helm: HelmRunner, cache: ChartCache, request: ChartRequest) -> ChartOutcome:
     """The same from the beginning, for who can wait: the chart is fetched where it is not here yet."""
     try:
         path = await cache.path(request.source)

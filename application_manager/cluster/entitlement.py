@@ -29,7 +29,7 @@ async def missing_rights(client: Client, needed: Iterable[Right], namespaces: Co
     return [each for each, may in zip(verbs, allowed, strict=True) if not may]
 
 
-def judge(lacks: Collection[Lack]) -> None:
+def report_missing(lacks: Collection[Lack]) -> None:
     """Report the missing rights, each with what does not work without it and with the remedy.
 
     Raises ConfigurationError where nothing works without it.

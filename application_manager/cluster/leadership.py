@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from application_manager.cluster.client import LEASES, Client
 from application_manager.cluster.errors import ApiError, Unreachable
 from application_manager.cluster.podaccount import FOLDER
-from application_manager.core.holders.leading import DEADLINE, LOOK_EVERY, RENEW_EVERY, Candidate
+from application_manager.core.holders.leading import DEADLINE, LOOK_EVERY, RENEW_EVERY, LeaseCandidate
 from application_manager.measures import Measures
 from wayside.leases import holder_of
 
@@ -77,7 +77,7 @@ class Leadership:
         self._client = client
         self._key = key
         self._measures = measures
-        self._candidate = Candidate(identity or own_identity())
+        self._candidate = LeaseCandidate(identity or own_identity())
         self._changed = asyncio.Event()
         self._logged = ""
         self._was_active = False

@@ -11,7 +11,7 @@ _TASKS_SHOWN = 20
 _PODS_SHOWN = 20
 
 
-def text(explanation: Explanation) -> str:
+def explanation_text(explanation: Explanation) -> str:
     """The explanation as lines, the last one ended too."""
     return "".join(f"{line}\n" for line in _lines(explanation))
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from application_manager.charts.chartcache import ChartCache, default_folder
-from application_manager.charts.helm import Helm
+from application_manager.charts.helm import HelmRunner
 from application_manager.charts.rendering import rendered_at_once
 from application_manager.core.claims.operations import Standing
 from application_manager.core.demand import drafting
@@ -25,7 +25,7 @@ from wayside.manifests import to_yaml
 
 
 @dataclass(frozen=True, slots=True)
-class Rendered:
+class OfflineResult:
     """What would run.
 
     Attributes:
@@ -46,7 +46,7 @@ class Rendered:
 
 def render_files(
     paths: Iterable[Path], policy: Policy, limit: int | None = None, charts: Charts = no_charts
-) -> Rendered:
+) -> OfflineResult:
     """What the templates and tasks in the files make run; other kinds are passed over.
 
     Args:
@@ -60,7 +60,7 @@ def render_files(
     return render_objects([document.object for document in load_documents(paths)], policy, time.time(), limit, charts)
 
 
-def charts_at_once(helm: Helm, cache: Path | None, folder: Path) -> Charts:
+def charts_at_once(helm: HelmRunner, cache: Path | None, folder: Path) -> Charts:
     """Renders charts while the caller waits.
 
     Args:
@@ -74,7 +74,7 @@ def charts_at_once(helm: Helm, cache: Path | None, folder: Path) -> Charts:
 
 def render_objects(
     objects: Sequence[Kind], policy: Policy, now: float, limit: int | None = None, charts: Charts = no_charts
-) -> Rendered:
+) -> OfflineResult:
     """What the templates and tasks make run, namespace by namespace.
 
     Args:
@@ -84,7 +84,7 @@ def render_objects(
         limit: how many instances a namespace may have; None: any number.
         charts: renders charts.
     """
-    result = Rendered()
+    result = OfflineResult()
     for namespace in sorted({each.namespace for each in objects}):
         here = [each for each in objects if each.namespace == namespace]
         templates = {each.name: each for each in here if isinstance(each, ApplicationTemplate)}
@@ -102,7 +102,7 @@ def render_objects(
 
 
 def _render(
-    decision: Decision, template: ApplicationTemplate, policy: Policy, charts: Charts, result: Rendered
+    decision: Decision, template: ApplicationTemplate, policy: Policy, charts: Charts, result: OfflineResult
 ) -> None:
     instance = drafting.draft((template.namespace, decision.name), decision, None)
     result.objects.append(drafting.created(instance, template))

@@ -31,7 +31,7 @@ def seconds_of(option: str, written: str) -> float:
         raise typer.BadParameter(str(error), param_hint=option) from None
 
 
-def bytes_of(option: str, written: str) -> int:
+def option_bytes(option: str, written: str) -> int:
     """The quantity of an option, in bytes."""
     from wayside.api.base import PositiveQuantity
 

@@ -9,7 +9,11 @@ from pathlib import Path
 import typer
 
 from application_manager.cluster.connection import ConfigurationError
-from application_manager.core.findings.webhooks import Place, injection_configuration, webhook_configuration
+from application_manager.core.findings.webhooks import (
+    WebhookClientConfig,
+    injection_configuration,
+    webhook_configuration,
+)
 from wayside import commandline
 from wayside.manifests import to_yaml
 
@@ -43,7 +47,9 @@ def print_webhooks(
     if ca_bundle is not None and folder is not None:
         commandline.refuse("--ca-bundle and --make-certificates exclude each other: give one")
     try:
-        place = Place.of_service(service) if service is not None else Place.of_url(url or "")
+        place = (
+            WebhookClientConfig.of_service(service) if service is not None else WebhookClientConfig.of_url(url or "")
+        )
     except ValueError as error:
         raise typer.BadParameter(str(error), param_hint="--url" if service is None else "--service") from None
     bundle = _authority(ca_bundle, folder, place)
@@ -51,7 +57,7 @@ def print_webhooks(
     sys.stdout.write(to_yaml([each(place, bundle, namespaces, name) for each in made]))
 
 
-def _authority(given: Path | None, folder: Path | None, place: Place) -> bytes | None:
+def _authority(given: Path | None, folder: Path | None, place: WebhookClientConfig) -> bytes | None:
     if folder is not None:
         from application_manager.admission.authority import make_certificates  # noqa: PLC0415  hardly ever needed
 

@@ -29,14 +29,14 @@ Lack = Callable[[], str | None]
 _TEXT = "text/plain; version=0.0.4; charset=utf-8"
 
 
-class Queue(Protocol):
+class _Queue(Protocol):
     """What reports a worker that is at one key for too long."""
 
     def stuck(self, limit: float) -> str | None:
         """The key and for how long, in words."""
 
 
-def stalled(measures: Measures, every: float, queues: Sequence[Queue] = (), least: float = STALLED_AFTER) -> Lack:
+def stalled(measures: Measures, every: float, queues: Sequence[_Queue] = (), least: float = STALLED_AFTER) -> Lack:
     """Whether work has stalled: no resync has ended, or a worker was at one key, for too long.
 
     A resync that fails, the API server being away, ends as well. Any thread may ask.

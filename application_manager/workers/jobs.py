@@ -121,7 +121,7 @@ class TemplateJob:
 
 
 @dataclass(frozen=True, slots=True)
-class Surroundings:
+class RuleContext:
     """What a rule is judged with: the valid objects of its namespace, and the names of the others."""
 
     detectors: Sequence[Detector] = ()
@@ -136,7 +136,7 @@ class RuleJob:
     """What is wrong with a rule."""
 
     rule: EventRule
-    among: Surroundings
+    among: RuleContext
 
     def run(self) -> Findings:
         """The findings."""

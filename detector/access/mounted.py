@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from wayside.api.access import Access
-from wayside.api.database import Database
+from wayside.api.database import DatabaseConnection
 
 SECRETS_VARIABLE = "WAYSIDE_SECRETS"
 SECRETS_FOLDER = "/etc/wayside/secrets"
@@ -92,7 +92,7 @@ def secret_text(name: str, key: str, field: str) -> str:
     return _text(_secret(name, field) / key, field)
 
 
-def database_uri(database: Database, field: str) -> str:
+def database_uri(database: DatabaseConnection, field: str) -> str:
     """The connection string of a database; `field` is where `database` stands. Raises AccessError."""
     if database.uri_file is not None:
         return _text(Path(database.uri_file), f"{field}.uriFile")

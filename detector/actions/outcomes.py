@@ -50,7 +50,7 @@ class ActionTally:
 
 
 @dataclass(frozen=True, slots=True)
-class Lost:
+class _Lost:
     """What an action lost."""
 
     which: Which
@@ -129,11 +129,11 @@ class Outcomes:
         with self._lock:
             return {which: _copied(tally) for which, tally in sorted(self._tallies.items())}
 
-    def lost(self) -> list[Lost]:
+    def lost(self) -> list[_Lost]:
         """All that was lost."""
         with self._lock:
             return [
-                Lost(which, what, count, self._reasons[which, what])
+                _Lost(which, what, count, self._reasons[which, what])
                 for (which, what), count in sorted(self._lost.items())
             ]
 

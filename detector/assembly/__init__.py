@@ -60,7 +60,7 @@ class Inlets:
 
 
 @dataclass(frozen=True, slots=True)
-class Refusal:
+class RefusedRule:
     """A rule that is refused, with the reason."""
 
     rule: EventRule
@@ -199,10 +199,10 @@ class RuleIndex:
         detector: Detector,
         fields: Mapping[str, Fields],
         places: KnownPlaces | None = None,
-    ) -> tuple[list[CompiledRule], list[Refusal]]:
+    ) -> tuple[list[CompiledRule], list[RefusedRule]]:
         """The rules to evaluate, and the refused ones."""
         compiled: list[CompiledRule] = []
-        refused: list[Refusal] = []
+        refused: list[RefusedRule] = []
         good: dict[str, EventRule] = {}
         wrong = dependency_problems(rules)
         for rule in rules:
@@ -213,7 +213,7 @@ class RuleIndex:
             except RuleError as error:
                 before = self._good.get(rule.name)
                 last = None if before is None else _compiled(before, detector, fields, places)
-                refused.append(Refusal(rule, error.problems, kept=last is not None))
+                refused.append(RefusedRule(rule, error.problems, kept=last is not None))
                 if before is not None and last is not None:
                     compiled.append(last)
                     good[rule.name] = before

@@ -15,7 +15,7 @@ from detector.findings.checks import (
     UNKNOWN_RULE,
 )
 from detector.onnx.binding import bind_models
-from detector.sources.registry import source_problems
+from detector.sources.registry import source_plugin_problems
 from wayside.api import Detector, EventRule
 from wayside.api.detector import Clock
 from wayside.api.documents import Document, Problem
@@ -27,7 +27,7 @@ from wayside.rules.contradictions import contradictions
 _CHECKED = (Detector, EventRule)
 
 
-class Findings(NamedTuple):
+class CheckResult(NamedTuple):
     """Errors, and warnings without those that the annotation of their object ignores."""
 
     problems: list[Problem]
@@ -39,7 +39,7 @@ def check_documents(documents: Sequence[Document]) -> list[Problem]:
     return findings(documents).problems
 
 
-def findings(documents: Sequence[Document]) -> Findings:
+def findings(documents: Sequence[Document]) -> CheckResult:
     """The findings about the Detectors, and about the rules with each Detector that selects them."""
     problems: list[Problem] = []
     warnings: list[Problem] = []
@@ -49,7 +49,7 @@ def findings(documents: Sequence[Document]) -> Findings:
             try:
                 problems += [
                     document.problem(each.path, each.message, INVALID_DETECTOR.name)
-                    for each in source_problems(document.object)
+                    for each in source_plugin_problems(document.object)
                 ]
                 entries = inlets(document.object)
                 detectors.append((document, document.object, entries))
@@ -76,7 +76,7 @@ def findings(documents: Sequence[Document]) -> Findings:
         problems += [
             of_detector.problem(path, text, UNKNOWN_RULE.name) for path, text in unknown_rules(detector, names)
         ]
-    return Findings(list(dict.fromkeys(problems)), list(dict.fromkeys(warnings)))
+    return CheckResult(list(dict.fromkeys(problems)), list(dict.fromkeys(warnings)))
 
 
 def _without_stamps(document: Document, detector: Detector, entries: Inlets) -> Iterator[Problem]:
@@ -148,7 +148,7 @@ def _rule_problems(
             warnings += _unignored(document, (document.problem(each.path, each.message, each.check) for each in found))
 
 
-def summary(documents: Sequence[Document]) -> str:
+def checked_summary(documents: Sequence[Document]) -> str:
     """How much was looked at, and what was not."""
     counts = Counter(type(document.object).__name__ for document in documents)
     looked = ", ".join(_counted(counts.pop(kind.__name__, 0), kind.__name__) for kind in _CHECKED)

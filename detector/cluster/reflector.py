@@ -24,7 +24,7 @@ _PAUSE = 0.1
 
 
 @dataclass(frozen=True)
-class Listed:
+class Replaced:
     """All existing objects; any other object known before is deleted."""
 
     objects: list[JsonObject]
@@ -46,7 +46,7 @@ class Deleted:
     object: JsonObject
 
 
-Change = Listed | Changed | Deleted
+Change = Replaced | Changed | Deleted
 
 
 def version_of(obj: JsonObject) -> int:
@@ -91,7 +91,7 @@ class Reflector:
             try:
                 listed = await self._api.list(self._resource, self._namespace, self._selectors)
                 self._recovered()
-                yield Listed(listed["items"], version_of(listed))
+                yield Replaced(listed["items"], version_of(listed))
                 async with aclosing(self._watch(listed["metadata"]["resourceVersion"])) as changes:
                     async for change in changes:
                         yield change

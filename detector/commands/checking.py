@@ -7,15 +7,15 @@ from pathlib import Path
 
 import typer
 
-from detector.assembly.checking import findings, summary
+from detector.assembly.checking import checked_summary, findings
 from detector.findings.checks import CHECKS, UNREADABLE_RECORDING
 from wayside.api.documents import DocumentError, load_documents
-from wayside.findings import UNREADABLE_FILE, ignorable, listed
+from wayside.findings import UNREADABLE_FILE, check_lines, ignorable
 
 
 def list_checks() -> None:
     """Print the name, severity and meaning of every finding."""
-    for line in listed(CHECKS):
+    for line in check_lines(CHECKS):
         typer.echo(line)
 
 
@@ -57,4 +57,4 @@ def check_files(files: Sequence[Path], recordings: Sequence[Path], ignore: Seque
     if found.problems or unread or (strict and warnings):
         raise typer.Exit(1)
     count = f", {len(warnings)} warning{'s' if len(warnings) > 1 else ''}" if warnings else ""
-    typer.echo(f"{summary(documents)}: nothing wrong{count}", err=True)
+    typer.echo(f"{checked_summary(documents)}: nothing wrong{count}", err=True)

@@ -16,7 +16,7 @@ import typer
 from detector.commands import inquiry, recordings
 from detector.commands.catalog.command import command as catalog_command
 from detector.commands.mine_command import mine
-from detector.results.kinds import Kind, chosen
+from detector.results.kinds import ResultKind, chosen
 from wayside import commandline
 from wayside.beginning import importing
 from wayside.commandline import leave, refuse
@@ -121,7 +121,7 @@ def run(
     with importing():
         import asyncio
 
-        from detector.live.service import Files, Named, Options
+        from detector.live.service import Files, Named, RunOptions
         from detector.live.service import run as run_service
         from detector.status.server import PagesAddress
 
@@ -132,7 +132,7 @@ def run(
     else:
         assert detector is not None  # noqa: S101  one of both is given
         source = Files(detector, tuple(rules or ()), output or Path("out"))
-    asyncio.run(run_service(Options(source, record_intake, pages, _view(foxglove))))
+    asyncio.run(run_service(RunOptions(source, record_intake, pages, _view(foxglove))))
     leave()
 
 
@@ -182,7 +182,7 @@ def replay(
         bool, typer.Option("--as-one", help=("Play all recordings as one, merged by time: they belong to one drive."))
     ] = False,
     results: Annotated[
-        list[Kind] | None,
+        list[ResultKind] | None,
         typer.Option(
             help="Also write results to look at: report.html; results.mcap for Foxglove; the table of episodes as "
             "Parquet and CSV; or all. May be repeated."

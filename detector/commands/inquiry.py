@@ -68,7 +68,7 @@ def status(
     if subject is not None and rule is None:
         refuse("--subject requires --rule")
     given = {"rule": rule, "subject": subject, "wait": f"{min(timeout * 0.6, 99):.3f}"} if rule is not None else {}
-    answers = inquire(
+    answers = query_selected(
         "status", {name: value for name, value in given.items() if value is not None}, detector, name, connect, timeout
     )
     if as_json:
@@ -122,7 +122,7 @@ def _inquire_all(
         DocumentError: the file is wrong, or holds no Detector.
     """
     if detector is None:
-        return [answer.payload for answer in inquire("status", {}, None, None, connect, timeout)], {}
+        return [answer.payload for answer in query_selected("status", {}, None, None, connect, timeout)], {}
     with importing():
         from detector.resources.files import load_detectors
         from detector.streams.querying import NetworkError, NoAnswerError, query_detectors
@@ -175,7 +175,7 @@ def evaluate(
     rule: RuleName, detector: DetectorFile = None, name: Name = None, connect: Connect = None, timeout: Timeout = 3.0
 ) -> None:
     """Evaluate a rule with onDemand, and print a line of JSON for each subject."""
-    for answer in inquire("evaluate", {"rule": rule}, detector, name, connect, timeout):
+    for answer in query_selected("evaluate", {"rule": rule}, detector, name, connect, timeout):
         for each in json.loads(answer.payload):
             typer.echo(json.dumps(each))
 
@@ -184,14 +184,14 @@ def pause(
     rule: RuleName, detector: DetectorFile = None, name: Name = None, connect: Connect = None, timeout: Timeout = 3.0
 ) -> None:
     """Do not evaluate a rule until it is resumed; its open episodes are kept."""
-    _print_replies("pause", rule, inquire("pause", {"rule": rule}, detector, name, connect, timeout))
+    _print_replies("pause", rule, query_selected("pause", {"rule": rule}, detector, name, connect, timeout))
 
 
 def resume(
     rule: RuleName, detector: DetectorFile = None, name: Name = None, connect: Connect = None, timeout: Timeout = 3.0
 ) -> None:
     """Evaluate a paused rule again."""
-    _print_replies("resume", rule, inquire("resume", {"rule": rule}, detector, name, connect, timeout))
+    _print_replies("resume", rule, query_selected("resume", {"rule": rule}, detector, name, connect, timeout))
 
 
 def _print_replies(what: str, rule: str, answers: list[Reply]) -> None:
@@ -199,7 +199,7 @@ def _print_replies(what: str, rule: str, answers: list[Reply]) -> None:
         typer.echo(f"{answer.holder}: rule {rule} {what}d", err=True)
 
 
-def inquire(
+def query_selected(
     what: str,
     given: dict[str, str],
     detector: Path | None,

@@ -13,11 +13,11 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from detector.assembly import lasting_problems
-from detector.mining.mining import Run, Share, run_mining
-from detector.mining.report import REPORT, write_report
+from detector.mining.mining import MiningRun, WorkShare, run_mining
+from detector.mining.report import REPORT, write_mining_report
 from detector.mining.sources import sampled, sources_of
 from detector.mining.summary import Summary, show, summary_of
-from detector.mining.workers import Pool, Workers
+from detector.mining.workers import LocalWorkers, Workers
 from detector.resources.files import load_rules
 from detector.results.installed import check_package
 from wayside.commandline import refuse
@@ -96,12 +96,12 @@ def mine_recordings(
         return
     summary = summary_of(output)
     if run.changed or not (output / REPORT).exists():
-        write_report(output, summary)
+        write_mining_report(output, summary)
     show(console if console.is_terminal else Console(stderr=True, width=_WIDTH), summary)
     _finish(run, summary, output, shared=part is not None)
 
 
-def _finish(run: Run, summary: Summary, output: Path, *, shared: bool) -> None:
+def _finish(run: MiningRun, summary: Summary, output: Path, *, shared: bool) -> None:
     """Print the errors and the last line. A share fails only where another attempt may help."""
     for cut in run.cut:
         whole = ", ".join(f"{rule} ({why})" for rule, why in sorted(cut.whole.items()))
@@ -120,7 +120,7 @@ def _finish(run: Run, summary: Summary, output: Path, *, shared: bool) -> None:
         raise typer.Exit(1)
 
 
-def _did(run: Run) -> str:
+def _did(run: MiningRun) -> str:
     if not run.mined:
         return "nothing was left to do"
     rules = f"{len(run.rules_run)} rules" if len(run.rules_run) > _NAMES else ", ".join(sorted(run.rules_run))
@@ -130,7 +130,7 @@ def _did(run: Run) -> str:
 def _workers(processes: int | None, dask: str | None) -> Workers:
     """Raises ClusterError."""
     if dask is None:
-        return Pool(processes or len(os.sched_getaffinity(0)))
+        return LocalWorkers(processes or len(os.sched_getaffinity(0)))
     if processes is not None:
         refuse("--processes is for this machine, and a Dask cluster has workers of its own: remove one of both")
     check_package("distributed", "--dask", "dask")
@@ -139,11 +139,11 @@ def _workers(processes: int | None, dask: str | None) -> Workers:
     return DaskWorkers(dask)
 
 
-def _share(text: str) -> Share:
+def _share(text: str) -> WorkShare:
     found = re.fullmatch(r"(\d+)/(\d+)", text)
     if found is None or int(found[1]) >= int(found[2]):
         refuse(f"--share {text}: give NUMBER/OF, counted from 0, e.g. 0/8 to 7/8")
-    return Share(int(found[1]), int(found[2]))
+    return WorkShare(int(found[1]), int(found[2]))
 
 
 class _Bar:
@@ -172,10 +172,10 @@ class _Bar:
         self._progress.stop()
 
     def expect(self, recordings: int, amount: int) -> None:
-        """See `mining.Watch`."""
+        """See `MiningProgress`."""
         self._progress.update(self._task, total=amount, recordings=recordings)
 
     def done(self, amount: int) -> None:
-        """See `mining.Watch`."""
+        """See `MiningProgress`."""
         self._recordings += 1
         self._progress.update(self._task, advance=amount, done=self._recordings)

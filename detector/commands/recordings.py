@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from detector.commands.inquiry import Connect, DetectorFile, Name, Timeout, inquire
+from detector.commands.inquiry import Connect, DetectorFile, Name, Timeout, query_selected
 from wayside.beginning import importing
 from wayside.commandline import refuse
 
@@ -106,7 +106,7 @@ def _request_reports(
     """The reports, each with the name of the detector that gave it."""
     from detector.actions.trigger.requests import RECORDINGS, read_reports, write_request
 
-    answers = inquire(RECORDINGS, {}, detector, name, connect, timeout, write_request(request))
+    answers = query_selected(RECORDINGS, {}, detector, name, connect, timeout, write_request(request))
     return [(answer.key.split("/")[2], report) for answer in answers for report in read_reports(answer.payload)]
 
 

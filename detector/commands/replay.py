@@ -23,16 +23,16 @@ from detector.plugins.outages import Outages
 from detector.plugins.processes import REPLAY_PATIENCE, ProcessHost
 from detector.replay.clips import Clips
 from detector.replay.errors import RecordingError
-from detector.replay.gathering import Recording, intake_file_of, name_of, recordings_of
+from detector.replay.gathering import Recording, intake_file_of, recording_name, recordings_of
 from detector.replay.intake_file import read_intake, recorded_outages
 from detector.replay.playing import Played, play
-from detector.replay.progress import Progress
+from detector.replay.progress import ProgressLine
 from detector.replay.recordings import quick_span_of
 from detector.replay.replaying import Outcome, replay_intake
 from detector.replay.variants import Variant, variants_of, with_variants
 from detector.resources.files import load_rules
 from detector.resources.selection import select
-from detector.results.kinds import Kind
+from detector.results.kinds import ResultKind
 from detector.results.variants import comparisons, show_variants, write_variants
 from detector.results.writing import Look, Looking, check_installed, show_summary, write_results
 from wayside.api import ApplicationTask, Detector, EventRule
@@ -47,7 +47,7 @@ _WIDTH = 160
 """Columns of a table that goes into a pipe or a file."""
 
 
-class Options(NamedTuple):
+class PlayOptions(NamedTuple):
     """How recordings are played."""
 
     as_one: bool
@@ -63,7 +63,7 @@ def replay_files(
     rules: Sequence[Path],
     *,
     as_one: bool,
-    kinds: frozenset[Kind] = frozenset(),
+    kinds: frozenset[ResultKind] = frozenset(),
     sets: Sequence[str] = (),
     sweeps: Sequence[str] = (),
     record: bool = False,
@@ -91,9 +91,9 @@ def replay_files(
     """
     check_installed(kinds)
     looking = Looking() if kinds else None
-    with Progress(Console(stderr=True)) as progress:
+    with ProgressLine(Console(stderr=True)) as progress:
         clips = Clips(output / CLIPS) if record else None
-        options = Options(as_one, clips, tuple(sets), tuple(sweeps))
+        options = PlayOptions(as_one, clips, tuple(sets), tuple(sweeps))
         played, variants = _replayed(recordings, detector, rules, options, progress, looking)
         output.mkdir(parents=True, exist_ok=True)
         results = [] if looking is None else looking.results(played.outcomes)
@@ -214,8 +214,8 @@ def _replayed(
     recordings: Sequence[Path],
     detector: Path | None,
     rules: Sequence[Path],
-    options: Options,
-    progress: Progress,
+    options: PlayOptions,
+    progress: ProgressLine,
     looking: Looking | None,
 ) -> tuple[Played, Sequence[Variant]]:
     """What the recordings came to, and the variants of rules."""
@@ -223,7 +223,7 @@ def _replayed(
     if intake is not None:
         if options.sweeps or any("." in option.partition("=")[0] for option in options.sets):
             refuse("an intake file has no variants of rules, only --set RULE=OTHER: give the recording itself")
-        name = name_of((intake,))
+        name = recording_name((intake,))
         outcome = _intake_replayed(
             intake, detector, rules, progress, None if looking is None else looking.watch(name), options.clips
         )
@@ -255,7 +255,7 @@ def _intake_replayed(
     recording: Path,
     detector: Path | None,
     rules: Sequence[Path],
-    progress: Progress,
+    progress: ProgressLine,
     look: Look | None,
     clips: Clips | None,
 ) -> Outcome:

@@ -18,7 +18,7 @@ from detector.replay.errors import RecordingError
 from detector.replay.gathering import recordings_of
 from detector.replay.playing import play
 from detector.replay.recorded_types import with_recorded_types
-from detector.results.series import Kind, Series, Trace
+from detector.results.series import Series, SeriesKind, Trace
 from detector.results.tracing import Tracer
 from wayside.api import Detector, EventRule
 from wayside.api.wording import messages
@@ -109,10 +109,10 @@ def _said(series: Series, trace: Trace) -> str:
         return "unknown"
     lasting = np.diff(series.times, append=trace.end).astype(float)[known]
     values = series.values[known]
-    if series.kind is Kind.TEXT:
+    if series.kind is SeriesKind.TEXT:
         return ", ".join(dict.fromkeys(str(series.plain(value)) for value in values.tolist()))
     mean = float(np.average(values, weights=lasting)) if lasting.sum() else float(values[0])
-    if series.kind is Kind.BOOLEAN:
+    if series.kind is SeriesKind.BOOLEAN:
         return f"{plot(series, trace.begin, trace.end)}  true {mean:.0%} of the time"
     facts = f"min {values.min():.6g}, mean {mean:.6g}, max {values.max():.6g}"
     return f"{plot(series, trace.begin, trace.end)}  {facts}"

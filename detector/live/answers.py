@@ -20,7 +20,7 @@ from detector.live.evaluator import Evaluator
 from detector.live.outlet import LiveOutlet
 from detector.live.requested import Requested
 from detector.sources.supervision import SourceThread
-from detector.status.model import ActionStatus, CertificateStatus, Drops, Explanation, SourceStatus, Status, to_json
+from detector.status.model import ActionStatus, CertificateStatus, Drops, RuleExplanation, SourceStatus, Status, to_json
 from wayside.times import format_time
 
 Result = TypeVar("Result")
@@ -162,7 +162,7 @@ class Answers:
         except TimeoutError:
             raise ValueError(f"the evaluation did not answer within {_PATIENCE:g} s: it is overloaded") from None
 
-    def _explanation(self, rule: str, subject: str | None, wait: str) -> Explanation | None:
+    def _explanation(self, rule: str, subject: str | None, wait: str) -> RuleExplanation | None:
         """What the rule's next evaluation sees; None if there is none within `wait` seconds."""
         if not re.fullmatch(r"[0-9]{1,2}(\.[0-9]{1,3})?", wait):
             raise ValueError(f"wait={wait}: give seconds below 100, e.g. wait=2.5")
@@ -171,7 +171,7 @@ class Answers:
             watching = self._evaluator.call(lambda: self._evaluator.status.watch(rule, subject)).result(_PATIENCE)
             return watching.result(float(wait))
         except ValueError as error:
-            return Explanation(0.0, [], [str(error)])
+            return RuleExplanation(0.0, [], [str(error)])
         except TimeoutError:
             return None
         finally:

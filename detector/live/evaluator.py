@@ -54,7 +54,7 @@ _SAVE_EVERY = 1_000_000_000
 """Nanoseconds between two writes of open episodes with statistics: a kill costs no more of them."""
 
 
-class Recorder(Protocol):
+class IntakeRecorder(Protocol):
     """Keeps what the engine consumes, in that order."""
 
     def arrivals(self, arrivals: Sequence[Arrival]) -> None:
@@ -86,7 +86,7 @@ class Outlet(Protocol):
         """All demands by task name, and the ends of those that are gone (nanoseconds)."""
 
 
-class Onlooker(Observer, Protocol):
+class LiveObserver(Observer, Protocol):
     """Observes the evaluation, on its thread. It decides nothing, and never waits."""
 
     def attend(self, engine: Engine) -> None:
@@ -106,10 +106,10 @@ class Evaluator:
         outlet: Outlet,
         *,
         now: Callable[[], int],
-        recorder: Recorder | None = None,
+        recorder: IntakeRecorder | None = None,
         on_failure: Callable[[BaseException], None],
         outages: Outages | None = None,
-        onlooker: Onlooker | None = None,
+        onlooker: LiveObserver | None = None,
     ) -> None:
         """`now` gives nanoseconds since the epoch; `on_failure` is called if the thread dies of an error.
 

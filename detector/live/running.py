@@ -20,7 +20,7 @@ from detector.engine.samples.intake import Intake
 from detector.engine.samples.liveliness import LIVELINESS
 from detector.findings.losses import Loss
 from detector.live.answers import Answers
-from detector.live.evaluator import Evaluator, Onlooker
+from detector.live.evaluator import Evaluator, LiveObserver
 from detector.live.event_log import EventLog
 from detector.live.outlet import LiveOutlet
 from detector.live.requested import Requested
@@ -28,9 +28,9 @@ from detector.live.restoring import Restored
 from detector.live.state import StateFile
 from detector.plugins.processes import ProcessHost
 from detector.resources.selection import RuleSet
-from detector.sources.registry import source_problems
+from detector.sources.registry import source_plugin_problems
 from detector.sources.supervision import Sources
-from detector.status.pulse import Pulse
+from detector.status.pulse import LoopMonitor
 from detector.status.server import PagesAddress, StatusServer
 from detector.streams.answering import Answering
 from detector.streams.tally import Tally
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 
-class View(Onlooker, Protocol):
+class View(LiveObserver, Protocol):
     """Shows people what is evaluated."""
 
     @property
@@ -109,7 +109,7 @@ class Running:
         )
         requested = Requested(self._engine, self._evaluator.call)
         self._outlet.actions.outcomes.on_outcome = requested.on_outcome
-        pulse = Pulse(self._loop)
+        pulse = LoopMonitor(self._loop)
         self.answers = Answers(
             self._evaluator, lambda: self._outlet, lambda: self._sources.threads, requested, pulse.silence
         )
@@ -274,7 +274,7 @@ def _unused(path: Path) -> Path:
 def _checked(detector: Detector) -> Inlets:
     """What its streams need. Raises DetectorError, also where a plugin is missing or refuses its parameters."""
     entries = inlets(detector)
-    problems = list(source_problems(detector))
+    problems = list(source_plugin_problems(detector))
     if problems:
         raise DetectorError(problems)
     return entries

@@ -49,7 +49,7 @@ class Named:
 
 
 @dataclass(frozen=True, slots=True)
-class Options:
+class RunOptions:
     """What to run."""
 
     source: Files | Named
@@ -59,7 +59,7 @@ class Options:
     view: View | None = None
 
 
-async def run(options: Options) -> None:
+async def run(options: RunOptions) -> None:
     """Run until SIGTERM or SIGINT.
 
     Raises:
@@ -75,7 +75,7 @@ async def run(options: Options) -> None:
         await _run(options, stopping, traces)
 
 
-async def _run(options: Options, stopping: asyncio.Event, traces: EpisodeTraces | None) -> None:
+async def _run(options: RunOptions, stopping: asyncio.Event, traces: EpisodeTraces | None) -> None:
     match options.source:
         case Files() as files:
             await _run_from_files(files, options, stopping, traces)
@@ -90,7 +90,7 @@ async def _run(options: Options, stopping: asyncio.Event, traces: EpisodeTraces 
 
 
 async def _run_from_files(
-    files: Files, options: Options, stopping: asyncio.Event, traces: EpisodeTraces | None
+    files: Files, options: RunOptions, stopping: asyncio.Event, traces: EpisodeTraces | None
 ) -> None:
     changed = hangups()
     loaded = load_rules(files.detector, files.rules, detector_problems)

@@ -13,17 +13,17 @@ from pathlib import Path
 
 import msgspec
 
-from detector.mining.sources import Seen, Source
-from detector.mining.work import Mined, read
+from detector.mining.sources import InputRecording, RecordingPreview
+from detector.mining.work import Mined, decode_mined
 
 
-class Entry(msgspec.Struct):
+class CacheEntry(msgspec.Struct):
     """What a job came to."""
 
     keys: dict[str, str]
     """By rule, its key (see `keys`)."""
     mined: bytes
-    """As `work.mine` gave it."""
+    """As `work.mine_recording` gave it."""
     clips: str | None = None
     """The name of its folder of clips."""
     failed: bool = False
@@ -38,9 +38,9 @@ class Cache:
         self._folder = folder
         self._entries = folder / "mined"
         self._entries.mkdir(parents=True, exist_ok=True)
-        self._seen: dict[str, tuple[str, Seen]] = self._read_seen()
+        self._seen: dict[str, tuple[str, RecordingPreview]] = self._read_seen()
 
-    def put(self, content: str, entry: Entry) -> None:
+    def put(self, content: str, entry: CacheEntry) -> None:
         """Keep what a job came to. Raises OSError."""
         name = f"{content}-{job_digest(entry.keys)}"
         if entry.failed:
@@ -59,22 +59,22 @@ class Cache:
 
     # What recordings are known by
 
-    def seen(self, source: Source, stamp: str | None) -> Seen | None:
+    def seen(self, source: InputRecording, stamp: str | None) -> RecordingPreview | None:
         """What an earlier look at the recording showed, where its files are as they were."""
         before = self._seen.get("\0".join(source.files))
         return before[1] if before is not None and before[0] == stamp else None
 
-    def note_seen(self, looks: Iterable[tuple[Source, str | None, Seen]]) -> None:
+    def note_seen(self, looks: Iterable[tuple[InputRecording, str | None, RecordingPreview]]) -> None:
         """Keep what looks showed. Raises OSError."""
         new = {"\0".join(source.files): (stamp, seen) for source, stamp, seen in looks if stamp is not None}
         if new:
             self._seen = {**self._read_seen(), **new}
             _write(self._folder / "seen.json", msgspec.json.encode(self._seen))
 
-    def _read_seen(self) -> dict[str, tuple[str, Seen]]:
+    def _read_seen(self) -> dict[str, tuple[str, RecordingPreview]]:
         try:
             data = (self._folder / "seen.json").read_bytes()
-            return msgspec.json.decode(data, type=dict[str, tuple[str, Seen]])
+            return msgspec.json.decode(data, type=dict[str, tuple[str, RecordingPreview]])
         except (FileNotFoundError, msgspec.DecodeError):
             return {}
 
@@ -84,17 +84,17 @@ def job_digest(keys: Mapping[str, str]) -> str:
     return hashlib.blake2b("".join(sorted(keys.values())).encode(), digest_size=8).hexdigest()
 
 
-def read_entry(path: Path) -> Entry | None:
+def read_entry(path: Path) -> CacheEntry | None:
     """The entry; None where another version wrote it. Raises OSError."""
     try:
-        return msgspec.msgpack.decode(path.read_bytes(), type=Entry)
+        return msgspec.msgpack.decode(path.read_bytes(), type=CacheEntry)
     except msgspec.DecodeError:
         return None
 
 
-def mined_in(entry: Entry) -> Mined:
+def mined_in(entry: CacheEntry) -> Mined:
     """What the entry holds."""
-    return read(entry.mined)
+    return decode_mined(entry.mined)
 
 
 def _write(path: Path, data: bytes) -> None:

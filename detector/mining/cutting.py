@@ -29,7 +29,7 @@ START, END = 0, 2**63 - 1
 """In place of the ends of a recording; nanoseconds."""
 
 
-class Span(NamedTuple):
+class PieceTimes(NamedTuple):
     """The times of one piece; nanoseconds."""
 
     reads: int
@@ -43,7 +43,7 @@ class Span(NamedTuple):
 class Cutting(NamedTuple):
     """How a recording is cut."""
 
-    spans: list[Span]
+    spans: list[PieceTimes]
     rules: frozenset[str]
     """Those for which it is exact."""
     whole: dict[str, str]
@@ -114,7 +114,7 @@ def warmup_of(detector: Detector, rules: Sequence[CompiledRule]) -> int:
     return max(kept) + max(stale) + spec.client_timeout.ns + 2 * (every + HOUSEKEEPING)
 
 
-def _spans(chunks: Sequence[tuple[int, int]], pieces: int, warmup: int) -> list[Span]:
+def _spans(chunks: Sequence[tuple[int, int]], pieces: int, warmup: int) -> list[PieceTimes]:
     """Pieces of about equal size that begin where chunks do; fewer where they would be too short."""
     total, size = sum(size for _, size in chunks), 0
     cuts = [START]
@@ -124,4 +124,4 @@ def _spans(chunks: Sequence[tuple[int, int]], pieces: int, warmup: int) -> list[
         size += length
     if len(cuts) > 1 and chunks[-1][0] - cuts[-1] < warmup:
         cuts.pop()
-    return [Span(max(after - warmup, 0), after, until) for after, until in pairwise([*cuts, END])]
+    return [PieceTimes(max(after - warmup, 0), after, until) for after, until in pairwise([*cuts, END])]

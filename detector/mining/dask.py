@@ -8,7 +8,7 @@ from typing import Any
 from distributed import Client, as_completed
 from distributed.scheduler import KilledWorker
 
-from detector.mining.workers import ATTEMPTS, Call, Lost
+from detector.mining.workers import ATTEMPTS, Lost, RemoteCall
 from wayside.inputerror import InputError
 
 _PATIENCE = 60
@@ -40,7 +40,7 @@ class DaskWorkers:
         """See `Workers`."""
         return sum(self._client.nthreads().values())  # type: ignore[no-untyped-call]
 
-    def run(self, calls: Iterable[Call]) -> Iterator[tuple[Call, Any]]:
+    def run(self, calls: Iterable[RemoteCall]) -> Iterator[tuple[RemoteCall, Any]]:
         """See `Workers`. The scheduler gives what a dead worker was at to another one, up to its `allowed-failures`."""
         running = {self._client.submit(*call, pure=False, retries=ATTEMPTS): call for call in calls}
         for future in as_completed([*running]):  # type: ignore[no-untyped-call]

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from detector.mining.work import Mined
-from detector.results.episodes import Episode, kinds_of, merged_kind, table_of
+from detector.results.episodes import EpisodeRow, merged_kind, table_of, value_kinds
 
 EPISODES = "episodes"
 TABLES = ("recordings", "rules", "streams", "errors")
@@ -49,7 +49,7 @@ def write_dataset(
     kinds: dict[str, str] = {}
     for recording in recordings:
         for part in recording.parts():
-            for name, kind in kinds_of(part.episodes).items():
+            for name, kind in value_kinds(part.episodes).items():
                 kinds[name] = merged_kind(kinds.get(name, "null"), kind)
     new = folder / ".new"
     shutil.rmtree(new, ignore_errors=True)
@@ -75,7 +75,7 @@ def _write_episodes(
             path = folder / f"rule={rule}" / "part-0.parquet"
             path.parent.mkdir(parents=True)
             writers[rule] = stack.enter_context(pq.ParquetWriter(path, schema, compression="zstd"))
-        waiting: dict[str, list[tuple[Episode, Sequence[str]]]] = {rule: [] for rule in rules}
+        waiting: dict[str, list[tuple[EpisodeRow, Sequence[str]]]] = {rule: [] for rule in rules}
         for recording in recordings:
             for part in recording.parts():
                 for episode in part.episodes:
@@ -91,7 +91,7 @@ def _write_episodes(
                 writers[rule].write_table(_table(rows, kinds, with_clips))
 
 
-def _table(rows: Sequence[tuple[Episode, Sequence[str]]], kinds: dict[str, str], with_clips: bool) -> Any:
+def _table(rows: Sequence[tuple[EpisodeRow, Sequence[str]]], kinds: dict[str, str], with_clips: bool) -> Any:
     """The rows as a pyarrow.Table; the rule is the name of the folder."""
     import pyarrow as pa  # noqa: PLC0415
 

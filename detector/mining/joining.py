@@ -17,13 +17,13 @@ from detector.engine.episodes.subjects import Subject
 from detector.engine.evaluation.rule import RuleRun
 from detector.engine.scoping.scopes import Candidate
 from detector.mining.pieces import LOST, Observed, Values
-from detector.mining.work import Job, Mined, RuleCount, holder_of, in_their_order
+from detector.mining.work import Mined, MiningJob, RuleCount, in_their_order, job_holder
 from detector.replay.gathering import Recording
 from detector.replay.parts import PAUSE
 from detector.replay.recorded_types import with_recorded_types
 from detector.results.episodes import episodes_of
 from detector.results.quality import Arrivals
-from detector.results.series import Kind, Series, SubjectTrace, Trace
+from detector.results.series import Series, SeriesKind, SubjectTrace, Trace
 from detector.results.tracing import series_of
 from wayside.expressions.columns.values import Tag
 
@@ -41,7 +41,7 @@ def flaw_of(pieces: Sequence[Observed]) -> str | None:
     return flaws[0] if flaws else None
 
 
-def joined(job: Job, recording: Recording, pieces: Sequence[Observed]) -> Mined:
+def joined(job: MiningJob, recording: Recording, pieces: Sequence[Observed]) -> Mined:
     """What a recording came to; the pieces, in order, have no flaw. The job's rules are those that they looked at."""
     detector = with_recorded_types(job.detector, recording)
     entries = inlets(detector)
@@ -50,7 +50,7 @@ def joined(job: Job, recording: Recording, pieces: Sequence[Observed]) -> Mined:
     end = there[-1].last
     texts = _Texts()
     subjects = sorted({key for piece in pieces for key in piece.seen}, key=lambda key: (key[0], key[1] or "", key[2]))
-    identity = Identity(detector.name, holder_of(job), detector.namespace)
+    identity = Identity(detector.name, job_holder(job), detector.namespace)
     runs = {rule.name: RuleRun(rule, identity, RuleCounters()) for rule in compiled}
     events: list[Event] = []
     traces = []
@@ -154,8 +154,8 @@ def _whole(parts: Sequence[Values]) -> Values:
 def _series(values: Values, texts: Sequence[str]) -> Series:
     """As of the whole recording: what is a text anywhere has no statistics."""
     series = series_of(values.times, values.values, values.tags, texts)
-    kinds = {Tag.BOOLEAN: Kind.BOOLEAN, Tag.TEXT: Kind.TEXT}
-    return replace(series, kind=next((kinds[tag] for tag in kinds if tag in values.kinds), Kind.NUMBER))
+    kinds = {Tag.BOOLEAN: SeriesKind.BOOLEAN, Tag.TEXT: SeriesKind.TEXT}
+    return replace(series, kind=next((kinds[tag] for tag in kinds if tag in values.kinds), SeriesKind.NUMBER))
 
 
 class _At:
@@ -171,6 +171,8 @@ class _At:
         for name, each in self._values.items():
             place = int(np.searchsorted(each.times, time, "right")) - 1
             if place >= 0 and each.tags[place] in _KNOWN:
-                kind = {Tag.BOOLEAN: Kind.BOOLEAN, Tag.TEXT: Kind.TEXT}.get(Tag(each.tags[place]), Kind.NUMBER)
+                kind = {Tag.BOOLEAN: SeriesKind.BOOLEAN, Tag.TEXT: SeriesKind.TEXT}.get(
+                    Tag(each.tags[place]), SeriesKind.NUMBER
+                )
                 found[name] = Series(each.times, each.values, kind, self._texts).plain(float(each.values[place]))
         return found

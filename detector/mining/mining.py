@@ -19,12 +19,12 @@ from typing import NamedTuple, Protocol
 
 import msgspec
 
-from detector.mining.cache import Cache, Entry, job_digest, mined_in, read_entry
+from detector.mining.cache import Cache, CacheEntry, job_digest, mined_in, read_entry
 from detector.mining.dataset import EPISODES, TABLES, MinedRecording, write_dataset
 from detector.mining.keys import mined_rule, records, rule_keys, with_dependencies
-from detector.mining.sources import Seen, Source, look, stamp_of
+from detector.mining.sources import InputRecording, RecordingPreview, look, stamp_of
 from detector.mining.tasks import CutRecording, Done, run_jobs
-from detector.mining.work import Flaw, Job, Mined
+from detector.mining.work import Flaw, Mined, MiningJob
 from detector.mining.workers import Lost, Workers
 from wayside.api import Detector, EventRule
 
@@ -34,7 +34,7 @@ _READERS = 8
 """Threads that look at recordings."""
 
 
-class Share(NamedTuple):
+class WorkShare(NamedTuple):
     """A part of the work: what others do is left to them."""
 
     number: int
@@ -46,7 +46,7 @@ class Share(NamedTuple):
         return int(content[:8], 16) % self.of == self.number
 
 
-class Watch(Protocol):
+class MiningProgress(Protocol):
     """Sees how far a run is."""
 
     def expect(self, recordings: int, amount: int) -> None:
@@ -57,7 +57,7 @@ class Watch(Protocol):
 
 
 @dataclass
-class Run:
+class MiningRun:
     """What a run did."""
 
     recordings: int
@@ -73,16 +73,16 @@ class Run:
 
 
 def run_mining(
-    sources: Sequence[Source],
+    sources: Sequence[InputRecording],
     output: Path,
     detector: Detector,
     rules: Sequence[EventRule],
     workers: Workers,
-    watch: Watch,
+    watch: MiningProgress,
     *,
     record: bool = False,
-    share: Share | None = None,
-) -> Run:
+    share: WorkShare | None = None,
+) -> MiningRun:
     """Mine the recordings that have no result yet, and write the dataset.
 
     Args:
@@ -103,13 +103,13 @@ def run_mining(
     work = _Work(output, detector, {rule.name: rule for rule in rules}, rule_keys(detector, rules), record)
     seen = _look_at(sources, cache)
     entries = _Entries(cache, work.keys)
-    jobs: dict[str, tuple[Job, int]] = {}
+    jobs: dict[str, tuple[MiningJob, int]] = {}
     for source in sources:
         found = seen[source]
-        if isinstance(found, Seen) and found.content not in jobs and (left := entries.left(found.content)):
+        if isinstance(found, RecordingPreview) and found.content not in jobs and (left := entries.left(found.content)):
             jobs[found.content] = work.job(source, found.content, left), found.bytes
     own = {content: each for content, each in jobs.items() if share is None or share.takes(content)}
-    run = Run(len(sources), len(own), {name for job, _ in own.values() for name in job.wanted})
+    run = MiningRun(len(sources), len(own), {name for job, _ in own.values() for name in job.wanted})
     watch.expect(len(own), sum(size for _, size in own.values()))
     left_of = {content: job.wanted for content, (job, _) in own.items()}
     for done in run_jobs(own.values(), workers, run.cut):
@@ -136,21 +136,21 @@ class _Work(NamedTuple):
     keys: Mapping[str, str]
     record: bool
 
-    def job(self, source: Source, content: str, wanted: frozenset[str]) -> Job:
+    def job(self, source: InputRecording, content: str, wanted: frozenset[str]) -> MiningJob:
         evaluated = [self.rules[name] for name in sorted(with_dependencies(wanted, self.rules))]
         clips = None
         if self.record and any(records(self.rules[name]) for name in wanted):
             clips = str((self.output / CLIPS / self._folder(content, wanted)).resolve())
-        return Job(source, content, self.detector, evaluated, wanted, clips)
+        return MiningJob(source, content, self.detector, evaluated, wanted, clips)
 
-    def entry(self, done: Done) -> Entry:
+    def entry(self, done: Done) -> CacheEntry:
         """What is kept of a result."""
         result = done.result
         if isinstance(result, Lost):
             result = msgspec.msgpack.encode(Mined(flaws=[Flaw("failed", result.reason)]))
         keys = {name: self.keys[name] for name in sorted(done.rules)}
         clips = None if done.job.clips is None else Path(done.job.clips).name
-        entry = Entry(keys, result, clips)
+        entry = CacheEntry(keys, result, clips)
         entry.failed = mined_in(entry).is_failed
         return entry
 
@@ -195,10 +195,10 @@ class _Entries:
         return good | bad
 
 
-def _look_at(sources: Sequence[Source], cache: Cache) -> dict[Source, Seen | Flaw]:
+def _look_at(sources: Sequence[InputRecording], cache: Cache) -> dict[InputRecording, RecordingPreview | Flaw]:
     """What each recording is known by, or why it cannot be read."""
 
-    def seen(source: Source) -> tuple[str | None, Seen | Flaw, bool]:
+    def seen(source: InputRecording) -> tuple[str | None, RecordingPreview | Flaw, bool]:
         try:
             stamp = stamp_of(source)
             known = cache.seen(source, stamp) if stamp is not None else None
@@ -211,16 +211,25 @@ def _look_at(sources: Sequence[Source], cache: Cache) -> dict[Source, Seen | Fla
     with ThreadPoolExecutor(_READERS) as pool:
         looks = dict(zip(sources, pool.map(seen, sources), strict=True))
     cache.note_seen(
-        (source, stamp, found) for source, (stamp, found, new) in looks.items() if new and isinstance(found, Seen)
+        (source, stamp, found)
+        for source, (stamp, found, new) in looks.items()
+        if new and isinstance(found, RecordingPreview)
     )
     return {source: found for source, (_, found, _) in looks.items()}
 
 
 def _write(
-    output: Path, sources: Sequence[Source], seen: Mapping[Source, Seen | Flaw], entries: _Entries, work: _Work
+    output: Path,
+    sources: Sequence[InputRecording],
+    seen: Mapping[InputRecording, RecordingPreview | Flaw],
+    entries: _Entries,
+    work: _Work,
 ) -> bool:
     """Write the dataset unless it is there; returns whether it was written."""
-    used = {source: entries.used(found.content) if isinstance(found, Seen) else {} for source, found in seen.items()}
+    used = {
+        source: entries.used(found.content) if isinstance(found, RecordingPreview) else {}
+        for source, found in seen.items()
+    }
     state = [
         [source.name, str(seen[source]), sorted((path.name, sorted(names)) for path, names in used[source].items())]
         for source in sources
@@ -249,7 +258,9 @@ def _forget_clips(folder: Path, used: Iterable[Path]) -> None:
             shutil.rmtree(path)
 
 
-def _recording(source: Source, seen: Seen | Flaw, used: Mapping[Path, frozenset[str]]) -> MinedRecording:
+def _recording(
+    source: InputRecording, seen: RecordingPreview | Flaw, used: Mapping[Path, frozenset[str]]
+) -> MinedRecording:
     if isinstance(seen, Flaw):
         return MinedRecording(source.name, "", lambda: [Mined(flaws=[seen])])
     return MinedRecording(source.name, seen.content, _reader(used))

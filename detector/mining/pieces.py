@@ -21,9 +21,9 @@ from detector.engine.columns.verdicts import Codes
 from detector.engine.engine import Engine
 from detector.engine.episodes.episodes import OUTSIDE, TRUE, UNTIL
 from detector.engine.samples.sample import Arrival
-from detector.mining.cutting import END, Span
+from detector.mining.cutting import END, PieceTimes
 from detector.mining.work import tuned
-from detector.replay.batches import merged
+from detector.replay.batches import merged_batches
 from detector.replay.mcap_file import read_mcap
 from detector.replay.message import Cut
 from detector.replay.parts import PAUSE, parts_of
@@ -44,7 +44,7 @@ LOST = 255
 class PieceJob(NamedTuple):
     """A piece, and the rules to look at, for all of which cutting is exact."""
 
-    span: Span
+    span: PieceTimes
     files: tuple[str, ...]
     detector: Detector
     rules: Sequence[EventRule]
@@ -61,7 +61,7 @@ class Values(NamedTuple):
     """All tags that there are, also of the changes that are left out."""
 
 
-class Seen(NamedTuple):
+class _Seen(NamedTuple):
     """What a rule saw of one client, for one element."""
 
     times: Integers
@@ -81,7 +81,7 @@ class Observed:
     first: int = 0
     last: int = 0
     """When its first and last sample were received."""
-    seen: dict[tuple[str, str | None, str], Seen] = field(default_factory=dict)
+    seen: dict[tuple[str, str | None, str], _Seen] = field(default_factory=dict)
     """By rule, element and client."""
     texts: list[str] = field(default_factory=list)
     counts: dict[str, NDArray[np.int64]] = field(default_factory=dict)
@@ -105,7 +105,7 @@ def _observed(job: PieceJob) -> Observed:
     router = Router(detector.spec.streams, str(recording[0]))
     cuts: list[Cut] = []
     between = (job.span.reads, job.span.until)
-    batches = merged([read_mcap(path, router.wanted, cuts.append, between=between) for path in recording])
+    batches = merged_batches([read_mcap(path, router.wanted, cuts.append, between=between) for path in recording])
     found, recorder = Observed(), _Recorder(job.span.after)
     replay: Replay | None = None
     before = _Counted({}, {}, 0, 0)
@@ -148,7 +148,7 @@ def _split(parts: Iterable[Sequence[Arrival]], after: int) -> Iterator[Sequence[
         yield from (each for each in (part[:cut], part[cut:]) if each)
 
 
-def _begun(replay: Replay, span: Span) -> _Counted:
+def _begun(replay: Replay, span: PieceTimes) -> _Counted:
     """Run the ticks before the piece; returns what was counted up to there."""
     if span.after > replay.engine.now:
         replay.take((), span.after)
@@ -204,7 +204,7 @@ class _Recorder:
         """Whether there are values that are neither numbers, booleans nor texts."""
 
     def attend(self, engine: Engine) -> None:
-        """See `Onlooker`."""
+        """See `ReplayObserver`."""
 
     def fleet(self, tracks: Sequence[Track], block: FleetBlock) -> None:
         """See `Observer`."""
@@ -238,9 +238,9 @@ class _Recorder:
         for group in self._groups.values():
             self._nobody_until(group, until + 1)
 
-    def seen(self) -> dict[tuple[str, str | None, str], Seen]:
+    def seen(self) -> dict[tuple[str, str | None, str], _Seen]:
         """What was noted."""
-        found: dict[tuple[str, str | None, str], Seen] = {}
+        found: dict[tuple[str, str | None, str], _Seen] = {}
         names = [*self._numbers]
         for group in self._groups.values():
             signals: dict[int, dict[int, Values]] = {}
@@ -254,7 +254,7 @@ class _Recorder:
                     codes = values.astype(np.uint8)
                     kept = _Relevant(times, codes)
                     own = signals.get(client, {})
-                    found[track.rule.name, track.element.name, names[client]] = Seen(
+                    found[track.rule.name, track.element.name, names[client]] = _Seen(
                         times, codes, {name: kept.of(own[at]) for name, at in track.signals.items() if at in own}
                     )
         return found

@@ -10,6 +10,7 @@ from urllib.parse import quote
 
 from detector.mining.dataset import EPISODES
 from detector.mining.summary import Summary
+from detector.results.report import html_page
 
 REPORT = "report.html"
 _EPISODES = 200
@@ -17,27 +18,16 @@ _EPISODES = 200
 _ROWS = 500
 """How many rows other tables have."""
 
-_PAGE = """<!doctype html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta name="color-scheme" content="light dark">
-<meta http-equiv="Content-Security-Policy" content="default-src 'none'; style-src 'unsafe-inline'; \
-script-src 'unsafe-inline'">
-<title>Mined recordings</title>
-<style>
-body {{ font: 15px/1.5 system-ui, sans-serif; margin: 0 auto; max-width: 75rem; padding: 1rem; }}
-table {{ border-collapse: collapse; font-variant-numeric: tabular-nums; }}
-th, td {{ border-bottom: 1px solid #8884; padding: .2rem .8rem .2rem 0; text-align: left; vertical-align: top; }}
-td.n, th.n {{ text-align: right; }}
-.scroll {{ overflow-x: auto; }}
-.hint {{ opacity: .75; }}
-input {{ font: inherit; max-width: 100%; width: 24rem; }}
-</style>
-</head>
-<body>
-<h1>Mined recordings</h1>
+_STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; margin: 0 auto; max-width: 75rem; padding: 1rem; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
+th, td { border-bottom: 1px solid #8884; padding: .2rem .8rem .2rem 0; text-align: left; vertical-align: top; }
+td.n, th.n { text-align: right; }
+.scroll { overflow-x: auto; }
+.hint { opacity: .75; }
+input { font: inherit; max-width: 100%; width: 24rem; }
+"""
+_BODY = """<h1>Mined recordings</h1>
 <p>{brief}</p>
 <p><label>Only rows with <input id="filter" type="search" placeholder="a rule, a recording, a vehicle"></label></p>
 {sections}
@@ -48,21 +38,22 @@ filter.addEventListener("input", () => {{
   for (const row of document.querySelectorAll("tbody tr"))
     row.hidden = !row.textContent.toLowerCase().includes(wanted);
 }});
-</script>
-</body>
-</html>
-"""
+</script>"""
 
 
-def write_report(folder: Path, summary: Summary) -> None:
+def write_mining_report(folder: Path, summary: Summary) -> None:
     """Write the page beside the dataset that it is about. Raises OSError."""
     brief = (
         f"{summary.recordings_read} recordings, {summary.seconds / 3600:.1f} hours, {summary.samples} samples, "
         f"{sum(rule.episodes for rule in summary.rules)} episodes, {len(summary.errors)} errors"
     )
-    (folder / REPORT).write_text(
-        _PAGE.format(brief=brief, sections="\n".join(_sections(folder, summary))), encoding="utf-8"
+    page = html_page(
+        "Mined recordings",
+        _BODY.format(brief=brief, sections="\n".join(_sections(folder, summary))),
+        style=_STYLE,
+        policy="style-src 'unsafe-inline'; script-src 'unsafe-inline'",
     )
+    (folder / REPORT).write_text(page, encoding="utf-8")
 
 
 def _sections(folder: Path, summary: Summary) -> Iterator[str]:

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 from urllib.parse import urlsplit
 
 from detector.replay.errors import RecordingError
-from detector.replay.gathering import BINARY, TEXT, Recording, name_of, recordings_of
+from detector.replay.gathering import BINARY, TEXT, Recording, recording_name, recordings_of
 from detector.results.installed import check_package
 
 _BLOCK = 1 << 20
@@ -24,7 +24,7 @@ _CHECKSUMS = ("ETag", "Content-MD5", "Digest", "Last-Modified", "mtime", "LastMo
 """By what stores say that a file is another one, the best first."""
 
 
-class Source(NamedTuple):
+class InputRecording(NamedTuple):
     """One recording."""
 
     name: str
@@ -38,7 +38,7 @@ class Source(NamedTuple):
         return "://" in self.files[0]
 
 
-class Seen(NamedTuple):
+class RecordingPreview(NamedTuple):
     """What a look at a recording shows before it is read."""
 
     content: str
@@ -46,7 +46,7 @@ class Seen(NamedTuple):
     bytes: int
 
 
-def sources_of(given: Iterable[str]) -> list[Source]:
+def sources_of(given: Iterable[str]) -> list[InputRecording]:
     """The recordings, in order of their names; each once.
 
     Args:
@@ -66,7 +66,7 @@ def sources_of(given: Iterable[str]) -> list[Source]:
     return sorted({source.files: source for source in found}.values())
 
 
-def look(source: Source) -> Seen:
+def look(source: InputRecording) -> RecordingPreview:
     """What the recording is known by. Of one on disk that is read; of a URL, its store says it.
 
     Raises:
@@ -78,10 +78,10 @@ def look(source: Source) -> Seen:
         digest, length = _stored(file) if source.is_remote else _read(Path(file))
         whole.update(digest)
         size += length
-    return Seen(whole.hexdigest(), size)
+    return RecordingPreview(whole.hexdigest(), size)
 
 
-def stamp_of(source: Source) -> str | None:
+def stamp_of(source: InputRecording) -> str | None:
     """Changes if the files on disk do: size and time of change of each; None for URLs, whose look costs little."""
     if source.is_remote:
         return None
@@ -90,7 +90,7 @@ def stamp_of(source: Source) -> str | None:
 
 
 @contextmanager
-def fetched(source: Source) -> Iterator[Recording]:
+def fetched(source: InputRecording) -> Iterator[Recording]:
     """The recording's files on disk; those of URLs are there for as long as the context lasts.
 
     Raises:
@@ -113,8 +113,8 @@ def _listed(item: str) -> list[str]:
     return items
 
 
-def _on_disk(recording: Recording) -> Source:
-    return Source(name_of(recording), tuple(str(path.absolute()) for path in recording))
+def _on_disk(recording: Recording) -> InputRecording:
+    return InputRecording(recording_name(recording), tuple(str(path.absolute()) for path in recording))
 
 
 def _files(path: Path) -> Iterator[Path]:
@@ -165,7 +165,7 @@ def _s3_options() -> dict[str, str]:
     return options
 
 
-def _behind(url: str) -> Iterator[Source]:
+def _behind(url: str) -> Iterator[InputRecording]:
     """The recordings that a URL stands for."""
     store, path = _store(url)
     is_file = PurePosixPath(path).suffix in (*BINARY, *TEXT)
@@ -182,7 +182,7 @@ def _behind(url: str) -> Iterator[Source]:
     prefix = "s3://" if url.startswith("s3://") else ""
     for each in found:
         whole = each if "://" in each else prefix + each
-        yield Source(whole, (whole,))
+        yield InputRecording(whole, (whole,))
 
 
 def _members(store: Any, path: str) -> list[str]:
@@ -219,7 +219,7 @@ def _fetch(url: str, folder: Path) -> Path:
     return folder / PurePosixPath(path).name if members == [path] else folder
 
 
-def sampled(sources: Sequence[Source], number: int) -> list[Source]:
+def sampled(sources: Sequence[InputRecording], number: int) -> list[InputRecording]:
     """Some of the recordings, in their order: by a digest of their names, so the same ones each time."""
     by_chance = sorted(sources, key=lambda source: hashlib.blake2b(source.name.encode(), digest_size=8).digest())
     return sorted(by_chance[:number])

@@ -17,8 +17,8 @@ from detector.mining.cutting import Cutting, cutting_of
 from detector.mining.joining import flaw_of, joined
 from detector.mining.keys import with_dependencies
 from detector.mining.pieces import Observed, PieceJob, observe
-from detector.mining.work import Job, mine
-from detector.mining.workers import Call, Lost, Workers
+from detector.mining.work import MiningJob, mine_recording
+from detector.mining.workers import Lost, RemoteCall, Workers
 from detector.replay.errors import RecordingError
 
 _PER_WORKER = 2
@@ -28,7 +28,7 @@ _PER_WORKER = 2
 class Done(NamedTuple):
     """What a job came to, or a part of its rules."""
 
-    job: Job
+    job: MiningJob
     rules: frozenset[str]
     result: bytes | Lost
 
@@ -42,7 +42,7 @@ class CutRecording(NamedTuple):
     """The rules that ran over the whole, and why."""
 
 
-def run_jobs(jobs: Iterable[tuple[Job, int]], workers: Workers, cut: list[CutRecording]) -> Iterator[Done]:
+def run_jobs(jobs: Iterable[tuple[MiningJob, int]], workers: Workers, cut: list[CutRecording]) -> Iterator[Done]:
     """Run the jobs, each with the size of its recording in bytes; results as they are ready, by parts of the rules.
 
     Adds to `cut` which recordings were cut.
@@ -50,20 +50,23 @@ def run_jobs(jobs: Iterable[tuple[Job, int]], workers: Workers, cut: list[CutRec
     # The largest first: the last one decides when all are done.
     ordered = sorted(jobs, key=lambda each: (-each[1], each[0].content))
     total = sum(size for _, size in ordered)
-    calls: list[Call] = []
+    calls: list[RemoteCall] = []
     of_pieces: dict[int, _Pieces] = {}
     for job, size in ordered:
         most = _PER_WORKER * workers.count
         cutting = _cutting(job, ceil(most * size / total)) if workers.count > 1 and total else None
         if cutting is None:
-            calls.append(Call(mine, job))
+            calls.append(RemoteCall(mine_recording, job))
             continue
         cut.append(CutRecording(job.source.name, len(cutting.spans), cutting.whole))
         exact = job.wanted & cutting.rules
         pieces = _Pieces(_with(job, exact), cutting)
         of_pieces |= {id(call): pieces for call in pieces.calls}
-        calls += [*([Call(mine, _with(job, job.wanted - exact))] if job.wanted - exact else []), *pieces.calls]
-    again: list[Call] = []
+        calls += [
+            *([RemoteCall(mine_recording, _with(job, job.wanted - exact))] if job.wanted - exact else []),
+            *pieces.calls,
+        ]
+    again: list[RemoteCall] = []
     for call, result in workers.run(calls):
         found = of_pieces.get(id(call))
         if found is None:
@@ -71,14 +74,14 @@ def run_jobs(jobs: Iterable[tuple[Job, int]], workers: Workers, cut: list[CutRec
         elif found.take(call, result):
             done = found.result()
             if done is None:
-                again.append(Call(mine, found.job))
+                again.append(RemoteCall(mine_recording, found.job))
             else:
                 yield Done(found.job, found.job.wanted, done)
     for call, result in workers.run(again):
         yield Done(call.argument, call.argument.wanted, result)
 
 
-def _cutting(job: Job, count: int) -> Cutting | None:
+def _cutting(job: MiningJob, count: int) -> Cutting | None:
     """How to cut the recording of a job; what is wrong with it comes to light when it is mined."""
     if count < 2 or job.source.is_remote:
         return None
@@ -89,7 +92,7 @@ def _cutting(job: Job, count: int) -> Cutting | None:
     return cutting if cutting is not None and job.wanted & cutting.rules else None
 
 
-def _with(job: Job, wanted: frozenset[str]) -> Job:
+def _with(job: MiningJob, wanted: frozenset[str]) -> MiningJob:
     """The job for some of its rules alone."""
     needed = with_dependencies(wanted, {rule.name: rule for rule in job.rules})
     return job._replace(wanted=wanted, rules=[rule for rule in job.rules if rule.name in needed])
@@ -98,13 +101,13 @@ def _with(job: Job, wanted: frozenset[str]) -> Job:
 class _Pieces:
     """The pieces of a recording, and what came of them so far."""
 
-    def __init__(self, job: Job, cutting: Cutting) -> None:
+    def __init__(self, job: MiningJob, cutting: Cutting) -> None:
         self.job = job._replace(clips=None)
         given = job.source.files, job.detector, job.rules
-        self.calls = [Call(observe, PieceJob(span, *given)) for span in cutting.spans]
+        self.calls = [RemoteCall(observe, PieceJob(span, *given)) for span in cutting.spans]
         self._observed: dict[int, Observed] = {}
 
-    def take(self, call: Call, result: Observed | Lost) -> bool:
+    def take(self, call: RemoteCall, result: Observed | Lost) -> bool:
         """What came of a piece; whether it was the last one."""
         found = Observed(flaw=result.reason) if isinstance(result, Lost) else result
         self._observed[[id(each) for each in self.calls].index(id(call))] = found

@@ -13,16 +13,16 @@ from typing import NamedTuple
 import msgspec
 
 from detector.actions.record.description import DESCRIPTION
-from detector.actions.record.destination import finished
+from detector.actions.record.destination import finished_recordings
 from detector.assembly.memory import tune_garbage_collection
-from detector.mining.sources import Source, fetched
+from detector.mining.sources import InputRecording, fetched
 from detector.plugins.outages import Outages
 from detector.plugins.processes import REPLAY_PATIENCE, ProcessHost
 from detector.replay.clips import Clips
 from detector.replay.gathering import Recording
 from detector.replay.playing import play
 from detector.replay.replaying import Outcome
-from detector.results.episodes import Episode
+from detector.results.episodes import EpisodeRow
 from detector.results.quality import Arrivals, StreamQuality
 from detector.results.result import Result, result_of
 from detector.results.tracing import Tracer
@@ -55,7 +55,7 @@ class RuleCount(msgspec.Struct, frozen=True):
 class Mined(msgspec.Struct):
     """What a recording came to, for some rules."""
 
-    episodes: list[Episode] = []
+    episodes: list[EpisodeRow] = []
     """In order of the rules, then of their starts; they name no recording."""
     counts: list[RuleCount] = []
     streams: list[StreamQuality] = []
@@ -73,10 +73,10 @@ class Mined(msgspec.Struct):
         return any(flaw.kind == "failed" for flaw in self.flaws)
 
 
-class Job(NamedTuple):
+class MiningJob(NamedTuple):
     """One recording, and the rules to run over it."""
 
-    source: Source
+    source: InputRecording
     content: str
     detector: Detector
     rules: Sequence[EventRule]
@@ -87,7 +87,7 @@ class Job(NamedTuple):
     """The folder for clips of this job alone; None: no clips."""
 
 
-def mine(job: Job) -> bytes:
+def mine_recording(job: MiningJob) -> bytes:
     """Mine one recording; returns a `Mined` as msgpack. What is wrong with the recording is part of it."""
     tuned()
     return msgspec.msgpack.encode(_mined(job))
@@ -99,12 +99,12 @@ def tuned() -> None:
     tune_garbage_collection()
 
 
-def read(data: bytes) -> Mined:
+def decode_mined(data: bytes) -> Mined:
     """The inverse. Raises msgspec.DecodeError where another version wrote it."""
     return msgspec.msgpack.decode(data, type=Mined)
 
 
-def _mined(job: Job) -> Mined:
+def _mined(job: MiningJob) -> Mined:
     recording: Recording = ()
     try:
         with fetched(job.source) as recording:
@@ -125,7 +125,7 @@ def _plain(text: str, recording: Recording) -> str:
     return text
 
 
-def _replayed(job: Job, recording: Recording) -> Mined:
+def _replayed(job: MiningJob, recording: Recording) -> Mined:
     tracer, arrivals = Tracer(dict.fromkeys(job.wanted), ways=False), Arrivals()
     clips = None if job.clips is None else _clips(Path(job.clips))
     played = play(
@@ -136,7 +136,7 @@ def _replayed(job: Job, recording: Recording) -> Mined:
         arrivals.watch_batches,
         lambda _: tracer,
         clips,
-        holder_of(job),
+        job_holder(job),
     )
     (outcome,) = played.outcomes.values()
     result = result_of(job.source.name, outcome, tracer, arrivals)
@@ -148,7 +148,7 @@ def _replayed(job: Job, recording: Recording) -> Mined:
     return mined
 
 
-def holder_of(job: Job) -> str:
+def job_holder(job: MiningJob) -> str:
     """Under whose name the job's episodes are."""
     return f"{job.detector.name}.{job.content[:_DIGITS]}"
 
@@ -166,12 +166,12 @@ def mined_of(result: Result, wanted: frozenset[str]) -> Mined:
     )
 
 
-def in_their_order(episodes: Iterable[Episode]) -> list[Episode]:
+def in_their_order(episodes: Iterable[EpisodeRow]) -> list[EpisodeRow]:
     """As a `Mined` has them."""
     return sorted(episodes, key=lambda each: (each.rule, each.start_time, each.subject))
 
 
-def _flaws(outcome: Outcome, job: Job, recording: Recording) -> list[Flaw]:
+def _flaws(outcome: Outcome, job: MiningJob, recording: Recording) -> list[Flaw]:
     cuts = [Flaw("cut", _plain(str(cut), recording)) for cut in outcome.cuts]
     refusals = [
         Flaw("refused", str(refusal), refusal.rule.name)
@@ -189,7 +189,7 @@ def _clips(folder: Path) -> Clips:
 
 def _clips_by_episode(folder: Path) -> dict[str, list[str]]:
     found: dict[str, list[str]] = {}
-    for kept in finished(folder):
+    for kept in finished_recordings(folder):
         description = msgspec.json.decode((kept.path / DESCRIPTION).read_bytes())
         found.setdefault(str(description["episode"]), []).append(kept.path.relative_to(folder).as_posix())
     return {episode: sorted(names) for episode, names in sorted(found.items())}

@@ -14,7 +14,7 @@ ATTEMPTS = 2
 """In the company of others. A process that dies may have been killed for what another one does."""
 
 
-class Call(NamedTuple):
+class RemoteCall(NamedTuple):
     """A function of a module, and what it is called with; both travel to another process."""
 
     function: Callable[[Any], Any]
@@ -35,7 +35,7 @@ class Workers(Protocol):
     def count(self) -> int:
         """How many calls run side by side."""
 
-    def run(self, calls: Iterable[Call]) -> Iterator[tuple[Call, Any]]:
+    def run(self, calls: Iterable[RemoteCall]) -> Iterator[tuple[RemoteCall, Any]]:
         """Each call with its result, or `Lost`, in the order in which they are ready.
 
         An error that a call raises is raised here.
@@ -45,7 +45,7 @@ class Workers(Protocol):
         """Nothing more is called."""
 
 
-class Pool:
+class LocalWorkers:
     """Processes of this machine."""
 
     def __init__(self, processes: int) -> None:
@@ -58,13 +58,13 @@ class Pool:
         """See `Workers`."""
         return self._processes
 
-    def run(self, calls: Iterable[Call]) -> Iterator[tuple[Call, Any]]:
+    def run(self, calls: Iterable[RemoteCall]) -> Iterator[tuple[RemoteCall, Any]]:
         """See `Workers`. A process that dies breaks its pool: what was under way begins again in another one.
 
         A call that was under way that often runs alone, so that it is known which one it is that kills its process.
         """
         left = deque((call, 0) for call in calls)
-        alone: list[Call] = []
+        alone: list[RemoteCall] = []
         while left:
             yield from self._run(left, alone)
         for call in alone:
@@ -81,10 +81,10 @@ class Pool:
             self._executor.shutdown(cancel_futures=True)
             self._executor = None
 
-    def _run(self, left: deque[tuple[Call, int]], alone: list[Call]) -> Iterator[tuple[Call, Any]]:
+    def _run(self, left: deque[tuple[RemoteCall, int]], alone: list[RemoteCall]) -> Iterator[tuple[RemoteCall, Any]]:
         """Until a process dies, or nothing is left."""
         self._executor = executor = self._executor or _pool(self._processes)
-        running: dict[Future[Any], tuple[Call, int]] = {}
+        running: dict[Future[Any], tuple[RemoteCall, int]] = {}
         try:
             while left or running:
                 while left and len(running) < self._processes:

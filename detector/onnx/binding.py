@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from detector.onnx.loading import ModelError, ModelFile, Tensor, load_model
 from detector.streams.codecs.tensors import gray, image, points
 from wayside.api.documents import FieldPath
-from wayside.api.model import Channels, Layout, ModelImage, ModelInput, ModelPoints
+from wayside.api.model import Channels, ImageLayout, ModelImage, ModelInput, ModelPoints
 from wayside.rules import CompiledModel, CompiledRule, RuleError, RuleProblem
 
 MAXIMUM_OUTPUT = 4096
@@ -170,7 +170,7 @@ def _image(wanted: ModelImage, payload: bytes) -> NDArray[np.float32]:
         pixels = pixels[rows][:, columns]
     mean, std = np.array(wanted.mean or [0.0], np.float32), np.array(wanted.std or [1.0], np.float32)
     scaled: NDArray[np.float32] = (pixels * np.float32(wanted.scale) - mean) / std
-    return scaled.transpose(2, 0, 1) if wanted.layout is Layout.CHW else scaled
+    return scaled.transpose(2, 0, 1) if wanted.layout is ImageLayout.CHW else scaled
 
 
 def _points(wanted: ModelPoints, payload: bytes) -> NDArray[np.float64]:

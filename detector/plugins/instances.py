@@ -9,7 +9,7 @@ from detector.engine.queries.queries import Queries
 from detector.engine.scoping.plugins import PluginCall, PluginFailedError
 from detector.plugins.base import Plugin, Subject
 from detector.plugins.registry import prepare_plugin
-from detector.plugins.values import plain
+from detector.plugins.values import plain_value
 from wayside.expressions import Reason, Value
 from wayside.rules import CompiledPlugin, CompiledRule
 
@@ -28,7 +28,7 @@ class Instances:
         found = self._objects.get(subject.text)
         if found is None:
             found = self._objects[subject.text] = self._plugin(self._parameters, subject)
-        return plain(found.value(queries, clients))
+        return plain_value(found.value(queries, clients))
 
     def keep(self, subjects: Collection[str]) -> None:
         """Drop the objects of all other subjects."""

@@ -9,7 +9,7 @@ from detector.plugins.assignment import Point, assigned
 
 
 @dataclass(slots=True)
-class Track:
+class TrackedPoint:
     """A point that is followed. Times are nanoseconds."""
 
     place: Point
@@ -28,7 +28,7 @@ class Tracks:
         self._within = within
         self._speed = speed
         self._gap = gap
-        self._tracks: list[Track] = []
+        self._tracks: list[TrackedPoint] = []
 
     def follow(self, points: Sequence[Point], time: int) -> None:
         """These are the points at that time (ns), which is later than the one before."""
@@ -39,9 +39,9 @@ class Tracks:
             tracks[index].place, tracks[index].last = points[point], time
         new = set(range(len(points))) - set(same.values())
         self._tracks = [track for track in tracks if track.last == time or time - track.last < self._gap]
-        self._tracks += [Track(points[index], time, time) for index in sorted(new)]
+        self._tracks += [TrackedPoint(points[index], time, time) for index in sorted(new)]
 
-    def lasting(self, time: int, least: int) -> list[Track]:
+    def lasting(self, time: int, least: int) -> list[TrackedPoint]:
         """Those that are there at that time and have been for at least this many nanoseconds, oldest first."""
         return sorted(
             (track for track in self._tracks if track.last == time and time - track.since >= least),

@@ -11,7 +11,7 @@ _DEEPEST = 32
 _EXACT = 2**53
 
 
-def plain(value: Any, depth: int = _DEEPEST) -> Value:
+def plain_value(value: Any, depth: int = _DEEPEST) -> Value:
     """The value with integers as doubles and tuples as lists; NaN is None, at the top as inside.
 
     Raises TypeError for what is no plain data, or nested too deep.
@@ -24,14 +24,14 @@ def plain(value: Any, depth: int = _DEEPEST) -> Value:
         case float():
             return None if math.isnan(value) else float(value)
         case list() | tuple() if depth:
-            return [plain(item, depth - 1) for item in value]
+            return [plain_value(item, depth - 1) for item in value]
         case dict() if depth and all(isinstance(key, str) for key in value):
-            return {key: plain(item, depth - 1) for key, item in value.items()}
+            return {key: plain_value(item, depth - 1) for key, item in value.items()}
     if not depth:
         raise TypeError(f"the value is nested more than {_DEEPEST} levels deep")
     scalar = getattr(value, "item", None)  # numpy's numbers
     if scalar is not None and getattr(value, "shape", None) == ():
-        return plain(scalar(), depth - 1)
+        return plain_value(scalar(), depth - 1)
     raise TypeError(
         f"the value is a {type(value).__name__}: return None, a boolean, a number, a text, or lists and "
         "maps (with text keys) of these"

@@ -101,7 +101,7 @@ class RemoteQueries:
         return msgspec.convert(content[0], kind)
 
 
-def serve(wire: Wire) -> None:
+def _serve(wire: Wire) -> None:
     """Answer until the detector hangs up."""
     _, plugin, parameters = wire.receive()
     try:
@@ -148,7 +148,7 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_leave_with_the_detector, daemon=True).start()
     with contextlib.suppress(ClosedError):
-        serve(Wire(socket.socket(fileno=int(sys.argv[1]))))
+        _serve(Wire(socket.socket(fileno=int(sys.argv[1]))))
 
 
 if __name__ == "__main__":

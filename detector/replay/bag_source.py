@@ -10,7 +10,7 @@ from typing import Annotated, ClassVar
 from pydantic import BaseModel, Field
 
 from detector.replay.batches import messages_of
-from detector.replay.gathering import name_of, paths_of
+from detector.replay.gathering import recording_name, recording_paths
 from detector.replay.recordings import open_recordings
 from detector.replay.routing import Router
 from detector.sources.base import Feed, Source
@@ -49,8 +49,8 @@ class BagSource(Source[BagParameters]):
             feed.wait(0.01)  # a recording of no length must not keep the processor busy
 
     def _play(self, feed: Feed) -> None:
-        paths = paths_of(Path(path) for path in self.parameters.paths)
-        router = Router([stream.spec for stream in feed.streams], name_of(tuple(paths)))
+        paths = recording_paths(Path(path) for path in self.parameters.paths)
+        router = Router([stream.spec for stream in feed.streams], recording_name(tuple(paths)))
         recordings = open_recordings(paths, router.wanted, lambda cut: _log.warning("%s", cut))
         first: int | None = None
         began = time.monotonic()

@@ -87,7 +87,7 @@ def batched(messages: Iterable[Message]) -> Iterator[Batch]:
         yield batch
 
 
-def merged(recordings: Sequence[Iterator[Batch]]) -> Iterator[Batch]:
+def merged_batches(recordings: Sequence[Iterator[Batch]]) -> Iterator[Batch]:
     """The messages of all recordings by time; of equal times, those of the recording given first.
 
     Where the times of a recording go back, its messages wait for earlier ones of the others, as in `heapq.merge`.

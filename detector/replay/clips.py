@@ -11,7 +11,7 @@ from pathlib import Path
 
 from detector.actions.base import ActionError, Surroundings
 from detector.actions.host import ActionHost
-from detector.actions.record.destination import finished
+from detector.actions.record.destination import finished_recordings
 from detector.engine.consequences.consequences import Consequence
 from wayside.api import Detector, EventRule
 from wayside.api.recordings import Recordings
@@ -27,7 +27,7 @@ class Clips:
     def __init__(self, folder: Path) -> None:
         """Raises OSError where clips of an earlier replay cannot be removed."""
         self.folder = folder
-        for each in [*finished(folder)]:
+        for each in [*finished_recordings(folder)]:
             shutil.rmtree(each.path)
 
     def placed(self, detector: Detector) -> Detector:
@@ -44,7 +44,7 @@ class Clips:
     @property
     def count(self) -> int:
         """How many there are."""
-        return sum(1 for _ in finished(self.folder))
+        return sum(1 for _ in finished_recordings(self.folder))
 
 
 class Recorders:

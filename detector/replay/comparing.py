@@ -16,7 +16,7 @@ from wayside.times import format_time
 
 
 @dataclass(frozen=True, slots=True, order=True)
-class Span:
+class EpisodeTimes:
     """An episode's time for one subject; nanoseconds since the epoch."""
 
     start: int
@@ -27,7 +27,7 @@ class Span:
     recording: str | None = None
     """The recording that it is from, where there are several."""
 
-    def shared(self, other: Span) -> int:
+    def shared(self, other: EpisodeTimes) -> int:
         """How long both last, in nanoseconds; negative where they are apart."""
         return min(self.end, other.end) - max(self.start, other.start)
 
@@ -48,9 +48,9 @@ class Comparison:
 
     first: str
     second: str
-    both: tuple[tuple[Span, Span], ...]
-    only_first: tuple[Span, ...]
-    only_second: tuple[Span, ...]
+    both: tuple[tuple[EpisodeTimes, EpisodeTimes], ...]
+    only_first: tuple[EpisodeTimes, ...]
+    only_second: tuple[EpisodeTimes, ...]
 
     @property
     def start_differences(self) -> list[float]:
@@ -93,7 +93,7 @@ class Comparison:
 
 def compare(events: Iterable[Event], first: str, second: str, end: int) -> Comparison:
     """Compare the episodes of two rules; the recording ends at `end`, in nanoseconds since the epoch."""
-    of_rule: dict[str, list[Span]] = {first: [], second: []}
+    of_rule: dict[str, list[EpisodeTimes]] = {first: [], second: []}
     open_spans: dict[str, tuple[str, Event]] = {}
     for event in events:
         if event.rule not in of_rule:
@@ -102,15 +102,15 @@ def compare(events: Iterable[Event], first: str, second: str, end: int) -> Compa
             open_spans[event.episode] = (event.rule, event)
         else:
             open_spans.pop(event.episode, None)
-            span = Span(event.start_time, event.end_time, event.subject, recording=event.recording)
+            span = EpisodeTimes(event.start_time, event.end_time, event.subject, recording=event.recording)
             of_rule[event.rule].append(span)
     for rule, event in open_spans.values():
         last = max(end, event.start_time)
-        of_rule[rule].append(Span(event.start_time, last, event.subject, open=True, recording=event.recording))
+        of_rule[rule].append(EpisodeTimes(event.start_time, last, event.subject, open=True, recording=event.recording))
     return _matched(first, second, sorted(of_rule[first]), sorted(of_rule[second]))
 
 
-def joined(comparisons: Sequence[Comparison]) -> Comparison:
+def combined(comparisons: Sequence[Comparison]) -> Comparison:
     """Those of several recordings as one; there is at least one."""
     return Comparison(
         comparisons[0].first,
@@ -121,12 +121,12 @@ def joined(comparisons: Sequence[Comparison]) -> Comparison:
     )
 
 
-def _matched(first: str, second: str, spans: Sequence[Span], others: Sequence[Span]) -> Comparison:
-    left: dict[str, list[Span]] = {}
+def _matched(first: str, second: str, spans: Sequence[EpisodeTimes], others: Sequence[EpisodeTimes]) -> Comparison:
+    left: dict[str, list[EpisodeTimes]] = {}
     for other in others:
         left.setdefault(other.subject, []).append(other)
-    both: list[tuple[Span, Span]] = []
-    only: list[Span] = []
+    both: list[tuple[EpisodeTimes, EpisodeTimes]] = []
+    only: list[EpisodeTimes] = []
     for span in spans:
         candidates = [other for other in left.get(span.subject, ()) if span.shared(other) >= 0]
         if not candidates:

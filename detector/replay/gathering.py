@@ -44,7 +44,7 @@ def recordings_of(given: Sequence[Path], *, as_one: bool = False) -> list[Record
     What is damaged or of no known kind is a recording of its own: an error when it is played. Raises RecordingError
     for what is missing, and for folders and patterns without any recording.
     """
-    paths = paths_of(given)
+    paths = recording_paths(given)
     for path in paths:
         check_exists(path)
     return [tuple(paths)] if as_one else list(_joined(paths))
@@ -52,20 +52,20 @@ def recordings_of(given: Sequence[Path], *, as_one: bool = False) -> list[Record
 
 def intake_file_of(given: Sequence[Path]) -> Path | None:
     """The intake file, if one is given. Raises RecordingError where other recordings are given with it."""
-    paths = paths_of(given)
+    paths = recording_paths(given)
     found = next(filter(_is_intake_file, paths), None)
     if found is not None and len(paths) > 1:
         raise RecordingError(f"{found} is an intake file: replay it alone")
     return found
 
 
-def name_of(recording: Recording) -> str:
+def recording_name(recording: Recording) -> str:
     """For people, and for the events of several recordings."""
     first = os.fsencode(recording[0]).decode(errors="replace")
     return first if len(recording) == 1 else f"{first} and {len(recording) - 1} more"
 
 
-def paths_of(given: Iterable[Path]) -> list[Path]:
+def recording_paths(given: Iterable[Path]) -> list[Path]:
     """Files, and rosbag2 folders: folders and patterns are replaced by what they hold. Each path once."""
     found = [path for each in given for path in _expanded(each)]
     return list({path.resolve(): path for path in found}.values())

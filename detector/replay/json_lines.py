@@ -10,7 +10,7 @@ import msgspec
 
 from detector.replay.batches import Batch, Channel
 from detector.replay.errors import RecordingError
-from detector.replay.message import Cut, OnCut, Wanted, key_of
+from detector.replay.message import Cut, OnCut, Wanted, topic_key
 
 EXAMPLE = '{"t": 1700000000000000000, "key": "vehicles/car7/pose", "value": {"x": 1.5}}'
 
@@ -109,13 +109,13 @@ class _Wrong(NamedTuple):
 def _first_wrong(lines: Sequence[_Line], last: int) -> _Wrong | None:
     """The first line whose time goes back from that before, which is `last` at first, or that has no key."""
     times = [last, *[line.t for line in lines]]
-    if sorted(times) == times and all(map(key_of, {line.key for line in lines})):
+    if sorted(times) == times and all(map(topic_key, {line.key for line in lines})):
         return None
     for position, (line, previous) in enumerate(zip(lines, times[:-1], strict=True)):
         if line.t < previous:
             back = f"t goes back from {previous} to {line.t}: sort the lines by t"
             return _Wrong(position, "t is negative" if line.t < 0 else back)
-        if not key_of(line.key):
+        if not topic_key(line.key):
             return _Wrong(position, f"key is empty: a line reads {EXAMPLE}")
     return None
 
@@ -125,7 +125,7 @@ def _batch(lines: Sequence[_Line], wanted: Wanted, channels: dict[str, Channel |
     keys = [line.key for line in lines]
     there = set(keys)
     for key in there - channels.keys():
-        channels[key] = Channel(key_of(key), "json", None) if wanted(key_of(key)) else None
+        channels[key] = Channel(topic_key(key), "json", None) if wanted(topic_key(key)) else None
     kept = lines
     if any(channels[key] is None for key in there):
         kept = [line for line in lines if channels[line.key] is not None]

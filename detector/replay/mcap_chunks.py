@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from detector.replay.batches import MAXIMUM_BYTES, MAXIMUM_MESSAGES, Batch, Channel
 from detector.replay.errors import DAMAGE
-from detector.replay.message import Wanted, key_of
+from detector.replay.message import Wanted, topic_key
 
 Left = Callable[[McapChannel], Callable[[int], bool] | None]
 """For a channel, whether the message with a sequence number is left out; None where none of its messages is.
@@ -92,7 +92,7 @@ class Chunks:
         self._filters: dict[int, Callable[[int], bool]] = {}
         for number, channel in summary.channels.items():
             self._known[number] = True
-            self._wanted[number] = wanted(key_of(channel.topic))
+            self._wanted[number] = wanted(topic_key(channel.topic))
             leaves_out = left(channel)
             if leaves_out is not None:
                 self._filters[number] = leaves_out

@@ -27,7 +27,7 @@ _CHUNK = struct.Struct("<QQQII")
 _MESSAGE = struct.Struct("<HIQ")
 
 
-class Place(NamedTuple):
+class ChunkLocation(NamedTuple):
     """Where a chunk lies, or a message outside of chunks."""
 
     start: int
@@ -39,19 +39,19 @@ class Place(NamedTuple):
 
 
 @dataclass
-class Contents:
+class UnindexedMcap:
     """What a file without an index holds."""
 
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
-    places: list[Place] = field(default_factory=list)
+    places: list[ChunkLocation] = field(default_factory=list)
     cut: str | None = None
     """Where the file ends, if not where it should."""
 
 
-def contents_of(file: BinaryIO) -> Contents:
+def scan_mcap(file: BinaryIO) -> UnindexedMcap:
     """Goes through the file. Raises struct.error, ValueError, McapError where its records are damaged."""
-    found = Contents()
+    found = UnindexedMcap()
     size = os.fstat(file.fileno()).st_size
     at = len(MAGIC)
     while True:
@@ -67,9 +67,9 @@ def contents_of(file: BinaryIO) -> Contents:
         at += _RECORD.size
         there = min(length, size - at)
         if opcode == Opcode.CHUNK and there >= _CHUNK.size:
-            found.places.append(Place(_CHUNK.unpack(file.read(_CHUNK.size))[0], at, there, is_chunk=True))
+            found.places.append(ChunkLocation(_CHUNK.unpack(file.read(_CHUNK.size))[0], at, there, is_chunk=True))
         elif opcode == Opcode.MESSAGE and there == length:
-            found.places.append(Place(_MESSAGE.unpack(file.read(_MESSAGE.size))[2], at, there, is_chunk=False))
+            found.places.append(ChunkLocation(_MESSAGE.unpack(file.read(_MESSAGE.size))[2], at, there, is_chunk=False))
         if there < length:
             found.cut = f"a record of {length} bytes at byte {at} reaches beyond the end"
             return found
@@ -80,7 +80,7 @@ def contents_of(file: BinaryIO) -> Contents:
         at += length
 
 
-def messages_at(file: BinaryIO, place: Place, contents: Contents) -> Iterator[Message]:
+def messages_at(file: BinaryIO, place: ChunkLocation, contents: UnindexedMcap) -> Iterator[Message]:
     """The messages of a chunk, or the one that lies there; schemas and channels on the way are added to the contents.
 
     Raises ValueError, McapError where the chunk is damaged.
@@ -108,7 +108,7 @@ def messages_at(file: BinaryIO, place: Place, contents: Contents) -> Iterator[Me
         at += length
 
 
-def _define(opcode: int, data: bytes, contents: Contents) -> None:
+def _define(opcode: int, data: bytes, contents: UnindexedMcap) -> None:
     if opcode == Opcode.SCHEMA:
         schema = Schema.read(_stream(data))
         contents.schemas[schema.id] = schema

@@ -18,8 +18,8 @@ from mcap.summary import Summary
 from detector.replay.batches import Batch, Channel, batched
 from detector.replay.errors import DAMAGE, RecordingError
 from detector.replay.mcap_chunks import Chunks, Left
-from detector.replay.mcap_cut import MAGIC, Contents, Place, contents_of, messages_at
-from detector.replay.message import Cut, Message, OnCut, Piece, RecordedType, Wanted, in_order, key_of
+from detector.replay.mcap_cut import MAGIC, ChunkLocation, UnindexedMcap, messages_at, scan_mcap
+from detector.replay.message import Cut, Message, OnCut, Piece, RecordedType, Wanted, messages_in_order, topic_key
 from detector.replay.protobuf import ENCODING as PROTOBUF
 from detector.replay.protobuf import Decoders
 
@@ -52,7 +52,7 @@ def read_mcap(
 
     def described(schema: Schema | None, channel: McapChannel) -> Channel:
         return Channel(
-            key_of(channel.topic),
+            topic_key(channel.topic),
             channel.message_encoding,
             _type(schema.name) if schema is not None and channel.message_encoding == "cdr" else None,
             protobuf.decoder(schema, channel.topic) if channel.message_encoding == PROTOBUF else None,
@@ -65,7 +65,7 @@ def read_mcap(
                 yield from batched(_without_index(path, file, wanted, on_cut, left, described))
                 return
             summary = index.summary
-            topics = {channel.topic for channel in summary.channels.values() if wanted(key_of(channel.topic))}
+            topics = {channel.topic for channel in summary.channels.values() if wanted(topic_key(channel.topic))}
             if not topics:
                 return
             if summary.chunk_indexes:
@@ -113,14 +113,14 @@ def _without_index(
     left: Left,
     described: Callable[[Schema | None, McapChannel], Channel],
 ) -> Iterator[Message]:
-    contents = contents_of(file)
+    contents = scan_mcap(file)
     kept = _Kept(left)
 
-    def messages(place: Place) -> Iterator[Message]:
+    def messages(place: ChunkLocation) -> Iterator[Message]:
         try:
             for message in messages_at(file, place, contents):
                 channel = contents.channels[message.channel_id]
-                if wanted(key_of(channel.topic)) and kept(channel, message):
+                if wanted(topic_key(channel.topic)) and kept(channel, message):
                     yield _message(described(contents.schemas.get(channel.schema_id), channel), message)
         except _DAMAGE:
             if contents.cut is None or place is not contents.places[-1]:
@@ -129,7 +129,7 @@ def _without_index(
     if contents.places != sorted(contents.places):
         _define_all(file, contents)  # a channel's first chunk in the file is not the first in time
     count = 0
-    for message in in_order(Piece(place[0], partial(messages, place)) for place in contents.places):
+    for message in messages_in_order(Piece(place[0], partial(messages, place)) for place in contents.places):
         count += 1
         yield message
     if contents.cut is not None:
@@ -141,7 +141,7 @@ def mcap_types(path: Path) -> list[RecordedType]:
     with path.open("rb") as file:
         try:
             index = _index(file)
-            schemas = _define_all(file, contents_of(file)) if index is None else index.summary.schemas
+            schemas = _define_all(file, scan_mcap(file)) if index is None else index.summary.schemas
             return [
                 RecordedType(_type(schema.name), schema.data.decode(errors="replace"), schema.encoding == "ros2idl")
                 for schema in schemas.values()
@@ -190,7 +190,7 @@ def _is_whole(file: BinaryIO) -> bool:
     return size >= 2 * len(MAGIC) and file.read() == MAGIC
 
 
-def _define_all(file: BinaryIO, contents: Contents) -> dict[int, Schema]:
+def _define_all(file: BinaryIO, contents: UnindexedMcap) -> dict[int, Schema]:
     """Takes in the schemas and channels that stand in chunks as well; returns the schemas."""
     for place in contents.places:
         try:

@@ -65,7 +65,7 @@ class Piece(NamedTuple):
     read: Callable[[], Iterable[Message]]
 
 
-def in_order(pieces: Iterable[Piece]) -> Iterator[Message]:
+def messages_in_order(pieces: Iterable[Piece]) -> Iterator[Message]:
     """The messages of all pieces in the order of their times, those of equal times as they lie in the file.
 
     The pieces are given in that order. Each is read when its start is reached, so no more of them are in memory than
@@ -81,6 +81,6 @@ def in_order(pieces: Iterable[Piece]) -> Iterator[Message]:
         yield heapq.heappop(waiting)[-1]
 
 
-def key_of(topic: str) -> str:
+def topic_key(topic: str) -> str:
     """The key of a ROS topic."""
     return topic.removeprefix("/")

@@ -12,11 +12,11 @@ from detector.engine.samples.sample import Arrival
 from detector.engine.scoping.plugins import PluginHost
 from detector.replay.clips import Clips
 from detector.replay.errors import RecordingError
-from detector.replay.gathering import Recording, name_of
+from detector.replay.gathering import Recording, recording_name
 from detector.replay.latched import recorded_arrivals
 from detector.replay.message import Cut
 from detector.replay.recorded_types import with_recorded_types
-from detector.replay.replaying import Onlooker, Outcome, replay_arrivals
+from detector.replay.replaying import Outcome, ReplayObserver, replay_arrivals
 from detector.replay.routing import Router
 from wayside.api import Detector, EventRule
 
@@ -24,7 +24,7 @@ Plugins = Callable[[], AbstractContextManager[PluginHost | None]]
 """Runs the plugins of one recording."""
 
 
-class Watch(Protocol):
+class ReplayWatch(Protocol):
     """Sees what is replayed on its way."""
 
     def __call__(self, batches: Iterable[Sequence[Arrival]], /) -> Iterable[Sequence[Arrival]]:
@@ -45,8 +45,8 @@ def play(
     detector: Detector,
     rules: Sequence[EventRule],
     plugins: Plugins = nullcontext,
-    watch: Watch = lambda batches: batches,
-    onlooker: Callable[[str], Onlooker | None] = lambda _: None,
+    watch: ReplayWatch = lambda batches: batches,
+    onlooker: Callable[[str], ReplayObserver | None] = lambda _: None,
     clips: Clips | None = None,
     holder: str | None = None,
 ) -> Played:
@@ -65,7 +65,7 @@ def play(
     errors: list[RecordingError] = []
     unrouted: dict[str, list[str]] = {}
     for number, recording in enumerate(recordings, start=1):
-        name = name_of(recording)
+        name = recording_name(recording)
         try:
             of = (holder or detector.name) + (f".{number}" if number > 1 else "")
             outcome, unrouted[name] = _played(recording, detector, rules, plugins, watch, of, onlooker(name), clips)
@@ -86,15 +86,15 @@ def _played(
     detector: Detector,
     rules: Sequence[EventRule],
     plugins: Plugins,
-    watch: Watch,
+    watch: ReplayWatch,
     holder: str,
-    onlooker: Onlooker | None,
+    onlooker: ReplayObserver | None,
     clips: Clips | None,
 ) -> tuple[Outcome, list[str]]:
     """What a recording came to, and its keys that belong to no stream."""
     cuts: list[Cut] = []
     completed = with_recorded_types(detector, recording)
-    router = Router(completed.spec.streams, name_of(recording))
+    router = Router(completed.spec.streams, recording_name(recording))
     arrivals = recorded_arrivals(recording, router, completed, cuts.append)
     with plugins() as host:
         outcome = replay_arrivals(watch(arrivals), completed, rules, host, holder, onlooker, clips)

@@ -18,7 +18,7 @@ Span = tuple[int, int]
 _EVERY = 10_000
 
 
-class Progress:
+class ProgressLine:
     """Shows a line that is taken away at the end; nothing where the console is no terminal."""
 
     def __init__(self, console: Console, monotonic: Callable[[], float] = time.monotonic) -> None:
@@ -30,7 +30,7 @@ class Progress:
         self._watched = 0
         self._begin = monotonic()
 
-    def __enter__(self) -> Progress:
+    def __enter__(self) -> ProgressLine:
         self._status = self._console.status("reading the recording")
         if self._console.is_terminal:
             self._stack.enter_context(self._status)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from detector.replay.batches import Batch, merged
+from detector.replay.batches import Batch, merged_batches
 from detector.replay.errors import RecordingError
 from detector.replay.json_lines import json_lines_span, read_json_lines
 from detector.replay.mcap_file import MAGIC as MCAP_MAGIC
@@ -31,7 +31,7 @@ def open_recordings(
     RecordingError at once for one that is missing or of no known kind, later where one turns out to be damaged.
     """
     readers = [(_reader(path), path) for path in paths]
-    return merged([read(path, wanted, on_cut) for read, path in readers])
+    return merged_batches([read(path, wanted, on_cut) for read, path in readers])
 
 
 def check_exists(path: Path) -> None:

@@ -13,7 +13,7 @@ from functools import partial
 from typing import Any, Protocol
 
 from detector.actions.base import Surroundings
-from detector.assembly import Inlets, Refusal, RuleIndex, inlets, make_engine
+from detector.assembly import Inlets, RefusedRule, RuleIndex, inlets, make_engine
 from detector.engine.engine import Engine, NoAnswerError
 from detector.engine.episodes.demands import Demand, from_task, to_task
 from detector.engine.episodes.events import Event
@@ -36,7 +36,7 @@ from wayside.times import format_time
 _BATCH = 4096
 
 
-class Onlooker(Observer, Protocol):
+class ReplayObserver(Observer, Protocol):
     """Sees what a replay evaluates. It decides nothing."""
 
     def attend(self, engine: Engine) -> None:
@@ -49,7 +49,7 @@ class Outcome:
 
     events: list[Event] = field(default_factory=list)
     tasks: dict[str, ApplicationTask] = field(default_factory=dict)
-    refusals: list[Refusal] = field(default_factory=list)
+    refusals: list[RefusedRule] = field(default_factory=list)
     samples: int = 0
     notes: list[str] = field(default_factory=list)
     """What a person should know: pauses, losses, and what was unknown or failed."""
@@ -81,7 +81,7 @@ class Replay:
         plugins: PluginHost | None = None,
         version: int = ORDER,
         order: int = ORDER,
-        onlooker: Onlooker | None = None,
+        onlooker: ReplayObserver | None = None,
         clips: Clips | None = None,
     ) -> None:
         """`start` is when the detector started, in nanoseconds since the epoch; `plugins` runs them.
@@ -213,7 +213,7 @@ def replay_intake(
     detector: Detector | None,
     rules: Sequence[EventRule] | None,
     plugins: PluginHost | None = None,
-    onlooker: Onlooker | None = None,
+    onlooker: ReplayObserver | None = None,
     clips: Clips | None = None,
 ) -> Outcome:
     """Replay an intake file: with what it holds, or with another Detector or other rules where given.
@@ -261,7 +261,7 @@ def _begin(
     rules: Sequence[EventRule] | None,
     outcome: Outcome,
     plugins: PluginHost | None,
-    onlooker: Onlooker | None,
+    onlooker: ReplayObserver | None,
     clips: Clips | None,
 ) -> Replay:
     document = record.document
@@ -325,7 +325,7 @@ def replay_arrivals(
     rules: Sequence[EventRule],
     plugins: PluginHost | None = None,
     holder: str | None = None,
-    onlooker: Onlooker | None = None,
+    onlooker: ReplayObserver | None = None,
     clips: Clips | None = None,
 ) -> Outcome:
     """Replay what any other recording holds, as the live intake would have queued it; `plugins` as for an intake file.

@@ -19,8 +19,8 @@ from rosbags.typesys.store import Typestore
 
 from detector.replay.batches import Batch, batched
 from detector.replay.errors import DAMAGE, RecordingError
-from detector.replay.message import Cut, Message, OnCut, Piece, RecordedType, Wanted, in_order, key_of
-from detector.replay.rosbag1_cut import Chunk, Contents, contents_of, messages_of
+from detector.replay.message import Cut, Message, OnCut, Piece, RecordedType, Wanted, messages_in_order, topic_key
+from detector.replay.rosbag1_cut import Chunk, UnindexedBag, chunk_messages, scan_bag
 
 ROSBAG1_MAGIC = b"#ROSBAG V2.0\n"
 
@@ -43,7 +43,7 @@ def _messages(path: Path, wanted: Wanted, on_cut: OnCut) -> Iterator[Message]:
             yield from _read_cut(path, cut, wanted, on_cut)
             return
         with Reader(path) as reader:
-            connections = [connection for connection in reader.connections if wanted(key_of(connection.topic))]
+            connections = [connection for connection in reader.connections if wanted(topic_key(connection.topic))]
             if not connections:  # rosbags would read none as all
                 return
             convert = _converter(path, connections)
@@ -56,31 +56,31 @@ def _messages(path: Path, wanted: Wanted, on_cut: OnCut) -> Iterator[Message]:
         raise _damaged(path, error) from error
 
 
-def _read_cut(path: Path, contents: Contents, wanted: Wanted, on_cut: OnCut) -> Iterator[Message]:
+def _read_cut(path: Path, contents: UnindexedBag, wanted: Wanted, on_cut: OnCut) -> Iterator[Message]:
     connections = {
-        number: connection for number, connection in contents.connections.items() if wanted(key_of(connection.topic))
+        number: connection for number, connection in contents.connections.items() if wanted(topic_key(connection.topic))
     }
     convert = _converter(path, list(connections.values())) if connections else None
 
     def messages(chunk: Chunk) -> Iterator[Message]:
-        for time, connection, payload in messages_of(path, chunk, contents):
+        for time, connection, payload in chunk_messages(path, chunk, contents):
             if convert is not None and connection in connections:
                 yield convert(connections[connection], time, payload)
 
     count = 0
-    for message in in_order(Piece(chunk.start, partial(messages, chunk)) for chunk in contents.chunks):
+    for message in messages_in_order(Piece(chunk.start, partial(messages, chunk)) for chunk in contents.chunks):
         count += 1
         yield message
     on_cut(Cut(path, count, contents.cut or "it has no index"))
 
 
-def _contents(path: Path) -> Contents | None:
+def _contents(path: Path) -> UnindexedBag | None:
     """What a bag that has no index holds; None where it has one."""
     try:
         with Reader(path):
             return None
     except (*DAMAGE, ReaderError, TypesysError):
-        return contents_of(path, ROSBAG1_MAGIC)
+        return scan_bag(path, ROSBAG1_MAGIC)
 
 
 def _converter(path: Path, connections: Sequence[Connection]) -> Callable[[Connection, int, bytes], Message]:
@@ -97,7 +97,7 @@ def _converter(path: Path, connections: Sequence[Connection]) -> Callable[[Conne
                 f"as the bag defines it: {error}: "
                 f"repair the bag with `rosbag fix {path}`, or take the topic out of the Detector's streams"
             ) from error
-        return Message(time, key_of(connection.topic), cdr, "cdr", connection.msgtype)
+        return Message(time, topic_key(connection.topic), cdr, "cdr", connection.msgtype)
 
     return convert
 

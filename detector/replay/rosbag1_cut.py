@@ -49,7 +49,7 @@ class Chunk(NamedTuple):
 
 
 @dataclass
-class Contents:
+class UnindexedBag:
     """What a bag without an index holds."""
 
     connections: dict[int, Connection] = field(default_factory=dict)
@@ -58,9 +58,9 @@ class Contents:
     """Where the bag ends, if not where it should."""
 
 
-def contents_of(path: Path, magic: bytes) -> Contents:
+def scan_bag(path: Path, magic: bytes) -> UnindexedBag:
     """Goes through the bag. Raises OSError, ValueError, LookupError, struct.error where its records are damaged."""
-    found = Contents()
+    found = UnindexedBag()
     with path.open("rb") as file:
         size = os.fstat(file.fileno()).st_size
         at = len(magic)
@@ -87,14 +87,14 @@ def contents_of(path: Path, magic: bytes) -> Contents:
     return found
 
 
-def messages_of(path: Path, chunk: Chunk, contents: Contents) -> Iterator[Recorded]:
+def chunk_messages(path: Path, chunk: Chunk, contents: UnindexedBag) -> Iterator[Recorded]:
     """The messages of a chunk, as they lie there."""
     with path.open("rb") as file:
         file.seek(chunk.offset)
         return _messages(file.read(chunk.length), chunk.compression, contents)
 
 
-def _messages(data: bytes, compression: str, contents: Contents) -> Iterator[Recorded]:
+def _messages(data: bytes, compression: str, contents: UnindexedBag) -> Iterator[Recorded]:
     if compression not in _UNPACK:
         raise ValueError(f"unknown bag compression {compression!r}")
     inside = _UNPACK[compression](data)

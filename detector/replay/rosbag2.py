@@ -10,10 +10,10 @@ from backports.zstd import ZstdError
 from rosbags.interfaces import ConnectionExtRosbag2, MessageDefinitionFormat
 from rosbags.rosbag2 import Reader, ReaderError
 
-from detector.replay.batches import Batch, batched, merged
+from detector.replay.batches import Batch, batched, merged_batches
 from detector.replay.errors import DAMAGE, RecordingError
 from detector.replay.mcap_file import is_cut, mcap_types, read_mcap
-from detector.replay.message import Message, OnCut, RecordedType, Wanted, key_of
+from detector.replay.message import Message, OnCut, RecordedType, Wanted, topic_key
 
 SQLITE_MAGIC = b"SQLite format 3\0"
 
@@ -27,20 +27,20 @@ def read_rosbag2(path: Path, wanted: Wanted, on_cut: OnCut) -> Iterator[Batch]:
     """
     files = sorted(path.glob("*.mcap")) if path.is_dir() else []
     if any(is_cut(file) for file in files):
-        return merged([read_mcap(file, wanted, on_cut) for file in files])
+        return merged_batches([read_mcap(file, wanted, on_cut) for file in files])
     return batched(_messages(path, wanted))
 
 
 def _messages(path: Path, wanted: Wanted) -> Iterator[Message]:
     try:
         with Reader(path) as reader:
-            connections = [connection for connection in reader.connections if wanted(key_of(connection.topic))]
+            connections = [connection for connection in reader.connections if wanted(topic_key(connection.topic))]
             if not connections:  # rosbags would read none as all
                 return
             for connection, time, payload in reader.messages(connections):
                 extra = connection.ext
                 encoding = extra.serialization_format if isinstance(extra, ConnectionExtRosbag2) else "cdr"
-                yield Message(time, key_of(connection.topic), bytes(payload), encoding, connection.msgtype)
+                yield Message(time, topic_key(connection.topic), bytes(payload), encoding, connection.msgtype)
     except _DAMAGE as error:
         raise _damaged(path, error) from error
 

@@ -8,7 +8,7 @@ from collections.abc import AsyncGenerator
 from typing import Generic, TypeVar
 
 from detector.cluster.api import Api, JsonObject, Resource
-from detector.cluster.reflector import Change, Changed, Deleted, Listed, Reflector
+from detector.cluster.reflector import Change, Changed, Deleted, Reflector, Replaced
 from detector.resources.selection import RuleSet, select
 from wayside.api import API_VERSION, Detector, EventRule, Kind
 from wayside.api.documents import parse_object
@@ -110,7 +110,7 @@ class _Known(Generic[Object]):
 
     def take(self, change: Change) -> None:
         match change:
-            case Listed(objects, _):
+            case Replaced(objects, _):
                 self.listed = True
                 for name in (self.objects.keys() | self.unreadable.keys()) - {
                     obj["metadata"]["name"] for obj in objects

@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from detector.results.episodes import Episode
+from detector.results.episodes import EpisodeRow
 from detector.results.result import Result
 from wayside.times import parse_time
 
@@ -61,5 +61,5 @@ def _windows(result: Result) -> Iterator[Deed]:
             yield Deed(rule.name, action.name, episode.subject, kind, about, begin, end)
 
 
-def _after(episode: Episode, after: int) -> int | None:
+def _after(episode: EpisodeRow, after: int) -> int | None:
     return None if episode.end_time is None else episode.end_time + after

@@ -14,7 +14,7 @@ _NEVER_SEEN = 255
 """In place of a tag: no tag is like it, so the first point always counts."""
 
 
-class Found(NamedTuple):
+class ChangePoints(NamedTuple):
     """Points at which something changed, in order of the clients, then of the times."""
 
     rows: NDArray[np.intp]
@@ -35,7 +35,7 @@ class Changes:
 
     def add(
         self, clients: Integers, times: Integers, values: Doubles, tags: Bytes, present: NDArray[np.bool_] | None
-    ) -> Found:
+    ) -> ChangePoints:
         """Note what changed, and return where.
 
         Args:
@@ -64,7 +64,7 @@ class Changes:
         new = values[rows, ticks]
         if len(rows):
             self._parts.append((clients[rows], times[ticks], new, tags[rows, ticks]))
-        return Found(rows, ticks, new)
+        return ChangePoints(rows, ticks, new)
 
     def by_client(self, chosen: Container[int] | None) -> Iterator[tuple[int, Integers, Doubles, Bytes]]:
         """Of each chosen client (None: of all), its number, and times, values and tags of its changes."""

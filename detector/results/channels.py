@@ -17,11 +17,11 @@ from foxglove.messages import Log, LogLevel, Timestamp
 
 from detector.engine.episodes.events import Event
 from detector.results.result import Result
-from detector.results.series import WORDS, Integers, Kind, Series, SubjectTrace
+from detector.results.series import WORDS, Integers, Series, SeriesKind, SubjectTrace
 from detector.results.thinning import thinned
 from wayside.times import format_time
 
-_TYPES = {Kind.NUMBER: "number", Kind.BOOLEAN: "boolean", Kind.TEXT: "string"}
+_TYPES = {SeriesKind.NUMBER: "number", SeriesKind.BOOLEAN: "boolean", SeriesKind.TEXT: "string"}
 _SIGNS = {"+": "plus", "-": "minus", "*": "times", "/": "by"}
 
 
@@ -29,7 +29,7 @@ class _Field(NamedTuple):
     """One value of a message."""
 
     path: tuple[str, ...]
-    kind: Kind
+    kind: SeriesKind
     values: list[float | bool | str | None]
 
 
@@ -39,7 +39,7 @@ def topic_of(rule: str, subject: str) -> str:
 
 
 @lru_cache(maxsize=4096)
-def path_of(name: str) -> tuple[str, ...]:
+def message_path(name: str) -> tuple[str, ...]:
     """Where a signal or term stands in a message: `a.speed` in `a`, `fastest - speed` under `fastest_minus_speed`."""
     if re.fullmatch(r"[\w.]+", name):
         return tuple(name.split("."))
@@ -55,10 +55,10 @@ def subject_channel(
     named = {**subject.signals, **(terms.computed if terms is not None else {})}
     short = {name: thinned(series, trace.begin, trace.end, buckets, exact) for name, series in named.items()}
     times = np.unique(np.concatenate([exact, *(series.times for series in short.values())]))
-    fields = [_Field(path_of(name), each.kind, _plain(each, times)) for name, each in named.items()]
+    fields = [_Field(message_path(name), each.kind, _plain(each, times)) for name, each in named.items()]
     limits: dict[str, Any] = {}
     for each in terms.thresholds if terms is not None else ():
-        _put(limits, (each.field, *path_of(each.term)), each.value)
+        _put(limits, (each.field, *message_path(each.term)), each.value)
     said = {name: steps.at(times).tolist() for name, steps in subject.conditions.items()}
     reasons = {name: _reasons(steps.reasons, steps.times, times) for name, steps in subject.conditions.items()}
     schema: dict[str, Any] = {"type": "object", "title": f"wayside.{subject.rule}", "properties": {}}
@@ -99,7 +99,7 @@ def _messages(
 def _plain(series: Series, times: Integers) -> list[float | bool | str | None]:
     """The values at these times as JSON has them; None: unknown or infinite, which JSON cannot express."""
     values = series.at(times).tolist()
-    if series.kind is Kind.NUMBER:
+    if series.kind is SeriesKind.NUMBER:
         return [value if math.isfinite(value) else None for value in values]
     return [series.plain(value) for value in values]
 

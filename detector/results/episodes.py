@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from detector.engine.episodes.events import Event
-from detector.results.series import Kind, Series, SubjectTrace, Trace
+from detector.results.series import Series, SeriesKind, SubjectTrace, Trace
 from wayside.times import format_time
 
 Plain = float | bool | str | None
@@ -27,7 +27,7 @@ _KINDS: Mapping[type, str] = {bool: "boolean", float: "number", type(None): "nul
 
 
 @dataclass(slots=True)
-class Episode:
+class EpisodeRow:
     """One row."""
 
     recording: str
@@ -51,14 +51,14 @@ class Episode:
         return None if self.end_time is None else (self.end_time - self.start_time) / 1e9
 
 
-def episodes_of(recording: str, events: Iterable[Event], trace: Trace) -> list[Episode]:
+def episodes_of(recording: str, events: Iterable[Event], trace: Trace) -> list[EpisodeRow]:
     """The episodes of a recording, in order of their starts.
 
     Minimum and maximum are those of all ticks of the episode; the mean is weighted by time. An episode that is open
     has those up to the end of the recording.
     """
     traces = {(each.rule, each.subject): each for each in trace.subjects}
-    found: dict[str, Episode] = {}
+    found: dict[str, EpisodeRow] = {}
     for event in events:
         episode = found.get(event.episode)
         if episode is None:
@@ -75,8 +75,8 @@ def episodes_of(recording: str, events: Iterable[Event], trace: Trace) -> list[E
     return sorted(found.values(), key=lambda each: (each.start_time, each.rule, each.subject))
 
 
-def _episode(recording: str, event: Event) -> Episode:
-    return Episode(
+def _episode(recording: str, event: Event) -> EpisodeRow:
+    return EpisodeRow(
         recording, event.rule, event.subject, event.subjects, event.element, event.episode, event.onset_time,
         event.start_time, None, None, event.dry_run,
     )  # fmt: skip
@@ -97,11 +97,11 @@ def flat(values: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Plai
             yield above + name, float(value)
 
 
-def _statistics(trace: SubjectTrace, episode: Episode, last: int) -> dict[str, Plain]:
+def _statistics(trace: SubjectTrace, episode: EpisodeRow, last: int) -> dict[str, Plain]:
     end = last if episode.end_time is None else episode.end_time
     found: dict[str, Plain] = {}
     for name, series in trace.signals.items():
-        if series.kind is not Kind.NUMBER:
+        if series.kind is not SeriesKind.NUMBER:
             continue
         times, values = within(series, episode.start_time, end)
         known = ~np.isnan(values)
@@ -124,12 +124,12 @@ def within(series: Series, begin: int, end: int) -> tuple[Any, Any]:
     return times, values
 
 
-def columns_of(episodes: Iterable[Episode]) -> list[str]:
+def columns_of(episodes: Iterable[EpisodeRow]) -> list[str]:
     """The names of the values, in their order."""
     return sorted({name for each in episodes for name in each.values})
 
 
-def write_csv(path: Path, episodes: Sequence[Episode]) -> None:
+def write_csv(path: Path, episodes: Sequence[EpisodeRow]) -> None:
     """Write the table as CSV: times as RFC 3339, what is unknown as nothing."""
     names = columns_of(episodes)
     with path.open("w", encoding="utf-8", newline="") as file:
@@ -144,7 +144,7 @@ def write_csv(path: Path, episodes: Sequence[Episode]) -> None:
             writer.writerow(["" if value is None else value for value in row])
 
 
-def _times(each: Episode) -> tuple[int | None, ...]:
+def _times(each: EpisodeRow) -> tuple[int | None, ...]:
     return each.onset_time, each.start_time, each.end_time
 
 
@@ -153,14 +153,14 @@ def _text(value: Plain) -> Plain:
     return str(value).lower() if isinstance(value, bool) else value
 
 
-def write_parquet(path: Path, episodes: Sequence[Episode]) -> None:
+def write_parquet(path: Path, episodes: Sequence[EpisodeRow]) -> None:
     """Write the table as Parquet: times as timestamps in UTC to the nanosecond, subjects as a list."""
     import pyarrow.parquet as pq  # noqa: PLC0415  an extra
 
-    pq.write_table(table_of(episodes, kinds_of(episodes)), path, compression="zstd")
+    pq.write_table(table_of(episodes, value_kinds(episodes)), path, compression="zstd")
 
 
-def kinds_of(episodes: Iterable[Episode]) -> dict[str, str]:
+def value_kinds(episodes: Iterable[EpisodeRow]) -> dict[str, str]:
     """By the names of the values, sorted: `number`, `boolean`, `text` (also for a mixture), or `null`."""
     found: dict[str, str] = {}
     for each in episodes:
@@ -176,7 +176,7 @@ def merged_kind(one: str, other: str) -> str:
     return one if one == other else "text"
 
 
-def table_of(episodes: Sequence[Episode], kinds: Mapping[str, str]) -> Any:
+def table_of(episodes: Sequence[EpisodeRow], kinds: Mapping[str, str]) -> Any:
     """The episodes as a pyarrow.Table, with a column for each value that has a kind."""
     import pyarrow as pa  # noqa: PLC0415
 
@@ -195,6 +195,6 @@ def table_of(episodes: Sequence[Episode], kinds: Mapping[str, str]) -> Any:
     return pa.table(columns)
 
 
-def _cell(each: Episode, name: str) -> Any:
+def _cell(each: EpisodeRow, name: str) -> Any:
     value = getattr(each, name)
     return list(value) if name == "subjects" else value

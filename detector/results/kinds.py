@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import StrEnum
 
 
-class Kind(StrEnum):
+class ResultKind(StrEnum):
     """What `detector replay --results` writes."""
 
     REPORT = "report"
@@ -17,7 +17,7 @@ class Kind(StrEnum):
     ALL = "all"
 
 
-def chosen(kinds: list[Kind] | None) -> frozenset[Kind]:
+def chosen(kinds: list[ResultKind] | None) -> frozenset[ResultKind]:
     """All kinds that are meant, without ALL."""
-    each = frozenset(Kind) - {Kind.ALL}
-    return each if kinds and Kind.ALL in kinds else frozenset(kinds or ())
+    each = frozenset(ResultKind) - {ResultKind.ALL}
+    return each if kinds and ResultKind.ALL in kinds else frozenset(kinds or ())

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from foxglove import layouts
 
-from detector.results.channels import path_of, topic_of
+from detector.results.channels import message_path, topic_of
 from detector.results.result import Result
 from detector.results.scene import FRAME
-from detector.results.series import Kind, SubjectTrace
+from detector.results.series import SeriesKind, SubjectTrace
 
 _SUBJECTS = 3
 """Maximum number of subjects of a rule with plotted values: those with most episodes."""
@@ -58,12 +58,14 @@ def _series(result: Result, subject: SubjectTrace) -> list[layouts.PlotSeries]:
     terms = result.terms.get((subject.rule, subject.subject))
     named = {**subject.signals, **(terms.computed if terms is not None else {})}
     found = [
-        layouts.PlotSeries(value=f"{_quoted(subject)}.{'.'.join(path_of(name))}", label=f"{subject.subject} {name}")
+        layouts.PlotSeries(
+            value=f"{_quoted(subject)}.{'.'.join(message_path(name))}", label=f"{subject.subject} {name}"
+        )
         for name, series in named.items()
-        if series.kind is Kind.NUMBER
+        if series.kind is SeriesKind.NUMBER
     ]
     for each in terms.thresholds if terms is not None else ():
-        path = ".".join(("threshold", each.field, *path_of(each.term)))
+        path = ".".join(("threshold", each.field, *message_path(each.term)))
         label = f"{subject.subject} {each.field}: {each.operator} {each.value:g}"
         found.append(layouts.PlotSeries(value=f"{_quoted(subject)}.{path}", label=label))
     return found

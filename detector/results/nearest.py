@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from detector.results.episodes import Episode
+from detector.results.episodes import EpisodeRow
 from detector.results.series import SubjectTrace
 from wayside.rules import CompiledRule
 from wayside.times import format_time
@@ -19,7 +19,7 @@ _PROMINENCE = 1.0
 """Two moments count apart where the margin falls by this between them: by one unit of the scale."""
 
 
-class Near(NamedTuple):
+class NearMoment(NamedTuple):
     """One moment."""
 
     recording: str
@@ -31,25 +31,25 @@ class Near(NamedTuple):
     """At most 0 where the condition did not hold; more where it did not hold for long enough."""
 
 
-def nearest(
-    recording: str, rules: Mapping[str, CompiledRule], subjects: Iterable[SubjectTrace], episodes: Iterable[Episode]
-) -> list[Near]:
+def nearest_moments(
+    recording: str, rules: Mapping[str, CompiledRule], subjects: Iterable[SubjectTrace], episodes: Iterable[EpisodeRow]
+) -> list[NearMoment]:
     """The nearest moments of each rule without an episode, those with the largest margin first."""
     spans: dict[tuple[str, str], list[tuple[int, int | None]]] = {}
     for episode in episodes:
         spans.setdefault((episode.rule, episode.subject), []).append((episode.onset_time, episode.end_time))
-    found: dict[str, list[Near]] = {}
+    found: dict[str, list[NearMoment]] = {}
     for trace in subjects:
         rule = rules.get(trace.rule)
         if rule is not None and rule.has_margin and "margin" in trace.signals:
             series = trace.signals["margin"]
             times, values = series.times.tolist(), series.values.tolist()
             for time, margin in _peaks(times, values, spans.get((trace.rule, trace.subject), ())):
-                found.setdefault(trace.rule, []).append(Near(recording, trace.rule, trace.subject, time, margin))
+                found.setdefault(trace.rule, []).append(NearMoment(recording, trace.rule, trace.subject, time, margin))
     return [near for rule in sorted(found) for near in listed(found[rule])]
 
 
-def listed(moments: Iterable[Near]) -> list[Near]:
+def listed(moments: Iterable[NearMoment]) -> list[NearMoment]:
     """The nearest of these, in order."""
     return sorted(moments, key=lambda each: (-each.margin, each.time, each.subject))[:MOST]
 
@@ -90,9 +90,9 @@ def _of_stretch(stretch: Sequence[tuple[int, float]], after: bool, before: bool)
         yield best
 
 
-def write_csv(path: Path, moments: Sequence[Near]) -> None:
+def write_moments(path: Path, moments: Sequence[NearMoment]) -> None:
     """Write them as CSV, with times as RFC 3339."""
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(Near._fields)
+        writer.writerow(NearMoment._fields)
         writer.writerows([each._replace(time=format_time(each.time)) for each in moments])  # type: ignore[arg-type]

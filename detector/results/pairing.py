@@ -21,8 +21,8 @@ from detector.results.series import (
     Bytes,
     Doubles,
     Integers,
-    Kind,
     Series,
+    SeriesKind,
     Steps,
     SubjectTrace,
     Wanted,
@@ -46,7 +46,7 @@ class PairLog:
         if track.rule.until is not None:
             self._said["until"] = []
         self._values: dict[str, list[Doubles]] = {"distance": []}
-        self._kinds: dict[str, Kind] = {}
+        self._kinds: dict[str, SeriesKind] = {}
         self._odd: set[str] = set()
         self._unsure: dict[str, Integers] = {}
         self._reasons: dict[str, dict[tuple[int, int], str]] = {field: {} for field in self._said}
@@ -88,7 +88,7 @@ class PairLog:
         if ((tags == Tag.OTHER) | (tags == Tag.TEXT)).any():
             self._odd.add(name)
         if (tags == Tag.BOOLEAN).any():
-            self._kinds[name] = Kind.BOOLEAN
+            self._kinds[name] = SeriesKind.BOOLEAN
         return np.where((tags == Tag.NUMBER) | (tags == Tag.BOOLEAN), column.values, np.nan)
 
     def subjects(self, rule: str, names: Sequence[str], wanted: Wanted) -> Iterator[SubjectTrace]:
@@ -112,7 +112,7 @@ class PairLog:
             subject = SubjectTrace(rule, text, clients)
             left = _left(ordinals[own], len(ticks))
             for name, column in values.items():
-                kind = self._kinds.get(name, Kind.NUMBER)
+                kind = self._kinds.get(name, SeriesKind.NUMBER)
                 subject.signals[name] = Series(*_changes(ticks, ordinals[own], column[own], left, np.nan), kind)
             for field, codes_of in said.items():
                 times, codes = _changes(ticks, ordinals[own], codes_of[own].astype(float), left, AWAY)

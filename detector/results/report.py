@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 
 from detector.results.actions import Deed, deeds_of
-from detector.results.episodes import Episode
+from detector.results.episodes import EpisodeRow
 from detector.results.places import polygons_of
 from detector.results.result import Result
-from detector.results.series import UNKNOWN, Integers, Kind, Series, SubjectTrace
+from detector.results.series import UNKNOWN, Integers, Series, SeriesKind, SubjectTrace
 from detector.results.thinning import thinned
 from wayside.manifests import to_yaml
 from wayside.times import format_time
@@ -42,41 +42,40 @@ _DEEDS = 2000
 
 def write_report(path: Path, result: Result) -> None:
     """Write the page."""
-    path.write_text(page(data_of(result)), encoding="utf-8")
+    path.write_text(_page(data_of(result)), encoding="utf-8")
 
 
-def page(data: Mapping[str, Any]) -> str:
+def _page(data: Mapping[str, Any]) -> str:
     """The page around the data; the same data gives the same bytes."""
     own = resources.files("detector.results") / "page"
     scripts = resources.files("bokeh") / "server" / "static" / "js"
     packed = gzip.compress(json.dumps(data, separators=(",", ":"), allow_nan=False).encode(), 9, mtime=0)
-    parts = {
-        "title": escape(f"Replay of {data['recording']}"),
-        "style": (own / "report.css").read_text("utf-8"),
-        "body": (own / "report.html").read_text("utf-8"),
-        "data": base64.b64encode(packed).decode(),
-        "bokeh": "\n".join((scripts / name).read_text("utf-8") for name in ("bokeh.min.js", "bokeh-api.min.js")),
-        "script": (own / "report.js").read_text("utf-8"),
-    }
-    return _PAGE.format(**parts)
+    body = (own / "report.html").read_text("utf-8")
+    bokeh = "\n".join((scripts / name).read_text("utf-8") for name in ("bokeh.min.js", "bokeh-api.min.js"))
+    script = (own / "report.js").read_text("utf-8")
+    return html_page(
+        f"Replay of {data['recording']}",
+        f'{body}\n<script type="text/plain" id="data">{base64.b64encode(packed).decode()}</script>\n'
+        f"<script>{bokeh}</script>\n<script>{script}</script>",
+        style=(own / "report.css").read_text("utf-8"),
+        policy="script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:; font-src data:",
+    )
 
 
-_PAGE = """<!doctype html>
+def html_page(title: str, body: str, *, style: str, policy: str) -> str:
+    """A page that loads nothing; `policy` is the part of its Content-Security-Policy after `default-src 'none'`."""
+    return f"""<!doctype html>
 <html lang="en">
 <head>
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <meta name="color-scheme" content="light dark">
-<meta http-equiv="Content-Security-Policy" content="default-src 'none'; script-src 'unsafe-inline'; \
-style-src 'unsafe-inline'; img-src data: blob:; font-src data:">
-<title>{title}</title>
+<meta http-equiv="Content-Security-Policy" content="default-src 'none'; {policy}">
+<title>{escape(title)}</title>
 <style>{style}</style>
 </head>
 <body>
 {body}
-<script type="text/plain" id="data">{data}</script>
-<script>{bokeh}</script>
-<script>{script}</script>
 </body>
 </html>
 """
@@ -87,7 +86,7 @@ def data_of(result: Result) -> dict[str, Any]:
     trace = result.trace
     episodes = result.episodes
     table = _Table(result)
-    by_subject: dict[tuple[str, str], list[Episode]] = {}
+    by_subject: dict[tuple[str, str], list[EpisodeRow]] = {}
     told = {episode.episode for episode in episodes[:_VALUES]}
     for episode in episodes:
         by_subject.setdefault((episode.rule, episode.subject), []).append(episode)
@@ -167,9 +166,9 @@ class _Table:
         if place is None:
             place = self._places[digest] = len(self.entries)
             short = thinned(series, self._begin, self._end, self._buckets, self._exact[digest])
-            used = [*short.texts] if short.kind is Kind.TEXT else None
+            used = [*short.texts] if short.kind is SeriesKind.TEXT else None
             values = [value if math.isfinite(value) else None for value in short.values.tolist()]
-            if short.kind is not Kind.NUMBER:
+            if short.kind is not SeriesKind.NUMBER:
                 values = [None if value is None else int(value) for value in values]
             entry: dict[str, Any] = {"kind": short.kind.value, "t": self.times(short.times), "v": values}
             self.entries.append({**entry, "texts": used} if used is not None else entry)
@@ -216,7 +215,7 @@ def _event_times(result: Result) -> list[Integers]:
 
 
 def _subject(
-    result: Result, subject: SubjectTrace, episodes: Sequence[Episode], table: _Table, told: Set[str]
+    result: Result, subject: SubjectTrace, episodes: Sequence[EpisodeRow], table: _Table, told: Set[str]
 ) -> dict[str, Any]:
     terms = result.terms.get((subject.rule, subject.subject))
     return {
@@ -246,7 +245,7 @@ def _subject(
     }
 
 
-def _values(episode: Episode) -> dict[str, Any]:
+def _values(episode: EpisodeRow) -> dict[str, Any]:
     """Those that the page lists."""
     shown = (".start", ".max")
     values = ((name, value) for name, value in episode.values.items() if name.endswith(shown) and value is not None)
@@ -259,7 +258,7 @@ def _series_of(result: Result, subject: SubjectTrace) -> dict[str, Series]:
     return {**(terms.computed if terms is not None else {}), **subject.signals}
 
 
-def _rule(result: Result, name: str, episodes: Sequence[Episode]) -> dict[str, Any]:
+def _rule(result: Result, name: str, episodes: Sequence[EpisodeRow]) -> dict[str, Any]:
     document, rule = result.documents.get(name), result.rules[name]
     own = [each for each in episodes if each.rule == name]
     evaluations, unknowns, errors = result.counts.get(name, (0, 0, 0))

@@ -8,8 +8,8 @@ from functools import cached_property
 
 from detector.engine.episodes.events import Event
 from detector.replay.replaying import Outcome
-from detector.results.episodes import Episode, episodes_of
-from detector.results.nearest import Near, nearest
+from detector.results.episodes import EpisodeRow, episodes_of
+from detector.results.nearest import NearMoment, nearest_moments
 from detector.results.quality import Arrivals, StreamQuality
 from detector.results.series import Trace
 from detector.results.thresholds import Terms, terms_of
@@ -41,14 +41,14 @@ class Result:
     samples: int
 
     @cached_property
-    def episodes(self) -> list[Episode]:
+    def episodes(self) -> list[EpisodeRow]:
         """The episodes, in order of their starts."""
         return episodes_of(self.recording, self.events, self.trace)
 
     @cached_property
-    def nearest(self) -> list[Near]:
+    def nearest(self) -> list[NearMoment]:
         """The moments at which rules with a margin came nearest to an episode without one."""
-        return nearest(self.recording, self.rules, self.trace.subjects, self.episodes)
+        return nearest_moments(self.recording, self.rules, self.trace.subjects, self.episodes)
 
 
 def result_of(name: str, outcome: Outcome, tracer: Tracer, arrivals: Arrivals) -> Result:

@@ -23,7 +23,7 @@ Wanted = Callable[[str, str], bool]
 """Whether somebody wants to see a subject, by the rule's name and the subject's text."""
 
 
-class Kind(StrEnum):
+class SeriesKind(StrEnum):
     """What a series holds."""
 
     NUMBER = "number"
@@ -39,7 +39,7 @@ class Series:
     """int64[n], nanoseconds since the epoch, rising: where the value changes."""
     values: Doubles
     """float64[n]: the number, 1.0 or 0.0 of a boolean, an index into `texts`; NaN: unknown."""
-    kind: Kind = Kind.NUMBER
+    kind: SeriesKind = SeriesKind.NUMBER
     texts: Sequence[str] = ()
 
     def at(self, times: Integers) -> Doubles:
@@ -55,9 +55,9 @@ class Series:
         if value != value:  # noqa: PLR0124  NaN alone differs
             return None
         match self.kind:
-            case Kind.BOOLEAN:
+            case SeriesKind.BOOLEAN:
                 return value != 0
-            case Kind.TEXT:
+            case SeriesKind.TEXT:
                 return self.texts[int(value)]
         return value
 
@@ -136,7 +136,7 @@ def ways_of(subjects: Sequence[SubjectTrace]) -> tuple[dict[str, Way], bool]:
 
 
 def _have(subject: SubjectTrace, axes: Sequence[str]) -> bool:
-    return all(axis in subject.signals and subject.signals[axis].kind is Kind.NUMBER for axis in axes)
+    return all(axis in subject.signals and subject.signals[axis].kind is SeriesKind.NUMBER for axis in axes)
 
 
 @dataclass(slots=True)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from detector.results.series import Doubles, Kind, Series, SubjectTrace
+from detector.results.series import Doubles, Series, SeriesKind, SubjectTrace
 from wayside.expressions import Expression, Path
 from wayside.expressions.syntax import Call, Constant, Node, Select, path_of
 from wayside.rules import CompiledRule
@@ -158,7 +158,7 @@ def _computed(term: _Term, names: frozenset[str], signals: Mapping[str, Series])
     values = np.broadcast_to(np.asarray(values, float), times.shape)
     kept = np.ones(len(times), bool)
     kept[1:] = (values[1:] != values[:-1]) & ~(np.isnan(values[1:]) & np.isnan(values[:-1]))
-    return Series(times[kept], values[kept], Kind.NUMBER)
+    return Series(times[kept], values[kept], SeriesKind.NUMBER)
 
 
 def _values(node: Node, names: frozenset[str], of: Callable[[str], Doubles]) -> Any:

@@ -28,8 +28,8 @@ from detector.results.series import (
     Bytes,
     Doubles,
     Integers,
-    Kind,
     Series,
+    SeriesKind,
     Steps,
     SubjectTrace,
     Trace,
@@ -384,9 +384,9 @@ def series_of(times: Integers, values: Doubles, tags: Bytes, texts: Sequence[str
     if (tags == Tag.NUMBER).all():
         return Series(times, values)
     known = (tags != Tag.ABSENT) & (tags != Tag.UNREACHABLE)
-    kinds = {Tag.BOOLEAN: Kind.BOOLEAN, Tag.TEXT: Kind.TEXT}
-    kind = next((kinds[tag] for tag in kinds if (tags == tag).any()), Kind.NUMBER)
-    return Series(times, np.where(known, values, np.nan), kind, texts if kind is Kind.TEXT else ())
+    kinds = {Tag.BOOLEAN: SeriesKind.BOOLEAN, Tag.TEXT: SeriesKind.TEXT}
+    kind = next((kinds[tag] for tag in kinds if (tags == tag).any()), SeriesKind.NUMBER)
+    return Series(times, np.where(known, values, np.nan), kind, texts if kind is SeriesKind.TEXT else ())
 
 
 def _joined(parts: Sequence[Series]) -> Series:

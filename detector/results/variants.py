@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from detector.replay.comparing import Comparison, compare, joined
+from detector.replay.comparing import Comparison, combined, compare
 from detector.replay.replaying import Outcome
 from detector.replay.variants import Variant
 
@@ -19,7 +19,7 @@ from detector.replay.variants import Variant
 def comparisons(outcomes: Sequence[Outcome], variants: Sequence[Variant]) -> list[Comparison]:
     """Each variant with its rule as written, over all recordings."""
     return [
-        joined([compare(outcome.events, each.of, each.rule.name, outcome.end) for outcome in outcomes])
+        combined([compare(outcome.events, each.of, each.rule.name, outcome.end) for outcome in outcomes])
         for each in variants
     ]
 

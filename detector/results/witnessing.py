@@ -11,7 +11,7 @@ import numpy as np
 from detector.engine.scoping.scopes import Evaluated
 from detector.engine.scoping.snapshots import snapshot
 from detector.results.reasons import of_variables
-from detector.results.series import AWAY, FALSE, TRUE, UNKNOWN, Kind, Series, Steps, SubjectTrace
+from detector.results.series import AWAY, FALSE, TRUE, UNKNOWN, Series, SeriesKind, Steps, SubjectTrace
 from wayside.expressions import UNKNOWN as NOT_KNOWN
 from wayside.rules import CompiledRule
 
@@ -37,8 +37,8 @@ class _Values:
         if texts:
             codes = {text: float(code) for code, text in enumerate(texts)}
             numbers = [codes.get(value, np.nan) if isinstance(value, str) else np.nan for value in self.values]
-            return Series(times, np.array(numbers), Kind.TEXT, texts)
-        kind = Kind.BOOLEAN if any(isinstance(value, bool) for value in self.values) else Kind.NUMBER
+            return Series(times, np.array(numbers), SeriesKind.TEXT, texts)
+        kind = SeriesKind.BOOLEAN if any(isinstance(value, bool) for value in self.values) else SeriesKind.NUMBER
         found = [np.nan if value is None else float(value) for value in self.values]
         return Series(times, np.array(found), kind)
 

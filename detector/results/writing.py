@@ -11,20 +11,20 @@ from rich.table import Table
 
 from detector.engine.samples.sample import Arrival
 from detector.replay.replaying import Outcome
-from detector.results.episodes import Episode, write_csv, write_parquet
+from detector.results.episodes import EpisodeRow, write_csv, write_parquet
 from detector.results.installed import check_package
-from detector.results.kinds import Kind
-from detector.results.nearest import Near, listed
-from detector.results.nearest import write_csv as write_nearest
+from detector.results.kinds import ResultKind
+from detector.results.nearest import NearMoment, listed
+from detector.results.nearest import write_moments as write_nearest
 from detector.results.quality import Arrivals
 from detector.results.result import Result, result_of
 from detector.results.tracing import Tracer
 from wayside.times import format_time
 
-_NEEDED = {Kind.REPORT: "bokeh", Kind.MCAP: "foxglove", Kind.EPISODES: "pyarrow"}
+_NEEDED = {ResultKind.REPORT: "bokeh", ResultKind.MCAP: "foxglove", ResultKind.EPISODES: "pyarrow"}
 
 
-def check_installed(kinds: Iterable[Kind]) -> None:
+def check_installed(kinds: Iterable[ResultKind]) -> None:
     """Raises MissingExtraError where a package of the extra is missing: before hours of replay, not after them."""
     for kind in sorted(kinds):
         check_package(_NEEDED[kind], f"--results {kind}")
@@ -57,7 +57,7 @@ class Looking:
         return [result_of(name, outcome, *self._looks[name]) for name, outcome in outcomes.items()]
 
 
-def write_results(folder: Path, results: Sequence[Result], kinds: frozenset[Kind]) -> list[Path]:
+def write_results(folder: Path, results: Sequence[Result], kinds: frozenset[ResultKind]) -> list[Path]:
     """Write them; returns the files. Each of several recordings has files of its own, but all are in one table."""
     written: list[Path] = []
 
@@ -66,20 +66,20 @@ def write_results(folder: Path, results: Sequence[Result], kinds: frozenset[Kind
         return written[-1]
 
     episodes = [episode for result in results for episode in result.episodes]
-    if Kind.EPISODES in kinds:
+    if ResultKind.EPISODES in kinds:
         write_csv(path("episodes.csv"), episodes)
         write_parquet(path("episodes.parquet"), episodes)
         if near := _nearest(results):
             write_nearest(path("nearest.csv"), near)
     for number, result in enumerate(results, start=1):
         suffix = f"-{number}" if len(results) > 1 else ""
-        if Kind.MCAP in kinds:
+        if ResultKind.MCAP in kinds:
             from detector.results.foxglove_file import write_mcap  # noqa: PLC0415  an extra
             from detector.results.layout import layout_of  # noqa: PLC0415
 
             write_mcap(path(f"results{suffix}.mcap"), result)
             path(f"layout{suffix}.json").write_text(layout_of(result) + "\n", encoding="utf-8")
-        if Kind.REPORT in kinds:
+        if ResultKind.REPORT in kinds:
             from detector.results.report import write_report  # noqa: PLC0415
 
             write_report(path(f"report{suffix}.html"), result)
@@ -114,7 +114,7 @@ def show_summary(console: Console, results: Sequence[Result]) -> None:
         _show_nearest(console, near)
 
 
-def _nearest(results: Sequence[Result]) -> list[Near]:
+def _nearest(results: Sequence[Result]) -> list[NearMoment]:
     """What nearly happened in all recordings, rule by rule."""
     every = [each for result in results for each in result.nearest]
     return [
@@ -122,7 +122,7 @@ def _nearest(results: Sequence[Result]) -> list[Near]:
     ]
 
 
-def _show_nearest(console: Console, near: Sequence[Near]) -> None:
+def _show_nearest(console: Console, near: Sequence[NearMoment]) -> None:
     table = Table(
         box=None, header_style="bold", pad_edge=False, title="nearest without an episode", title_justify="left"
     )
@@ -134,5 +134,5 @@ def _show_nearest(console: Console, near: Sequence[Near]) -> None:
     console.print(table)
 
 
-def _is_open(episode: Episode) -> bool:
+def _is_open(episode: EpisodeRow) -> bool:
     return episode.end_time is None

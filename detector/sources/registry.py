@@ -31,7 +31,7 @@ def prepare_source(source: DataSource) -> Make:
     return lambda: plugin(parameters)
 
 
-def source_problems(detector: Detector) -> Iterator[RuleProblem]:
+def source_plugin_problems(detector: Detector) -> Iterator[RuleProblem]:
     """What is wrong with the Detector's sources, as far as their plugins can check here."""
     for index, source in enumerate(detector.spec.sources):
         try:

@@ -15,6 +15,7 @@ from detector.streams.tally import Cause, Tally
 from wayside.api import Detector
 from wayside.api.source import DataSource
 from wayside.api.stream import Stream
+from wayside.backoff import Backoff
 
 log = logging.getLogger(__name__)
 
@@ -26,7 +27,7 @@ _STEADY = 60.0
 """Seconds: a run that lasted this long was a good one, and resets the backoff."""
 
 
-class State(StrEnum):
+class SourceState(StrEnum):
     """Where a source stands."""
 
     RUNNING = "Running"
@@ -53,11 +54,11 @@ class SourceThread:
         """The pauses are in seconds. Raises PluginError, KeyPatternError."""
         self.source = source
         self.streams = streams
-        self.state = State.RUNNING
+        self.state = SourceState.RUNNING
         self.last_error = ""
         self._make: Make = prepare_source(source)
         self._tally = tally
-        self._first_pause, self._longest_pause = first_pause, longest_pause
+        self._backoff = Backoff(first_pause, longest_pause)
         self._feed = Feed(streams, putter, lambda key: tally.add(Cause.UNROUTED, source.name, last=key))
         self._thread = threading.Thread(target=self._run, name=f"source {source.name}", daemon=True)
 
@@ -86,9 +87,8 @@ class SourceThread:
             )
 
     def _run(self) -> None:
-        pause = self._first_pause
         while not self._feed.stopping:
-            self.state = State.RUNNING
+            self.state = SourceState.RUNNING
             began = time.monotonic()
             try:
                 self._make().run(self._feed)
@@ -96,23 +96,23 @@ class SourceThread:
                 if self._feed.stopping:
                     break
                 if time.monotonic() - began >= _STEADY:
-                    pause = self._first_pause
+                    self._backoff.succeed()
+                pause = self._backoff.fail()
                 self._failed(error, pause)
                 self._feed.wait(pause)
-                pause = min(2 * pause, self._longest_pause)
             else:
                 break
         if self._feed.stopping:
-            self.state = State.STOPPED
+            self.state = SourceState.STOPPED
         else:
-            self.state = State.FINISHED
+            self.state = SourceState.FINISHED
             log.info("source %s has ended after %d messages", self.source.name, self.messages)
 
     def _failed(self, error: BaseException, pause: float) -> None:
-        self.state = State.PAUSING
+        self.state = SourceState.PAUSING
         self.last_error = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
         self._tally.add(Cause.FAILED, self.source.name, last=self.last_error)
-        log.warning("source %s failed; restarting it in %g s: %s", self.source.name, pause, self.last_error)
+        log.warning("source %s failed; restarting it in %.1f s: %s", self.source.name, pause, self.last_error)
         log.debug("source %s", self.source.name, exc_info=error)
 
 

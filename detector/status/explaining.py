@@ -15,7 +15,7 @@ from detector.engine.engine import Engine
 from detector.engine.episodes.plain import plain
 from detector.engine.scoping.scopes import Evaluated
 from detector.engine.scoping.snapshots import snapshot
-from detector.status.model import Explanation, SubjectStatus
+from detector.status.model import RuleExplanation, SubjectStatus
 from wayside.expressions import UNKNOWN
 from wayside.names import parse_subject
 from wayside.rules import ClientSubject, FleetSubject, PairSubject
@@ -36,7 +36,7 @@ class Watching:
             raise ValueError(f"rule {rule} is not evaluated: see its state and message")
         if run.witness is not None:
             raise ValueError(f"another request about rule {rule} is in progress: try again")
-        self.future: Future[Explanation] = Future()
+        self.future: Future[RuleExplanation] = Future()
         self._engine = engine
         self._run = run
         self._subject = subject
@@ -53,7 +53,7 @@ class Watching:
         notes, self._run.witness, self._run.counters.notes = self._run.counters.notes or [], None, None
         if self.future.set_running_or_notify_cancel():
             tick = self._run.counters.last_tick / 1e9
-            self.future.set_result(Explanation(tick, self._statuses(), [*dict.fromkeys(notes)][:_MAXIMUM_NOTES]))
+            self.future.set_result(RuleExplanation(tick, self._statuses(), [*dict.fromkeys(notes)][:_MAXIMUM_NOTES]))
         return True
 
     def _statuses(self) -> list[SubjectStatus]:

@@ -15,7 +15,7 @@ from concurrent.futures import Future
 from importlib.metadata import version
 from itertools import islice
 
-from detector.assembly import Refusal
+from detector.assembly import RefusedRule
 from detector.engine.buffering.buffer import NEVER, Lane
 from detector.engine.engine import Engine
 from detector.engine.evaluation.rule import RuleRun
@@ -26,8 +26,8 @@ from detector.status.explaining import Watching
 from detector.status.model import (
     ClientStatus,
     Drops,
-    Explanation,
     Histogram,
+    RuleExplanation,
     RuleState,
     RuleStatus,
     Status,
@@ -75,7 +75,7 @@ class StatusKeeper:
         self._started = now()
         self._beat = time.monotonic()
         self._taken = 0
-        self._refusals: dict[str, Refusal] = {}
+        self._refusals: dict[str, RefusedRule] = {}
         self._last: dict[str, Arrival] = {}
         """With clock Data, the last arrival of each stream: the buffer knows only stamps."""
         self._looked: dict[str, int] = {}
@@ -102,12 +102,12 @@ class StatusKeeper:
         if not self._engine.on_wall_clock:
             self._last.update((arrival.stream, arrival) for arrival in arrivals)
 
-    def refused(self, refusals: Iterable[Refusal]) -> None:
+    def refused(self, refusals: Iterable[RefusedRule]) -> None:
         """Set the rules that are refused now."""
         self._refusals = {refusal.rule.name: refusal for refusal in refusals}
         self._taken = 0
 
-    def watch(self, rule: str, subject: str | None) -> Future[Explanation]:
+    def watch(self, rule: str, subject: str | None) -> Future[RuleExplanation]:
         """What the rule's next evaluation sees: of a subject, or of the first ones. Raises ValueError."""
         watching = Watching(self._engine, rule, subject)
         self._watching.append(watching)

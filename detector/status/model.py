@@ -123,7 +123,7 @@ class SubjectStatus(msgspec.Struct, frozen=True, rename="camel"):
     """The signals without a value, and why."""
 
 
-class Explanation(msgspec.Struct, frozen=True, rename="camel"):
+class RuleExplanation(msgspec.Struct, frozen=True, rename="camel"):
     """What one evaluation of a rule saw."""
 
     tick: float
@@ -211,7 +211,7 @@ class Status(msgspec.Struct, frozen=True, rename="camel"):
     streams: list[StreamStatus]
     rules: list[RuleStatus]
     drops: list[Drops]
-    explanation: Explanation | None = None
+    explanation: RuleExplanation | None = None
     """Of the requested rule, if it was evaluated in the meantime."""
     connected: bool = False
     """Whether a router, a peer or a client is connected."""

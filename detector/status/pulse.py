@@ -7,7 +7,7 @@ import threading
 import time
 
 
-class Pulse:
+class LoopMonitor:
     """Schedules a callback in the loop, and measures how long it does not run."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:

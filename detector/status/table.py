@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from rich.console import Group, RenderableType
 from rich.table import Table
 
-from detector.status.model import ActionStatus, Drops, Explanation, Histogram, RuleStatus, Status, StreamStatus
+from detector.status.model import ActionStatus, Drops, Histogram, RuleExplanation, RuleStatus, Status, StreamStatus
 from detector.status.total import Total
 
 _CLIENTS = 20
@@ -193,7 +193,7 @@ def _acting(actions: Sequence[ActionStatus]) -> Iterator[RenderableType]:
                 yield f"{each.rule}/{each.action}: episode {episode}: {message}"
 
 
-def _explained(explanation: Explanation) -> Iterator[RenderableType]:
+def _explained(explanation: RuleExplanation) -> Iterator[RenderableType]:
     for subject in explanation.subjects:
         if not subject.looked_at:
             yield f"{subject.subject}: not evaluated: {subject.why}"

@@ -27,7 +27,7 @@ def expression(stream: Stream) -> zenoh.KeyExpr:
         case Layout.PLAIN:
             return zenoh.KeyExpr.autocanonize(topics)
         case Layout.RMW_ZENOH:
-            return zenoh.KeyExpr.autocanonize(rmw_zenoh.expression(topics, stream.domain))
+            return zenoh.KeyExpr.autocanonize(rmw_zenoh.topics_expression(topics, stream.domain))
 
 
 def pump_for(stream: Stream, put: Put, tally: Tally) -> Pump:
@@ -36,4 +36,4 @@ def pump_for(stream: Stream, put: Put, tally: Tally) -> Pump:
         case Layout.PLAIN:
             return partial(plain.pump, put=put)
         case Layout.RMW_ZENOH:
-            return partial(rmw_zenoh.pump, put=put, reader=rmw_zenoh.Reader(stream.name, stream.type, tally))
+            return partial(rmw_zenoh.pump, put=put, reader=rmw_zenoh.RmwReader(stream.name, stream.type, tally))

@@ -32,7 +32,7 @@ class MisfitError(ValueError):
     """A key that does not belong to the stream; the message gives the reason."""
 
 
-def expression(topics: str, domain: int | None) -> str:
+def topics_expression(topics: str, domain: int | None) -> str:
     """The key expression for topics, given as one; `domain` None: of every domain."""
     return f"{'*' if domain is None else domain}/{topics}/*/*"
 
@@ -62,7 +62,7 @@ def numbered(attachment: bytes) -> tuple[bytes, int] | None:
     return None
 
 
-class Reader:
+class RmwReader:
     """Reads keys and attachments of one stream; for the one thread that receives it."""
 
     def __init__(self, stream: str, type_name: str | None, tally: Tally) -> None:
@@ -100,7 +100,7 @@ class Reader:
             self._sequences.follow(*given, topic)
 
 
-def pump(bursts: Iterable[Sequence[zenoh.Sample]], put: Put, reader: Reader) -> None:
+def pump(bursts: Iterable[Sequence[zenoh.Sample]], put: Put, reader: RmwReader) -> None:
     """Hands over every message by its topic, as `plain.pump` does by its key."""
     put_kind = zenoh.SampleKind.PUT
     for burst in bursts:

@@ -13,12 +13,13 @@ import zenoh
 from detector.access.credentials import Material, read_material
 from detector.access.mounted import AccessError
 from wayside.api.zenoh import Zenoh, ZenohMode
+from wayside.backoff import Backoff
 from wayside.inputerror import InputError
 
 log = logging.getLogger(__name__)
 
-_RETRY_SECONDS = (0.2, 0.5, 1.0, 2.0)
-"""Waits between attempts to reach a router at the start; the last one repeats."""
+_FIRST, _LONGEST = 0.2, 2.0
+"""Seconds between attempts to reach a router at the start."""
 
 _FIELD = "spec.zenoh"
 
@@ -51,7 +52,7 @@ def open_session(config: Zenoh, material: Material | None = None) -> zenoh.Sessi
 
 def await_session(config: Zenoh, stop: threading.Event) -> tuple[zenoh.Session, Material] | None:
     """Tries to open a session until it succeeds; None once `stop` is set. Once open, it reconnects by itself."""
-    attempt, logged = 0, ""
+    backoff, logged = Backoff(_FIRST, _LONGEST), ""
     while not stop.is_set():
         try:
             material = material_of(config)
@@ -60,8 +61,7 @@ def await_session(config: Zenoh, stop: threading.Event) -> tuple[zenoh.Session, 
             if str(error) != logged:
                 logged = str(error)
                 log.warning("%s; retrying", error)
-        stop.wait(_RETRY_SECONDS[min(attempt, len(_RETRY_SECONDS) - 1)])
-        attempt += 1
+        stop.wait(backoff.fail())
     return None
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from detector.actions.deploy.kubernetes_store import KubernetesTaskStore
 from detector.actions.deploy.reconciler import DemandReconciler, DeployCounts
-from detector.actions.deploy.stores import TaskExistsError, manifest, restore
+from detector.actions.deploy.stores import TaskExistsError, restore, task_manifest
 from detector.engine.episodes.demands import Demand, to_task
 from tests.cluster.api import Api, Object, Objects
 from tests.cluster.background import Background, background
@@ -115,7 +115,7 @@ def test_a_demand_becomes_a_task_that_ends_with_it(api: Api, namespace: str, run
     wanted = demand(namespace)
     running.update(by_name(wanted))
     [task] = tasks_are(api, {wanted.name})
-    assert task["spec"] == manifest(to_task(wanted))["spec"]
+    assert task["spec"] == task_manifest(to_task(wanted))["spec"]
     assert task["metadata"]["labels"] == {"wayside.dev/holder": HOLDER}
     assert running.restored() == [wanted]
 
@@ -256,10 +256,10 @@ def test_a_detector_that_stops_leaves_its_live_tasks_alive_and_adopts_them(
 def test_others_tasks_are_neither_ended_nor_taken_for_own(api: Api, namespace: str, running: Running) -> None:
     wanted = demand(namespace)
     foreign = demand(namespace, "x+y", holder="intersection-b")
-    usurped = manifest(to_task(wanted))
+    usurped = task_manifest(to_task(wanted))
     usurped["metadata"]["labels"] = {"wayside.dev/holder": "intersection-b"}
     usurped["spec"]["requester"]["holder"] = "intersection-b"
-    disguised = manifest(to_task(foreign))  # the label says ours, the requester does not
+    disguised = task_manifest(to_task(foreign))  # the label says ours, the requester does not
     disguised["metadata"]["labels"] = {"wayside.dev/holder": HOLDER}
     persons = {
         "apiVersion": "wayside.dev/v1alpha1",

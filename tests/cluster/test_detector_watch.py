@@ -9,7 +9,7 @@ import pytest
 
 from detector.cluster.api import JsonObject, Resource
 from detector.cluster.errors import GoneError, UnavailableError
-from detector.cluster.reflector import Change, Changed, Deleted, Listed, Reflector
+from detector.cluster.reflector import Change, Changed, Deleted, Reflector, Replaced
 from tests.cluster.api import Api
 from tests.cluster.background import Background, background
 from tests.cluster.controlplane import ControlPlane
@@ -37,7 +37,7 @@ class Following:
     async def _follow(self) -> None:
         async for change in self.reflector.follow():
             match change:
-                case Listed(objects, _):
+                case Replaced(objects, _):
                     self.data = {name(each): each["data"]["x"] for each in objects}
                 case Changed(each):
                     self.data[name(each)] = each["data"]["x"]

@@ -10,55 +10,34 @@ import subprocess
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
 
-from application_manager.core.objects.detectors import object_name, sidecar_roles
-from application_manager.core.objects.rights import sidecar_rights
-from application_manager.core.objects.sidecars import CONTAINER
-from tests import programs
 from tests.cluster.api import Api, Object
-from tests.cluster.chain import CARS, FAR, HOLDER, NEAR, Vehicles
+from tests.cluster.chain import HOLDER
 from tests.cluster.controlplane import ControlPlane
-from tests.cluster.faulty_proxy import faulty_proxy
 from tests.cluster.managed_world import condition, start_manager
 from tests.cluster.processes import BIN, Processes
-from tests.cluster.test_manager_detectors import close_vehicles, detector, live
-from tests.cluster.test_manager_rbac import ALLOWED, granted, may, printed, put, used, wait_in_force
+from tests.cluster.sidecars import (
+    IMAGE,
+    LABELS,
+    RUNS,
+    create_accounts,
+    event_of,
+    pod,
+    sidecar_detector,
+    sidecars,
+    wait_injecting,
+)
 from tests.cluster.waiting import wait_until
 from tests.cluster.webhook import Webhook
-from tests.ports import free_endpoint, free_port
-
-IMAGE = "wayside:1"
-RUNS = ("--detector-image", IMAGE)
-NAME = object_name(HOLDER)
-LABELS = {"wayside.dev/detector": HOLDER}
-
-
-def sidecar_detector(*accounts: str, **spec: Any) -> Object:
-    return detector(mode="Sidecar", serviceAccountNames=list(accounts), **spec)
-
-
-def pod(name: str = "car", account: str = "vehicle", **spec: Any) -> Object:
-    main = {"name": "main", "image": "app:1"}
-    return {
-        "apiVersion": "v1",
-        "kind": "Pod",
-        "metadata": {"name": name, "labels": dict(LABELS)},
-        "spec": {"serviceAccountName": account, "containers": [main], **spec},
-    }
-
-
-def sidecars(raw: Object) -> list[Object]:
-    return [each for each in raw["spec"].get("initContainers", []) if each["name"] == CONTAINER]
+from tests.ports import free_port
 
 
 @pytest.fixture
 def accounts(api: Api) -> None:
-    for name in ("vehicle", "other"):
-        api.create({"apiVersion": "v1", "kind": "ServiceAccount", "metadata": {"name": name}})
+    create_accounts(api)
 
 
 @pytest.fixture
@@ -73,32 +52,6 @@ def asked(webhook: Webhook, api: Api) -> Iterator[Webhook]:
     with webhook.asked():
         wait_injecting(api)
         yield webhook
-
-
-def wait_injecting(api: Api) -> None:
-    wait_until(
-        lambda: sidecars(api.apply(pod("probe"), dry_run=True)),
-        lambda found: len(found) == 1,
-        what="pods are asked about",
-    )
-
-
-def event_of(api: Api, name: str, part: str) -> Object:
-    """The Event about the pod whose note has the part."""
-
-    def about(found: list[Object]) -> list[Object]:
-        return [
-            each
-            for each in found
-            if (each["involvedObject"]["kind"], each["involvedObject"]["name"]) == ("Pod", name)
-            and part in each["message"]
-        ]
-
-    found = about(api.wait_list("Event", lambda found: bool(about(found)), what=f"an Event of pod {name} has: {part}"))
-    assert len(found) == 1
-    assert (found[0]["reason"], found[0]["type"]) == ("NotInjected", "Warning")
-    assert found[0]["involvedObject"]["uid"] == api.get("Pod", name)["metadata"]["uid"]
-    return found[0]
 
 
 def injected(
@@ -264,139 +217,6 @@ def test_an_event_is_not_told_again_by_the_next_manager(
     api.create(pod("second"))
     event_of(api, "second", "has no Detector")
     event_of(api, "car", "has no Detector")
-
-
-def test_bindings_follow_the_accounts_that_the_detector_names(
-    api: Api, processes: Processes, namespace: str, control_plane: ControlPlane, accounts: None
-) -> None:
-    start_manager(processes, namespace, *RUNS)
-    vehicle, other = (
-        Api(control_plane.kubeconfig_of_service_account(namespace, name), namespace) for name in ("vehicle", "other")
-    )
-
-    def settles(*which: Api) -> None:
-        for account in (vehicle, other):
-            wanted = {True} if account in which else {False}
-            wait_until(lambda account=account: answers(account), lambda found, w=wanted: found == w, what=f"{wanted}")
-
-    def answers(account: Api) -> set[bool]:
-        return {
-            may(account, namespace, right.group, right.resource, verb, right.name)
-            for right in sidecar_rights(HOLDER)
-            for verb in right.verbs
-        }
-
-    settles()
-    api.create(sidecar_detector("vehicle"))
-    settles(vehicle)
-    assert not may(vehicle, namespace, "wayside.dev", "detectors", "hold", HOLDER)
-    assert not may(vehicle, namespace, "wayside.dev", "detectors", "hold-as-pod", "other")
-    api.patch("Detector", HOLDER, {"spec": {"serviceAccountNames": ["other"]}})
-    settles(other)
-    api.patch("Detector", HOLDER, {"spec": {"serviceAccountNames": []}})
-    settles()
-    said = api.wait_for(
-        "Detector", HOLDER, lambda raw: condition(raw, "Running").get("reason") == "NoAccounts", what="it says so"
-    )
-    assert "spec.serviceAccountNames is empty" in condition(said, "Running")["message"]
-    # Who is named no more has no rights any more, be the rest of the Detector right or wrong.
-    api.patch("Detector", HOLDER, {"spec": {"serviceAccountNames": ["vehicle"]}})
-    settles(vehicle)
-    wrong = detector()["spec"]["streams"][0] | {"stamp": "msg.t +"}
-    api.patch("Detector", HOLDER, {"spec": {"serviceAccountNames": ["other"], "streams": [wrong]}})
-    settles(other)
-    api.wait_for(
-        "Detector", HOLDER, lambda raw: condition(raw, "Running").get("reason") == "NotAccepted", what="it says so"
-    )
-
-
-def test_what_one_mode_needs_goes_with_the_change_to_the_other(api: Api, processes: Processes, namespace: str) -> None:
-    start_manager(processes, namespace, *RUNS)
-    api.create(detector(mode="Standalone"))
-    api.wait_for("Deployment", NAME, bool, what="it runs by itself")
-    api.patch("Detector", HOLDER, {"spec": {"mode": "Sidecar", "serviceAccountNames": ["vehicle"]}})
-    for kind in ("Deployment", "ServiceAccount"):
-        api.wait_gone(kind, NAME)
-    api.wait_for(
-        "RoleBinding", NAME, lambda raw: raw["subjects"][0]["name"] == "vehicle", what="its accounts are bound"
-    )
-    api.patch("Detector", HOLDER, {"spec": {"mode": "Standalone", "serviceAccountNames": None}})
-    api.wait_for("Deployment", NAME, bool, what="it runs by itself again")
-    api.wait_for("RoleBinding", NAME, lambda raw: raw["subjects"][0]["name"] == NAME, what="its own account is bound")
-    api.delete("Detector", HOLDER)
-    for kind in ("Deployment", "ServiceAccount", "Role", "RoleBinding"):
-        api.wait_gone(kind, NAME)
-
-
-def test_the_manager_puts_it_into_pods_with_the_rights_that_are_printed(
-    api: Api, processes: Processes, namespace: str, control_plane: ControlPlane, tmp_path: Path, accounts: None
-) -> None:
-    api.create({"apiVersion": "v1", "kind": "ServiceAccount", "metadata": {"name": "manager"}})
-    account = control_plane.kubeconfig_of_service_account(namespace, "manager")
-    manifests = printed("--namespace", namespace, "--account", f"{namespace}/manager", "--detectors", *ALLOWED)
-    put(api, manifests)
-    wait_in_force(account, namespace, manifests)
-    webhook = Webhook(processes, api, tmp_path / "certificates", options=(*RUNS, *ALLOWED), kubeconfig=account)
-    with webhook.asked():
-        api.create(sidecar_detector("vehicle"))
-        wait_injecting(api)
-        api.create(pod(account="other"))
-        event_of(api, "car", "has only vehicle")
-    api.wait_for(
-        "Detector", HOLDER, lambda raw: condition(raw, "Running").get("reason") == "InPods", what="it runs in pods"
-    )
-    assert webhook.manager.terminate() == 0
-    assert "orbidden" not in webhook.manager.output()
-    assert "may not" not in webhook.manager.output()
-
-
-def test_in_a_pod_it_holds_for_this_pod_alone_and_needs_its_rights_and_no_more(
-    api: Api, processes: Processes, namespace: str, control_plane: ControlPlane, accounts: None, tmp_path: Path
-) -> None:
-    roles = sidecar_roles(namespace, HOLDER, ["vehicle"])
-    put(api, roles)
-    account = control_plane.kubeconfig_of_service_account(namespace, "vehicle")
-    wait_in_force(account, namespace, roles)
-    endpoint = free_endpoint()
-    api.create(sidecar_detector("vehicle", zenoh={"mode": "peer", "listen": [endpoint]}))
-    api.create(close_vehicles())
-    uid = api.create(pod())["metadata"]["uid"]
-    holder = f"{HOLDER}.car"
-    with faulty_proxy(account) as (proxy, kubeconfig):
-        environment = {"KUBECONFIG": str(kubeconfig), "POD_NAME": "car", "POD_UID": uid}
-        options = ("--name", HOLDER, "--namespace", namespace, "--as-pod")
-        running = processes.start("detector", "run", *options, environment=environment)
-        running.wait_for_output(f"Detector {HOLDER} runs with 1 rules")
-        with Vehicles(endpoint) as vehicles:
-            vehicles.place(CARS, NEAR)
-            (task,) = api.wait_list("ApplicationTask", lambda found: len(live(found)) == 1, what="there is a task")
-            vehicles.place(CARS, FAR)
-            api.wait_list("ApplicationTask", lambda found: bool(found) and not live(found), what="the task has ended")
-        assert status_of(tmp_path, endpoint) == [holder]
-        assert task["spec"]["requester"]["holder"] == holder
-        assert task["spec"]["requester"]["detectorName"] == HOLDER
-        lease = api.get("Lease", f"wayside-{holder}")
-        assert [each["uid"] for each in lease["metadata"]["ownerReferences"]] == [uid]
-        api.wait_for(
-            "Lease",
-            f"wayside-{holder}",
-            lambda raw: raw["spec"]["renewTime"] != lease["spec"]["renewTime"],
-            what="its Lease is renewed",
-        )
-        assert running.terminate() == 0
-        asked = set(used(proxy.seen, namespace))
-    assert asked <= granted(roles)
-    seldom = {("applicationtasks", "get"), ("applicationtasks", "delete"), ("detectors", "hold-as-pod")}
-    assert {(resource, verb) for _, resource, verb in granted(roles) - asked} <= seldom
-
-
-def status_of(folder: Path, endpoint: str) -> list[str]:
-    """The holders that answer `detector status` about the Detector of the file, which names no pod."""
-    (file := folder / "detector.yaml").write_text(
-        yaml.safe_dump(sidecar_detector("vehicle", zenoh={"mode": "peer", "listen": [endpoint]}))
-    )
-    done = programs.run("detector", "status", "--detector", file, "--json", "--timeout", "30", check=True)
-    return [json.loads(line)["holder"] for line in done.stdout.splitlines()]
 
 
 def test_what_the_command_cannot_do_is_said_and_the_rest_is_printed(

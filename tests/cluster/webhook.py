@@ -14,7 +14,11 @@ from typing import Any
 import yaml
 
 from application_manager.admission.authority import make_certificates
-from application_manager.core.findings.webhooks import Place, injection_configuration, webhook_configuration
+from application_manager.core.findings.webhooks import (
+    WebhookClientConfig,
+    injection_configuration,
+    webhook_configuration,
+)
 from tests import programs
 from tests.cluster.api import Api, ApiError, Object
 from tests.cluster.controlplane import ControlPlane
@@ -64,7 +68,7 @@ class Webhook:
 
     def certified(self) -> Object:
         """Make new certificates, and return the configuration that trusts them."""
-        place = Place.of_url(f"https://127.0.0.1:{self.port}")
+        place = WebhookClientConfig.of_url(f"https://127.0.0.1:{self.port}")
         authority = make_certificates(self.folder, place.hosts)
         self.injection = injection_configuration(place, authority, [self._api.namespace], self.name)
         made = webhook_configuration(place, authority, [self._api.namespace], self.name)

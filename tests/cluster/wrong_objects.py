@@ -357,72 +357,24 @@ WRONG: list[tuple[str, str, Changes, str]] = [
 
 TIME = "2026-01-02T03:05:00Z"
 
+_KEY = "Forbidden: is immutable and can be neither added nor removed"
+_TASK = "Forbidden: is immutable; only parameters and endTime can change"
+_INSTANCE = "Forbidden: is immutable: delete this instance"
+
 UPDATES: list[tuple[str, Changes, str]] = [
-    (
-        "ApplicationTemplate",
-        {"spec.key": "other"},
-        r"spec\.key: Forbidden: is immutable and can be neither added nor removed",
-    ),
-    (
-        "ApplicationTemplate",
-        {"spec.key": ABSENT},
-        r"spec\.key: Forbidden: is immutable and can be neither added nor removed",
-    ),
-    (
-        "ApplicationTask",
-        {"spec.templateName": "other"},
-        r"spec\.templateName: Forbidden: is immutable; only parameters and endTime can change",
-    ),
-    (
-        "ApplicationTask",
-        {"spec.operation": "Suspend"},
-        r"spec\.operation: Forbidden: is immutable; only parameters and endTime can change",
-    ),
-    (
-        "ApplicationTask",
-        {"spec.priority": 4},
-        r"spec\.priority: Forbidden: is immutable; only parameters and endTime can change",
-    ),
-    (
-        "ApplicationTask",
-        {"spec.requester.holder": "other"},
-        r"spec\.requester: Forbidden: is immutable; only parameters and endTime can change",
-    ),
-    (
-        "ApplicationTask",
-        {"spec.requester.subjects": ["car3"]},
-        r"spec\.requester: Forbidden: is immutable; only parameters and endTime can change",
-    ),
-    (
-        "ApplicationTask",
-        {"spec.requester": ABSENT},
-        r"spec\.requester: Forbidden: is immutable; only parameters and endTime can change",
-    ),
-    (
-        "ApplicationTask",
-        {"spec.event": ABSENT},
-        r"spec\.event: Forbidden: is immutable; only parameters and endTime can change",
-    ),
-    (
-        "ApplicationTask",
-        {"spec.event.startTime": TIME},
-        r"spec\.event: Forbidden: is immutable; only parameters and endTime can change",
-    ),
-    (
-        "ApplicationTask",
-        {"spec.event.classification": {}},
-        r"spec\.event: Forbidden: is immutable; only parameters and endTime can change",
-    ),
-    (
-        "ApplicationTask",
-        {"spec.event.classification": ABSENT},
-        r"spec\.event: Forbidden: is immutable; only parameters and endTime can change",
-    ),
-    (
-        "ApplicationInstance",
-        {"spec.templateName": "other"},
-        r"spec\.templateName: Forbidden: is immutable: delete this instance",
-    ),
-    ("ApplicationInstance", {"spec.key": "south"}, r"spec\.key: Forbidden: is immutable: delete this instance"),
-    ("ApplicationInstance", {"spec.key": ABSENT}, r"spec\.key: Forbidden: is immutable: delete this instance"),
+    ("ApplicationTemplate", {"spec.key": "other"}, rf"spec\.key: {_KEY}"),
+    ("ApplicationTemplate", {"spec.key": ABSENT}, rf"spec\.key: {_KEY}"),
+    ("ApplicationTask", {"spec.templateName": "other"}, rf"spec\.templateName: {_TASK}"),
+    ("ApplicationTask", {"spec.operation": "Suspend"}, rf"spec\.operation: {_TASK}"),
+    ("ApplicationTask", {"spec.priority": 4}, rf"spec\.priority: {_TASK}"),
+    ("ApplicationTask", {"spec.requester.holder": "other"}, rf"spec\.requester: {_TASK}"),
+    ("ApplicationTask", {"spec.requester.subjects": ["car3"]}, rf"spec\.requester: {_TASK}"),
+    ("ApplicationTask", {"spec.requester": ABSENT}, rf"spec\.requester: {_TASK}"),
+    ("ApplicationTask", {"spec.event": ABSENT}, rf"spec\.event: {_TASK}"),
+    ("ApplicationTask", {"spec.event.startTime": TIME}, rf"spec\.event: {_TASK}"),
+    ("ApplicationTask", {"spec.event.classification": {}}, rf"spec\.event: {_TASK}"),
+    ("ApplicationTask", {"spec.event.classification": ABSENT}, rf"spec\.event: {_TASK}"),
+    ("ApplicationInstance", {"spec.templateName": "other"}, rf"spec\.templateName: {_INSTANCE}"),
+    ("ApplicationInstance", {"spec.key": "south"}, rf"spec\.key: {_INSTANCE}"),
+    ("ApplicationInstance", {"spec.key": ABSENT}, rf"spec\.key: {_INSTANCE}"),
 ]

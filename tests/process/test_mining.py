@@ -25,8 +25,8 @@ from distributed import LocalCluster
 from detector.commands.cli import app
 from detector.commands.replay import replay_files
 from detector.mining.dask import DaskWorkers
-from detector.mining.workers import Call, Lost, Pool
-from detector.results.kinds import Kind
+from detector.mining.workers import LocalWorkers, Lost, RemoteCall
+from detector.results.kinds import ResultKind
 from tests import s3
 from tests.cluster.waiting import wait_until
 from tests.fleets import HARSH, write_fleet, write_mcap
@@ -84,7 +84,7 @@ def test_episodes_are_those_of_a_replay_of_each_recording(fleet: Path, monkeypat
         Path("detector.yaml"),
         [Path("rules.yaml")],
         as_one=False,
-        kinds=frozenset({Kind.EPISODES}),
+        kinds=frozenset({ResultKind.EPISODES}),
     )
     names = pq.read_schema(fleet / "replayed/episodes.parquet").names
     columns = ", ".join(f'"{name}"' for name in names if name != "episode")  # the holder differs
@@ -201,10 +201,10 @@ def test_a_worker_that_is_killed_changes_nothing(fleet: Path) -> None:
 
 def test_a_dask_cluster_of_which_a_worker_is_killed_gives_the_same(fleet: Path) -> None:
     with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
-        calls = [Call(end_once, str(fleet / "ended"))] + [Call(end, number) for number in range(3)]
+        calls = [RemoteCall(end_once, str(fleet / "ended"))] + [RemoteCall(end, number) for number in range(3)]
         workers = DaskWorkers(cluster.scheduler_address)
         assert sorted(result for _, result in workers.run(calls)) == [-1, 0, 1, 2]
-        ((_, lost),) = workers.run([Call(end, 3)])
+        ((_, lost),) = workers.run([RemoteCall(end, 3)])
         assert isinstance(lost, Lost)
         workers.close()
         assert f"{RECORDINGS + BROKEN} mined now" in mine(fleet, "dask", "--dask", cluster.scheduler_address)
@@ -272,9 +272,9 @@ def end(number: int) -> int:
 
 
 def test_a_call_that_kills_its_process_takes_no_other_with_it() -> None:
-    pool = Pool(2)
+    pool = LocalWorkers(2)
     try:
-        found = {call.argument: result for call, result in pool.run(Call(end, number) for number in range(8))}
+        found = {call.argument: result for call, result in pool.run(RemoteCall(end, number) for number in range(8))}
     finally:
         pool.close()
     assert isinstance(found.pop(3), Lost)

@@ -11,7 +11,7 @@ import pytest
 from paho.mqtt.client import Client
 
 from detector.sources.mqtt import topic_filter
-from detector.sources.supervision import SourceThread, State
+from detector.sources.supervision import SourceState, SourceThread
 from detector.streams.tally import Cause, Tally
 from tests.certificates import Authority
 from tests.networks import PATIENCE, Arrivals, stream, wait_for
@@ -39,7 +39,7 @@ def mqtt(
     finally:
         thread.request_stop()
         thread.join(PATIENCE)
-    assert thread.state is State.STOPPED
+    assert thread.state is SourceState.STOPPED
 
 
 def publish_until(client: Client, topic: str, done: Callable[[], object]) -> None:
@@ -55,7 +55,7 @@ def test_messages_arrive_on_their_keys_also_after_the_broker_was_killed(port: in
     tally = Tally()
     with mqtt(arrivals, tally, port=port) as thread:
         for client in ("car1", "car2"):  # at first there is no broker yet
-            wait_for(lambda: thread.state is State.PAUSING)
+            wait_for(lambda: thread.state is SourceState.PAUSING)
             with broker(port), publisher(port) as sender:
                 publish_until(sender, f"vehicles/{client}/pose", lambda: client in str(arrivals.seen))  # noqa: B023
     assert set(arrivals.seen) == {("pose", "vehicles/car1/pose", b"{}"), ("pose", "vehicles/car2/pose", b"{}")}

@@ -20,8 +20,8 @@ from detector.live.running import Running
 from detector.plugins import entrypoints
 from detector.resources.selection import RuleSet
 from detector.sources import Feed, Source
-from detector.sources.registry import OFFERS, source_problems
-from detector.sources.supervision import Sources, SourceThread, State
+from detector.sources.registry import OFFERS, source_plugin_problems
+from detector.sources.supervision import Sources, SourceState, SourceThread
 from detector.streams.tally import Cause, Tally
 from tests.driving import a_detector, a_stream
 from tests.networks import PATIENCE, Arrivals, stream, wait_for
@@ -135,7 +135,7 @@ def test_a_message_that_belongs_to_several_streams_reaches_them_at_one_time() ->
 def test_messages_reach_their_streams_and_others_are_counted(arrivals: Arrivals) -> None:
     tally = Tally()
     thread = a_thread("once", arrivals, tally)
-    wait_for(lambda: thread.state is State.FINISHED)
+    wait_for(lambda: thread.state is SourceState.FINISHED)
     assert arrivals.seen == [("pose", "vehicles/car1/pose", b"once")]
     assert thread.messages == 1
     assert [(e.cause, e.name, e.count, e.last) for e in tally.entries()] == [
@@ -156,7 +156,7 @@ def test_a_source_that_fails_is_run_again_and_counted(plugin: str, error: str, a
     wait_for(lambda: failures() >= 3)
     thread.request_stop()
     thread.join(PATIENCE)
-    assert thread.state is State.STOPPED
+    assert thread.state is SourceState.STOPPED
     assert thread.last_error == error
     assert len(arrivals.seen) in ((0,) if plugin == "leaving" else (failures(), failures() + 1))
 
@@ -171,7 +171,7 @@ def test_a_source_that_hangs_is_left_behind_and_what_it_brings_later_is_not_take
     thread.join(0.05)
     assert [(entry.cause, entry.count) for entry in tally.entries()] == [(Cause.LEFT_BEHIND, 1)]
     Hanging.ended.set()
-    wait_for(lambda: thread.state is State.STOPPED)
+    wait_for(lambda: thread.state is SourceState.STOPPED)
     assert arrivals.seen == []
 
 
@@ -185,10 +185,10 @@ def test_sources_that_stay_the_same_go_on_while_others_change(arrivals: Arrivals
     assert sources.threads[0] is kept
     sources.follow(a_detector_of(first, {**second, "parameters": {"text": "new"}}, buffer={"duration": "1m"}))
     assert sources.threads[0] is kept
-    wait_for(lambda: changed.state is State.STOPPED)
+    wait_for(lambda: changed.state is SourceState.STOPPED)
     arrivals.wait_for(lambda seen: [payload for _, _, payload in seen].count(b"new") == 1)
     sources.follow(a_detector())
-    wait_for(lambda: kept.state is State.STOPPED)
+    wait_for(lambda: kept.state is SourceState.STOPPED)
     assert not sources.threads
     sources.close()
 
@@ -241,7 +241,7 @@ def test_a_running_detector_follows_changes_of_its_sources_and_tells_their_state
     ],
 )
 def test_what_is_wrong_with_a_source_is_told_with_its_field(source: dict[str, Any], problem: str) -> None:
-    found = [str(each) for each in source_problems(a_detector_of({"name": "s", **source}))]
+    found = [str(each) for each in source_plugin_problems(a_detector_of({"name": "s", **source}))]
     assert len(found) == 1
     assert problem in found[0]
 

@@ -43,7 +43,7 @@ class Driven:
         self.outcomes: list[Outcome] = []
         self.lost: list[str] = []
         self.closing = threading.Event()
-        self.parameters = api.Trigger.model_validate(trigger)
+        self.parameters = api.TriggerAction.model_validate(trigger)
         rule = a_rule("r", when="true", actions=[{"name": "other", "trigger": trigger}])
         self.setting = Setting(
             rule=rule,
@@ -71,7 +71,7 @@ class Driven:
         return any("Recording" in outcome.message for outcome in self.outcomes)
 
 
-def an_episode(parameters: api.Trigger, **fields: Any) -> Episode:
+def an_episode(parameters: api.TriggerAction, **fields: Any) -> Episode:
     now = time.time_ns()
     given: dict[str, Any] = {
         "id": "e1", "rule": "r", "subject": "car1", "clients": ("car1",), "element": None, "onset_time": now,
@@ -250,4 +250,4 @@ def test_one_dead_endpoint_costs_one_attempt_at_a_time() -> None:
 )
 def test_what_makes_no_sense_is_refused(fields: dict[str, Any], told: str) -> None:
     with pytest.raises(ValueError, match=told):
-        api.Trigger.model_validate({"http": fields})
+        api.TriggerAction.model_validate({"http": fields})

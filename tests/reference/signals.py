@@ -10,7 +10,7 @@ from typing import Any
 from tests.reference.aggregates import NOTHING, aggregated
 from tests.reference.places import Where, with_fields
 from tests.reference.world import SECOND, World
-from wayside.expressions import UNKNOWN, Environment, Expression, Kind
+from wayside.expressions import UNKNOWN, CelType, Environment, Expression
 
 VARIABLES = ("msg", "item", "before", "key", "sample")
 """Of expressions over one sample."""
@@ -18,7 +18,7 @@ VARIABLES = ("msg", "item", "before", "key", "sample")
 
 @cache
 def _compiled(source: str, names: tuple[str, ...]) -> Expression:
-    return Environment(dict.fromkeys(names, Kind.DYN)).compile(source)
+    return Environment(dict.fromkeys(names, CelType.DYN)).compile(source)
 
 
 def truth(source: str | None, variables: dict[str, Any], names: Iterable[str]) -> bool | None:

@@ -9,6 +9,7 @@ from pydantic import Field, field_validator
 from pydantic.config import JsonDict
 
 from wayside.api.base import (
+    ATOMIC_LIST,
     Condition,
     Identifier,
     Kind,
@@ -86,7 +87,7 @@ class Demands(Model):
         default_factory=list,
         max_length=20,
         description="The names of the tasks, oldest first; at most 20.",
-        json_schema_extra={"x-kubernetes-list-type": "atomic"},
+        json_schema_extra=ATOMIC_LIST,
     )
 
 
@@ -125,14 +126,14 @@ class ApplicationInstanceStatus(Model):
         max_length=128,
         description="The objects of the instance. An object that is added later is listed before it is applied. Until "
         "the list of a new instance is written, its objects are identified by label and controller reference.",
-        json_schema_extra={"x-kubernetes-list-type": "atomic"},
+        json_schema_extra=ATOMIC_LIST,
     )
     suspended_replicas: list[SuspendedReplicas] = Field(
         default_factory=list,
         max_length=64,
         description="The replica counts to restore when the suspension ends. Written before any workload is scaled to "
         "zero, removed once all are restored.",
-        json_schema_extra={"x-kubernetes-list-type": "atomic"},
+        json_schema_extra=ATOMIC_LIST,
     )
     demands: Demands = Field(default=Demands(), description="The live tasks that the instance serves.")
     conditions: list[Condition] = conditions_field(

@@ -9,6 +9,7 @@ from pydantic import Field
 from pydantic.config import JsonDict
 
 from wayside.api.base import (
+    ATOMIC_LIST,
     Condition,
     Identifier,
     Kind,
@@ -50,7 +51,7 @@ class Requester(Model):
         default_factory=list,
         max_length=1024,
         description="The clients of the episode.",
-        json_schema_extra={"x-kubernetes-list-type": "atomic"},
+        json_schema_extra=ATOMIC_LIST,
     )
 
 

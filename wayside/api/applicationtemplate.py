@@ -9,6 +9,7 @@ from pydantic import Field, field_validator, model_validator
 from pydantic.config import JsonDict
 
 from wayside.api.base import (
+    ATOMIC_LIST,
     Condition,
     Duration,
     Expression,
@@ -165,7 +166,7 @@ class ApplicationTemplateSpec(Model):
         description="The objects of an instance, with ${…} over parameters and instance (name, key, namespace, and "
         "configMap if there is a configuration). apiVersion and kind must be literal. The namespace is that of the "
         "template. With a key, every name must contain ${instance.name}.",
-        json_schema_extra={"x-kubernetes-list-type": "atomic"},
+        json_schema_extra=ATOMIC_LIST,
     )
     helm: Helm | None = Field(
         default=None,

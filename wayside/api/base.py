@@ -106,7 +106,7 @@ class PositiveDuration(Duration):
         return parsed
 
 
-class Over(PositiveDuration):
+class WindowLength(PositiveDuration):
     """The length of a window, or `Episode`: from the start of the open episode on."""
 
     pattern = rf"({PositiveDuration.pattern}|Episode)"
@@ -202,6 +202,17 @@ JsonValue = Any
 """Any JSON value; the schema has `x-kubernetes-preserve-unknown-fields`."""
 
 
+ATOMIC_LIST: JsonDict = {"x-kubernetes-list-type": "atomic"}
+"""Of a field: server-side apply replaces the list as a whole."""
+SET_LIST: JsonDict = {"x-kubernetes-list-type": "set"}
+"""Of a field: each applier owns the items that it applies; no item occurs twice."""
+
+
+def map_list(key: str) -> JsonDict:
+    """Of a field: server-side apply merges the items by this field of theirs, whose values are unique."""
+    return {"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": [key]}
+
+
 def validation(rule: str, message: str, field: str = "", reason: str = "") -> JsonDict:
     """A CEL validation for the CRD.
 
@@ -283,7 +294,7 @@ def conditions_field(description: str) -> Any:
         default_factory=list,
         description=description,
         max_length=16,
-        json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["type"]},
+        json_schema_extra=map_list("type"),
     )
 
 

@@ -7,11 +7,12 @@ from typing import Any
 from pydantic import Field, field_validator
 from pydantic.alias_generators import to_snake
 
-from wayside.api.base import Model
+from wayside.api.base import SET_LIST, Model
 from wayside.api.scheme import (
     SCHEME,
     ActingEntity,
     AffectedEntity,
+    CharacteristicValue,
     DataSourceEntity,
     DetectionAlgorithm,
     Dimension,
@@ -24,18 +25,17 @@ from wayside.api.scheme import (
     TimeSensitivity,
     TypeOfAction,
     TypeOfParticipants,
-    Value,
 )
 
 _DESCRIPTIONS = {dimension.values: dimension.described() for dimension in SCHEME}
 
 
-def _dimension(values: type[Value]) -> Any:
+def _dimension(values: type[CharacteristicValue]) -> Any:
     return Field(
         default_factory=list,
         description=_DESCRIPTIONS[values],
         max_length=len(values),
-        json_schema_extra={"x-kubernetes-list-type": "set"},
+        json_schema_extra=SET_LIST,
     )
 
 
@@ -58,7 +58,7 @@ class Classification(Model):
 
     @field_validator("*")
     @classmethod
-    def _once(cls, values: list[Value]) -> list[Value]:
+    def _once(cls, values: list[CharacteristicValue]) -> list[CharacteristicValue]:
         twice = [value for value in values if values.count(value) > 1]
         if twice:
             raise ValueError(f"{twice[0].value} is given twice: remove one")
@@ -68,7 +68,7 @@ class Classification(Model):
         """The dimensions that have a value; empty ones are left out."""
         return {dimension: values for dimension, values in super().to_json().items() if values}
 
-    def values_of(self, dimension: Dimension) -> list[Value]:
+    def values_of(self, dimension: Dimension) -> list[CharacteristicValue]:
         """The values in a dimension of the scheme, in the order in which they are written."""
-        values: list[Value] = getattr(self, to_snake(dimension.name))
+        values: list[CharacteristicValue] = getattr(self, to_snake(dimension.name))
         return values

@@ -10,7 +10,7 @@ from wayside.api.base import Identifier
 from wayside.api.freedata import Value, bounded
 
 
-def checked(constants: dict[str, Any]) -> dict[str, Any]:
+def _checked(constants: dict[str, Any]) -> dict[str, Any]:
     """The constants, if expressions can take them. Raises ValueError, which names the value and the remedy."""
     bounded(constants)
     for name, value in constants.items():
@@ -28,5 +28,5 @@ def _check(name: str, value: object) -> None:
             _check(f"{name}[{part}]" if isinstance(part, int) else f"{name}.{part}", child)
 
 
-Constants = Annotated[dict[Identifier, Value], Field(max_length=64), AfterValidator(checked)]
+Constants = Annotated[dict[Identifier, Value], Field(max_length=64), AfterValidator(_checked)]
 """By the names that expressions use."""

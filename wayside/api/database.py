@@ -19,7 +19,7 @@ class WriteConcern(StrEnum):
     ONE = "One"
 
 
-class Spool(Model):
+class DatabaseSpool(Model):
     """The buffer of documents on disk while the database is unavailable."""
 
     path: FilePath = Field(
@@ -44,7 +44,7 @@ class DatabaseFiles(Model):
     )
 
 
-class Database(Model):
+class DatabaseConnection(Model):
     """A MongoDB server or replica set, with the storage beside it."""
 
     model_config = validations(
@@ -66,7 +66,7 @@ class Database(Model):
         description="When a document counts as written. Majority: when most members of the replica set have it. One: "
         "when the primary has it; a change of the primary can still undo the write.",
     )
-    spool: Spool | None = Field(
+    spool: DatabaseSpool | None = Field(
         default=None,
         description="Buffers documents on disk while the database is unavailable. Without a spool, up to 64 MiB are "
         "buffered in memory and lost when the process ends.",
@@ -76,7 +76,7 @@ class Database(Model):
     )
 
     @model_validator(mode="after")
-    def _one_place(self) -> Database:
+    def _one_place(self) -> DatabaseConnection:
         if [self.uri_secret_name, self.uri_variable, self.uri_file].count(None) != 2:
             raise ValueError(_ONE)
         return self

@@ -9,6 +9,8 @@ from pydantic import Field, model_validator
 
 from wayside.api.asn1 import Asn1Module
 from wayside.api.base import (
+    ATOMIC_LIST,
+    SET_LIST,
     ClientName,
     Condition,
     Duration,
@@ -18,10 +20,11 @@ from wayside.api.base import (
     PositiveDuration,
     PositiveQuantity,
     conditions_field,
+    map_list,
     validations,
 )
 from wayside.api.constants import Constants
-from wayside.api.database import Database
+from wayside.api.database import DatabaseConnection
 from wayside.api.place import MapFile, Place
 from wayside.api.pod import OF_ITS_OWN_POD, DetectorMode, DetectorPod
 from wayside.api.recordings import Recordings
@@ -37,7 +40,7 @@ STALE_AFTER = PositiveDuration("5s")
 """The default of a stream's `staleAfter`: a stream with one sample per second, such as slow CAMs, may miss a few."""
 
 
-class Client(Model):
+class KnownClient(Model):
     """A client that is known in advance."""
 
     name: ClientName = Field(description="The name of the client, as in the keys of the streams.")
@@ -57,7 +60,7 @@ class Client(Model):
     )
 
 
-class Buffer(Model):
+class BufferLimits(Model):
     """The limits of the buffer of all streams."""
 
     duration: PositiveDuration = Field(
@@ -130,53 +133,53 @@ class DetectorSpec(Model):
         max_length=64,
         description="The service accounts whose pods may run the detector. Only these accounts get the detector's "
         "permissions. Only with mode Sidecar.",
-        json_schema_extra={"x-kubernetes-list-type": "set"},
+        json_schema_extra=SET_LIST,
     )
     zenoh: Zenoh = Field(default=Zenoh(), description="The Zenoh session.")
     sources: list[DataSource] = Field(
         default_factory=list,
         max_length=16,
         description="Sources of streams other than Zenoh.",
-        json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
+        json_schema_extra=map_list("name"),
     )
-    clients: list[Client] = Field(
+    clients: list[KnownClient] = Field(
         default_factory=list,
         max_length=1024,
         description="Clients that are known in advance. Other clients appear with their first sample.",
-        json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
+        json_schema_extra=map_list("name"),
     )
     streams: list[Stream] = Field(
         min_length=1,
         max_length=128,
         description="The data that the detector receives.",
-        json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
+        json_schema_extra=map_list("name"),
     )
     asn1: list[Asn1Module] = Field(
         default_factory=list,
         max_length=32,
         description="ASN.1 modules for uper streams: for messages that no package defines, such as etsi/cpm, or to "
         "replace the versions of the packages. All modules that they import must be included.",
-        json_schema_extra={"x-kubernetes-list-type": "atomic"},
+        json_schema_extra=ATOMIC_LIST,
     )
     messages: list[MessageDefinition] = Field(
         default_factory=list,
         max_length=256,
         description="Definitions of ROS 2 message types that the common packages lack or define differently.",
-        json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
+        json_schema_extra=map_list("name"),
     )
     places: list[Place] = Field(
         default_factory=list,
         max_length=512,
         description='The areas, lines and lanes that rules can name, as in at(position, "crossing").',
-        json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
+        json_schema_extra=map_list("name"),
     )
     maps: list[MapFile] = Field(
         default_factory=list,
         max_length=16,
         description="Files with more places. Lanelet2 maps, and origin, need the extra maps.",
-        json_schema_extra={"x-kubernetes-list-type": "atomic"},
+        json_schema_extra=ATOMIC_LIST,
     )
-    buffer: Buffer = Field(default=Buffer(), description="The limits of the buffer of samples.")
+    buffer: BufferLimits = Field(default=BufferLimits(), description="The limits of the buffer of samples.")
     client_timeout: PositiveDuration = Field(
         default=PositiveDuration("30s"),
         description="A client is lost after this time without data: its episodes end with reason ClientLost. The time "
@@ -202,7 +205,7 @@ class DetectorSpec(Model):
     recordings: Recordings | None = Field(
         default=None, description="The storage of record actions. Required by rules that record."
     )
-    database: Database | None = Field(
+    database: DatabaseConnection | None = Field(
         default=None, description="The MongoDB database of database actions. Required by rules that use them."
     )
     rule_selector: LabelSelector = Field(

@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from wayside.api import API_VERSION, KINDS
 from wayside.api.base import Kind
-from wayside.api.schema import fields_at
+from wayside.api.schema import field_names_at
 from wayside.api.wording import FieldPath, field_text, messages
 from wayside.findings import ignored_by
 from wayside.inputerror import InputError
@@ -140,7 +140,8 @@ def parse_object(raw: dict[str, Any]) -> Kind:
     except ValidationError as error:
         raise ValueError(
             "; ".join(
-                f"{field_text(path)}: {message}" for path, message in messages(error, raw, partial(fields_at, kind))
+                f"{field_text(path)}: {message}"
+                for path, message in messages(error, raw, partial(field_names_at, kind))
             )
         ) from None
 
@@ -213,7 +214,7 @@ def _document(node: yaml.Node, file: str, problems: list[Problem]) -> Document |
     try:
         return Document(kind.model_validate(raw), file, marks)
     except ValidationError as error:
-        for path, message in messages(error, raw, partial(fields_at, kind)):
+        for path, message in messages(error, raw, partial(field_names_at, kind)):
             problems.append(Problem(file, *_mark(marks, path), field_text(path), message))
         return None
 

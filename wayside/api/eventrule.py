@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 
 from wayside.api.actions.action import Action
 from wayside.api.base import (
+    ATOMIC_LIST,
     ClientName,
     Condition,
     Duration,
@@ -17,9 +18,10 @@ from wayside.api.base import (
     Kind,
     Model,
     ObjectName,
-    Over,
     PositiveDuration,
+    WindowLength,
     conditions_field,
+    map_list,
     validations,
 )
 from wayside.api.classification import Classification
@@ -173,7 +175,7 @@ class Signal(Model):
     where: Expression | None = Field(
         default=None, description="CEL over msg, key, sample and parameters. Only samples for which it is true count."
     )
-    over: Over | None = Field(
+    over: WindowLength | None = Field(
         default=None,
         description="The length of the window: at tick t it is (t - over, t]. Required, except with the aggregates "
         "Last, First, Previous, Age and Active. Episode, for a signal with of: the evaluations of the open episode, "
@@ -267,7 +269,7 @@ class EventRuleSpec(Model):
         default_factory=list,
         max_length=64,
         description="The values that conditions use. In a pairs scope, each client has its own: a.speed, b.speed.",
-        json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
+        json_schema_extra=map_list("name"),
     )
     when: Expression = Field(description="CEL, boolean: the condition that starts an episode.")
     margin: dict[Identifier, Annotated[float, Field(gt=0)]] | None = Field(
@@ -305,7 +307,7 @@ class EventRuleSpec(Model):
         default_factory=list,
         max_length=16,
         description="The actions of an episode. Without actions, the rule only publishes events.",
-        json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
+        json_schema_extra=map_list("name"),
     )
 
     @model_validator(mode="after")
@@ -327,7 +329,7 @@ class EventRuleStatus(Model):
         default_factory=list,
         max_length=256,
         description="The Detectors that select the rule.",
-        json_schema_extra={"x-kubernetes-list-type": "atomic"},
+        json_schema_extra=ATOMIC_LIST,
     )
     selected_by: str = Field(
         default="", max_length=1024, description="The names of these Detectors as one text, for tables."

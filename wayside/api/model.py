@@ -6,11 +6,8 @@ from enum import StrEnum
 from typing import Annotated
 
 from pydantic import Field, model_validator
-from pydantic.config import JsonDict
 
-from wayside.api.base import Identifier, Model, ObjectName, PositiveDuration
-
-_ATOMIC: JsonDict = {"x-kubernetes-list-type": "atomic"}
+from wayside.api.base import ATOMIC_LIST, Identifier, Model, ObjectName, PositiveDuration, map_list
 
 TensorName = Annotated[str, Field(min_length=1, max_length=128)]
 """The name of an input or output, as the model file has it."""
@@ -24,7 +21,7 @@ class ModelWindow(Model):
         max_length=64,
         description="Signals of this rule over a stream. The input is made of the values of their samples; their "
         "aggregates are ignored.",
-        json_schema_extra=_ATOMIC,
+        json_schema_extra=ATOMIC_LIST,
     )
     last: int | None = Field(
         default=None,
@@ -66,7 +63,7 @@ class Channels(StrEnum):
     BGR = "Bgr"
 
 
-class Layout(StrEnum):
+class ImageLayout(StrEnum):
     """The order of an image's axes."""
 
     CHW = "Chw"
@@ -84,8 +81,8 @@ class ModelImage(Model):
     channels: Channels = Field(
         default=Channels.RGB, description="The channels of a pixel: Gray, Rgb or Bgr. The image is converted to them."
     )
-    layout: Layout = Field(
-        default=Layout.CHW,
+    layout: ImageLayout = Field(
+        default=ImageLayout.CHW,
         description="The order of the axes. Chw: channels, rows, columns. Hwc: rows, columns, channels.",
     )
     scale: float = Field(
@@ -95,13 +92,13 @@ class ModelImage(Model):
         default_factory=list,
         max_length=3,
         description="The values to subtract after scaling, one per channel. Default: 0.",
-        json_schema_extra=_ATOMIC,
+        json_schema_extra=ATOMIC_LIST,
     )
     std: list[Annotated[float, Field(gt=0)]] = Field(
         default_factory=list,
         max_length=3,
         description="The values to divide by after subtracting the mean, one per channel. Default: 1.",
-        json_schema_extra=_ATOMIC,
+        json_schema_extra=ATOMIC_LIST,
     )
 
     @model_validator(mode="after")
@@ -126,7 +123,7 @@ class ModelPoints(Model):
         min_length=1,
         max_length=16,
         description="The fields of each point, e.g. x, y, z and intensity.",
-        json_schema_extra=_ATOMIC,
+        json_schema_extra=ATOMIC_LIST,
     )
     count: int = Field(
         ge=1,
@@ -138,7 +135,7 @@ class ModelPoints(Model):
         default_factory=list,
         max_length=16,
         description="The factors for the fields, one per field. Default: 1.",
-        json_schema_extra=_ATOMIC,
+        json_schema_extra=ATOMIC_LIST,
     )
 
     @model_validator(mode="after")
@@ -158,7 +155,7 @@ class ModelInput(Model):
         default_factory=list,
         max_length=64,
         description="Signals of the rule. The input is a vector of their current values, numbers or booleans.",
-        json_schema_extra=_ATOMIC,
+        json_schema_extra=ATOMIC_LIST,
     )
     window: ModelWindow | None = Field(
         default=None, description="The latest values of signals: a vector, or a matrix of rows with several signals."
@@ -183,7 +180,7 @@ class ModelInput(Model):
             return (self.window.steps, *several)
         if self.image is not None:
             flat, depth = (self.image.height, self.image.width), self.image.depth
-            return (depth, *flat) if self.image.layout is Layout.CHW else (*flat, depth)
+            return (depth, *flat) if self.image.layout is ImageLayout.CHW else (*flat, depth)
         if self.points is not None:
             return (self.points.count, len(self.points.fields))
         return (len(self.signals),)
@@ -208,7 +205,7 @@ class ModelSource(Model):
         min_length=1,
         max_length=16,
         description="The inputs of the model, all of them.",
-        json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
+        json_schema_extra=map_list("name"),
     )
     output: TensorName | None = Field(
         default=None,

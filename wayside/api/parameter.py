@@ -7,7 +7,7 @@ from enum import StrEnum
 
 from pydantic import Field, model_validator
 
-from wayside.api.base import JsonValue, Model, validations
+from wayside.api.base import ATOMIC_LIST, JsonValue, Model, validations
 
 
 class ParameterType(StrEnum):
@@ -127,7 +127,7 @@ class Parameter(Model):
         min_length=1,
         max_length=64,
         description="The allowed values. Not with merge Union, Intersection or Sum, whose results may be other values.",
-        json_schema_extra={"x-kubernetes-list-type": "atomic"},
+        json_schema_extra=ATOMIC_LIST,
     )
     merge: Merge = Field(
         default=Merge.SAME,

@@ -7,18 +7,16 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from wayside.api.base import ClientName, Model, validations
+from wayside.api.base import ATOMIC_LIST, ClientName, Model, validations
 
 _SHAPE = "give area, line, or both"
 _WIDTH = "width is for a line without area: remove it, or give a line alone"
 
-Corner = Annotated[
-    list[float], Field(min_length=2, max_length=2, json_schema_extra={"x-kubernetes-list-type": "atomic"})
-]
+Corner = Annotated[list[float], Field(min_length=2, max_length=2, json_schema_extra=ATOMIC_LIST)]
 """x and y, or latitude and longitude."""
 
 
-class Frame(StrEnum):
+class CoordinateFrame(StrEnum):
     """What the coordinates of places are."""
 
     METRES = "Metres"
@@ -34,8 +32,8 @@ class Place(Model):
     )
 
     name: ClientName = Field(description='The name of the place in expressions, as in at(position, "crossing").')
-    frame: Frame = Field(
-        default=Frame.METRES,
+    frame: CoordinateFrame = Field(
+        default=CoordinateFrame.METRES,
         description="Metres: the points are x and y in the frame of the positions. Wgs84: they are latitude and "
         "longitude in degrees.",
     )
@@ -44,14 +42,14 @@ class Place(Model):
         min_length=3,
         max_length=1000,
         description="The corners of an area. It is closed automatically, and its edges must not cross.",
-        json_schema_extra={"x-kubernetes-list-type": "atomic"},
+        json_schema_extra=ATOMIC_LIST,
     )
     line: list[Corner] | None = Field(
         default=None,
         min_length=2,
         max_length=1000,
         description="The points of a line, in its direction. With an area: the middle of the lane that the area is.",
-        json_schema_extra={"x-kubernetes-list-type": "atomic"},
+        json_schema_extra=ATOMIC_LIST,
     )
     width: float | None = Field(
         default=None, gt=0, le=1000, description="The width in metres of a lane, of which line is the middle."

@@ -1,11 +1,12 @@
-"""Signals that plugins compute: which plugin, and what it is to do."""
+"""Plugins of signals and of actions, and their parameters."""
 
 from __future__ import annotations
 
 from pydantic import Field
 
+from wayside.api.actions.window import Window
 from wayside.api.base import Model
-from wayside.api.freedata import FreeData
+from wayside.api.freedata import FreeData, NamedData
 from wayside.api.source import PluginName
 
 
@@ -20,3 +21,21 @@ class SignalPlugin(Model):
         default_factory=dict,
         description="The parameters of the plugin; see its documentation.",
     )
+
+
+class ActionPlugin(Model):
+    """An action of an installed package, and its parameters."""
+
+    name: PluginName = Field(
+        description="The plugin: the name of a wayside.actions entry point of an installed package."
+    )
+    parameters: FreeData = Field(
+        default_factory=dict,
+        description="The parameters of the plugin; see its documentation.",
+    )
+    values: NamedData = Field(
+        default_factory=dict,
+        description="Values that the plugin receives for each episode, with ${…} over the rule's variables at the "
+        "start of the episode.",
+    )
+    window: Window | None = Field(default=None, description="The samples that the plugin receives. Default: none.")

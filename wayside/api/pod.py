@@ -9,7 +9,17 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, Field, model_validator
 from pydantic.alias_generators import to_snake
 
-from wayside.api.base import Identifier, Model, ObjectName, PositiveQuantity, Quantity, validations
+from wayside.api.base import (
+    ATOMIC_LIST,
+    SET_LIST,
+    Identifier,
+    Model,
+    ObjectName,
+    PositiveQuantity,
+    Quantity,
+    map_list,
+    validations,
+)
 from wayside.api.freedata import of_bounded_size
 
 _SOURCES = ("persistentVolumeClaim", "ephemeral", "emptyDir", "configMap", "secret", "projected", "csi")
@@ -295,7 +305,7 @@ class DetectorPod(Model):
         default_factory=list,
         max_length=16,
         description="The node taints that the pod tolerates. Not with mode Sidecar.",
-        json_schema_extra={"x-kubernetes-list-type": "atomic"},
+        json_schema_extra=ATOMIC_LIST,
     )
     priority_class_name: Annotated[str, Field(min_length=1, max_length=253)] | None = Field(
         default=None, description="The PriorityClass of the pod. Not with mode Sidecar."
@@ -308,7 +318,7 @@ class DetectorPod(Model):
         max_length=16,
         description="The Secrets to pull the image with, in addition to those of the manager's option "
         "--detector-pull-secret.",
-        json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
+        json_schema_extra=map_list("name"),
     )
     security_context: Embedded | None = Field(
         default=None,
@@ -320,20 +330,20 @@ class DetectorPod(Model):
         max_length=64,
         description="Environment variables. They are added to those of the manager's option --detector-env and take "
         "precedence over them.",
-        json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
+        json_schema_extra=map_list("name"),
     )
     volumes: list[DetectorVolume] = Field(
         default_factory=list,
         max_length=16,
         description="Volumes for volumeMounts.",
-        json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
+        json_schema_extra=map_list("name"),
     )
     volume_mounts: list[DetectorVolumeMount] = Field(
         default_factory=list,
         max_length=16,
         description="The mounts of the volumes, for the folders of the state, the recordings, the database spool and "
         "the database files. A folder that is on none of them gets a volume that is removed with the pod.",
-        json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["mountPath"]},
+        json_schema_extra=map_list("mountPath"),
     )
     secret_names: list[ObjectName] = Field(
         default_factory=list,
@@ -341,7 +351,7 @@ class DetectorPod(Model):
         description="The Secrets that rules may use. A Secret that the Detector itself refers to is available to "
         "rules only if it is listed here as well. Anyone who can write rules can send the contents of these Secrets "
         "elsewhere.",
-        json_schema_extra={"x-kubernetes-list-type": "set"},
+        json_schema_extra=SET_LIST,
     )
 
     @model_validator(mode="after")

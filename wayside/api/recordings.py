@@ -6,7 +6,7 @@ from enum import StrEnum
 
 from pydantic import Field
 
-from wayside.api.base import Model, ObjectName, PositiveDuration, PositiveQuantity, Quantity
+from wayside.api.base import SET_LIST, Model, ObjectName, PositiveDuration, PositiveQuantity, Quantity
 
 
 class WhenFull(StrEnum):
@@ -24,7 +24,7 @@ class OnRequest(Model):
         min_length=1,
         max_length=128,
         description="The streams that may be recorded. Latched streams are always included. Default: all.",
-        json_schema_extra={"x-kubernetes-list-type": "set"},
+        json_schema_extra=SET_LIST,
     )
     maximum_duration: PositiveDuration = Field(
         default=PositiveDuration("1h"),

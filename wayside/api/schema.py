@@ -46,7 +46,7 @@ def crd(kind: type[Kind]) -> dict[str, Any]:
     }
 
 
-def fields_at(kind: type[Kind], path: Sequence[str | int]) -> list[str]:
+def field_names_at(kind: type[Kind], path: Sequence[str | int]) -> list[str]:
     """The names of the fields that an object of the kind has at a path; empty where any name is allowed."""
     node = _object_schema(kind)
     for part in path:

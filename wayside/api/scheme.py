@@ -12,7 +12,7 @@ from enum import StrEnum
 from typing import Self
 
 
-class Value(StrEnum):
+class CharacteristicValue(StrEnum):
     """A characteristic value: its name in files, its name in prose, and its definition."""
 
     words: str
@@ -31,7 +31,7 @@ class Value(StrEnum):
         return f"{self.value} ({self.definition})"
 
 
-class OverarchingPurpose(Value):
+class OverarchingPurpose(CharacteristicValue):
     """The goal that the use case serves."""
 
     SAFETY = "Safety", "safety", "to make road traffic safer"
@@ -39,7 +39,7 @@ class OverarchingPurpose(Value):
     USER_SATISFACTION = "UserSatisfaction", "user satisfaction", "to improve the experience of the users"
 
 
-class TypeOfParticipants(Value):
+class TypeOfParticipants(CharacteristicValue):
     """The kinds of entity that take part directly in the processing of the data."""
 
     VEHICLE = "Vehicle", "vehicle", "a car or another motor vehicle"
@@ -56,7 +56,7 @@ class TypeOfParticipants(Value):
     )
 
 
-class NumberOfParticipants(Value):
+class NumberOfParticipants(CharacteristicValue):
     """The number of entities that take part directly in the processing of the data."""
 
     ONE = "One", "one", "a single participant"
@@ -64,7 +64,7 @@ class NumberOfParticipants(Value):
     MULTIPLE = "Multiple", "multiple", "three or more participants"
 
 
-class DataSourceEntity(Value):
+class DataSourceEntity(CharacteristicValue):
     """The entity that originally produces the data in which the event is detected."""
 
     EVENT_SOURCE_ENTITY = (
@@ -75,7 +75,7 @@ class DataSourceEntity(Value):
     EXTERNAL = "External", "external", "another entity produces the data"
 
 
-class EventDetectionEntity(Value):
+class EventDetectionEntity(CharacteristicValue):
     """The entity that detects the event in the data."""
 
     EVENT_SOURCE_ENTITY = (
@@ -91,7 +91,7 @@ class EventDetectionEntity(Value):
     )
 
 
-class ActingEntity(Value):
+class ActingEntity(CharacteristicValue):
     """The entity that carries out the action."""
 
     EVENT_DETECTION_ENTITY = (
@@ -102,14 +102,14 @@ class ActingEntity(Value):
     EXTERNAL = "External", "external", "another entity acts"
 
 
-class AffectedEntity(Value):
+class AffectedEntity(CharacteristicValue):
     """The entity that the action affects directly."""
 
     ACTING_ENTITY = "ActingEntity", "acting entity", "the action affects the entity that acts"
     EXTERNAL = "External", "external", "the action affects another entity"
 
 
-class ScopeOfImpact(Value):
+class ScopeOfImpact(CharacteristicValue):
     """The reach of the consequences of the action."""
 
     PARTICIPANT = "Participant", "participant", "the consequences are limited to the participants"
@@ -121,7 +121,7 @@ class ScopeOfImpact(Value):
     )
 
 
-class ObservationPeriod(Value):
+class ObservationPeriod(CharacteristicValue):
     """The time span of the data that is needed to detect the event."""
 
     IMMEDIATE = "Immediate", "immediate", "a single sample is enough to detect the event"
@@ -129,7 +129,7 @@ class ObservationPeriod(Value):
     LONG_TERM = "LongTerm", "long-term", "the detection needs data of hours or more"
 
 
-class TimeSensitivity(Value):
+class TimeSensitivity(CharacteristicValue):
     """The time until the action has its consequences."""
 
     IMMEDIATE = "Immediate", "immediate", "the consequences are immediate"
@@ -137,7 +137,7 @@ class TimeSensitivity(Value):
     LONG_TERM = "LongTerm", "long-term", "the consequences follow after hours or later"
 
 
-class Incidence(Value):
+class Incidence(CharacteristicValue):
     """The frequency of the event and its action."""
 
     FREQUENT = "Frequent", "frequent", "often, as part of normal operation"
@@ -146,14 +146,14 @@ class Incidence(Value):
     UNEXPECTED = "Unexpected", "unexpected", "not expected to occur, though possible in theory"
 
 
-class DetectionAlgorithm(Value):
+class DetectionAlgorithm(CharacteristicValue):
     """The kind of algorithm that detects the event."""
 
     RULE_BASED = "RuleBased", "rule-based", "rules or heuristics detect the event"
     LEARNING_BASED = "LearningBased", "learning-based", "an algorithm learnt from data detects the event"
 
 
-class TypeOfAction(Value):
+class TypeOfAction(CharacteristicValue):
     """The kind of action."""
 
     DATA_COLLECTION = "DataCollection", "data collection", "the action records data"
@@ -171,7 +171,7 @@ class Dimension:
     """The name in files, e.g. typeOfAction."""
     words: str
     """The name in prose, e.g. Type of Action."""
-    values: type[Value]
+    values: type[CharacteristicValue]
 
     @property
     def definition(self) -> str:
@@ -183,7 +183,7 @@ class Dimension:
         return f"{self.definition} " + " ".join(f"{value.value}: {value.definition}." for value in self.values)
 
 
-def _dimension(values: type[Value]) -> Dimension:
+def _dimension(values: type[CharacteristicValue]) -> Dimension:
     name = values.__name__
     parts = "".join(f" {letter}" if letter.isupper() else letter for letter in name).split()
     words = " ".join(part.lower() if part == "Of" else part for part in parts)

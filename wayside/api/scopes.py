@@ -4,7 +4,16 @@ from __future__ import annotations
 
 from pydantic import ConfigDict, Field, model_validator
 
-from wayside.api.base import ClientName, Expression, Identifier, Model, ObjectName, PositiveDuration, validations
+from wayside.api.base import (
+    ClientName,
+    Expression,
+    Identifier,
+    Model,
+    ObjectName,
+    PositiveDuration,
+    map_list,
+    validations,
+)
 from wayside.api.freedata import bounded
 
 _POSITION = "give x and y (and z, if it matters) in metres, or latitude and longitude in degrees"
@@ -162,7 +171,7 @@ class Each(Model):
         min_length=1,
         max_length=256,
         description="The elements. Each has a name and any other fields; at most 64 KiB in total.",
-        json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
+        json_schema_extra=map_list("name"),
     )
 
     @model_validator(mode="after")

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from wayside.api.base import Model, validations
+from wayside.api.base import ATOMIC_LIST, Model, validations
 
 LabelKey = Annotated[
     str, Field(min_length=1, max_length=317, pattern=r"^([-a-z0-9.]{1,253}/)?[A-Za-z0-9]([-_.A-Za-z0-9]*[A-Za-z0-9])?$")
@@ -49,7 +49,7 @@ class LabelRequirement(Model):
         default_factory=list,
         max_length=64,
         description="The values for operators In and NotIn.",
-        json_schema_extra={"x-kubernetes-list-type": "atomic"},
+        json_schema_extra=ATOMIC_LIST,
     )
 
     @model_validator(mode="after")
@@ -93,7 +93,7 @@ class LabelSelector(Model):
         default_factory=list,
         max_length=16,
         description="Further requirements, all of which an object must meet.",
-        json_schema_extra={"x-kubernetes-list-type": "atomic"},
+        json_schema_extra=ATOMIC_LIST,
     )
 
     def matches(self, labels: Mapping[str, str]) -> bool:

@@ -8,7 +8,7 @@ from typing import Annotated
 from pydantic import Field, model_validator
 
 from wayside.api.access import ACCESS_VALIDATIONS, Access
-from wayside.api.base import Key, checked, validations
+from wayside.api.base import ATOMIC_LIST, Key, checked, validations
 
 Endpoint = Annotated[str, Field(min_length=1, max_length=256, pattern=r"^[a-z]+/.+$")]
 """A Zenoh endpoint such as tcp/zenoh:7447."""
@@ -50,14 +50,14 @@ class Zenoh(Access):
         max_length=16,
         description="The endpoints to connect to, e.g. tcp/zenoh:7447 or tls/zenoh:7447. Lost connections are "
         "re-established.",
-        json_schema_extra={"x-kubernetes-list-type": "atomic"},
+        json_schema_extra=ATOMIC_LIST,
     )
     listen: list[Endpoint] = Field(
         default_factory=list,
         max_length=16,
         description="The endpoints to listen on, e.g. tcp/0.0.0.0:7447. Default: a free port (peer) or port 7447 "
         "(router).",
-        json_schema_extra={"x-kubernetes-list-type": "atomic"},
+        json_schema_extra=ATOMIC_LIST,
     )
     scouting: bool = Field(default=False, description="If true, discovers other Zenoh nodes by multicast.")
     shared_memory: bool = Field(

@@ -1,6 +1,6 @@
 """CEL for both programs: numbers are doubles, unknowns follow Kleene, and texts may hold `${…}`."""
 
-from wayside.expressions.cel import RESERVED_WORDS, Environment, Expression, Kind, Value
+from wayside.expressions.cel import RESERVED_WORDS, CelType, Environment, Expression, Value
 from wayside.expressions.errors import EvaluationError, ExpressionError, InterpolationError
 from wayside.expressions.interpolation import CompiledTemplate, Embedded, Json, compile_template
 from wayside.expressions.projection import normalise
@@ -10,6 +10,7 @@ from wayside.expressions.unknown import UNKNOWN, Reason, Unknown
 __all__ = [
     "RESERVED_WORDS",
     "UNKNOWN",
+    "CelType",
     "CompiledTemplate",
     "Embedded",
     "Environment",
@@ -18,7 +19,6 @@ __all__ = [
     "ExpressionError",
     "InterpolationError",
     "Json",
-    "Kind",
     "Path",
     "Reason",
     "Unknown",

@@ -34,7 +34,7 @@ def tables() -> dict[str, dict[str, str]]:
     }
 
 
-def written(page: str, of_page: Mapping[str, str]) -> str:
+def with_tables(page: str, of_page: Mapping[str, str]) -> str:
     """The page with its tables. Raises ValueError for a table that is not in it."""
     for heading, table in of_page.items():
         before, found, rest = page.partition(f"\n| {heading} |")
@@ -51,7 +51,7 @@ def main() -> None:
     folder = Path(sys.argv[1] if len(sys.argv) > 1 else "docs")
     for name, of_page in tables().items():
         path = folder / name
-        path.write_text(written(path.read_text(encoding="utf-8"), of_page), encoding="utf-8")
+        path.write_text(with_tables(path.read_text(encoding="utf-8"), of_page), encoding="utf-8")
 
 
 def _kinds_with(field: str) -> str:

@@ -21,10 +21,10 @@ from cel_expr_python import cel
 
 from wayside.expressions.diagnostics import EMPTY, diagnose
 from wayside.expressions.errors import EvaluationError, ExpressionError, position
-from wayside.expressions.expanding import Places, expanded
+from wayside.expressions.expanding import NamedPlaces, expanded
 from wayside.expressions.failures import NO_MEMBERS, clean, says_absent
 from wayside.expressions.functions import DECLARATIONS, TAKING_HANDLES
-from wayside.expressions.functions.calls import settle
+from wayside.expressions.functions.calls import drop_lost_references
 from wayside.expressions.growth import MOST, growth
 from wayside.expressions.handles import begin, end, value_of
 from wayside.expressions.lexer import tokens
@@ -54,7 +54,7 @@ _CACHE_SIZE = 1024
 _ORDERING = frozenset({"_<_", "_<=_", "_>_", "_>=_"})
 
 
-class Kind(enum.Enum):
+class CelType(enum.Enum):
     """The type of a variable or a result; DYN is checked only at evaluation."""
 
     DYN = "any value"
@@ -66,26 +66,26 @@ class Kind(enum.Enum):
 
 
 _TYPES: Final = {
-    Kind.DYN: cel.Type.DYN,
-    Kind.DOUBLE: cel.Type.DOUBLE,
-    Kind.STRING: cel.Type.STRING,
-    Kind.BOOL: cel.Type.BOOL,
-    Kind.MAP: cel.Type.Map(cel.Type.STRING, cel.Type.DYN),
-    Kind.LIST: cel.Type.List(cel.Type.DYN),
+    CelType.DYN: cel.Type.DYN,
+    CelType.DOUBLE: cel.Type.DOUBLE,
+    CelType.STRING: cel.Type.STRING,
+    CelType.BOOL: cel.Type.BOOL,
+    CelType.MAP: cel.Type.Map(cel.Type.STRING, cel.Type.DYN),
+    CelType.LIST: cel.Type.List(cel.Type.DYN),
 }
-_PYTHON: Final[Mapping[Kind, type | tuple[type, ...]]] = {
-    Kind.DOUBLE: (float, int),
-    Kind.STRING: str,
-    Kind.BOOL: bool,
-    Kind.MAP: dict,
-    Kind.LIST: list,
+_PYTHON: Final[Mapping[CelType, type | tuple[type, ...]]] = {
+    CelType.DOUBLE: (float, int),
+    CelType.STRING: str,
+    CelType.BOOL: bool,
+    CelType.MAP: dict,
+    CelType.LIST: list,
 }
 _NAMED_KINDS: Final = {
-    "BOOL": Kind.BOOL,
-    "DOUBLE": Kind.DOUBLE,
-    "INT": Kind.DOUBLE,
-    "UINT": Kind.DOUBLE,
-    "STRING": Kind.STRING,
+    "BOOL": CelType.BOOL,
+    "DOUBLE": CelType.DOUBLE,
+    "INT": CelType.DOUBLE,
+    "UINT": CelType.DOUBLE,
+    "STRING": CelType.STRING,
 }
 _WORDS: Final = (
     "as break const continue else false for function if import in let loop namespace null package return true var void"
@@ -103,33 +103,36 @@ class Environment:
     """The variables that expressions may use. Immutable; compiled expressions are cached."""
 
     def __init__(
-        self, variables: Mapping[str, Kind], members: Mapping[str, Kind] | None = None, places: Places | None = None
+        self,
+        variables: Mapping[str, CelType],
+        members: Mapping[str, CelType] | None = None,
+        places: NamedPlaces | None = None,
     ) -> None:
         """`members` are those of maps whose kind is known, by their paths, such as `parameters.maxSpeed`.
 
         They serve to find wrong types when compiling, and change nothing in what an expression yields.
         """
-        self._places = places or Places()
+        self._places = places or NamedPlaces()
         for name in variables:
             if not _NAME.fullmatch(name):
                 raise ValueError(f"variable {name!r}: not a CEL identifier; use letters, digits and `_`")
             if name in RESERVED_WORDS:
                 raise ValueError(f"variable {name!r}: a word that CEL reserves; choose another name")
-        self.variables: Mapping[str, Kind] = MappingProxyType(dict(variables))
-        self._members: Mapping[str, Kind] = MappingProxyType(dict(members or {}))
+        self.variables: Mapping[str, CelType] = MappingProxyType(dict(variables))
+        self._members: Mapping[str, CelType] = MappingProxyType(dict(members or {}))
         self._env = _cel_environment(self.variables)
         self._typed = _cel_environment({**self.variables, **self._members}) if self._members else None
-        self._cache: dict[tuple[str, Kind], Expression] = {}
+        self._cache: dict[tuple[str, CelType], Expression] = {}
 
-    def knowing(self, members: Mapping[str, Kind]) -> Environment:
+    def knowing(self, members: Mapping[str, CelType]) -> Environment:
         """The same, with the kinds of more members known."""
         return Environment(self.variables, {**self._members, **members}, self._places) if members else self
 
-    def naming(self, places: Places) -> Environment:
+    def naming(self, places: NamedPlaces) -> Environment:
         """The same, with places that expressions can name."""
         return Environment(self.variables, self._members, places)
 
-    def compile(self, source: str, *, result: Kind = Kind.DYN) -> Expression:
+    def compile(self, source: str, *, result: CelType = CelType.DYN) -> Expression:
         """Compiles `source`; if its type is known only at evaluation, `result` is checked then.
 
         Raises ExpressionError, pointing into `source`, for what does not parse, has the wrong type or names what is
@@ -169,12 +172,12 @@ class Environment:
         names = frozenset(self.variables)
         leaves = dict.fromkeys(arguments(node, names, _ORDERING), Leaf.ORDERED)
         for path in nothing_but_arguments(node, names, TAKING_HANDLES):
-            if len(path) > 1 or self.variables[str(path[0])] is Kind.DYN:
+            if len(path) > 1 or self.variables[str(path[0])] is CelType.DYN:
                 leaves[path] = Leaf.HANDED
         return paths(node, names), leaves
 
 
-def _cel_environment(variables: Mapping[str, Kind]) -> cel.Env:
+def _cel_environment(variables: Mapping[str, CelType]) -> cel.Env:
     return cel.NewEnv(variables={name: _TYPES[kind] for name, kind in variables.items()}, functions=list(DECLARATIONS))
 
 
@@ -192,15 +195,15 @@ class Expression:
         program: cel.Expression,
         read: frozenset[Path],
         leaves: Mapping[Path, Leaf],
-        result: Kind,
-        variables: Mapping[str, Kind],
+        result: CelType,
+        variables: Mapping[str, CelType],
         places: tuple[Shape, ...] = (),
     ) -> None:
         self.source = source
         self.places = places
         self.paths = read
         self.names = frozenset(str(path[0]) for path in read)
-        self.kinds: Mapping[str, Kind] = {name: variables[name] for name in self.names}
+        self.kinds: Mapping[str, CelType] = {name: variables[name] for name in self.names}
         self.result = result
         self._program = program
         self._read = tree(read, leaves)
@@ -263,7 +266,7 @@ class Expression:
         finally:
             end(before)
             if before is None:
-                settle()
+                drop_lost_references()
 
     def _run_holding(self, values: Mapping[str, object], *, known: bool) -> Value:
         try:
@@ -289,21 +292,21 @@ class Expression:
             message = clean(value)
             raise EvaluationError(message, absent=says_absent(message) or (known and "null" in message))
         result = _plain(value)
-        if self.result is not Kind.DYN:
+        if self.result is not CelType.DYN:
             self._check(result)
         return result
 
     def _check(self, value: Value) -> None:
         wanted = _PYTHON[self.result]
-        if isinstance(value, wanted) and not (isinstance(value, bool) and self.result is Kind.DOUBLE):
+        if isinstance(value, wanted) and not (isinstance(value, bool) and self.result is CelType.DOUBLE):
             return
         raise EvaluationError(f"must be {self.result.value}, is {_describe(value)}", absent=value is None)
 
 
-def _check_static(actual: cel.Type, wanted: Kind, source: str) -> None:
+def _check_static(actual: cel.Type, wanted: CelType, source: str) -> None:
     name = actual.name()
     kind = _NAMED_KINDS.get(name)
-    if wanted is Kind.DYN or name == "DYN" or wanted is kind or name.split("<")[0] == wanted.name:
+    if wanted is CelType.DYN or name == "DYN" or wanted is kind or name.split("<")[0] == wanted.name:
         return
     start = len(source) - len(source.lstrip())
     line, column = position(source, start)

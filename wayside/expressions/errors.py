@@ -5,59 +5,18 @@ from __future__ import annotations
 from typing import Self
 
 
-class ExpressionError(Exception):
-    """An expression that does not compile.
+class _LocatedError(Exception):
+    """An error at a place in the author's text.
 
-    `line` and `column` count from 1, in characters of the author's own text. `hint` is the remedy where one is known.
-    `others` holds the further errors of the same expression.
+    `line` and `column` count from 1, in characters of that text. `hint` is the remedy where one is known. `others`
+    holds the further errors of the same text. `path` is that of its field, or empty.
     """
 
     def __init__(
         self,
         message: str,
         *,
-        source: str,
-        line: int = 1,
-        column: int = 1,
-        hint: str | None = None,
-        others: tuple[Self, ...] = (),
-    ) -> None:
-        self.message = message
-        self.source = source
-        self.line = line
-        self.column = column
-        self.hint = hint
-        self.others = others
-        super().__init__(message)
-
-    def __str__(self) -> str:
-        return _located("", self.line, self.column, self.message, self.hint)
-
-
-class EvaluationError(Exception):
-    """An expression that failed on the values it was given.
-
-    `absent` distinguishes an absent value (a variable, map key or list index) from a fault of the expression.
-    """
-
-    def __init__(self, message: str, *, absent: bool = False) -> None:
-        self.message = message
-        self.absent = absent
-        super().__init__(message)
-
-
-class InterpolationError(Exception):
-    """A field whose `${…}` does not compile or cannot be rendered.
-
-    `path` is the field's, such as `spec.manifests[0].spec.replicas`; `line` and `column` count from 1 inside the
-    field's text. `others` holds the further errors of the same template.
-    """
-
-    def __init__(
-        self,
-        message: str,
-        *,
-        path: str,
+        path: str = "",
         line: int = 1,
         column: int = 1,
         hint: str | None = None,
@@ -72,13 +31,45 @@ class InterpolationError(Exception):
         super().__init__(message)
 
     def __str__(self) -> str:
-        return _located(self.path, self.line, self.column, self.message, self.hint)
+        where = f"line {self.line}, column {self.column}"
+        start = f"{self.path}, {where}" if self.path else where
+        return f"{start}: {self.message} ({self.hint})" if self.hint else f"{start}: {self.message}"
 
 
-def _located(path: str, line: int, column: int, message: str, hint: str | None) -> str:
-    where = f"line {line}, column {column}"
-    start = f"{path}, {where}" if path else where
-    return f"{start}: {message} ({hint})" if hint else f"{start}: {message}"
+class ExpressionError(_LocatedError):
+    """An expression, `source`, that does not compile."""
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        source: str,
+        line: int = 1,
+        column: int = 1,
+        hint: str | None = None,
+        others: tuple[Self, ...] = (),
+    ) -> None:
+        self.source = source
+        super().__init__(message, line=line, column=column, hint=hint, others=others)
+
+
+class EvaluationError(Exception):
+    """An expression that failed on the values it was given.
+
+    `absent` distinguishes an absent value (a variable, map key or list index) from a fault of the expression.
+    """
+
+    def __init__(self, message: str, *, absent: bool = False) -> None:
+        self.message = message
+        self.absent = absent
+        super().__init__(message)
+
+
+class InterpolationError(_LocatedError):
+    """A field whose `${…}` does not compile or cannot be rendered.
+
+    `path` is the field's, such as `spec.manifests[0].spec.replicas`.
+    """
 
 
 def position(text: str, offset: int) -> tuple[int, int]:

@@ -45,7 +45,7 @@ FIELDS_SEEN: Final = {
 
 
 @dataclass(frozen=True)
-class Places:
+class NamedPlaces:
     """The places that expressions can name, and where the positions come from."""
 
     shapes: Mapping[str, Shape] = field(default_factory=dict)
@@ -69,7 +69,7 @@ class Expanded(NamedTuple):
     shapes: tuple[Shape, ...]
 
 
-def expanded(source: str, places: Places) -> Expanded:
+def expanded(source: str, places: NamedPlaces) -> Expanded:
     """Rewrites `source`. Raises ExpressionError, which points into it, for a place or a field that is not there."""
     return _Expansion(source, places).expanded()
 
@@ -80,7 +80,7 @@ class _Piece(NamedTuple):
 
 
 class _Expansion:
-    def __init__(self, source: str, places: Places) -> None:
+    def __init__(self, source: str, places: NamedPlaces) -> None:
         self._source = source
         self._places = places
         self._tokens = [

@@ -20,7 +20,7 @@ from wayside.rules.compiled import (
 )
 from wayside.rules.compiling import compile_rule
 from wayside.rules.dependencies import dependency_problems, depends, in_order
-from wayside.rules.fields import BYTES, Each, Fields
+from wayside.rules.fields import BYTES, Fields, ItemFields
 from wayside.rules.parameters import unknown_rules
 from wayside.rules.places import KnownPlaces, place_problems, places_of, shape_problems
 from wayside.rules.problems import RuleError, RuleProblem
@@ -41,9 +41,9 @@ __all__ = [
     "CompiledSignal",
     "CompiledStream",
     "CompiledWindow",
-    "Each",
     "Fields",
     "FleetSubject",
+    "ItemFields",
     "KnownPlaces",
     "PairSubject",
     "RuleError",

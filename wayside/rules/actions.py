@@ -1,22 +1,23 @@
-"""Compiles actions other than deploy: their windows of samples, and their templates."""
+"""Compiles actions: their templates, and the windows of samples of those other than deploy."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Protocol
 
 from wayside.api import Detector
 from wayside.api.actions.action import Action
+from wayside.api.actions.database import DatabaseAction
+from wayside.api.actions.deploy import Deploy
 from wayside.api.actions.window import Window, WindowClients
 from wayside.api.base import JsonValue
 from wayside.api.detector import DetectorSpec
 from wayside.api.eventrule import EventRuleSpec
 from wayside.api.stream import Stream
 from wayside.api.wording import FieldPath
-from wayside.expressions import CompiledTemplate, Environment
-from wayside.rules.compiled import CompiledAction, CompiledWindow
-from wayside.rules.database import database_problems
+from wayside.expressions import CompiledTemplate, Environment, compile_template
+from wayside.rules.compiled import CompiledAction, CompiledDeploy, CompiledWindow
 
 
 class Compiler(Protocol):
@@ -40,16 +41,49 @@ class Compiler(Protocol):
         """Report a problem with a field."""
 
 
+def compile_deploys(
+    compiler: Compiler, actions: Iterable[tuple[int, Action]], environment: Environment
+) -> list[CompiledDeploy]:
+    """The deploy actions among these, which have their places; problems are reported to the compiler."""
+    found = (
+        _deploy(compiler, ("spec", "actions", index, "deploy", "parameters"), action.name, action.deploy, environment)
+        for index, action in actions
+        if action.deploy is not None
+    )
+    return [each for each in found if each is not None]
+
+
 def compile_actions(
     compiler: Compiler, actions: Iterable[tuple[int, Action]], environment: Environment
 ) -> list[CompiledAction]:
-    """The actions, each with its place among the rule's; problems are reported to the compiler."""
-    return [_compiled(compiler, ("spec", "actions", index), action, environment) for index, action in actions]
+    """The actions other than deploy among these, which have their places; problems are reported to the compiler."""
+    return [
+        _compiled(compiler, ("spec", "actions", index), action, environment)
+        for index, action in actions
+        if action.deploy is None
+    ]
 
 
-def canonical(value: object) -> str:
+def canonical_json(value: object) -> str:
     """JSON that is the same for the same value."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"))
+
+
+def _deploy(
+    compiler: Compiler, at: FieldPath, action: str, deploy: Deploy, environment: Environment
+) -> CompiledDeploy | None:
+    parameters = compiler.template(at, dict(deploy.parameters), environment)
+    if parameters is None:
+        return None
+    one_by_one = {
+        name: compile_template(value, environment, path=name)
+        for name, value in deploy.parameters.items()
+        if deploy.follow
+    }
+    source = canonical_json(deploy.parameters)
+    return CompiledDeploy(
+        action, deploy.template_name, deploy.priority, source, parameters, deploy.follow, one_by_one, deploy.operation
+    )
 
 
 def _compiled(compiler: Compiler, at: FieldPath, action: Action, environment: Environment) -> CompiledAction:
@@ -64,14 +98,14 @@ def _compiled(compiler: Compiler, at: FieldPath, action: Action, environment: En
         name: compiler.template((*at, *below), {name: value}, environment) for name, value in values.items()
     }  # one by one: what cannot be rendered takes nothing else with it
     if action.database is not None:
-        for path, text in database_problems(action.database, compiler.detector):
+        for path, text in _database_problems(action.database, compiler.detector):
             compiler.problem((*at, *path), text)
     window = action.window
     return CompiledAction(
         action.name,
         {name: template for name, template in rendered.items() if template is not None},
         None if window is None else _window(compiler, (*at, action.field), action, window),
-        canonical(action.to_json()),
+        canonical_json(action.to_json()),
     )
 
 
@@ -117,3 +151,18 @@ def window_of(
 def _of_one(stream: Stream) -> bool:
     """Whether all its samples belong to a client named by the Detector."""
     return stream.client is not None and not stream.names_by_message
+
+
+def _database_problems(action: DatabaseAction, detector: Detector) -> Iterator[tuple[FieldPath, str]]:
+    """The missing fields; the paths begin at the action."""
+    database = detector.spec.database
+    if database is None:
+        yield (
+            ("database",),
+            f"Detector {detector.name} has no spec.database: add it, e.g. {{uriVariable: MONGODB_URI}}",
+        )
+    elif action.files is not None and database.files is None:
+        yield (
+            ("database", "files"),
+            f"Detector {detector.name} has no spec.database.files: add it with a path, or remove files",
+        )

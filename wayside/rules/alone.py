@@ -10,7 +10,7 @@ from functools import lru_cache
 
 from wayside.api import Detector, EventRule
 from wayside.api.base import Metadata, PositiveDuration
-from wayside.api.detector import Buffer, DetectorSpec
+from wayside.api.detector import BufferLimits, DetectorSpec
 from wayside.api.stream import Stream
 from wayside.rules.compiling import compile_rule
 from wayside.rules.places import NO_MORE_IS_KNOWN
@@ -41,5 +41,7 @@ def _taking_everything() -> Detector:
         "recordings": {"path": "/recordings"},
         "database": {"uriVariable": "WAYSIDE_DATABASE", "files": {"path": "/files"}},
     }
-    spec = _AllStreams.model_validate(raw).model_copy(update={"buffer": Buffer(duration=PositiveDuration("999999h"))})
+    spec = _AllStreams.model_validate(raw).model_copy(
+        update={"buffer": BufferLimits(duration=PositiveDuration("999999h"))}
+    )
     return Detector.model_construct(kind="Detector", metadata=Metadata(name="any"), spec=spec)

@@ -9,27 +9,25 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 from wayside.api import Detector, EventRule
-from wayside.api.actions.action import Action
 from wayside.api.base import JsonValue
 from wayside.api.documents import FieldPath
 from wayside.api.eventrule import Samples, Signal
 from wayside.api.stream import Stream
 from wayside.expressions import (
+    CelType,
     CompiledTemplate,
     Embedded,
     Environment,
     Expression,
     ExpressionError,
     InterpolationError,
-    Kind,
     Path,
     compile_template,
 )
-from wayside.expressions.expanding import POSITION, Places
+from wayside.expressions.expanding import POSITION, NamedPlaces
 from wayside.geometry import Shape
-from wayside.rules.actions import canonical, compile_actions
+from wayside.rules.actions import canonical_json, compile_actions, compile_deploys
 from wayside.rules.compiled import (
-    CompiledDeploy,
     CompiledPlugin,
     CompiledRule,
     CompiledSignal,
@@ -128,13 +126,13 @@ class _RuleCompiler:
         for field, condition in (("when", when), ("until", until)):
             for text in () if condition is None else statistics_read(condition, derived):
                 self.problem(("spec", field), text)
-        deploys = [self._deploy(index, action.name, environment) for index, action in self._actions(deploy=True)]
-        actions = compile_actions(self, self._actions(deploy=False), environment)
+        deploys = compile_deploys(self, enumerate(self.spec.actions), environment)
+        actions = compile_actions(self, enumerate(self.spec.actions), environment)
         elements = with_signals(elements, element_of(self.spec), [each for each in signals if each is not None])
         for path, text in element_problems(elements, models):
             self.problem(path, text)
         if subject is not None:
-            templates = [deploy.parameters for deploy in deploys if deploy]
+            templates = [deploy.parameters for deploy in deploys]
             templates += [template for action in actions for template in action.templates.values()]
             embedded = [each.expression for template in templates for each in template.embedded]
             subject = self._closing(subject, (when, until, *(each.of for each in derived), *embedded))
@@ -154,7 +152,7 @@ class _RuleCompiler:
             unknown_timeout_ns=(spec.unknown_timeout or self.detector.spec.client_timeout).ns,
             enabled=spec.enabled,
             dry_run=spec.dry_run,
-            deploys=tuple(deploy for deploy in deploys if deploy is not None),
+            deploys=tuple(deploys),
             actions=tuple(actions),
             classification=None if spec.classification is None else spec.classification.to_json(),
             digest=_digest(self._written, self.rule, self.detector, self._used),
@@ -179,8 +177,8 @@ class _RuleCompiler:
         if signal.stream is None:
             return None  # a model's or a plugin's, or computed from other signals
         stream = self.stream((*at, "stream"), signal.stream)
-        value = self.sample((*at, "value"), signal.value, stream, Kind.DYN, element_of(self.spec))
-        where = self.sample((*at, "where"), signal.where, stream, Kind.BOOL, element_of(self.spec))
+        value = self.sample((*at, "value"), signal.value, stream, CelType.DYN, element_of(self.spec))
+        where = self.sample((*at, "where"), signal.where, stream, CelType.BOOL, element_of(self.spec))
         over = None if signal.over is None else signal.over.ns
         only = None if stream is None or stream.names_by_message else stream.client
         if only is not None and signal.client not in (None, only):
@@ -203,7 +201,7 @@ class _RuleCompiler:
         ends = signal.samples is Samples.ENDS
         value, where = (
             self.sample((*at, field), source, None, kind, element_of(self.spec), of_rule=True)
-            for field, source, kind in (("value", signal.value, Kind.DYN), ("where", signal.where, Kind.BOOL))
+            for field, source, kind in (("value", signal.value, CelType.DYN), ("where", signal.where, CelType.BOOL))
         )
         for field, expression in (("value", value), ("where", where)):
             members = END_MEMBERS if ends else EPISODE_MEMBERS
@@ -214,35 +212,6 @@ class _RuleCompiler:
             signal.name, episode_stream(rule, ends=ends), signal.aggregate, value, where, over, self.parameters, rule,
             quantile=signal.quantile, client=signal.client,
         )  # fmt: skip
-
-    def _actions(self, *, deploy: bool) -> list[tuple[int, Action]]:
-        """The actions that deploy, or those that do not, with their places."""
-        return [each for each in enumerate(self.spec.actions) if (each[1].deploy is not None) is deploy]
-
-    def _deploy(self, index: int, action: str, environment: Environment) -> CompiledDeploy | None:
-        deploy = self.spec.actions[index].deploy
-        if deploy is None:
-            return None
-        at: FieldPath = ("spec", "actions", index, "deploy", "parameters")
-        parameters = self.template(at, dict(deploy.parameters), environment)
-        if parameters is None:
-            return None
-        one_by_one = {
-            name: compile_template(value, environment, path=name)
-            for name, value in deploy.parameters.items()
-            if deploy.follow
-        }
-        source = canonical(deploy.parameters)
-        return CompiledDeploy(
-            action,
-            deploy.template_name,
-            deploy.priority,
-            source,
-            parameters,
-            deploy.follow,
-            one_by_one,
-            deploy.operation,
-        )
 
     def template(
         self, path: FieldPath, value: Mapping[str, JsonValue], environment: Environment
@@ -270,7 +239,7 @@ class _RuleCompiler:
         return stream
 
     def condition(
-        self, path: FieldPath, source: str | None, environment: Environment, kind: Kind = Kind.BOOL
+        self, path: FieldPath, source: str | None, environment: Environment, kind: CelType = CelType.BOOL
     ) -> Expression | None:
         """An expression over what a subject is seen as; None where there is none, or it is wrong."""
         expression = self._expression(path, source, environment, kind)
@@ -283,7 +252,7 @@ class _RuleCompiler:
         path: FieldPath,
         source: str | None,
         stream: Stream | None,
-        kind: Kind,
+        kind: CelType,
         element: str | None = None,
         *,
         of_rule: bool = False,
@@ -319,8 +288,8 @@ class _RuleCompiler:
         path: FieldPath,
         source: str | None,
         environment: Environment,
-        kind: Kind,
-        places: Places | None = None,
+        kind: CelType,
+        places: NamedPlaces | None = None,
         whose: str = "",
     ) -> Expression | None:
         """`whose` samples it is over: the stream's name, or `rule`."""
@@ -339,7 +308,7 @@ class _RuleCompiler:
     def _use(self, expression: Expression) -> None:
         self._used.update({shape.name: shape for shape in expression.places})
 
-    def _typed(self, environment: Environment, places: Places | None = None) -> Environment:
+    def _typed(self, environment: Environment, places: NamedPlaces | None = None) -> Environment:
         """The environment, knowing of which kinds the rule's parameters are, and the places; None: of conditions."""
         key = environment, None if places is None else places.stream
         if key not in self._knowing:
@@ -393,7 +362,7 @@ def _digest(written: EventRule, rule: EventRule, detector: Detector, places: Map
         for stream in detector.spec.streams
         if stream.position is not None and any(POSITION in each for each in _of_stream(written, stream.name))
     ]
-    return hashlib.sha256(canonical(decisive).encode()).hexdigest()[:16]
+    return hashlib.sha256(canonical_json(decisive).encode()).hexdigest()[:16]
 
 
 def _of_stream(rule: EventRule, stream: str) -> list[str]:

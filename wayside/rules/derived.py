@@ -8,25 +8,27 @@ from typing import Protocol
 from wayside.api import Detector, EventRule
 from wayside.api.documents import FieldPath
 from wayside.api.eventrule import Aggregate, Signal
-from wayside.expressions import Environment, Expression, Kind
+from wayside.expressions import CelType, Environment, Expression
 from wayside.rules.compiled import CompiledDerived
 from wayside.rules.margins import MARGIN, MarginError, margin_of
 
 
-class Compiling(Protocol):
+class _Compiler(Protocol):
     """The rule that is being compiled, and the receiver of its problems."""
 
     rule: EventRule
     detector: Detector
 
-    def condition(self, path: FieldPath, source: str | None, environment: Environment, kind: Kind) -> Expression | None:
+    def condition(
+        self, path: FieldPath, source: str | None, environment: Environment, kind: CelType
+    ) -> Expression | None:
         """An expression over what conditions see; None where there is none, or it is wrong."""
 
     def problem(self, path: FieldPath, message: str) -> None:
         """Report a problem with a field."""
 
 
-def compile_derived(compiler: Compiling, environment: Environment) -> tuple[CompiledDerived, ...]:
+def compile_derived(compiler: _Compiler, environment: Environment) -> tuple[CompiledDerived, ...]:
     """The signals over what conditions see, each after those that it reads."""
     found: dict[str, CompiledDerived] = {}
     places: dict[str, FieldPath] = {}
@@ -34,7 +36,7 @@ def compile_derived(compiler: Compiling, environment: Environment) -> tuple[Comp
         if not signal.is_derived:
             continue
         at: FieldPath = ("spec", "signals", index)
-        of = compiler.condition((*at, "of"), signal.of, environment, Kind.DYN)
+        of = compiler.condition((*at, "of"), signal.of, environment, CelType.DYN)
         if of is None and signal.of is not None:
             continue
         places[signal.name] = (*at, "of")
@@ -51,7 +53,7 @@ def compile_derived(compiler: Compiling, environment: Environment) -> tuple[Comp
     return tuple(found[name] for name in ordered)
 
 
-def _margin(compiler: Compiling, environment: Environment) -> Expression | None:
+def _margin(compiler: _Compiler, environment: Environment) -> Expression | None:
     """The margin of `when`; None, and problems, where it can have none."""
     spec = compiler.rule.spec
     for index, signal in enumerate(spec.signals):
@@ -59,7 +61,7 @@ def _margin(compiler: Compiling, environment: Environment) -> Expression | None:
             compiler.problem(("spec", "signals", index, "name"), "the rule's margin has this name: choose another")
             return None
     try:
-        return compiler.condition(("spec", MARGIN), margin_of(spec), environment, Kind.DOUBLE)
+        return compiler.condition(("spec", MARGIN), margin_of(spec), environment, CelType.DOUBLE)
     except MarginError as error:
         compiler.problem(error.path, str(error))
         return None
@@ -71,7 +73,7 @@ def statistics_read(expression: Expression, derived: Iterable[CompiledDerived]) 
         yield f"{name} is known only while an episode is open: use it in actions; conditions and signals cannot read it"
 
 
-def _compiled(compiler: Compiling, at: FieldPath, signal: Signal, of: Expression | None) -> CompiledDerived:
+def _compiled(compiler: _Compiler, at: FieldPath, signal: Signal, of: Expression | None) -> CompiledDerived:
     episode = signal.over is not None and signal.over.is_episode
     kept = compiler.detector.spec.buffer.duration
     lag = 0 if signal.lag is None else signal.lag.ns

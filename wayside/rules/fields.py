@@ -15,7 +15,7 @@ BYTES: Fields = {}
 """Those of a message that is bytes: none."""
 
 
-class Each(dict[str, "Fields | None"]):
+class ItemFields(dict[str, "Fields | None"]):
     """The fields of each item of a list."""
 
 
@@ -26,7 +26,7 @@ def unknown_fields(paths: Iterable[Path], variable: str, fields: Fields) -> Iter
             continue
         here: Fields | None = fields
         for depth, step in enumerate(path[1:], start=1):
-            if isinstance(here, Each):
+            if isinstance(here, ItemFields):
                 if isinstance(step, str):
                     parent = ".".join(map(str, path[:depth]))
                     yield f"{parent} is a list and has no field {step}; read an item, e.g. {parent}[0].{step}"
@@ -46,7 +46,7 @@ def fields_at(path: Path, fields: Fields | None) -> Fields | None:
     for step in path:
         if fields is None:
             return None
-        if isinstance(fields, Each):
+        if isinstance(fields, ItemFields):
             fields = dict(fields) if isinstance(step, int) else None
         else:
             fields = fields.get(str(step))

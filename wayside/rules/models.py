@@ -22,7 +22,7 @@ Located = tuple[FieldPath, str]
 """A field below the model, and its problem."""
 
 
-class Compiling(Protocol):
+class _Compiler(Protocol):
     """The rule that is being compiled, and the receiver of its problems."""
 
     @property
@@ -37,7 +37,7 @@ class Compiling(Protocol):
         """Report a problem with a field."""
 
 
-def compile_models(rule: Compiling, compiled: Sequence[CompiledSignal]) -> tuple[CompiledModel, ...]:
+def compile_models(rule: _Compiler, compiled: Sequence[CompiledSignal]) -> tuple[CompiledModel, ...]:
     """The rule's model signals; their files are not there yet. `compiled` has the signals over streams."""
     by_name = {signal.name: signal for signal in compiled}
     models = []

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from wayside.api import Detector, EventRule
 from wayside.api.documents import FieldPath
-from wayside.expressions import Kind, normalise
+from wayside.expressions import CelType, normalise
 
 Values = Mapping[str, Any]
 """Parameters by name, as expressions take them."""
@@ -47,7 +47,7 @@ def parameters_of(rule: EventRule, detector: Detector) -> Parameters:
     return Parameters(own, overridden)
 
 
-def kinds_of(rule: EventRule) -> Mapping[str, Kind]:
+def kinds_of(rule: EventRule) -> Mapping[str, CelType]:
     """The kinds of the rule's parameters, by their paths in expressions, those of a pair's a and b among them."""
     prefixes = ("", "a.", "b.") if rule.spec.scope.pairs is not None else ("",)
     return {
@@ -95,11 +95,11 @@ def _misfits(name: str, own: object, other: object, rule: str) -> Iterator[str]:
 
 
 _KINDS: Final = {
-    "boolean": Kind.BOOL,
-    "number": Kind.DOUBLE,
-    "text": Kind.STRING,
-    "list": Kind.LIST,
-    "map": Kind.MAP,
+    "boolean": CelType.BOOL,
+    "number": CelType.DOUBLE,
+    "text": CelType.STRING,
+    "list": CelType.LIST,
+    "map": CelType.MAP,
 }
 
 

@@ -9,9 +9,9 @@ from typing import Final, NamedTuple
 from wayside.api import Detector, EventRule
 from wayside.api.documents import FieldPath
 from wayside.api.eventrule import EventRuleSpec, Signal
-from wayside.api.place import Frame, Place
+from wayside.api.place import CoordinateFrame, Place
 from wayside.api.stream import Stream
-from wayside.expressions.expanding import SEEN_FROM, Places
+from wayside.expressions.expanding import SEEN_FROM, NamedPlaces
 from wayside.geometry import FARTHEST, Point, Shape, crossing, interned
 from wayside.rules.problems import RuleProblem
 
@@ -33,7 +33,7 @@ NO_MORE_IS_KNOWN: Final = KnownPlaces({}, complete=False)
 def place_problems(detector: Detector) -> Iterator[RuleProblem]:
     """What is wrong with the places that the Detector defines itself."""
     for index, place in enumerate(detector.spec.places):
-        for field, text in shape_problems(place.frame is Frame.WGS84, place.area, place.line):
+        for field, text in shape_problems(place.frame is CoordinateFrame.WGS84, place.area, place.line):
             yield RuleProblem(("spec", "places", index, *field), text)
 
 
@@ -88,7 +88,7 @@ def shape_of_place(place: Place) -> Shape:
     """The geometry of a place without problems."""
     rings = () if place.area is None else (tuple(map(_point, place.area)),)
     line = tuple(map(_point, place.line or ()))
-    return interned(Shape(place.name, place.frame is Frame.WGS84, rings, line, place.width))
+    return interned(Shape(place.name, place.frame is CoordinateFrame.WGS84, rings, line, place.width))
 
 
 def _point(corner: Sequence[float]) -> Point:
@@ -128,16 +128,16 @@ def _conditions(spec: EventRuleSpec) -> str:
     return f"{where} {spec.when} {spec.until} {of} {[action.to_json() for action in spec.actions]}"
 
 
-def of_conditions(rule: EventRule, known: KnownPlaces) -> Places:
+def of_conditions(rule: EventRule, known: KnownPlaces) -> NamedPlaces:
     """What the rule's conditions can name."""
     pairs = rule.spec.scope.pairs
-    return Places(known.shapes, known.complete, None if pairs is None else pairs.position.latitude is not None)
+    return NamedPlaces(known.shapes, known.complete, None if pairs is None else pairs.position.latitude is not None)
 
 
-def of_samples(stream: Stream | None, known: KnownPlaces) -> Places:
+def of_samples(stream: Stream | None, known: KnownPlaces) -> NamedPlaces:
     """What an expression over a sample of the stream can name; of the start of an episode, there is no stream."""
     if stream is None:
-        return Places(known.shapes, known.complete)
+        return NamedPlaces(known.shapes, known.complete)
     axes = {} if stream.position is None else stream.position.axes
     own = "msg" if stream.items is None else "item"
-    return Places(known.shapes, known.complete, None, axes, stream.name, own)
+    return NamedPlaces(known.shapes, known.complete, None, axes, stream.name, own)

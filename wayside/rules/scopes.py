@@ -11,7 +11,7 @@ from wayside.api.documents import FieldPath
 from wayside.api.eventrule import EventRuleSpec
 from wayside.api.scopes import Each, PairsScope
 from wayside.api.stream import Stream
-from wayside.expressions import Environment, Expression, Kind
+from wayside.expressions import CelType, Environment, Expression
 from wayside.rules.compiled import (
     ClientSubject,
     CompiledElement,
@@ -47,7 +47,7 @@ class Expressions(Protocol):
     def condition(self, path: FieldPath, source: str | None, environment: Environment) -> Expression | None:
         """A boolean expression; None where there is none, or it is wrong."""
 
-    def sample(self, path: FieldPath, source: str | None, stream: Stream | None, kind: Kind) -> Expression | None:
+    def sample(self, path: FieldPath, source: str | None, stream: Stream | None, kind: CelType) -> Expression | None:
         """An expression over one sample; None where there is none, or it is wrong."""
 
     def stream(self, path: FieldPath, name: str) -> Stream | None:
@@ -96,7 +96,7 @@ def _pairs(compiler: Expressions, pairs: PairsScope, element: str | None) -> Pai
     for axis in ("x", "y", "z", "latitude", "longitude"):
         source = getattr(position, axis)
         if source is not None:
-            expression = compiler.sample((*at, "position", axis), source, stream, Kind.DOUBLE)
+            expression = compiler.sample((*at, "position", axis), source, stream, CelType.DOUBLE)
             if expression is None:
                 complete = False
             else:

@@ -6,10 +6,10 @@ from collections.abc import Iterable
 
 from wayside.api.stream import Stream
 from wayside.api.wording import FieldPath
-from wayside.expressions import ExpressionError, InterpolationError, Kind, compile_template
+from wayside.expressions import CelType, ExpressionError, InterpolationError, compile_template
 from wayside.keys import KeyPattern, KeyPatternError
 from wayside.rules.compiled import CompiledStream
-from wayside.rules.fields import Each, Fields, fields_at, unknown_fields
+from wayside.rules.fields import Fields, ItemFields, fields_at, unknown_fields
 from wayside.rules.problems import RuleError, RuleProblem
 from wayside.rules.variables import items_environment, naming_environment, sample_environment, stamp_environment
 
@@ -23,10 +23,10 @@ def compile_stream(stream: Stream, index: int, fields: Fields | None = None) -> 
     problems = list(stream_problems(stream, index, fields))
     if problems:
         raise RuleError(problems)
-    stamp = None if stream.stamp is None else stamp_environment().compile(stream.stamp, result=Kind.DOUBLE)
+    stamp = None if stream.stamp is None else stamp_environment().compile(stream.stamp, result=CelType.DOUBLE)
     of_items = stream.items is not None
     client = compile_template(stream.client, naming_environment(items=of_items)) if stream.names_by_message else None
-    items = None if stream.items is None else items_environment().compile(stream.items, result=Kind.LIST)
+    items = None if stream.items is None else items_environment().compile(stream.items, result=CelType.LIST)
     return CompiledStream(stream.name, stamp, client, items)
 
 
@@ -46,7 +46,7 @@ def stream_problems(stream: Stream, index: int, fields: Fields | None = None) ->
         return
     path: FieldPath = ("spec", "streams", index, "stamp")
     try:
-        expression = stamp_environment().compile(stream.stamp, result=Kind.DOUBLE)
+        expression = stamp_environment().compile(stream.stamp, result=CelType.DOUBLE)
     except ExpressionError as error:
         received = stream.stamp.strip() == "t" and "; write sample.received for the t of JSON lines"
         yield from (RuleProblem(path, f"{each}{received or ''}") for each in (error, *error.others))
@@ -59,7 +59,7 @@ def stream_problems(stream: Stream, index: int, fields: Fields | None = None) ->
 def _sample_problems(path: FieldPath, source: str, stream: Stream, fields: Fields | None) -> Iterable[RuleProblem]:
     """The problems of an expression for a number of a sample."""
     try:
-        expression = sample_environment(items=stream.items is not None).compile(source, result=Kind.DOUBLE)
+        expression = sample_environment(items=stream.items is not None).compile(source, result=CelType.DOUBLE)
     except ExpressionError as error:
         yield from (RuleProblem(path, str(each)) for each in (error, *error.others))
         return
@@ -79,13 +79,13 @@ def item_fields(stream: Stream, fields: Fields | None) -> Fields | None:
     except ExpressionError:
         return None
     found = None if path is None else fields_at(path[1:], fields)
-    return dict(found) if isinstance(found, Each) else None
+    return dict(found) if isinstance(found, ItemFields) else None
 
 
 def _items_problems(items: str, path: FieldPath, fields: Fields | None) -> Iterable[RuleProblem]:
     """The problems of an `items` expression."""
     try:
-        expression = items_environment().compile(items, result=Kind.LIST)
+        expression = items_environment().compile(items, result=CelType.LIST)
     except ExpressionError as error:
         yield from (RuleProblem(path, str(each)) for each in (error, *error.others))
         return
@@ -95,7 +95,7 @@ def _items_problems(items: str, path: FieldPath, fields: Fields | None) -> Itera
     yield from (RuleProblem(path, text) for text in wrong)
     plain = expression.path
     found = None if plain is None or wrong else fields_at(plain[1:], fields)
-    if found is not None and not isinstance(found, Each):
+    if found is not None and not isinstance(found, ItemFields):
         yield RuleProblem(path, f"{items} is not a list: name a field that holds a list of objects")
 
 

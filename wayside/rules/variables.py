@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import cache, lru_cache
 
 from wayside.api.eventrule import EventRuleSpec
-from wayside.expressions import Environment, ExpressionError, Kind
+from wayside.expressions import CelType, Environment, ExpressionError
 from wayside.rules.fields import Fields
 
 MEMBER_OF_CLIENT = ("client", "labels", "streams", "parameters")
@@ -29,38 +29,38 @@ def sample_environment(element: str | None = None, *, items: bool = False, befor
     latency (seconds) and size (bytes); parameters are those of the sample's client. `items`: item is the client's item.
     `before`: before is the client's message or item before.
     """
-    fixed = {"msg": Kind.DYN, "key": Kind.MAP, "sample": Kind.MAP, "parameters": Kind.MAP}
+    fixed = {"msg": CelType.DYN, "key": CelType.MAP, "sample": CelType.MAP, "parameters": CelType.MAP}
     if items:
-        fixed["item"] = Kind.DYN
+        fixed["item"] = CelType.DYN
     if before:
-        fixed["before"] = Kind.DYN
-    members = {f"sample.{member}": Kind.DOUBLE for member in SAMPLE_MEMBERS}
+        fixed["before"] = CelType.DYN
+    members = {f"sample.{member}": CelType.DOUBLE for member in SAMPLE_MEMBERS}
     return Environment(_with_element(fixed, element), members)
 
 
 @cache
 def stamp_environment() -> Environment:
     """For a stream's `stamp`: the decoded message, and when the sample was received."""
-    return Environment({"msg": Kind.DYN, "sample": Kind.MAP}, {"sample.received": Kind.DOUBLE})
+    return Environment({"msg": CelType.DYN, "sample": CelType.MAP}, {"sample.received": CelType.DOUBLE})
 
 
 @cache
 def items_environment() -> Environment:
     """For a stream's `items`: the decoded message."""
-    return Environment({"msg": Kind.DYN})
+    return Environment({"msg": CelType.DYN})
 
 
 @cache
 def naming_environment(*, items: bool = False) -> Environment:
     """For a stream's `client`: the decoded message, the captured chunks of its key, and with `items` the item."""
-    return Environment({"msg": Kind.DYN, "key": Kind.MAP, **({"item": Kind.DYN} if items else {})})
+    return Environment({"msg": CelType.DYN, "key": CelType.MAP, **({"item": CelType.DYN} if items else {})})
 
 
 @lru_cache(maxsize=1024)
 def is_taken(name: str) -> bool:
     """Whether the name means something to CEL itself, so that no signal can have it."""
     try:
-        Environment({name: Kind.DYN}).compile(name)
+        Environment({name: CelType.DYN}).compile(name)
     except (ValueError, ExpressionError):
         return True
     return False
@@ -69,26 +69,28 @@ def is_taken(name: str) -> bool:
 @lru_cache(maxsize=256)
 def client_environment(signals: tuple[str, ...] = (), element: str | None = None) -> Environment:
     """For one client: client, labels, streams (those that are not stale), the signals and the element of `each`."""
-    fixed = {"client": Kind.STRING, "labels": Kind.MAP, "streams": Kind.LIST, "parameters": Kind.MAP}
-    return Environment(_with_element({**dict.fromkeys(signals, Kind.DYN), **fixed}, element))
+    fixed = {"client": CelType.STRING, "labels": CelType.MAP, "streams": CelType.LIST, "parameters": CelType.MAP}
+    return Environment(_with_element({**dict.fromkeys(signals, CelType.DYN), **fixed}, element))
 
 
 @lru_cache(maxsize=256)
 def pairs_environment(element: str | None = None) -> Environment:
     """For a pair: a and b (maps of what a client scope has, and position), distance in metres, closingSpeed in m/s."""
-    numbers = {"distance": Kind.DOUBLE, "closingSpeed": Kind.DOUBLE}
-    return Environment(_with_element({"a": Kind.MAP, "b": Kind.MAP, "parameters": Kind.MAP, **numbers}, element))
+    numbers = {"distance": CelType.DOUBLE, "closingSpeed": CelType.DOUBLE}
+    return Environment(
+        _with_element({"a": CelType.MAP, "b": CelType.MAP, "parameters": CelType.MAP, **numbers}, element)
+    )
 
 
 @lru_cache(maxsize=256)
 def fleet_environment(element: str | None = None) -> Environment:
     """For the fleet: members (a list of maps of what a client scope has)."""
-    return Environment(_with_element({"members": Kind.LIST, "parameters": Kind.MAP}, element))
+    return Environment(_with_element({"members": CelType.LIST, "parameters": CelType.MAP}, element))
 
 
-def _with_element(variables: dict[str, Kind], name: str | None) -> dict[str, Kind]:
+def _with_element(variables: dict[str, CelType], name: str | None) -> dict[str, CelType]:
     """Adds the element of `each`; an element with an invalid name is skipped, and reported elsewhere."""
-    return variables if name is None or name in variables or is_taken(name) else {**variables, name: Kind.MAP}
+    return variables if name is None or name in variables or is_taken(name) else {**variables, name: CelType.MAP}
 
 
 def element_of(spec: EventRuleSpec) -> str | None:
@@ -118,7 +120,7 @@ def condition_environment(spec: EventRuleSpec) -> Environment:
 @lru_cache(maxsize=256)
 def _with(environment: Environment, whole: tuple[str, ...]) -> Environment:
     """And the signals that the subject has as a whole."""
-    return Environment({**environment.variables, **dict.fromkeys(whole, Kind.DYN)})
+    return Environment({**environment.variables, **dict.fromkeys(whole, CelType.DYN)})
 
 
 def _scope_environment(spec: EventRuleSpec) -> Environment:

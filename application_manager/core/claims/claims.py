@@ -17,11 +17,11 @@ from application_manager.core.claims import parameters, values
 from wayside.api import ApplicationTask, ApplicationTemplate
 from wayside.api.operation import Operation
 from wayside.expressions import (
+    CelType,
     CompiledTemplate,
     Embedded,
     Environment,
     InterpolationError,
-    Kind,
     compile_template,
 )
 from wayside.expressions.errors import position
@@ -217,7 +217,7 @@ def key_parameters(template: ApplicationTemplate) -> frozenset[str]:
 
 @lru_cache(maxsize=1024)
 def _compiled_key(source: str, declared: tuple[str, ...]) -> CompiledTemplate:
-    environment, check = Environment({"parameters": Kind.MAP}), partial(unknown_members, {"parameters": declared})
+    environment, check = Environment({"parameters": CelType.MAP}), partial(unknown_members, {"parameters": declared})
     return compile_template(source, environment, path="spec.key", check=check)
 
 

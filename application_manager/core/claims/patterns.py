@@ -10,11 +10,11 @@ from functools import lru_cache
 from typing import Any
 
 from application_manager.core.claims import values
-from wayside.expressions import Environment, Expression, ExpressionError, Kind
+from wayside.expressions import CelType, Environment, Expression, ExpressionError
 from wayside.expressions.errors import EvaluationError
 from wayside.expressions.regex import LARGEST_PATTERN, LONGEST_INPUT, pattern_size
 
-_ENVIRONMENT = Environment({"text": Kind.STRING})
+_ENVIRONMENT = Environment({"text": CelType.STRING})
 
 
 def pattern_problem(pattern: str) -> str | None:
@@ -48,4 +48,4 @@ def mismatch(pattern: str, value: Any) -> str | None:
 @lru_cache(maxsize=256)
 def _matcher(pattern: str) -> Expression:
     literal = json.dumps(pattern, ensure_ascii=False)
-    return _ENVIRONMENT.compile(f"text.matches({literal})", result=Kind.BOOL)
+    return _ENVIRONMENT.compile(f"text.matches({literal})", result=CelType.BOOL)

@@ -34,7 +34,7 @@ def is_held(instance: ApplicationInstance) -> bool:
     return _reason(instance, HOLD_ANNOTATION) is not None
 
 
-def aspects(instance: ApplicationInstance) -> Iterator[Aspect]:
+def manual_aspects(instance: ApplicationInstance) -> Iterator[Aspect]:
     """The conditions Paused and Held: True while the annotation is there, False once it is gone, absent before."""
     known = instance.status.conditions if instance.status else ()
     for type_, annotation, meaning in _CONDITIONS:

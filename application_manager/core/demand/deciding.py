@@ -20,7 +20,7 @@ from application_manager.core.demand import byhand
 from application_manager.core.demand.decisions import Decision, is_managed
 from application_manager.core.demand.fallback import Fallback, fallback, fallback_of, overdue
 from application_manager.core.demand.lingering import linger_of, protected_until
-from application_manager.core.demand.places import BASELINE_RANK, Placement, Request
+from application_manager.core.demand.places import BASELINE_RANK, Placement, PlaceRequest
 from application_manager.core.demand.placing import PREEMPTED, candidate, placed
 from application_manager.core.holders.lapses import live_claims
 from application_manager.core.holders.leases import LeaseView
@@ -101,13 +101,13 @@ def decide_without_limits(name: str, indexes: Indexes, now: float) -> Decision |
     return decision
 
 
-def request(name: str, unlimited: Decision | None, indexes: Indexes, *, being_made: bool = False) -> Request:
+def request(name: str, unlimited: Decision | None, indexes: Indexes, *, being_made: bool = False) -> PlaceRequest:
     """What an instance requests of the limits; `being_made`: the API server may have it already."""
     if unlimited is None:
-        return Request(None, None)
+        return PlaceRequest(None, None)
     template = indexes.template(unlimited.template)
     wanted = candidate(unlimited, indexes.instance(name), template, being_made=being_made)
-    return Request(wanted, unlimited.next_change)
+    return PlaceRequest(wanted, unlimited.next_change)
 
 
 def fallback_claims(instance: ApplicationInstance, indexes: Indexes, now: float) -> Fallback | None:

@@ -23,7 +23,7 @@ BASELINE_RANK: Rank = (1_000_001, "", "")
 
 
 @dataclass(frozen=True, slots=True)
-class Candidate:
+class PlaceCandidate:
     """An instance that is demanded, or there.
 
     Attributes:
@@ -70,7 +70,7 @@ class Limits:
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class GrantedPlace:
     """What an instance gets.
 
     Attributes:
@@ -98,7 +98,7 @@ class Place:
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class PlaceRequest:
     """What an instance requests of the limits.
 
     Attributes:
@@ -106,11 +106,11 @@ class Request:
         next_change: when that changes by itself, in seconds since 1970; None: not at all.
     """
 
-    candidate: Candidate | None
+    candidate: PlaceCandidate | None
     next_change: float | None
 
 
-_NOTHING = Request(None, None)
+_NOTHING = PlaceRequest(None, None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,8 +122,8 @@ class Placement:
     """
 
     limits: Limits
-    requests: Mapping[str, Request] = field(default_factory=dict)
-    given: Mapping[str, Place] = field(default_factory=dict)
+    requests: Mapping[str, PlaceRequest] = field(default_factory=dict)
+    given: Mapping[str, GrantedPlace] = field(default_factory=dict)
     until: float = -math.inf
 
     def due(self, now: float) -> set[str]:
@@ -131,7 +131,7 @@ class Placement:
         times = ((name, each.next_change) for name, each in self.requests.items())
         return {name for name, when in times if when is not None and when <= now}
 
-    def updated(self, requests: Mapping[str, Request], limits: Limits, now: float) -> Placement:
+    def updated(self, requests: Mapping[str, PlaceRequest], limits: Limits, now: float) -> Placement:
         """The placement with these requests in place of the instances' former ones."""
         changed = {name: each for name, each in requests.items() if self.requests.get(name, _NOTHING) != each}
         stale = now >= self.until or limits != self.limits
@@ -148,13 +148,13 @@ class Placement:
 
     def moved(self, before: Placement | None) -> set[str]:
         """The instances whose place is another than before."""
-        then: Mapping[str, Place] = before.given if before is not None else {}
+        then: Mapping[str, GrantedPlace] = before.given if before is not None else {}
         if then is self.given:
             return set()
         return {name for name in self.given.keys() | then.keys() if self.given.get(name) != then.get(name)}
 
 
-def places(candidates: Iterable[Candidate], limits: Limits, now: float) -> dict[str, Place]:
+def places(candidates: Iterable[PlaceCandidate], limits: Limits, now: float) -> dict[str, GrantedPlace]:
     """What each candidate of one namespace gets, by name; `now` in seconds since 1970."""
     everybody = sorted(candidates, key=lambda each: each.name)
     fixed = [each for each in everybody if _is_fixed(each, now)]
@@ -174,12 +174,14 @@ def places(candidates: Iterable[Candidate], limits: Limits, now: float) -> dict[
     losers = [each for each in free if each.name in beyond and each.rank is not None]
     by = _preemptions(chosen, losers, limits)
     victims = {winner.name: loser for loser, winner in by.values()}
-    result = {each.name: Place(given=False, limit=beyond[each.name]) for each in free if each.name in beyond}
-    result |= {each.name: Place(preempts=victims[each.name].text if each.name in victims else "") for each in chosen}
+    result = {each.name: GrantedPlace(given=False, limit=beyond[each.name]) for each in free if each.name in beyond}
+    result |= {
+        each.name: GrantedPlace(preempts=victims[each.name].text if each.name in victims else "") for each in chosen
+    }
     bars, none = _bars(chosen, limits, now), _Bar(None, None)
     for each in losers:
         bar = bars.get("" if limits.namespace is not None else each.template, none)
-        result[each.name] = Place(
+        result[each.name] = GrantedPlace(
             given=False,
             limit=beyond[each.name],
             yields_to=by[each.name][1].text if each.name in by else "",
@@ -190,11 +192,11 @@ def places(candidates: Iterable[Candidate], limits: Limits, now: float) -> dict[
     return result
 
 
-def _is_fixed(each: Candidate, now: float) -> bool:
+def _is_fixed(each: PlaceCandidate, now: float) -> bool:
     return each.exists and not each.leaving and (each.kept or now < each.protected_until)
 
 
-def _order(each: Candidate) -> tuple[object, ...]:
+def _order(each: PlaceCandidate) -> tuple[object, ...]:
     if each.rank is None:
         return (1, -(each.deadline or 0.0), False, "", "", each.name)
     negated, created, task = each.rank
@@ -209,11 +211,11 @@ class _Room:
         self._taken: Counter[str] = Counter()
         self._total = 0
 
-    def take(self, each: Candidate) -> None:
+    def take(self, each: PlaceCandidate) -> None:
         self._taken[each.template] += 1
         self._total += 1
 
-    def lacks(self, each: Candidate) -> str:
+    def lacks(self, each: PlaceCandidate) -> str:
         """The limit that leaves no room for it, in words; empty where there is room."""
         own, all_ = self._limits.templates.get(each.template), self._limits.namespace
         if own is not None and self._taken[each.template] >= own:
@@ -227,7 +229,7 @@ def _instances(count: int) -> str:
     return "1 instance" if count == 1 else f"{count} instances"
 
 
-def _rivals(each: Candidate, others: Iterable[Candidate], limits: Limits) -> Iterator[Candidate]:
+def _rivals(each: PlaceCandidate, others: Iterable[PlaceCandidate], limits: Limits) -> Iterator[PlaceCandidate]:
     """Those that take places from the same limit."""
     for other in others:
         if other.name != each.name and (limits.namespace is not None or other.template == each.template):
@@ -235,13 +237,13 @@ def _rivals(each: Candidate, others: Iterable[Candidate], limits: Limits) -> Ite
 
 
 def _preemptions(
-    chosen: list[Candidate], losers: list[Candidate], limits: Limits
-) -> dict[str, tuple[Candidate, Candidate]]:
+    chosen: list[PlaceCandidate], losers: list[PlaceCandidate], limits: Limits
+) -> dict[str, tuple[PlaceCandidate, PlaceCandidate]]:
     """By the name of each that ran and has no place any more, itself and who has its place.
 
     The last in order gives way to the first of those that came after it with a higher priority.
     """
-    found: dict[str, tuple[Candidate, Candidate]] = {}
+    found: dict[str, tuple[PlaceCandidate, PlaceCandidate]] = {}
     left = sorted((each for each in chosen if each.rank is not None), key=_order)
     for loser in reversed(losers):
         if not loser.ran or loser.rank is None:
@@ -267,9 +269,9 @@ class _Bar:
     next_change: float | None
 
 
-def _bars(chosen: Iterable[Candidate], limits: Limits, now: float) -> dict[str, _Bar]:
+def _bars(chosen: Iterable[PlaceCandidate], limits: Limits, now: float) -> dict[str, _Bar]:
     """By template; by an empty name that of all together, where the namespace has a limit."""
-    groups: dict[str, list[Candidate]] = {}
+    groups: dict[str, list[PlaceCandidate]] = {}
     for each in chosen:
         groups.setdefault("" if limits.namespace is not None else each.template, []).append(each)
     found = {}
@@ -283,8 +285,8 @@ def _bars(chosen: Iterable[Candidate], limits: Limits, now: float) -> dict[str, 
 
 
 def _waiting(
-    everybody: list[Candidate], chosen: list[Candidate], so_far: Mapping[str, Place], limits: Limits
-) -> dict[str, Place]:
+    everybody: list[PlaceCandidate], chosen: list[PlaceCandidate], so_far: Mapping[str, GrantedPlace], limits: Limits
+) -> dict[str, GrantedPlace]:
     """The places of those that are to run, and wait until others are gone."""
     room = _Room(limits)
     for each in everybody:
@@ -295,7 +297,7 @@ def _waiting(
     for each in sorted((each for each in chosen if not each.exists), key=_order):
         if room.lacks(each):
             names = ", ".join(other.name for other in _rivals(each, going, limits))
-            found[each.name] = Place(preempts=so_far[each.name].preempts, awaits=names or "another")
+            found[each.name] = GrantedPlace(preempts=so_far[each.name].preempts, awaits=names or "another")
         else:
             room.take(each)
     return found

@@ -10,7 +10,7 @@ from application_manager.core.claims.operations import NOTHING_RUNS, Standing, V
 from application_manager.core.demand import byhand
 from application_manager.core.demand.decisions import Decision, is_managed
 from application_manager.core.demand.lingering import protected_until
-from application_manager.core.demand.places import Candidate, Limits, Place
+from application_manager.core.demand.places import GrantedPlace, Limits, PlaceCandidate
 from wayside.api import ApplicationInstance, ApplicationTemplate
 from wayside.times import format_seconds
 
@@ -37,7 +37,7 @@ def candidate(
     template: ApplicationTemplate | InvalidTemplate | None,
     *,
     being_made: bool = False,
-) -> Candidate | None:
+) -> PlaceCandidate | None:
     """What the decision requests; None where that is nothing, or the instance is a person's, beyond all limits."""
     if instance is not None and not is_managed(instance):
         return None
@@ -46,7 +46,7 @@ def candidate(
     kept = instance is not None and (
         decision.paused or byhand.is_held(instance) or (not decision.wanted and decision.release_time is None)
     )
-    return Candidate(
+    return PlaceCandidate(
         name=decision.name,
         template=decision.template,
         rank=decision.rank,
@@ -59,7 +59,7 @@ def candidate(
     )
 
 
-def placed(decision: Decision, place: Place | None, *, exists: bool, now: float) -> Decision:
+def placed(decision: Decision, place: GrantedPlace | None, *, exists: bool, now: float) -> Decision:
     """What becomes of the decision with the place that its instance got; None: no limit concerns it."""
     if place is None:
         return decision
@@ -90,7 +90,7 @@ def placed(decision: Decision, place: Place | None, *, exists: bool, now: float)
     )
 
 
-def _why(decision: Decision, place: Place) -> tuple[str, str]:
+def _why(decision: Decision, place: GrantedPlace) -> tuple[str, str]:
     if place.given:
         instead = f" in place of {place.preempts}, which it preempts," if place.preempts else ""
         return LIMIT_REACHED, f"instance {decision.name} starts{instead} as soon as {place.awaits} is gone"

@@ -15,7 +15,7 @@ from typing import Any
 from application_manager.core.findings.reviews import REVIEW_VERSION, Json, ReviewError, shortened
 from application_manager.core.findings.rulefindings import detector_findings
 from application_manager.core.objects.poddefaults import PodDefaults
-from application_manager.core.objects.sidecars import SIDECAR_LABEL, Addition, UnfitError, addition, patch
+from application_manager.core.objects.sidecars import SIDECAR_LABEL, Addition, SidecarError, addition, patch
 from wayside.api import Detector
 from wayside.api.pod import DetectorMode
 
@@ -89,7 +89,7 @@ def injection(
         return Injection(why_not=why_not)
     try:
         return Injection(addition(spec, detector, defaults))
-    except UnfitError as error:
+    except SidecarError as error:
         return Injection(why_not=str(error))
 
 

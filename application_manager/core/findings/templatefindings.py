@@ -21,19 +21,19 @@ from application_manager.core.objects.rendering import Renderer, RenderError
 from wayside.api import ApplicationInstance, ApplicationTemplate
 from wayside.api.base import Metadata
 from wayside.api.parameter import Parameter, ParameterType
-from wayside.expressions import Environment, InterpolationError, Kind, compile_template
+from wayside.expressions import CelType, Environment, InterpolationError, compile_template
 from wayside.expressions.syntax import Path
 from wayside.findings import Finding, ignored_by
 
-_KINDS: Mapping[ParameterType, Kind] = {
-    ParameterType.STRING: Kind.STRING,
-    ParameterType.NUMBER: Kind.DOUBLE,
-    ParameterType.INTEGER: Kind.DOUBLE,
-    ParameterType.BOOLEAN: Kind.BOOL,
-    ParameterType.ARRAY: Kind.LIST,
-    ParameterType.OBJECT: Kind.MAP,
+_KINDS: Mapping[ParameterType, CelType] = {
+    ParameterType.STRING: CelType.STRING,
+    ParameterType.NUMBER: CelType.DOUBLE,
+    ParameterType.INTEGER: CelType.DOUBLE,
+    ParameterType.BOOLEAN: CelType.BOOL,
+    ParameterType.ARRAY: CelType.LIST,
+    ParameterType.OBJECT: CelType.MAP,
 }
-_VARIABLES = {"parameters": Kind.MAP, "instance": Kind.MAP}
+_VARIABLES = {"parameters": CelType.MAP, "instance": CelType.MAP}
 _NAMES = "metadata.name"
 
 Reads = Iterable[tuple[str, frozenset[Path]]]

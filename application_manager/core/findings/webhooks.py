@@ -26,7 +26,7 @@ _URL = re.compile(r"https://(\[[0-9a-fA-F:]+\]|[^/:?#@\s]+)(:[0-9]{1,5})?")
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class WebhookClientConfig:
     """Where the API server finds the manager: a Service, or a URL.
 
     Attributes:
@@ -77,7 +77,7 @@ def certificate_secret(service: str) -> tuple[str, str]:
 
 
 def webhook_configuration(
-    place: Place, authority: bytes | None, namespaces: Sequence[str] = (), name: str = "wayside"
+    place: WebhookClientConfig, authority: bytes | None, namespaces: Sequence[str] = (), name: str = "wayside"
 ) -> dict[str, Any]:
     """What makes the API server ask about templates, rules and detectors.
 
@@ -109,7 +109,7 @@ def webhook_configuration(
 
 
 def injection_configuration(
-    place: Place, authority: bytes | None, namespaces: Sequence[str] = (), name: str = "wayside"
+    place: WebhookClientConfig, authority: bytes | None, namespaces: Sequence[str] = (), name: str = "wayside"
 ) -> dict[str, Any]:
     """What makes the API server ask about pods that are to have a detector; the arguments are as above."""
     webhook: dict[str, Any] = {

@@ -32,7 +32,7 @@ _ANCIENT = float("-inf")
 
 
 @dataclass(slots=True)
-class Candidate:
+class LeaseCandidate:
     """What one manager knows of the Lease, and until when it may act. Times are seconds of its monotonic clock.
 
     Attributes:

@@ -96,7 +96,7 @@ def no_charts(request: ChartRequest) -> ChartOutcome:
     return ChartFailure(UNAVAILABLE, f"spec.helm: chart {request.source} cannot be rendered here: there is no helm")
 
 
-def parse(source: ChartSource, text: str) -> ChartOutcome:
+def parse_chart(source: ChartSource, text: str) -> ChartOutcome:
     """The objects in what `helm template --include-crds` wrote, or why they cannot be used."""
     objects: list[ChartObject] = []
     problems: list[str] = []

@@ -13,7 +13,7 @@ from pathlib import PurePosixPath
 from typing import Any
 
 from application_manager.core.objects.poddefaults import PodDefaults
-from application_manager.core.objects.rights import bound, detector_rights, merged, sidecar_rights
+from application_manager.core.objects.rights import bound, detector_rights, merged_rules, sidecar_rights
 from wayside.api import API_VERSION, Detector
 from wayside.api.pod import OF_ITS_OWN_POD, DetectorMode, DetectorPod
 
@@ -56,13 +56,13 @@ def detector_roles(namespace: str, detector: str) -> list[Manifest]:
         "metadata": {"name": name, "namespace": namespace},
         "automountServiceAccountToken": False,
     }
-    return [account, *bound(name, namespace, merged(detector_rights(detector)), (namespace, name))]
+    return [account, *bound(name, namespace, merged_rules(detector_rights(detector)), (namespace, name))]
 
 
 def sidecar_roles(namespace: str, detector: str, accounts: Iterable[str]) -> list[Manifest]:
     """The Role and the RoleBinding with what the detector needs in others' pods, for their accounts and no others."""
     whose = [(namespace, each) for each in sorted(set(accounts))]
-    return list(bound(object_name(detector), namespace, merged(sidecar_rights(detector)), *whose))
+    return list(bound(object_name(detector), namespace, merged_rules(sidecar_rights(detector)), *whose))
 
 
 def detector_objects(detector: Detector, defaults: PodDefaults) -> list[Manifest]:

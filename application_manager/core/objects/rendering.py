@@ -25,11 +25,11 @@ from application_manager.core.objects.suspension import stated_replicas, stopped
 from wayside.api import ApplicationInstance, ApplicationTemplate
 from wayside.api.base import API_VERSION
 from wayside.api.chart import Helm
-from wayside.expressions import CompiledTemplate, Embedded, Environment, InterpolationError, Kind, compile_template
+from wayside.expressions import CelType, CompiledTemplate, Embedded, Environment, InterpolationError, compile_template
 
 _INSTANCE_VARIABLES = ("name", "key", "namespace")
 _WITH_CONFIGURATION = (*_INSTANCE_VARIABLES, "configMap")
-_ENVIRONMENT = Environment({"parameters": Kind.MAP, "instance": Kind.MAP})
+_ENVIRONMENT = Environment({"parameters": CelType.MAP, "instance": CelType.MAP})
 _RESERVED_METADATA = ("ownerReferences", "generateName", "uid", "resourceVersion", "managedFields", "finalizers")
 
 _NAME = re.compile(

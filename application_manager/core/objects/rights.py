@@ -69,7 +69,7 @@ def rights(plurals: Mapping[KindKey, str], *, detectors: bool = False) -> list[R
     return [*_own(), *_children(plurals), *(_running_detectors() if detectors else ())]
 
 
-def reading(needed: Iterable[Right]) -> list[Right]:
+def read_only(needed: Iterable[Right]) -> list[Right]:
     """What of the rights changes nothing: all that a manager of all namespaces has in each of them."""
     return _narrowed(needed, lambda verb: verb in _READING)
 
@@ -230,20 +230,20 @@ def roles(
     needed = rights(plurals, detectors=detectors)
     found: list[dict[str, Any]] = []
     for namespace in where:
-        found += bound(name, namespace, merged(needed), account)
+        found += bound(name, namespace, merged_rules(needed), account)
     if not where:
-        found += bound(name, None, merged([*reading(needed), *node_rights()]), account)
-        found.append(_role(f"{name}-writer", None, merged(writing(needed))))
+        found += bound(name, None, merged_rules([*read_only(needed), *node_rights()]), account)
+        found.append(_role(f"{name}-writer", None, merged_rules(writing(needed))))
         found += [_binding(name, each, ("ClusterRole", f"{name}-writer"), account) for each in dict.fromkeys(granted)]
     if certificates is not None:
         (namespace, secret), webhooks = certificates
         there, everywhere = certificate_rights(secret, webhooks)
-        found += bound(f"{name}-certificates", namespace, merged(there), account)
-        found += bound(f"{name}-certificates", None, merged(everywhere), account)
-    return [*found, *bound(f"{name}-lease", lease[0], merged(lease_rights(lease[1])), account)]
+        found += bound(f"{name}-certificates", namespace, merged_rules(there), account)
+        found += bound(f"{name}-certificates", None, merged_rules(everywhere), account)
+    return [*found, *bound(f"{name}-lease", lease[0], merged_rules(lease_rights(lease[1])), account)]
 
 
-def merged(needed: Iterable[Right]) -> list[dict[str, Any]]:
+def merged_rules(needed: Iterable[Right]) -> list[dict[str, Any]]:
     """As few rules as possible: resources of a group with the same verbs are one."""
     verbs: dict[tuple[str, str, str], dict[str, None]] = {}
     for each in needed:

@@ -48,7 +48,7 @@ class Addition:
     items: dict[str, list[Manifest]]
 
 
-class UnfitError(ValueError):
+class SidecarError(ValueError):
     """With the sidecar the pod would not be valid, and would not be made at all."""
 
 
@@ -61,7 +61,7 @@ def addition(spec: Mapping[str, Any], detector: Detector, defaults: PodDefaults)
         defaults: what holds for all detectors.
 
     Raises:
-        UnfitError: they do not go together.
+        SidecarError: they do not go together.
     """
     if has_sidecar(spec):
         return None
@@ -71,11 +71,11 @@ def addition(spec: Mapping[str, Any], detector: Detector, defaults: PodDefaults)
     paths = [each["mountPath"].rstrip("/") for each in mounts]
     for path in paths:
         if paths.count(path) > 1:
-            raise UnfitError(f"Detector {detector.name} has two volumes at {path}: give its folder another path")
+            raise SidecarError(f"Detector {detector.name} has two volumes at {path}: give its folder another path")
     there = {each.get("name"): each for each in _list(spec, "volumes")}
     for each in volumes:
         if each["name"] in there and there[each["name"]] != each:
-            raise UnfitError(
+            raise SidecarError(
                 f"spec.volumes: the name {each['name']} is taken, and the detector needs it: rename the pod's volume"
             )
     keys = {each.get("name") for each in _list(spec, "imagePullSecrets")}

@@ -23,7 +23,7 @@ from application_manager.core.health.readiness import not_ready
 from application_manager.core.holders.lapses import HOLDER_LOST
 from application_manager.core.holders.leases import LeaseView
 from application_manager.core.statuses.explanation import (
-    Contribution,
+    ExplainedContribution,
     ExplainedInstance,
     ExplainedObject,
     ExplainedParameter,
@@ -246,7 +246,7 @@ def _parameters(
         value = merged.get(name)
         layered = any(each.name in changing and each.spec.parameters.get(name) is not None for each in tasks)
         contributions = [
-            Contribution(task=each.name, value=each.spec.parameters[name], effect="outbid", why=_BELOW)
+            ExplainedContribution(task=each.name, value=each.spec.parameters[name], effect="outbid", why=_BELOW)
             if layered and each.name in counting
             else _contribution(
                 each, each.spec.parameters[name], value, parameter.merge, counts=each.name in counting | changing
@@ -277,14 +277,16 @@ def _parameters(
     return result
 
 
-def _contribution(task: ApplicationTask, given: Any, value: Any, merge: Merge, *, counts: bool) -> Contribution:
+def _contribution(
+    task: ApplicationTask, given: Any, value: Any, merge: Merge, *, counts: bool
+) -> ExplainedContribution:
     if not counts:
-        return Contribution(task=task.name, value=given, effect="none", why="the task does not count")
+        return ExplainedContribution(task=task.name, value=given, effect="none", why="the task does not count")
     if values.canonical(values.normal(given)) == values.canonical(value):
-        return Contribution(task=task.name, value=given, effect="decides")
+        return ExplainedContribution(task=task.name, value=given, effect="decides")
     if merge in _LATER:
-        return Contribution(task=task.name, value=given, effect="outbid", why=_LATER[merge])
-    return Contribution(task=task.name, value=given, effect="part")
+        return ExplainedContribution(task=task.name, value=given, effect="outbid", why=_LATER[merge])
+    return ExplainedContribution(task=task.name, value=given, effect="part")
 
 
 def _object(key: tuple[str, str, str], live: Object | None) -> ExplainedObject:

@@ -12,7 +12,7 @@ from pydantic import Field
 from wayside.api.base import Model
 
 
-class Contribution(Model):
+class ExplainedContribution(Model):
     """What one task gives for one parameter, and what came of it.
 
     `effect` is `decides` (the merged value is this one), `part` (it is in it), `outbid` (another value counts), or
@@ -37,7 +37,7 @@ class ExplainedParameter(Model):
     value: Any = None
     source: str
     note: str | None = None
-    contributions: list[Contribution] = Field(default_factory=list)
+    contributions: list[ExplainedContribution] = Field(default_factory=list)
 
 
 class ExplainedTask(Model):

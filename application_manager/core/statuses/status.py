@@ -212,7 +212,7 @@ def instance_status(
                     *([suspended] if suspended else []),
                     *_capped(old.conditions, decision),
                     *fallback.aspects(old.conditions, decision.overdue, decision.fallback, decision.stands_in_for),
-                    *byhand.aspects(instance),
+                    *byhand.manual_aspects(instance),
                 ),
                 generation,
                 now,

@@ -17,14 +17,14 @@ from detector.actions.database.documents import Documents, Made
 from detector.actions.database.episodes import Writing
 from detector.actions.database.folder import AttachmentFolder, FolderError
 from detector.actions.database.scenario import Scenario
-from detector.actions.database.store import Store
+from detector.actions.database.store import DatabaseWriter
 from detector.actions.database.stores import acquire, release
-from detector.actions.database.values import encoded
+from detector.actions.database.values import bson_bytes
 from detector.actions.database.work import BATCH_BYTES, BATCH_DOCUMENTS, Write
 from detector.actions.episode import Completion, Episode, EpisodeSample, Outcome, OutcomeState
 from wayside.api.actions.database import Attachments, DatabaseAction
 from wayside.api.base import JsonValue
-from wayside.api.database import Database as Place
+from wayside.api.database import DatabaseConnection as Place
 
 _log = logging.getLogger(__name__)
 
@@ -49,7 +49,7 @@ class Database(Action[DatabaseAction]):
     def __init__(self, parameters: DatabaseAction, setting: Setting) -> None:
         super().__init__(parameters, setting)
         self._place: Place | None = None
-        self._store: Store | None = None
+        self._store: DatabaseWriter | None = None
         self._folder: AttachmentFolder | None = None
         self._writings: dict[str, Writing] = {}
         self._batches: dict[str, _Batch] = {}
@@ -145,7 +145,7 @@ class Database(Action[DatabaseAction]):
         if not without:
             return made.document
         missing = [{"file": path, "error": why} for path, why in without.items()]
-        return encoded({**bson.decode(made.document), "filesMissing": missing})
+        return bson_bytes({**bson.decode(made.document), "filesMissing": missing})
 
     def _flush(self, collection: str) -> None:
         """Enqueue the documents of a collection."""

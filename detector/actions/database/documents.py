@@ -15,7 +15,7 @@ from bson import Binary, Int64
 from bson.datetime_ms import DatetimeMS
 
 from detector.actions.database.attachments import Attachment, detach
-from detector.actions.database.values import UnfitError, encoded
+from detector.actions.database.values import UnfitError, bson_bytes
 from detector.actions.episode import EpisodeSample
 from detector.engine.samples.sample import DecodeError, Decoder, NearDecoder
 from wayside.api.stream import Stream
@@ -112,7 +112,7 @@ class Documents:
         """The document; if it is too large, one that refers to the payload or lists the omitted fields."""
         collection = collection_of(stream)
         try:
-            made = encoded(document)
+            made = bson_bytes(document)
             if len(made) <= LARGEST:
                 return Made(collection, made, files, undecoded=undecoded)
             reason = f"the document would have {len(made)} bytes; MongoDB accepts at most {LARGEST}"
@@ -123,9 +123,9 @@ class Documents:
         if self.above is not None:
             whole = Attachment(f"{self._path(sample, identity)}.{stream.encoding}", sample.payload)
             document |= {"payload": whole.reference(), "note": f"the message is in a file: {reason}"}
-            return Made(collection, encoded(document), (whole,), undecoded=undecoded)
+            return Made(collection, bson_bytes(document), (whole,), undecoded=undecoded)
         document["cut"] = reason
-        return Made(collection, encoded(document), cut=reason, undecoded=undecoded)
+        return Made(collection, bson_bytes(document), cut=reason, undecoded=undecoded)
 
     def _path(self, sample: EpisodeSample, identity: bytes) -> str:
         return f"{self.place}/{sample.stream}/{sample.client}/{sample.time}-{identity[8:14].hex()}"

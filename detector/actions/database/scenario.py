@@ -15,7 +15,7 @@ from typing import Any
 from bson import Int64
 from bson.datetime_ms import DatetimeMS
 
-from detector.actions.database.values import plain
+from detector.actions.database.values import bson_values
 from detector.actions.database.work import Write
 from detector.actions.episode import Completion, Episode
 from wayside.api import Detector, EventRule
@@ -95,7 +95,7 @@ def begin(scenario: Scenario, episode: Episode, metadata: Mapping[str, JsonValue
         "onset": DatetimeMS(episode.onset_time // 1_000_000),
         "onsetTime": Int64(episode.onset_time),
         "startTime": Int64(episode.start_time),
-        **plain({"values": episode.values, "metadata": metadata}),
+        **bson_values({"values": episode.values, "metadata": metadata}),
         "complete": False,
         "rejected": False,
     }
@@ -138,7 +138,7 @@ def finish(
     known: dict[str, Any] = {
         "endTime": None if episode.end_time is None else Int64(episode.end_time),
         "reason": episode.reason,
-        **({} if episode.ended is None else plain({"endValues": episode.ended["data"]["values"]})),
+        **({} if episode.ended is None else bson_values({"endValues": episode.ended["data"]["values"]})),
         "clients": sorted(scenario.clients),
         "since": Int64(min((first for first, _, _ in scenario.clients.values()), default=0)),
         "until": Int64(max((last for _, last, _ in scenario.clients.values()), default=0)),

@@ -55,7 +55,7 @@ class WriteRefusedError(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Refused:
+class RefusedWrite:
     """One document or change that the server does not take."""
 
     index: int
@@ -115,7 +115,7 @@ class Server:
         except (PyMongoError, ValueError, TypeError, Warning) as error:
             raise ValueError(self.redact(error)) from None
 
-    def write(self, write: Write) -> tuple[int, list[Refused]]:
+    def write(self, write: Write) -> tuple[int, list[RefusedWrite]]:
         """Do it: how many documents changes have matched, and what was refused of it; all else is done.
 
         Raises DatabaseUnavailableError, WriteRefusedError.
@@ -155,7 +155,7 @@ class Server:
         except (BSONError, OverflowError, ValueError, TypeError) as error:
             raise WriteRefusedError(self.redact(error)) from None
 
-    def _insert(self, write: Write) -> tuple[int, list[Refused]]:
+    def _insert(self, write: Write) -> tuple[int, list[RefusedWrite]]:
         collection = self._client.get_database(write.database, write_concern=self._concern)[write.collection]
         if (write.database, write.collection) not in self._indexed:
             try:
@@ -166,7 +166,7 @@ class Server:
         collection.insert_many([RawBSONDocument(document) for document in write.documents], ordered=False)
         return len(write.documents), []
 
-    def _change(self, write: Write) -> tuple[int, list[Refused]]:
+    def _change(self, write: Write) -> tuple[int, list[RefusedWrite]]:
         requests = [
             UpdateMany(each["find"], each["change"])
             if each["many"]
@@ -177,7 +177,7 @@ class Server:
         done = collection.bulk_write(requests, ordered=False)
         return done.matched_count, []
 
-    def _refused(self, details: Mapping[str, Any], *, inserting: bool) -> list[Refused]:
+    def _refused(self, details: Mapping[str, Any], *, inserting: bool) -> list[RefusedWrite]:
         """What of a request was refused; that a document is there already is as it should be.
 
         Raises DatabaseUnavailableError if the rest is not safe yet, or another client made the same at the same time.
@@ -185,7 +185,7 @@ class Server:
         if not inserting and any(_there_already(each) for each in details.get("writeErrors", ())):
             raise DatabaseUnavailableError("another client is writing the same document")
         refused = [
-            Refused(int(each["index"]), self.redact(each.get("errmsg", "")))
+            RefusedWrite(int(each["index"]), self.redact(each.get("errmsg", "")))
             for each in details.get("writeErrors", ())
             if not _there_already(each)
         ]

@@ -7,7 +7,6 @@ found among what it takes. One queue and one thread serve all database actions o
 from __future__ import annotations
 
 import logging
-import random
 import threading
 import time
 from collections.abc import Callable
@@ -20,11 +19,12 @@ from detector.actions.database.queue import Queue
 from detector.actions.database.server import DatabaseUnavailableError, Server, WriteRefusedError
 from detector.actions.database.spool import Spool
 from detector.actions.database.work import Write
+from wayside.backoff import Backoff
 
 _log = logging.getLogger(__name__)
 
-_LONGEST = 5.0
-"""Maximum seconds between two attempts."""
+_FIRST, _LONGEST = 0.1, 5.0
+"""Seconds between two attempts."""
 _SUSPECT = 3
 """Number of connections lost with one request, while the server answers others, after which the request is to blame."""
 
@@ -41,7 +41,7 @@ Confirm = Callable[[bool, str], None]
 """Called with whether a scenario is complete in the database, and the reason if it is not."""
 
 
-class Store:
+class DatabaseWriter:
     """The queue, and the thread that empties it."""
 
     def __init__(self, server: Server, spool: Spool | None, lose: Callable[[str, int, str], None]) -> None:
@@ -158,7 +158,7 @@ class Store:
 
         `patience`: after this number of connections lost with it, the documents to blame are searched.
         """
-        pause, broke = 0.05, 0
+        backoff, broke = Backoff(_FIRST, _LONGEST), 0
         while True:
             try:
                 doubts = self._doubts or self._queue.damaged or self._queue.inherited
@@ -172,10 +172,9 @@ class Store:
                 if broke >= patience:
                     return self._divide(write, "the server closes the connection when it receives it")
                 if error.broke and broke:
-                    pause = 0.05  # it is there
-                if not self._pause(pause * random.uniform(0.7, 1.3)):  # noqa: S311  no secret
+                    backoff.succeed()  # it is there
+                if not self._pause(backoff.fail()):
                     return False
-                pause = min(_LONGEST, pause * 2)
                 continue
             self._note_back()
             self.written += len(write.documents) - (len(refused) if write.documents else 0)

@@ -10,18 +10,18 @@ from detector.access.mounted import AccessError, database_uri
 from detector.actions.base import ActionError
 from detector.actions.database.server import Server
 from detector.actions.database.spool import Spool, SpoolError
-from detector.actions.database.store import Store
-from wayside.api.database import Database, WriteConcern
+from detector.actions.database.store import DatabaseWriter
+from wayside.api.database import DatabaseConnection, WriteConcern
 
 _FIELD = "spec.database"
 _CLOSING = 3.0
 """Seconds at the end to write what is queued."""
 
 _lock = threading.Lock()
-_stores: dict[Database, tuple[Store, int]] = {}
+_stores: dict[DatabaseConnection, tuple[DatabaseWriter, int]] = {}
 
 
-def acquire(database: Database, lose: Callable[[str, int, str], None]) -> Store:
+def acquire(database: DatabaseConnection, lose: Callable[[str, int, str], None]) -> DatabaseWriter:
     """The database's queue. Raises ActionError where it cannot be made, without showing what is secret."""
     key = _key(database)
     with _lock:
@@ -32,7 +32,7 @@ def acquire(database: Database, lose: Callable[[str, int, str], None]) -> Store:
         return store
 
 
-def release(database: Database) -> None:
+def release(database: DatabaseConnection) -> None:
     """The caller needs the queue no more."""
     key = _key(database)
     with _lock:
@@ -44,11 +44,11 @@ def release(database: Database) -> None:
         store.close(_CLOSING)  # before another one can open the same spool
 
 
-def _key(database: Database) -> Database:
+def _key(database: DatabaseConnection) -> DatabaseConnection:
     return database.model_copy(update={"files": None})
 
 
-def _made(database: Database, lose: Callable[[str, int, str], None]) -> Store:
+def _made(database: DatabaseConnection, lose: Callable[[str, int, str], None]) -> DatabaseWriter:
     try:
         uri = database_uri(database, _FIELD)
         server = Server(uri, majority=database.write_concern is WriteConcern.MAJORITY)
@@ -61,4 +61,4 @@ def _made(database: Database, lose: Callable[[str, int, str], None]) -> Store:
     except SpoolError as error:
         server.close()
         raise ActionError(f"{_FIELD}.spool.path: {error}") from None
-    return Store(server, spool, lose)
+    return DatabaseWriter(server, spool, lose)

@@ -19,7 +19,7 @@ class UnfitError(ValueError):
     """A message that cannot be a document; the error gives the reason."""
 
 
-def encoded(document: Mapping[str, Any]) -> bytes:
+def bson_bytes(document: Mapping[str, Any]) -> bytes:
     """The document as BSON.
 
     Numbers stay what they are: NaN and infinities are doubles, integers beyond 64 bits become Decimal128, or text
@@ -28,10 +28,10 @@ def encoded(document: Mapping[str, Any]) -> bytes:
     try:
         return bson.encode(document)
     except (bson.errors.BSONError, ValueError, OverflowError, TypeError, RecursionError):
-        return bson.encode(plain(document))
+        return bson.encode(bson_values(document))
 
 
-def plain(document: Mapping[str, Any]) -> dict[str, Any]:
+def bson_values(document: Mapping[str, Any]) -> dict[str, Any]:
     """The document with values that BSON knows. Raises UnfitError where it is nested too deeply."""
     made: dict[str, Any] = _plain(document, 0)
     return made

@@ -20,7 +20,7 @@ from detector.actions.deploy.stores import (
     TaskRefusedError,
     Update,
     belongs_to,
-    manifest,
+    task_manifest,
 )
 from wayside.api import ApplicationTask
 from wayside.api.base import JsonValue
@@ -97,7 +97,7 @@ class FileTaskStore:
 
 def write_tasks_yaml(path: Path, tasks: Iterable[ApplicationTask]) -> None:
     """Write tasks into one file of several documents, in the order of their event's start and name."""
-    documents = [manifest(_created(task)) for task in sorted(tasks, key=_order)]
+    documents = [task_manifest(_created(task)) for task in sorted(tasks, key=_order)]
     _replace(path, to_yaml(documents))
 
 
@@ -155,7 +155,7 @@ class _Folder:
 
     def _write(self, task: ApplicationTask) -> StoredTask:
         self.path.mkdir(parents=True, exist_ok=True)
-        _replace(self._file(task.name), to_yaml([manifest(task)]))
+        _replace(self._file(task.name), to_yaml([task_manifest(task)]))
         return StoredTask(task, self._next())
 
     def _read(self, file: Path) -> StoredTask | None:

@@ -16,11 +16,11 @@ from detector.actions.deploy.stores import (
     TaskRefusedError,
     Update,
     belongs_to,
-    manifest,
+    task_manifest,
 )
 from detector.cluster.api import Api, JsonObject, Resource
 from detector.cluster.errors import AlreadyExistsError, ApiError, NotFoundError, UnavailableError
-from detector.cluster.reflector import Changed, Deleted, Listed, Reflector, version_of
+from detector.cluster.reflector import Changed, Deleted, Reflector, Replaced, version_of
 from detector.engine.episodes.demands import holder_label
 from wayside.api import API_VERSION, ApplicationTask
 from wayside.api.applicationtask import HOLDER_LABEL
@@ -49,7 +49,7 @@ class KubernetesTaskStore:
         reflector = Reflector(self._api, TASKS, self._namespace, selectors, self._resync)
         async for change in reflector.follow():
             match change:
-                case Listed(objects, version):
+                case Replaced(objects, version):
                     own = (self._own(obj) for obj in objects)
                     yield Snapshot({stored.task.name: stored for stored in own if stored}, version)
                 case Changed(obj):
@@ -70,7 +70,7 @@ class KubernetesTaskStore:
     async def create(self, task: ApplicationTask) -> StoredTask:
         """See `TaskStore`."""
         with _store_errors():
-            return _stored(await self._api.create(TASKS, self._namespace, manifest(task)))
+            return _stored(await self._api.create(TASKS, self._namespace, task_manifest(task)))
 
     async def set_parameters(self, stored: StoredTask, parameters: Mapping[str, JsonValue]) -> StoredTask:
         """See `TaskStore`."""

@@ -46,7 +46,7 @@ Owner = dict[str, str]
 
 
 @dataclass(frozen=True)
-class Identity:
+class ProcessIdentity:
     """Which process this is."""
 
     text: str
@@ -55,7 +55,7 @@ class Identity:
     """The own pod."""
 
     @classmethod
-    def of_this_process(cls) -> Identity:
+    def of_this_process(cls) -> ProcessIdentity:
         """The pod by the downward API; elsewhere the machine, its process namespace and the process."""
         pod, uid = os.environ.get("POD_NAME"), os.environ.get("POD_UID")
         if pod:
@@ -79,7 +79,7 @@ class HolderLease:
         api: Api,
         namespace: str,
         holder: str,
-        identity: Identity | None = None,
+        identity: ProcessIdentity | None = None,
         *,
         duration: float = DEFAULT_DURATION,
         monotonic: Callable[[], float] = time.monotonic,
@@ -99,7 +99,7 @@ class HolderLease:
         self.name = lease_name(holder)
         self._api = api
         self._namespace = namespace
-        self._identity = identity or Identity.of_this_process()
+        self._identity = identity or ProcessIdentity.of_this_process()
         self._duration = duration
         self._monotonic = monotonic
         self._now = now

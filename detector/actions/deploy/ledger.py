@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable, Mapping
 
-from detector.actions.deploy.steps import Step, next_step
+from detector.actions.deploy.steps import StoreChange, next_step
 from detector.actions.deploy.stores import Snapshot, StoredTask, Update
 from detector.engine.episodes.demands import Demand
 
@@ -69,13 +69,13 @@ class Ledger:
         else:
             self.stored[name] = stored
 
-    def next(self, name: str) -> Step:
+    def next(self, name: str) -> StoreChange:
         """What to do next about a task."""
         if self.demands is None or self.stored is None:
-            return Step.NOTHING
+            return StoreChange.NOTHING
         demand, stored = self.demands.get(name), self.stored.get(name)
         step = next_step(demand, stored, name in self.held)
-        if step is Step.NOTHING and stored is not None:
+        if step is StoreChange.NOTHING and stored is not None:
             self._settled(name, demand, stored)
         return step
 
@@ -95,4 +95,4 @@ class Ledger:
         return self._ends.get(name)
 
     def _due(self, names: Iterable[str]) -> list[str]:
-        return [name for name in names if self.next(name) is not Step.NOTHING]
+        return [name for name in names if self.next(name) is not StoreChange.NOTHING]

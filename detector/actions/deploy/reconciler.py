@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 
 from detector.actions.deploy.ledger import Ledger
 from detector.actions.deploy.queue import WorkQueue
-from detector.actions.deploy.steps import Step, differences
+from detector.actions.deploy.steps import StoreChange, differences
 from detector.actions.deploy.stores import (
     Snapshot,
     StoredTask,
@@ -89,7 +89,7 @@ class DemandReconciler:
         self._away = Backoff(0.1, 5.0)
         self._reachable = asyncio.Event()
         self._pause = 0.0
-        self._logged: set[tuple[Step, str]] = set()
+        self._logged: set[tuple[StoreChange, str]] = set()
         self._stopping = asyncio.Event()
         self._deadline = 0.0
         self.counts = DeployCounts()
@@ -178,9 +178,9 @@ class DemandReconciler:
     async def _attend(self, name: str) -> None:
         """Take the steps that a task needs, one after the other."""
         failures = self._away.failures
-        step = Step.NOTHING
+        step = StoreChange.NOTHING
         try:
-            while (step := self._ledger.next(name)) is not Step.NOTHING:
+            while (step := self._ledger.next(name)) is not StoreChange.NOTHING:
                 await self._take(step, name)
                 self._away.succeed()
         except StoreUnavailableError as error:
@@ -193,9 +193,9 @@ class DemandReconciler:
         finally:
             self._queue.done(name)
 
-    async def _take(self, step: Step, name: str) -> None:
+    async def _take(self, step: StoreChange, name: str) -> None:
         demand, stored = (self._ledger.demands or {}).get(name), (self._ledger.stored or {}).get(name)
-        if step is Step.CREATE and demand is not None:
+        if step is StoreChange.CREATE and demand is not None:
             await self._create(name, demand)
         elif stored is not None:
             try:
@@ -232,20 +232,20 @@ class DemandReconciler:
             if self._traces is not None and not deleted:
                 self._traces.created(demand, began)
 
-    async def _change(self, step: Step, name: str, demand: Demand | None, stored: StoredTask) -> None:
-        if step is Step.END:
+    async def _change(self, step: StoreChange, name: str, demand: Demand | None, stored: StoredTask) -> None:
+        if step is StoreChange.END:
             end = self._ledger.end_of(name)
             self._ledger.put(name, await self._store.end(stored, self._now() if end is None else end))
             self.counts.ended += 1
-        elif step is Step.REPLACE and demand is not None:
+        elif step is StoreChange.REPLACE and demand is not None:
             _log.info("replacing the task %s: %s", name, ", ".join(differences(demand, stored)) or "it has ended")
             await self._store.remove(stored)
             self._ledger.put(name, None)
             self.counts.replaced += 1
-        elif step is Step.SET_PARAMETERS and demand is not None:
+        elif step is StoreChange.SET_PARAMETERS and demand is not None:
             self._ledger.put(name, await self._store.set_parameters(stored, plain(demand.parameters)))
             self.counts.patched += 1
-            if self._ledger.next(name) is Step.SET_PARAMETERS:
+            if self._ledger.next(name) is StoreChange.SET_PARAMETERS:
                 raise TaskRefusedError("Altered", "the store changed the parameters that it received")
 
     def _unavailable(self, error: StoreUnavailableError) -> None:
@@ -254,7 +254,7 @@ class DemandReconciler:
         self._reachable.clear()
         self._pause = self._away.fail(error.retry_after)
 
-    def _refused(self, step: Step, name: str, error: TaskRefusedError) -> None:
+    def _refused(self, step: StoreChange, name: str, error: TaskRefusedError) -> None:
         self.counts.refused[error.reason] += 1
         if (step, error.reason) not in self._logged:
             self._logged.add((step, error.reason))

@@ -13,7 +13,7 @@ from detector.engine.episodes.plain import plain
 from wayside.times import format_time
 
 
-class Step(Enum):
+class StoreChange(Enum):
     """One change of the store."""
 
     NOTHING = "nothing"
@@ -24,7 +24,7 @@ class Step(Enum):
     END = "end"
 
 
-def next_step(demand: Demand | None, stored: StoredTask | None, held: bool) -> Step:
+def next_step(demand: Demand | None, stored: StoredTask | None, held: bool) -> StoreChange:
     """The next change that brings the store closer to the demand.
 
     Args:
@@ -35,18 +35,18 @@ def next_step(demand: Demand | None, stored: StoredTask | None, held: bool) -> S
             data.
     """
     if demand is None:
-        return Step.END if stored is not None and stored.live else Step.NOTHING
+        return StoreChange.END if stored is not None and stored.live else StoreChange.NOTHING
     if stored is None:
-        return Step.CREATE
+        return StoreChange.CREATE
     if stored.leaving:
-        return Step.NOTHING  # until it is gone
+        return StoreChange.NOTHING  # until it is gone
     if not stored.live:
-        return Step.NOTHING if held else Step.REPLACE
+        return StoreChange.NOTHING if held else StoreChange.REPLACE
     if differences(demand, stored):
-        return Step.REPLACE
+        return StoreChange.REPLACE
     if plain(demand.parameters) != stored.task.spec.parameters:
-        return Step.SET_PARAMETERS
-    return Step.NOTHING
+        return StoreChange.SET_PARAMETERS
+    return StoreChange.NOTHING
 
 
 def differences(demand: Demand, stored: StoredTask) -> list[str]:

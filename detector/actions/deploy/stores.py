@@ -119,7 +119,7 @@ def belongs_to(task: ApplicationTask, holder: str) -> bool:
     return task.spec.requester.holder == holder and from_task(task) is not None
 
 
-def manifest(task: ApplicationTask) -> dict[str, Any]:
+def task_manifest(task: ApplicationTask) -> dict[str, Any]:
     """The task as it is sent or written: without empty fields."""
     document = task.to_json()
     document["metadata"] = {key: value for key, value in document["metadata"].items() if value}

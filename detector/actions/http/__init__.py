@@ -1,6 +1,6 @@
 """The way out to HTTP endpoints that actions share: one request at a time, with a deadline that always holds."""
 
-from detector.actions.http.answer import Answer, Verdict, judge
+from detector.actions.http.answer import Answer, Disposition, judge
 from detector.actions.http.client import HttpClient, HttpError
 
-__all__ = ["Answer", "HttpClient", "HttpError", "Verdict", "judge"]
+__all__ = ["Answer", "Disposition", "HttpClient", "HttpError", "judge"]

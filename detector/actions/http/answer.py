@@ -15,7 +15,7 @@ _BUSY = frozenset({429, 502, 503, 504})
 """Responses of an endpoint that is busy, whatever the request."""
 
 
-class Verdict(Enum):
+class Disposition(Enum):
     """What follows from an answer."""
 
     DONE = "done"
@@ -50,16 +50,16 @@ class Answer:
         return self.status in _BUSY
 
 
-def judge(answer: Answer) -> tuple[Verdict, str]:
+def judge(answer: Answer) -> tuple[Disposition, str]:
     """What follows, and why, for people."""
     if 200 <= answer.status < 300:
-        return Verdict.DONE, f"answered {answer.status}"
+        return Disposition.DONE, f"answered {answer.status}"
     response = f"answered {answer.status}" + (f": {answer.excerpt}" if answer.excerpt else "")
     if 300 <= answer.status < 400:
-        return Verdict.FINAL, f"{response}: redirects are not followed, give the place where it is now"
+        return Disposition.FINAL, f"{response}: redirects are not followed, give the place where it is now"
     if answer.status in _AGAIN or answer.status >= 500:
-        return Verdict.AGAIN, response
-    return Verdict.FINAL, response
+        return Disposition.AGAIN, response
+    return Disposition.FINAL, response
 
 
 def retry_after_seconds(retry_after: str, now: float) -> float:

@@ -19,11 +19,11 @@ from pydantic import BaseModel
 from detector.actions.base import Action, Setting
 from detector.actions.episode import Completion, Episode
 from detector.actions.notify.alerting import AlertQueue, AlertTarget
-from detector.actions.notify.alerts import Batch
+from detector.actions.notify.alerts import AlertBatch
 from detector.actions.notify.events import EventQueue
 from detector.actions.notify.keeping import Keeping
-from detector.actions.notify.notice import Notice, Texts, texts
-from detector.actions.notify.outbox import Delivery, Message
+from detector.actions.notify.notice import Notice, NoticeTexts, texts
+from detector.actions.notify.outbox import Delivery, OutboxMessage
 from detector.actions.notify.sender import Sender
 from detector.actions.notify.targets import HttpTarget, Target, ZenohTarget
 from wayside.api.actions import notify as api
@@ -32,12 +32,12 @@ from wayside.api.actions.notify import Moment
 __all__ = ["Notify"]
 
 
-class Notify(Action[api.Notify]):
+class Notify(Action[api.NotifyAction]):
     """Enqueues notifications. The sender does what takes time: here only the disk blocks."""
 
-    Parameters: ClassVar[type[BaseModel]] = api.Notify
+    Parameters: ClassVar[type[BaseModel]] = api.NotifyAction
 
-    def __init__(self, parameters: api.Notify, setting: Setting) -> None:
+    def __init__(self, parameters: api.NotifyAction, setting: Setting) -> None:
         super().__init__(parameters, setting)
         self._keeping = Keeping(setting)
         name = f"notify {setting.rule.name} {setting.action}"
@@ -79,11 +79,13 @@ class Notify(Action[api.Notify]):
 class _Events:
     """Notifications as CloudEvents."""
 
-    def __init__(self, parameters: api.Notify, setting: Setting, keeping: Keeping, name: str, target: Target) -> None:
+    def __init__(
+        self, parameters: api.NotifyAction, setting: Setting, keeping: Keeping, name: str, target: Target
+    ) -> None:
         self._moments = parameters.moments
         self._queue = EventQueue(parameters, setting, keeping)
 
-        def send(message: Message, give_up: Callable[[], bool]) -> Delivery:
+        def send(message: OutboxMessage, give_up: Callable[[], bool]) -> Delivery:
             return target.send(message.event, give_up)
 
         self._sender = Sender(name, self._queue, send)
@@ -91,12 +93,12 @@ class _Events:
     def changing(self) -> AbstractContextManager[None]:
         return self._sender.changing()
 
-    def started(self, episode: Episode, rendered: Texts) -> None:
+    def started(self, episode: Episode, rendered: NoticeTexts) -> None:
         self._queue.opened(episode)
         if not episode.resumed:
             self._notify(Moment.STARTED, episode, episode.started, rendered)
 
-    def ended(self, episode: Episode, rendered: Texts) -> None:
+    def ended(self, episode: Episode, rendered: NoticeTexts) -> None:
         if episode.ended is not None:
             self._notify(Moment.ENDED, episode, episode.ended, rendered)
 
@@ -107,7 +109,7 @@ class _Events:
         self._sender.finish()
         self._queue.drain(keep)
 
-    def _notify(self, moment: Moment, episode: Episode, event: Mapping[str, Any], rendered: Texts) -> None:
+    def _notify(self, moment: Moment, episode: Episode, event: Mapping[str, Any], rendered: NoticeTexts) -> None:
         if moment in self._moments:
             self._queue.add(Notice(episode.id, event, rendered, time.time()), time.monotonic())
 
@@ -117,7 +119,7 @@ class _Alerts:
 
     def __init__(
         self,
-        parameters: api.Notify,
+        parameters: api.NotifyAction,
         alertmanager: api.NotifyAlertmanager,
         setting: Setting,
         keeping: Keeping,
@@ -125,15 +127,15 @@ class _Alerts:
         field: str,
     ) -> None:
         self._queue = AlertQueue(parameters, alertmanager, setting, keeping)
-        self._sender: Sender[Batch] = Sender(name, self._queue, AlertTarget(alertmanager, field).send)
+        self._sender: Sender[AlertBatch] = Sender(name, self._queue, AlertTarget(alertmanager, field).send)
 
     def changing(self) -> AbstractContextManager[None]:
         return self._sender.changing()
 
-    def started(self, episode: Episode, rendered: Texts) -> None:
+    def started(self, episode: Episode, rendered: NoticeTexts) -> None:
         self._queue.opened(episode, rendered)
 
-    def ended(self, episode: Episode, rendered: Texts) -> None:
+    def ended(self, episode: Episode, rendered: NoticeTexts) -> None:
         self._queue.over(episode)
 
     def completed(self, episode: Episode) -> None:
@@ -144,7 +146,7 @@ class _Alerts:
         self._queue.drain()
 
 
-def _target(parameters: api.Notify, setting: Setting, field: str) -> Target:
+def _target(parameters: api.NotifyAction, setting: Setting, field: str) -> Target:
     if parameters.http is not None:
         return HttpTarget(parameters.http, f"{field}.http")
     if parameters.zenoh is not None:

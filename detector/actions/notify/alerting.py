@@ -8,13 +8,13 @@ from collections.abc import Callable
 
 from detector.actions.base import Setting
 from detector.actions.episode import Episode, Outcome, OutcomeState
-from detector.actions.notify.alerts import Alert, Alerts, Batch, document, labels_of
+from detector.actions.notify.alerts import Alert, AlertBatch, Alerts, document, labels_of
 from detector.actions.notify.events import FULL, UNDELIVERED
 from detector.actions.notify.keeping import Keeping
-from detector.actions.notify.notice import Notice, Texts
+from detector.actions.notify.notice import Notice, NoticeTexts
 from detector.actions.notify.outbox import Delivery, Fate
 from detector.actions.notify.targets import Poster
-from wayside.api.actions.notify import Notify, NotifyAlertmanager
+from wayside.api.actions.notify import NotifyAction, NotifyAlertmanager
 
 _PATH = "/api/v2/alerts"
 
@@ -22,13 +22,15 @@ _PATH = "/api/v2/alerts"
 class AlertQueue:
     """Firing and resolved alerts. Guarded by the lock of the sender."""
 
-    def __init__(self, notify: Notify, alertmanager: NotifyAlertmanager, setting: Setting, keeping: Keeping) -> None:
+    def __init__(
+        self, notify: NotifyAction, alertmanager: NotifyAlertmanager, setting: Setting, keeping: Keeping
+    ) -> None:
         self._alerts = Alerts(alertmanager.repeat.seconds, notify.give_up_after.seconds, notify.waiting)
         self._setting = setting
         self._keeping = keeping
-        self._episodes: dict[str, tuple[Episode, Texts]] = {}
+        self._episodes: dict[str, tuple[Episode, NoticeTexts]] = {}
 
-    def opened(self, episode: Episode, texts: Texts) -> None:
+    def opened(self, episode: Episode, texts: NoticeTexts) -> None:
         """An alert fires from now on."""
         labels = labels_of(texts, episode.rule, self._setting.holder, episode.subject, episode.id, episode.element)
         given = {"summary": texts.title, "description": texts.text}
@@ -47,7 +49,7 @@ class AlertQueue:
             end = now if episode.end_time is None else min(episode.end_time, now)
             self._alerts.over(episode.id, end, time.monotonic())
 
-    def take(self, now: float) -> Batch | None:
+    def take(self, now: float) -> AlertBatch | None:
         """The alerts to send now."""
         return self._alerts.take(now)
 
@@ -59,7 +61,7 @@ class AlertQueue:
         """Try undelivered alerts once more."""
         self._alerts.hurry()
 
-    def settle(self, sent: Batch, delivery: Delivery, now: float) -> None:
+    def settle(self, sent: AlertBatch, delivery: Delivery, now: float) -> None:
         """What came of a request."""
         ended, given_up = self._alerts.settle(sent, delivery, now)
         if delivery.fate is Fate.REFUSED:
@@ -123,7 +125,7 @@ class AlertTarget:
         self._url = alertmanager.url.rstrip("/").removesuffix(_PATH) + _PATH
         self._repeat = alertmanager.repeat.seconds
 
-    def send(self, batch: Batch, give_up: Callable[[], bool]) -> Delivery:
+    def send(self, batch: AlertBatch, give_up: Callable[[], bool]) -> Delivery:
         """Try once."""
         now = time.time_ns()
         documents = [document(alert, alert.episode in batch.over, now, self._repeat) for alert in batch.alerts]

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from detector.actions.notify.notice import Texts
+from detector.actions.notify.notice import NoticeTexts
 from detector.actions.notify.outbox import FIRST, LONGEST, LONGEST_RETRY_AFTER, Delivery, Fate
 from wayside.backoff import Backoff
 from wayside.times import format_time
@@ -40,7 +40,7 @@ class Alert:
 
 
 @dataclass(frozen=True, slots=True)
-class Batch:
+class AlertBatch:
     """The alerts of one request."""
 
     alerts: Sequence[Alert]
@@ -48,7 +48,9 @@ class Batch:
     """The episodes of the resolved alerts: during the request, more may end."""
 
 
-def labels_of(texts: Texts, rule: str, holder: str, subject: str, episode: str, element: str | None) -> dict[str, str]:
+def labels_of(
+    texts: NoticeTexts, rule: str, holder: str, subject: str, episode: str, element: str | None
+) -> dict[str, str]:
     """An alert's labels; those that make it what it is come before the rule's own of the same name."""
     own = {"alertname": rule, "detector": holder, "subject": subject, "episode": episode}
     return {**texts.labels, **own, **({} if element is None else {"element": element})}
@@ -92,7 +94,7 @@ class Alerts:
         """From now on, only undelivered alerts are sent, once more and at once."""
         self._last_tries = set()
 
-    def take(self, now: float) -> Batch | None:
+    def take(self, now: float) -> AlertBatch | None:
         """What to send now, in one request."""
         if self._last_tries is not None:
             pending = (alert for alert in self._alerts.values() if alert.ends_at is not None or not alert.delivered)
@@ -103,14 +105,14 @@ class Alerts:
         else:
             chosen = [alert for alert in self._alerts.values() if alert.due <= now][:BATCH]
         over = frozenset(alert.episode for alert in chosen if alert.ends_at is not None)
-        return Batch(chosen, over) if chosen else None
+        return AlertBatch(chosen, over) if chosen else None
 
     def wait(self, now: float) -> float | None:
         """The seconds until `take` may have something; None: there are no alerts."""
         due = min((alert.due for alert in self._alerts.values()), default=None)
         return None if due is None else max(0.0, due - now, self._paused_until - now)
 
-    def settle(self, sent: Batch, delivery: Delivery, now: float) -> tuple[list[Alert], list[Alert]]:
+    def settle(self, sent: AlertBatch, delivery: Delivery, now: float) -> tuple[list[Alert], list[Alert]]:
         """Resolved alerts that were delivered, and resolved alerts that were given up; both are removed.
 
         Those that fire go on: a refusal holds until the next time they are due.

@@ -11,9 +11,9 @@ from detector.actions.notify.grouping import Groups
 from detector.actions.notify.keeping import Keeping
 from detector.actions.notify.ledger import DeliveryLedger
 from detector.actions.notify.notice import Notice, event_of, event_of_group
-from detector.actions.notify.outbox import Budget, Delivery, Fate, Message, Outbox
-from detector.actions.notify.targets import encoded
-from wayside.api.actions.notify import Notify
+from detector.actions.notify.outbox import Delivery, Fate, Outbox, OutboxMessage, RateLimit
+from detector.actions.notify.targets import event_json
+from wayside.api.actions.notify import NotifyAction
 
 UNDELIVERED = "the detector stopped, or the action was removed from the rule, before it was delivered"
 FULL = "the queue is full (waiting)"
@@ -22,9 +22,9 @@ FULL = "the queue is full (waiting)"
 class EventQueue:
     """The events of one action, from `add` to delivery. Guarded by the lock of the sender."""
 
-    def __init__(self, notify: Notify, setting: Setting, keeping: Keeping) -> None:
+    def __init__(self, notify: NotifyAction, setting: Setting, keeping: Keeping) -> None:
         rate, grouping = notify.rate, notify.grouping
-        budget = None if rate is None else Budget(rate.messages, rate.per.seconds)
+        budget = None if rate is None else RateLimit(rate.messages, rate.per.seconds)
         self._outbox = Outbox(notify.waiting, notify.give_up_after.seconds, budget)
         self._grouping = grouping
         self._groups = None if grouping is None else Groups(grouping.by, grouping.wait.seconds)
@@ -58,11 +58,11 @@ class EventQueue:
             event = event_of(notices[0])
         else:
             event = event_of_group(notices, self._action, self._grouping.by, self._grouping.maximum)
-        message = Message(event, notices)
+        message = OutboxMessage(event, notices)
         if not self._outbox.add(message):
             self._lose(message, FULL)
 
-    def take(self, now: float) -> Message | None:
+    def take(self, now: float) -> OutboxMessage | None:
         """The message to send now."""
         self._close_groups(now)
         return self._outbox.take(now)
@@ -73,11 +73,11 @@ class EventQueue:
         waits = [self._outbox.wait(now), None if group is None else max(0.0, group - now)]
         return min((wait for wait in waits if wait is not None), default=None)
 
-    def settle(self, sent: Message, delivery: Delivery, now: float) -> None:
+    def settle(self, sent: OutboxMessage, delivery: Delivery, now: float) -> None:
         """Apply the result of an attempt."""
         fate = self._outbox.settle(sent, delivery, now, time.time())
         if fate is Fate.DELIVERED:
-            size = len(encoded(sent.event))
+            size = len(event_json(sent.event))
             for notice in sent.notices:
                 self.ledger.delivered(notice.episode, size)
             self._keeping.delivered(sent.notices)
@@ -103,7 +103,7 @@ class EventQueue:
             else:
                 self._lose(message, UNDELIVERED)
 
-    def _lose(self, message: Message, why: str) -> None:
+    def _lose(self, message: OutboxMessage, why: str) -> None:
         self._keeping.lose(message.notices, why, message.attempts)
         for notice in message.notices:
             self.ledger.failed(notice.episode, why)

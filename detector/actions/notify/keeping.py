@@ -14,7 +14,7 @@ from typing import Any
 from detector.actions.base import Setting
 from detector.actions.notify.dead_letters import DeadLetters
 from detector.actions.notify.journal import Journal, JournalError
-from detector.actions.notify.notice import Notice, Texts, notice_from, texts
+from detector.actions.notify.notice import Notice, NoticeTexts, notice_from, texts
 from wayside.names import encode
 from wayside.times import format_seconds
 
@@ -83,13 +83,13 @@ class Keeping:
         """Whether this one is."""
         return self._journal is not None and _NOTICE + notice.id in self._journal.live
 
-    def open(self, episode: str, rendered: Texts) -> None:
+    def open(self, episode: str, rendered: NoticeTexts) -> None:
         """Keep what was rendered for an episode until its end: after a restart it cannot be rendered again."""
         key = _OPEN + episode
         self._claimed.add(key)
         self._put(key, rendered.to_json())
 
-    def rendered(self, episode: str) -> Texts | None:
+    def rendered(self, episode: str) -> NoticeTexts | None:
         """What was kept for it."""
         document = None if self._journal is None else self._journal.live.get(_OPEN + episode)
         return None if document is None else texts(document)

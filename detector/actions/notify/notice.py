@@ -15,7 +15,7 @@ GROUP_TYPE = "dev.wayside.event.group"
 
 
 @dataclass(frozen=True, slots=True)
-class Texts:
+class NoticeTexts:
     """The texts of a rule about an episode."""
 
     title: str | None = None
@@ -28,10 +28,10 @@ class Texts:
         return {name: value for name, value in given.items() if value is not None}
 
 
-def texts(rendered: Mapping[str, Any]) -> Texts:
+def texts(rendered: Mapping[str, Any]) -> NoticeTexts:
     """From what was rendered; values that are no text become one."""
     labels = rendered.get("labels")
-    return Texts(
+    return NoticeTexts(
         _text(rendered.get("title")),
         _text(rendered.get("text")),
         {name: _text(value) or "" for name, value in labels.items()} if isinstance(labels, Mapping) else {},
@@ -53,7 +53,7 @@ class Notice:
     episode: str
     event: Mapping[str, Any]
     """The CloudEvent as published on Zenoh."""
-    texts: Texts
+    texts: NoticeTexts
     created: float
     """Seconds since the epoch."""
 
@@ -109,7 +109,9 @@ def event_of_group(notices: Sequence[Notice], action: str, by: Sequence[str], ma
     more = len(notices) - 1
     labels = {name: first.texts.labels.get(name, "") for name in by}
     text = first.texts.text
-    notification = Texts(first.texts.title, f"{text} (and {more} more)" if text and more else text, labels).to_json()
+    notification = NoticeTexts(
+        first.texts.title, f"{text} (and {more} more)" if text and more else text, labels
+    ).to_json()
     starts = sum(notice.moment is Moment.STARTED for notice in notices)
     return {
         "specversion": "1.0",

@@ -43,7 +43,7 @@ class Delivery:
 
 
 @dataclass(eq=False, slots=True)
-class Message:
+class OutboxMessage:
     """One CloudEvent to deliver, and the events that it contains."""
 
     event: Mapping[str, Any]
@@ -63,7 +63,7 @@ class Message:
         return frozenset(notice.episode for notice in self.notices)
 
 
-class Budget:
+class RateLimit:
     """At most `messages` messages in any period of `per` seconds."""
 
     def __init__(self, messages: int, per: float) -> None:
@@ -85,9 +85,9 @@ class Budget:
 class Outbox:
     """At most `capacity` messages. `now` is in seconds of a monotonic clock, `wall` in seconds since the epoch."""
 
-    def __init__(self, capacity: int, give_up_after: float, budget: Budget | None = None) -> None:
+    def __init__(self, capacity: int, give_up_after: float, budget: RateLimit | None = None) -> None:
         self._capacity, self._give_up_after, self._budget = capacity, give_up_after, budget
-        self._waiting: list[Message] = []
+        self._waiting: list[OutboxMessage] = []
         self._pause = Backoff(FIRST, LONGEST)
         self._paused_until = 0.0
         self._last_tries: set[int] | None = None
@@ -96,7 +96,7 @@ class Outbox:
     def __len__(self) -> int:
         return len(self._waiting)
 
-    def add(self, message: Message) -> bool:
+    def add(self, message: OutboxMessage) -> bool:
         """False: it found no place."""
         if len(self._waiting) >= self._capacity:
             return False
@@ -107,7 +107,7 @@ class Outbox:
         """From now on, each message is tried once more, without waiting for its time."""
         self._last_tries = set()
 
-    def take(self, now: float) -> Message | None:
+    def take(self, now: float) -> OutboxMessage | None:
         """The message to send now; call `settle` with the result before the next."""
         if self._budget is not None and self._budget.wait(now) > 0:
             return None
@@ -123,7 +123,7 @@ class Outbox:
                 return message
         return None
 
-    def _first_of_their_episodes(self) -> Iterator[Message]:
+    def _first_of_their_episodes(self) -> Iterator[OutboxMessage]:
         """The messages that no earlier one about the same episode holds up."""
         held: set[str] = set()
         for message in self._waiting:
@@ -131,7 +131,7 @@ class Outbox:
                 yield message
             held |= message.episodes
 
-    def _is_due(self, message: Message, now: float) -> bool:
+    def _is_due(self, message: OutboxMessage, now: float) -> bool:
         if self._last_tries is not None:
             return id(message) not in self._last_tries
         return message.due <= now
@@ -144,7 +144,7 @@ class Outbox:
         wait = max(0.0, due - now, self._paused_until - now)
         return wait if self._budget is None else max(wait, self._budget.wait(now))
 
-    def settle(self, message: Message, delivery: Delivery, now: float, wall: float) -> Fate:
+    def settle(self, message: OutboxMessage, delivery: Delivery, now: float, wall: float) -> Fate:
         """What became of the message that `take` gave: DELIVERED or REFUSED, and it waits no more; or AGAIN."""
         if not delivery.whole:
             self._pause.succeed()
@@ -160,7 +160,7 @@ class Outbox:
             self._waiting.remove(message)
         return fate
 
-    def drain(self) -> list[Message]:
+    def drain(self) -> list[OutboxMessage]:
         """What still waits; it is here no more."""
         drained, self._waiting = self._waiting, []
         return drained

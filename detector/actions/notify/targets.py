@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 from detector.access.mounted import AccessError, secret_text
 from detector.actions.base import Messenger
-from detector.actions.http import HttpClient, HttpError, Verdict, judge
+from detector.actions.http import Disposition, HttpClient, HttpError, judge
 from detector.actions.http.answer import retry_after_seconds
 from detector.actions.notify.outbox import Delivery, Fate
 from wayside.api.actions.http import HttpAccess
@@ -29,21 +29,21 @@ class Target(Protocol):
         """Try once. Waits as long as the target's timeout, or until `give_up` is true."""
 
 
-def encoded(event: Mapping[str, Any]) -> bytes:
+def event_json(event: Mapping[str, Any]) -> bytes:
     """A CloudEvent in JSON. Raises ValueError where it holds what JSON cannot."""
     return json.dumps(event, separators=(",", ":"), ensure_ascii=False, allow_nan=False).encode()
 
 
 def structured(event: Mapping[str, Any]) -> tuple[dict[str, str], bytes]:
     """Headers and body of a request whose body is the whole event."""
-    return {"Content-Type": f"{STRUCTURED}; charset=utf-8"}, encoded(event)
+    return {"Content-Type": f"{STRUCTURED}; charset=utf-8"}, event_json(event)
 
 
 def binary(event: Mapping[str, Any]) -> tuple[dict[str, str], bytes]:
     """Headers and body of a request whose body is the event's data."""
     attributes = {name: value for name, value in event.items() if name not in ("data", "datacontenttype")}
     headers = {f"ce-{name}": _header_value(str(value)) for name, value in attributes.items()}
-    return {"Content-Type": str(event["datacontenttype"]), **headers}, encoded(event["data"])
+    return {"Content-Type": str(event["datacontenttype"]), **headers}, event_json(event["data"])
 
 
 def _header_value(text: str) -> str:
@@ -69,9 +69,9 @@ class Poster:
         except HttpError as error:
             return Delivery(Fate.AGAIN, str(error), whole=True)
         verdict, why = judge(answer)
-        if verdict is Verdict.DONE:
+        if verdict is Disposition.DONE:
             return Delivery(Fate.DELIVERED, why)
-        if verdict is Verdict.FINAL:
+        if verdict is Disposition.FINAL:
             return Delivery(Fate.REFUSED, why)
         return Delivery(
             Fate.AGAIN, why, retry_after=retry_after_seconds(answer.retry_after, time.time()), whole=answer.busy
@@ -117,7 +117,7 @@ class ZenohTarget:
     def send(self, event: Mapping[str, Any], give_up: Callable[[], bool]) -> Delivery:
         """Hand over."""
         try:
-            self._messenger.publish(self._key, encoded(event), STRUCTURED)
+            self._messenger.publish(self._key, event_json(event), STRUCTURED)
         except ValueError as error:
             return Delivery(Fate.REFUSED, f"cannot send the event as JSON: {error}")
         return Delivery(Fate.DELIVERED)

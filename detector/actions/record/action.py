@@ -20,7 +20,7 @@ from detector.actions.record.destination import Destination, Kept, NoRoomError, 
 from detector.actions.record.folder import RecordingFolder
 from detector.actions.record.recording import Recording, reason
 from detector.actions.record.recovery import REASON, recover
-from detector.actions.record.series import Series
+from detector.actions.record.series import RecordedSeries
 from wayside.api.actions import record as api
 
 log = logging.getLogger(__name__)
@@ -35,17 +35,17 @@ _EXPIRE_SECONDS = 30.0
 class _Open:
     """An episode that is being recorded."""
 
-    series: Series
+    series: RecordedSeries
     episode: Episode
     reported: float
 
 
-class Record(Action[api.Record]):
+class Record(Action[api.RecordAction]):
     """Writes the samples of each episode into a rosbag2 folder with MCAP files."""
 
-    Parameters: ClassVar[type[BaseModel]] = api.Record
+    Parameters: ClassVar[type[BaseModel]] = api.RecordAction
 
-    def __init__(self, parameters: api.Record, setting: Setting) -> None:
+    def __init__(self, parameters: api.RecordAction, setting: Setting) -> None:
         super().__init__(parameters, setting)
         self._open: dict[str, _Open] = {}
         self._flushed = self._expired = -math.inf
@@ -56,7 +56,7 @@ class Record(Action[api.Record]):
         renew = self.parameters.renew_after
         start = None if episode.resumed else episode.onset_time - self.parameters.before.ns
         try:
-            series = Series(
+            series = RecordedSeries(
                 self._begin,
                 self._description(episode, surroundings),
                 start=start,

@@ -19,14 +19,14 @@ _VERSION = 8
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class BagFile:
     """One file of a bag."""
 
     name: str
     contents: Contents
 
 
-def metadata_yaml(parts: Sequence[Part], custom: Mapping[str, str]) -> str:
+def metadata_yaml(parts: Sequence[BagFile], custom: Mapping[str, str]) -> str:
     """The text of metadata.yaml. `custom` is further metadata of the bag."""
     topics: dict[tuple[str, str], dict[str, Any]] = {}
     for part in parts:
@@ -64,7 +64,7 @@ def metadata_yaml(parts: Sequence[Part], custom: Mapping[str, str]) -> str:
     return yaml.safe_dump({"rosbag2_bagfile_information": information}, sort_keys=False, allow_unicode=True)
 
 
-def _file(part: Part) -> dict[str, Any]:
+def _file(part: BagFile) -> dict[str, Any]:
     first, last = part.contents.span
     return {
         "path": part.name,

@@ -30,7 +30,7 @@ _HISTORY = 100
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
+class ChannelFormat:
     """How the messages of a stream read. Where it changes, the stream goes on in another channel."""
 
     encoding: str
@@ -51,12 +51,12 @@ class Reading:
         return {"offered_qos_profiles": yaml.safe_dump(qos(self.latched)).strip(), "topic_type_hash": self.digest}
 
 
-def reading(stream: Stream, types: RosTypes) -> Reading:
+def channel_format(stream: Stream, types: RosTypes) -> ChannelFormat:
     """How the stream's messages read."""
     if stream.encoding is not Encoding.CDR or stream.type is None or not types.known(stream.type):
-        return Reading(stream.encoding.value, None, None, "", stream.latched)
+        return ChannelFormat(stream.encoding.value, None, None, "", stream.latched)
     digest = types.store.hash_rihs01(stream.type)
-    return Reading("cdr", stream.type, types.definition(stream.type), digest, stream.latched)
+    return ChannelFormat("cdr", stream.type, types.definition(stream.type), digest, stream.latched)
 
 
 def qos(latched: bool) -> list[dict[str, Any]]:
@@ -88,14 +88,14 @@ class FileChannels:
         """Samples of other streams than these go into new channels from now on."""
         self._numbers = {place: number for place, number in self._numbers.items() if place[0] in streams}
 
-    def number(self, place: Place, known: Reading | None) -> int | None:
+    def number(self, place: Place, known: ChannelFormat | None) -> int | None:
         """The number of a channel in the file; None where there are too many."""
         number = self._numbers.get(place)
         if number is None and len(self._file.contents.channels) < _MAXIMUM_CHANNELS:
-            number = self._numbers[place] = self._new(place, known or Reading("raw", None, None, "", False))
+            number = self._numbers[place] = self._new(place, known or ChannelFormat("raw", None, None, "", False))
         return number
 
-    def _new(self, place: Place, known: Reading) -> int:
+    def _new(self, place: Place, known: ChannelFormat) -> int:
         stream, key, client = place
         schema = 0
         if known.type is not None and known.definition is not None:

@@ -154,7 +154,7 @@ class Destination:
         self._kept_files = sum(each.files for each in self._kept)
 
     def _scan(self) -> None:
-        self._keep(finished(self.path))
+        self._keep(finished_recordings(self.path))
         self._scanned = time.monotonic()
 
 
@@ -163,7 +163,7 @@ def hidden_path(path: Path, ending: str) -> Path:
     return path.with_name(f".{path.name}{ending}")
 
 
-def finished(path: Path) -> Iterator[Kept]:
+def finished_recordings(path: Path) -> Iterator[Kept]:
     """The recordings in a folder that have their final names. What is not of our making is left alone."""
     for rule in _folders(path):
         for folder in _folders(rule):

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from detector.actions.record.bag import Part, metadata_yaml
+from detector.actions.record.bag import BagFile, metadata_yaml
 from detector.actions.record.description import DESCRIPTION, as_text
 from detector.actions.record.destination import PARTIAL, Destination, Kept, hidden_path
 
@@ -97,7 +97,7 @@ class RecordingFolder:
             return None
         return fields if isinstance(fields, dict) else None
 
-    def publish(self, parts: Sequence[Part], fields: Mapping[str, Any]) -> Kept:
+    def publish(self, parts: Sequence[BagFile], fields: Mapping[str, Any]) -> Kept:
         """Gives the folder its final name, once the disk has everything. Raises OSError: then it is as it was."""
         _write(self.path / "metadata.yaml", metadata_yaml(parts, as_text(fields)))
         self.describe(fields)

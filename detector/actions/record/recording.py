@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 
 from detector.actions.base import Surroundings
 from detector.actions.episode import EpisodeSample
-from detector.actions.record.bag import Part
-from detector.actions.record.channels import FileChannels, Owners, Place, Reading, reading
+from detector.actions.record.bag import BagFile
+from detector.actions.record.channels import ChannelFormat, FileChannels, Owners, Place, channel_format
 from detector.actions.record.compressing import compressor
 from detector.actions.record.description import (
     METADATA,
@@ -30,7 +30,7 @@ from detector.actions.record.folder import RecordingFolder
 from detector.actions.record.mcap_file import McapFile, SyncError
 from detector.actions.record.stamps import Stamps
 from detector.engine.buffering.lanes import latched_topics
-from wayside.api.actions.record import Record
+from wayside.api.actions.record import RecordAction
 
 
 class _Latched(NamedTuple):
@@ -47,7 +47,7 @@ class Recording:
         self,
         folder: RecordingFolder,
         description: Mapping[str, Any],
-        parameters: Record,
+        parameters: RecordAction,
         surroundings: Surroundings,
         *,
         start: int | None,
@@ -60,11 +60,11 @@ class Recording:
         self._description = description
         self._parameters = parameters
         self._start = start
-        self._parts: list[Part] = []
+        self._parts: list[BagFile] = []
         self._latched: dict[tuple[str, Hashable], _Latched] = {}
         self._numbers: Counter[Place] = Counter()
         self._held: list[EpisodeSample] = []
-        self._readings: dict[str, Reading] = {}
+        self._readings: dict[str, ChannelFormat] = {}
         self._first: int | None = None  # the earliest time in the file, but for latched streams
         self._file: McapFile | None = None
         self._began: int | None = None
@@ -90,7 +90,7 @@ class Recording:
         self._topics = latched_topics(surroundings.detector, surroundings.decoders)
         old, self._readings = self._readings, {}
         for name, stream in streams.items():
-            self._readings[name] = reading(stream, surroundings.types)
+            self._readings[name] = channel_format(stream, surroundings.types)
         if self._file is not None:
             self._channels.keep({name for name, each in self._readings.items() if old.get(name) == each})
 
@@ -195,7 +195,7 @@ class Recording:
     def _close(self, file: McapFile) -> None:
         file.give_up()
         self._file = None
-        self._parts.append(Part(file.path.name, file.contents))
+        self._parts.append(BagFile(file.path.name, file.contents))
         self._closed_bytes += file.end
         self._lost += file.lost
 

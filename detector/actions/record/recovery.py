@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from detector.actions.record.bag import Part
+from detector.actions.record.bag import BagFile
 from detector.actions.record.description import METADATA_CUT, METADATA_END, ending, with_ending
 from detector.actions.record.destination import DROPPED, PARTIAL, Destination, Kept, hidden
 from detector.actions.record.folder import RecordingFolder
@@ -65,7 +65,7 @@ def _recovered(destination: Destination, path: Path) -> Kept | None:
         raise
 
 
-def _part(path: Path, folder: RecordingFolder, fields: dict[str, Any], last: bool) -> Part | None:
+def _part(path: Path, folder: RecordingFolder, fields: dict[str, Any], last: bool) -> BagFile | None:
     """The file, completed; None where nothing of it can be read: it is deleted.
 
     The last one is looked through even if it seems complete: the disk may not have had all of it.
@@ -85,4 +85,4 @@ def _part(path: Path, folder: RecordingFolder, fields: dict[str, Any], last: boo
         finally:
             file.give_up()
         contents = file.contents
-    return Part(path.name, contents)
+    return BagFile(path.name, contents)

@@ -21,7 +21,7 @@ Begin = Callable[[Description, int | None], Recording]
 """Begins a recording whose window starts then, where that is known. Raises NoRoomError, OSError."""
 
 
-class Series:
+class RecordedSeries:
     """Takes the samples of an episode, and keeps account of what became of them."""
 
     def __init__(self, begin: Begin, description: Description, *, start: int | None, renew_after: int | None) -> None:

@@ -16,12 +16,12 @@ from typing import Any
 
 from detector.actions.base import Action, ActionError, Setting
 from detector.actions.episode import Completion, Episode, Outcome, OutcomeState
-from detector.actions.trigger.course import FOREVER, Course, CourseStep, Limits
+from detector.actions.trigger.course import FOREVER, Course, CourseStep, Timeouts
 from detector.actions.trigger.detectors import OtherDetector
 from detector.actions.trigger.endpoints import HttpEndpoint
 from detector.actions.trigger.journal import OrderJournal
 from detector.actions.trigger.orders import Order, Report, System
-from detector.actions.trigger.ros2 import Ros2Services, problems
+from detector.actions.trigger.ros2 import Ros2Services, call_problems
 from wayside.api import Detector
 from wayside.api.actions import trigger as api
 from wayside.api.detector import Clock
@@ -43,20 +43,20 @@ _LEAVE = 2.0
 """Seconds at the end for what still is to be stopped."""
 
 
-class Trigger(Action[api.Trigger]):
+class Trigger(Action[api.TriggerAction]):
     """Has another system record as long as an episode lasts."""
 
-    Parameters = api.Trigger
+    Parameters = api.TriggerAction
 
     @classmethod
-    def problems(cls, parameters: api.Trigger, detector: Detector) -> Iterable[tuple[FieldPath, str]]:
+    def problems(cls, parameters: api.TriggerAction, detector: Detector) -> Iterable[tuple[FieldPath, str]]:
         """Services that are not known, and requests that do not fit."""
-        return problems(parameters, detector)
+        return call_problems(parameters, detector)
 
-    def __init__(self, parameters: api.Trigger, setting: Setting) -> None:
+    def __init__(self, parameters: api.TriggerAction, setting: Setting) -> None:
         super().__init__(parameters, setting)
         self._system = self._make_system()
-        self._limits = Limits(
+        self._limits = Timeouts(
             FOREVER if self._system.ends_by_itself else parameters.maximum_duration.seconds,
             parameters.give_up_after.seconds,
             self._system.renew,
@@ -269,6 +269,6 @@ class Trigger(Action[api.Trigger]):
             self._journal.save([*self._left.values(), *(course.order for course in self._courses.values())])
 
 
-def _digest(parameters: api.Trigger) -> str:
+def _digest(parameters: api.TriggerAction) -> str:
     """Eight hexadecimal digits that distinguish versions of the action."""
     return hashlib.sha256(json.dumps(parameters.to_json(), sort_keys=True).encode()).hexdigest()[:8]

@@ -35,7 +35,7 @@ class CourseStep(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class Timeouts:
     """How long things may take, in seconds."""
 
     maximum: float
@@ -49,7 +49,7 @@ class Limits:
 class Course:
     """One recording elsewhere."""
 
-    def __init__(self, order: Order, limits: Limits, now: float, onset: float, *, resumed: bool = False) -> None:
+    def __init__(self, order: Order, limits: Timeouts, now: float, onset: float, *, resumed: bool = False) -> None:
         """`onset` is when the condition began to hold; `resumed`: another run of the detector may have requested it."""
         self.order = order
         self._limits = limits

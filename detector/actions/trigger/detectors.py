@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 from detector.actions.base import ActionError, Messenger
-from detector.actions.trigger.orders import Order, Report, member
+from detector.actions.trigger.orders import Order, Report, nested_value
 from detector.actions.trigger.requests import (
     MAXIMUM_CLIENTS,
     RECORDINGS,
@@ -16,7 +16,7 @@ from detector.actions.trigger.requests import (
     write_request,
 )
 from detector.streams.answering import status_key
-from wayside.api.actions.trigger import Trigger
+from wayside.api.actions.trigger import TriggerAction
 from wayside.api.actions.window import WindowClients
 from wayside.api.base import Duration
 
@@ -32,7 +32,7 @@ class OtherDetector:
     renew: float | None = _RENEW
     ends_by_itself = True
 
-    def __init__(self, parameters: Trigger, messenger: Messenger) -> None:
+    def __init__(self, parameters: TriggerAction, messenger: Messenger) -> None:
         assert parameters.detector is not None  # noqa: S101  that is what it is made for
         self._wanted = parameters.detector
         self._maximum = parameters.maximum_duration
@@ -41,7 +41,7 @@ class OtherDetector:
 
     def place(self, order: Order) -> str:
         """The other detector's holder."""
-        name = member(order.rendered, "detector", "name")
+        name = nested_value(order.rendered, "detector", "name")
         if not isinstance(name, str) or not _HOLDER.fullmatch(name):
             raise ActionError(
                 f"detector.name: {name!r} is not a detector name: it may have letters, digits, _, . and - only"
@@ -51,7 +51,7 @@ class OtherDetector:
     def start(self, order: Order, ago: float, *, again: bool) -> Report:
         """Record; where it was confirmed before, nothing that was earlier."""
         wanted = self._wanted
-        subjects = member(order.event, "data", "subjects")
+        subjects = nested_value(order.event, "data", "subjects")
         clients = None
         if wanted.clients is WindowClients.SUBJECTS and subjects:
             clients = sorted({*subjects, *wanted.with_clients})

@@ -13,9 +13,9 @@ import time
 from yarl import URL
 
 from detector.actions.base import ActionError
-from detector.actions.http import HttpClient, HttpError, Verdict, judge
-from detector.actions.trigger.orders import Order, Progress, Report, member
-from wayside.api.actions.trigger import HttpCall, Trigger
+from detector.actions.http import Disposition, HttpClient, HttpError, judge
+from detector.actions.trigger.orders import Order, Progress, Report, nested_value
+from wayside.api.actions.trigger import HttpCall, TriggerAction
 from wayside.names import encode
 
 _GONE = (404, 410)
@@ -28,7 +28,7 @@ class HttpEndpoint:
     renew: float | None = None
     ends_by_itself = False
 
-    def __init__(self, parameters: Trigger, closing: threading.Event) -> None:
+    def __init__(self, parameters: TriggerAction, closing: threading.Event) -> None:
         """Once `closing` is set, a request that is under way is given up; a further one may take its time."""
         assert parameters.http is not None  # noqa: S101  that is what it is made for
         self._wanted = parameters.http
@@ -55,7 +55,7 @@ class HttpEndpoint:
             raise
         repeated = again or order.id in self._unanswered
         self._unanswered.discard(order.id)
-        if verdict is Verdict.DONE or (status == _CONFLICT and repeated):
+        if verdict is Disposition.DONE or (status == _CONFLICT and repeated):
             return Report(Progress.RECORDING)
         return Report(Progress.FAILED, message)
 
@@ -64,7 +64,7 @@ class HttpEndpoint:
         if self._wanted.stop is None:
             return Report(Progress.DONE)
         status, verdict, message = self._send("stop", self._wanted.stop, order)
-        if verdict is Verdict.DONE:
+        if verdict is Disposition.DONE:
             return Report(Progress.DONE)
         return Report(Progress.DONE if status in _GONE else Progress.REFUSED, message)
 
@@ -72,9 +72,9 @@ class HttpEndpoint:
         """There is no more information than the responses gave."""
         return Report(Progress.DONE)
 
-    def _send(self, name: str, call: HttpCall, order: Order) -> tuple[int, Verdict, str]:
+    def _send(self, name: str, call: HttpCall, order: Order) -> tuple[int, Disposition, str]:
         """The status, what follows from it and the message. Raises ActionError if a retry is worthwhile."""
-        body = member(order.rendered, "http", name, "body")
+        body = nested_value(order.rendered, "http", name, "body")
         if body is None:
             body = {"id": order.id, "do": name, "maximumDuration": str(self._maximum), "event": order.event}
         headers = {"Content-Type": "application/json", "Idempotency-Key": f"{order.id}.{name}"}
@@ -90,6 +90,6 @@ class HttpEndpoint:
         except (HttpError, ValueError) as error:
             raise ActionError(str(error)) from error
         verdict, message = judge(answer)
-        if verdict is Verdict.AGAIN:
+        if verdict is Disposition.AGAIN:
             raise ActionError(f"{self.place(order)} {message}")
         return answer.status, verdict, f"{self.place(order)} {message}"

@@ -78,7 +78,7 @@ class System(Protocol):
         """How far it is."""
 
 
-def member(value: Any, *names: str) -> Any:
+def nested_value(value: Any, *names: str) -> Any:
     """What lies under these names in maps within maps; None where there is none."""
     for name in names:
         value = value.get(name) if isinstance(value, Mapping) else None

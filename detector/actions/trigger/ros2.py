@@ -21,12 +21,12 @@ from typing import Any
 
 from detector.actions.base import ActionError, Messenger
 from detector.actions.trigger.composing import ServiceError
-from detector.actions.trigger.orders import Order, Progress, Report, member
+from detector.actions.trigger.orders import Order, Progress, Report, nested_value
 from detector.actions.trigger.services import service
 from detector.streams.codecs.definitions import Definition, DefinitionsError
 from detector.streams.codecs.ros import RosTypes, types_with
 from wayside.api import Detector
-from wayside.api.actions.trigger import ServiceCall, Trigger
+from wayside.api.actions.trigger import ServiceCall, TriggerAction
 from wayside.api.stream import Layout
 from wayside.api.wording import FieldPath
 
@@ -37,7 +37,7 @@ class Ros2Services:
     renew: float | None = None
     ends_by_itself = False
 
-    def __init__(self, parameters: Trigger, messenger: Messenger, types: Callable[[], RosTypes]) -> None:
+    def __init__(self, parameters: TriggerAction, messenger: Messenger, types: Callable[[], RosTypes]) -> None:
         assert parameters.ros2 is not None  # noqa: S101  that is what it is made for
         self._wanted = parameters.ros2
         self.timeout = parameters.timeout.seconds
@@ -114,7 +114,7 @@ class Ros2Services:
 
     @staticmethod
     def _request(name: str, order: Order) -> Mapping[str, Any]:
-        value = member(order.rendered, "ros2", name, "request")
+        value = nested_value(order.rendered, "ros2", name, "request")
         return value if isinstance(value, Mapping) else {}
 
 
@@ -126,7 +126,7 @@ def _refusal(response: Mapping[str, Any]) -> str | None:
     return str(why or f"return code {response.get('return_code', 'none')}, success {response.get('success', 'none')}")
 
 
-def problems(parameters: Trigger, detector: Detector) -> Iterator[tuple[FieldPath, str]]:
+def call_problems(parameters: TriggerAction, detector: Detector) -> Iterator[tuple[FieldPath, str]]:
     """What is wrong with the calls, as far as that is known without an episode."""
     if parameters.ros2 is None:
         return

@@ -21,6 +21,7 @@ from rosbags.typesys.store import Typestore
 from detector.actions.trigger.composing import ServiceError, message
 from detector.engine.samples.sample import DecodeError
 from detector.streams.codecs.cdr import CdrDecoder
+from detector.streams.codecs.definitions import message_type_of
 from detector.streams.codecs.ros import REGISTERING, RosTypes
 
 _EVENT_INFO = "service_msgs/msg/ServiceEventInfo"
@@ -46,7 +47,7 @@ _PARSER = (TypesysError, ValueError, TypeError, KeyError, IndexError, AssertionE
 
 
 @dataclass(frozen=True, slots=True)
-class Service:
+class ServiceType:
     """A type of service, e.g. rosbag2_interfaces/srv/Snapshot."""
 
     name: str
@@ -81,7 +82,7 @@ class Service:
 
 
 @lru_cache(maxsize=64)
-def service(name: str, definition: str | None, types: RosTypes) -> Service:
+def service(name: str, definition: str | None, types: RosTypes) -> ServiceType:
     """The service of that type: with the definition where one is given, else as it is known.
 
     Raises ServiceError.
@@ -96,7 +97,7 @@ def service(name: str, definition: str | None, types: RosTypes) -> Service:
     made = {key: value for key, value in made.items() if key.startswith(f"{name}_") or key not in store.fielddefs}
     for key, (_, fields) in made.items():
         for field, desc in fields:
-            below = _named(desc)
+            below = message_type_of(desc)
             if below is not None and below not in made and below not in store.fielddefs:
                 raise ServiceError(f"{key}: {field} has the unknown type {below}: define it in spec.messages")
     made |= _event(name)
@@ -107,7 +108,7 @@ def service(name: str, definition: str | None, types: RosTypes) -> Service:
             store.register(made)
     except _PARSER as error:
         raise ServiceError(f"cannot use the definition of {name}: {error}") from error
-    return Service(name, store)
+    return ServiceType(name, store)
 
 
 def _parsed(name: str, text: str) -> Typesdict:
@@ -170,12 +171,3 @@ def _event(name: str) -> Typesdict:
             ],
         ),
     }
-
-
-def _named(desc: FieldDesc) -> str | None:
-    kind, detail = desc
-    if kind is Nodetype.NAME:
-        return str(detail)
-    if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
-        return _named(detail[0])  # type: ignore[arg-type]
-    return None

@@ -9,9 +9,9 @@ from pathlib import PurePath
 
 from wayside.api import EventRule
 from wayside.api.classification import Classification
-from wayside.api.scheme import SCHEME, Dimension, Value
+from wayside.api.scheme import SCHEME, CharacteristicValue, Dimension
 
-Chosen = Mapping[Dimension, frozenset[Value]]
+Chosen = Mapping[Dimension, frozenset[CharacteristicValue]]
 """Of some dimensions, values of which a rule must have one."""
 
 
@@ -35,7 +35,7 @@ class CatalogEntry:
         """Whether the rule has a value in any dimension."""
         return bool(self.classification.to_json())
 
-    def values(self, dimension: Dimension) -> tuple[Value, ...]:
+    def values(self, dimension: Dimension) -> tuple[CharacteristicValue, ...]:
         """Its values in the dimension, in the scheme's order."""
         given = self.classification.values_of(dimension)
         return tuple(value for value in dimension.values if value in given)
@@ -52,7 +52,7 @@ class Catalog:
 
     entries: tuple[CatalogEntry, ...]
 
-    def having(self, value: Value) -> tuple[CatalogEntry, ...]:
+    def having(self, value: CharacteristicValue) -> tuple[CatalogEntry, ...]:
         """The rules that have the value; values of two dimensions differ even where they are written alike."""
         dimension = next(each for each in SCHEME if isinstance(value, each.values))
         return tuple(each for each in self.entries if value in each.values(dimension))
@@ -92,7 +92,7 @@ def choose(texts: Iterable[str]) -> Chosen:
     Raises:
         ChoiceError: there is no such dimension or value; the message lists the valid ones.
     """
-    chosen: dict[Dimension, frozenset[Value]] = {}
+    chosen: dict[Dimension, frozenset[CharacteristicValue]] = {}
     for text in texts:
         name, _, written = text.partition("=")
         dimension = next((each for each in SCHEME if each.name == name), None)

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from html import escape
 
 from detector.commands.catalog.catalog import Catalog, CatalogEntry
-from wayside.api.scheme import SCHEME, Dimension, Value
+from wayside.api.scheme import SCHEME, CharacteristicValue, Dimension
 
 
 def page(catalog: Catalog) -> str:
@@ -65,7 +65,7 @@ def _rows(each: CatalogEntry) -> Iterator[str]:
         yield f"<tr><th>{escape(dimension.words)}</th><td>{values or '–'}</td></tr>"
 
 
-def _key(dimension: Dimension, value: Value) -> str:
+def _key(dimension: Dimension, value: CharacteristicValue) -> str:
     return f"{dimension.name}.{value.value}"
 
 

@@ -6,8 +6,8 @@ from collections.abc import Iterator, Sequence
 
 from detector.assembly import DetectorError, inlets
 from detector.commands.topics.proposal import Proposal
-from detector.commands.topics.shape import Shape
-from detector.commands.topics.survey import Topic, shape_of
+from detector.commands.topics.shape import MessageShape
+from detector.commands.topics.survey import Topic, topic_shape
 from detector.findings.checks import FIELD_NOT_RECORDED, UNMATCHED_STREAM
 from detector.resources.selection import select
 from wayside.api import Detector, EventRule
@@ -80,9 +80,9 @@ def _seen(encoding: Encoding, topics: Sequence[Topic]) -> Fields | None:
     """The fields of JSON and CBOR by the samples of all topics; None where they are not maps."""
     if encoding not in (Encoding.JSON, Encoding.CBOR) or not topics:
         return None
-    whole = Shape()
+    whole = MessageShape()
     for topic in topics:
-        shape = shape_of(topic, encoding)
+        shape = topic_shape(topic, encoding)
         if shape is None:
             return None
         whole.join(shape)

@@ -8,8 +8,8 @@ from typing import Any
 
 from detector.assembly import DetectorError, inlets
 from detector.commands.topics.proposal import Proposal, detector_document
-from detector.commands.topics.shape import paths_of
-from detector.commands.topics.survey import shape_of
+from detector.commands.topics.shape import message_paths
+from detector.commands.topics.survey import topic_shape
 from detector.replay.gathering import Recording
 from detector.replay.recorded_types import with_recorded_types
 from wayside.api import Detector
@@ -44,12 +44,12 @@ def lines(found: Sequence[Proposal], recordings: Sequence[Recording]) -> Iterato
 def _fields(each: Proposal, types: dict[str, Fields]) -> Iterator[tuple[str, str]]:
     found: dict[str, str] = {}
     for topic in each.topics:
-        shape = shape_of(topic, each.encoding)
+        shape = topic_shape(topic, each.encoding)
         found.update(shape.paths() if shape is not None else ())
     if found:
         yield from found.items()
     elif types.get(each.name):
-        yield from paths_of(types[each.name])
+        yield from message_paths(types[each.name])
     elif each.encoding is Encoding.RAW:
         yield "msg", "bytes, for numberAt, utf8 and checksum"
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from detector.commands.topics.survey import Topic, encoding_of, shape_of
+from detector.commands.topics.survey import Topic, encoding_of, topic_shape
 from wayside.api.stream import Encoding, Layout
 
 _STALE_S = 5.0
@@ -132,7 +132,7 @@ def _without_each(topic: Topic) -> Iterator[tuple[int, tuple[object, ...]]]:
 
 def _kind(topic: Topic) -> tuple[object, ...]:
     """What topics of one stream have in common; of messages without a type, the names of their fields."""
-    shape = shape_of(topic) if topic.type is None else None
+    shape = topic_shape(topic) if topic.type is None else None
     return topic.recorded_as, topic.type, None if shape is None else frozenset(shape.fields)
 
 

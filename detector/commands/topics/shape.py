@@ -5,21 +5,21 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from wayside.rules import Each, Fields
+from wayside.rules import Fields, ItemFields
 
 _FIELDS = 500
 """A map with more different names is a table, not a message: no more of them are noted."""
 _DEPTH = 12
 
 
-class Shape:
+class MessageShape:
     """Values of one place in messages."""
 
     def __init__(self) -> None:
         self.kinds: set[str] = set()
         """`number`, `boolean`, `text`, `bytes`, `list`, `map`, `null`."""
-        self.fields: dict[str, Shape] = {}
-        self.items: Shape | None = None
+        self.fields: dict[str, MessageShape] = {}
+        self.items: MessageShape | None = None
 
     def add(self, value: Any, depth: int = 0) -> None:
         """Look at one more value."""
@@ -33,20 +33,20 @@ class Shape:
                 if known is None:
                     if len(self.fields) >= _FIELDS:
                         continue
-                    known = self.fields[name] = Shape()
+                    known = self.fields[name] = MessageShape()
                 known.add(child, depth + 1)
         elif kind == "list" and value:
-            self.items = self.items or Shape()
+            self.items = self.items or MessageShape()
             for child in (value[0], value[-1]):
                 self.items.add(child, depth + 1)
 
-    def join(self, other: Shape) -> None:
+    def join(self, other: MessageShape) -> None:
         """Take in what another has seen."""
         self.kinds |= other.kinds
         for name, child in other.fields.items():
-            self.fields.setdefault(name, Shape()).join(child)
+            self.fields.setdefault(name, MessageShape()).join(child)
         if other.items is not None:
-            self.items = self.items or Shape()
+            self.items = self.items or MessageShape()
             self.items.join(other.items)
 
     @property
@@ -54,7 +54,7 @@ class Shape:
         """As for checking paths; None where the values are not maps or lists of maps, or there are too many names."""
         if self.items is not None and self.kinds <= {"list", "null"}:
             known = self.items.known_fields
-            return None if known is None or isinstance(known, Each) else Each(known)
+            return None if known is None or isinstance(known, ItemFields) else ItemFields(known)
         if "map" not in self.kinds or not self.kinds <= {"map", "null"} or len(self.fields) >= _FIELDS:
             return None
         return {name: child.known_fields for name, child in self.fields.items()}
@@ -70,15 +70,15 @@ class Shape:
             yield above, " or ".join(sorted(self.kinds)) + of
 
 
-def paths_of(fields: Fields | None, above: str = "msg", depth: int = 0) -> Iterator[tuple[str, str]]:
+def message_paths(fields: Fields | None, above: str = "msg", depth: int = 0) -> Iterator[tuple[str, str]]:
     """The places of a message whose type is known."""
     if not fields or depth >= _DEPTH:
         yield above, ""
         return
-    if isinstance(fields, Each):
+    if isinstance(fields, ItemFields):
         above = f"{above}[0]"
     for name, child in fields.items():
-        yield from paths_of(child, f"{above}.{name}", depth + 1)
+        yield from message_paths(child, f"{above}.{name}", depth + 1)
 
 
 def _kind(value: Any) -> str:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import msgspec
 
-from detector.commands.topics.shape import Shape
+from detector.commands.topics.shape import MessageShape
 from detector.engine.samples.sample import DecodeError
 from detector.replay.batches import Batch, Channel
 from detector.replay.gathering import Recording
@@ -110,15 +110,15 @@ def encoding_of(topic: Topic) -> Encoding:
         return Encoding.JSON
     if topic.recorded_as in {each.value for each in Encoding} - {Encoding.RAW.value}:
         return Encoding(topic.recorded_as)
-    return next((each for each in (Encoding.JSON, Encoding.CBOR) if shape_of(topic, each) is not None), Encoding.RAW)
+    return next((each for each in (Encoding.JSON, Encoding.CBOR) if topic_shape(topic, each) is not None), Encoding.RAW)
 
 
-def shape_of(topic: Topic, encoding: Encoding | None = None) -> Shape | None:
+def topic_shape(topic: Topic, encoding: Encoding | None = None) -> MessageShape | None:
     """What its samples look like; None where one is not of that encoding, or it is none of plain values."""
     encoding = encoding or encoding_of(topic)
     if encoding not in (Encoding.JSON, Encoding.CBOR):
         return None
-    shape = Shape()
+    shape = MessageShape()
     for value in _values(topic, encoding):
         if value is _UNREADABLE:
             return None

@@ -140,7 +140,7 @@ def distance(position: CompiledPosition, one: Place, other: Place) -> float:
     so that each computation in this order gives the same number.
     """
     if position.geographic:
-        return geodesy.distance(*min(one, other), *max(one, other))
+        return geodesy.surface_distance(*min(one, other), *max(one, other))
     squares = 0.0
     for p, q in zip(one, other, strict=True):
         squares += (p - q) * (p - q)
@@ -149,7 +149,7 @@ def distance(position: CompiledPosition, one: Place, other: Place) -> float:
 
 def distance_of_order_1(position: CompiledPosition, one: Place, other: Place) -> float:
     """What it was for detectors of order 1 (see `timeline.ORDER`): it differs in the last digits."""
-    return geodesy.distance(*one, *other) if position.geographic else math.dist(one, other)
+    return geodesy.surface_distance(*one, *other) if position.geographic else math.dist(one, other)
 
 
 def point(position: CompiledPosition, place: Place) -> Point:

@@ -48,7 +48,7 @@ _MOST_FIELDS = 20_000
 
 
 @dataclass(frozen=True, slots=True)
-class Value:
+class _Value:
     """A value that the source has read, and what makes it plain."""
 
     expression: str
@@ -61,7 +61,7 @@ class Walk:
 
     types: RosTypes
     source: CdrSource
-    found: dict[Path, Value] = field(default_factory=dict)
+    found: dict[Path, _Value] = field(default_factory=dict)
     """What was wanted, by its path."""
     fields: int = 0
 
@@ -88,18 +88,18 @@ class Walk:
                     self.source.align(following)
         return f"{{{', '.join(parts)}}}"
 
-    def _plain(self, value: Value) -> str:
+    def _plain(self, value: _Value) -> str:
         """The source of the plain value."""
         convert = value.convert
         if convert is None:
             return value.expression
         return f"{self.source.bind(convert)}({value.expression})"
 
-    def _field(self, desc: FieldDesc, wanted: Tree | bool, path: Path = ()) -> Value:
+    def _field(self, desc: FieldDesc, wanted: Tree | bool, path: Path = ()) -> _Value:
         """Walks through a field; its value counts where all of it is wanted."""
         kind, detail = desc
         if kind is Nodetype.NAME:
-            return Value(self.message(str(detail), wanted, path))
+            return _Value(self.message(str(detail), wanted, path))
         whole = wanted is True
         if kind is Nodetype.BASE:
             return self._scalar(str(detail[0]), whole)
@@ -118,16 +118,16 @@ class Walk:
             return self._sequence_of_messages(str(element[1]), whole)
         return self._sequence(str(element[1][0]), whole)
 
-    def _scalar(self, kind: str, wanted: bool) -> Value:
+    def _scalar(self, kind: str, wanted: bool) -> _Value:
         """A number or a text."""
         if kind == "string":
-            return Value(self._text(wanted))
+            return _Value(self._text(wanted))
         size = _size(kind)
         if wanted:
             # A byte is read as an octet right away.
-            return Value(self.source.read(_FORMATS[kind], size), float if kind == "byte" else scalar(kind))
+            return _Value(self.source.read(_FORMATS[kind], size), float if kind == "byte" else scalar(kind))
         self.source.advance(size)
-        return Value("")
+        return _Value("")
 
     def _text(self, wanted: bool) -> str:
         """A text; the name of its value."""
@@ -143,25 +143,25 @@ class Walk:
         self.source.line(f"{name} = {text}")
         return name
 
-    def _array(self, kind: str, count: int, wanted: bool) -> Value:
+    def _array(self, kind: str, count: int, wanted: bool) -> _Value:
         if kind == "string":
             values = self._collected(wanted)
             self._append(values, self._text(wanted))
             if count > 1:
                 with_values = partial(self._next_text, values)
                 self.source.loop(str(count - 1), with_values)
-            return Value(values or "")
+            return _Value(values or "")
         value = self._numbers(kind, str(count), self.source.at()) if wanted else ""
         self.source.advance(count * _size(kind))
-        return Value(value)
+        return _Value(value)
 
-    def _sequence(self, kind: str, wanted: bool) -> Value:
+    def _sequence(self, kind: str, wanted: bool) -> _Value:
         count = self.source.read("I", 4)
         if kind == "string":
             values = self._collected(wanted)
             self.source.line(f"if {self.source.at()} + 5 * {count} > len(p): raise IndexError")
             self.source.loop(count, partial(self._next_text, values))
-            return Value(values or "")
+            return _Value(values or "")
         size = _size(kind)
         begin = self.source.at()
         divisor = self.source.divisor()
@@ -171,7 +171,7 @@ class Walk:
         self.source.flush()
         value = self._numbers(kind, count, begin) if wanted else ""
         self.source.rebase(f"{begin} + {count} * {size}", math.gcd(divisor, size))
-        return Value(value)
+        return _Value(value)
 
     def _numbers(self, kind: str, count: str, begin: str) -> str:
         """Reads an array of numbers; the name of its value."""
@@ -188,7 +188,7 @@ class Walk:
         self.source.align(4)
         self._append(values, self._text(values is not None))
 
-    def _array_of_messages(self, type_name: str, count: int, wanted: bool) -> Value:
+    def _array_of_messages(self, type_name: str, count: int, wanted: bool) -> _Value:
         element: FieldDesc = (Nodetype.NAME, type_name)
         before = self._alignment(element)
         aligned = before > self._alignment_behind(element)
@@ -204,9 +204,9 @@ class Walk:
                 one(values)
         else:
             self.source.loop(str(count), partial(one, values))
-        return Value(values or "")
+        return _Value(values or "")
 
-    def _sequence_of_messages(self, type_name: str, wanted: bool) -> Value:
+    def _sequence_of_messages(self, type_name: str, wanted: bool) -> _Value:
         count = self.source.read("I", 4)
         before = self._alignment((Nodetype.NAME, type_name))
         self.source.line(f"if {self.source.at()} + {count} > len(p): raise IndexError")
@@ -219,7 +219,7 @@ class Walk:
             )
             stride = size + -size % before
             self.source.rebase(f"{begin} + {size} + {stride} * ({count} - 1) if {count} else {here}", divisor)
-            return Value("")
+            return _Value("")
 
         def one(values: str | None) -> None:
             self.source.align(before)
@@ -227,7 +227,7 @@ class Walk:
 
         values = self._collected(wanted)
         self.source.loop(count, partial(one, values))
-        return Value(values or "")
+        return _Value(values or "")
 
     def _fixed_size(self, type_name: str, alignment: int) -> int | None:
         """The size of messages of the type where it is always the same, given how they are aligned; else None."""

@@ -71,7 +71,7 @@ def from_idl(text: str) -> Typesdict:
         raise ValueError(f"not valid IDL: {str(error)[:200]}") from None
 
 
-def merged(definitions: Sequence[Definition]) -> Typesdict:
+def merged_types(definitions: Sequence[Definition]) -> Typesdict:
     """All types that the definitions hold. Raises DefinitionsError, with the problems of all of them."""
     types: Typesdict = {}
     given_in: dict[str, str] = {}
@@ -128,7 +128,7 @@ def _wrong_fields(fields: Iterable[tuple[str, FieldDesc]], known: Collection[str
         kind, detail = desc
         if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE) and not 0 <= int(detail[1]) < _LONGEST:
             yield field, f"has {detail[1]} elements, which no message can have"
-        below = _named(desc)
+        below = message_type_of(desc)
         if below is not None and below not in known:
             yield field, f"is of {_missing(below)}"
 
@@ -145,20 +145,20 @@ def _depth(name: str, types: Typesdict, seen: dict[str, int], above: tuple[str, 
     if name not in types:
         return 0
     if name not in seen:
-        below = (_named(desc) for _, desc in types[name][1])
+        below = (message_type_of(desc) for _, desc in types[name][1])
         seen[name] = 1 + max((_depth(each, types, seen, (*above, name)) for each in below if each), default=0)
     if len(above) + seen[name] > _DEEPEST:
         raise _EndlessError(f"{name} is nested more than {_DEEPEST} deep")
     return seen[name]
 
 
-def _named(desc: FieldDesc) -> str | None:
+def message_type_of(desc: FieldDesc) -> str | None:
     """The message type that a field is of, or its elements are."""
     kind, detail = desc
     if kind is Nodetype.NAME:
         return str(detail)
     if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
-        return _named(detail[0])  # type: ignore[arg-type]
+        return message_type_of(detail[0])  # type: ignore[arg-type]
     return None
 
 

@@ -10,7 +10,7 @@ from rosbags.interfaces.typing import FieldDesc
 
 from detector.streams.codecs.ros import RosTypes, standard
 from wayside.api.stream import Encoding, Stream
-from wayside.rules import BYTES, Each, Fields
+from wayside.rules import BYTES, Fields, ItemFields
 
 
 def message_fields(stream: Stream, types: RosTypes | None = None) -> Fields | None:
@@ -33,5 +33,5 @@ def _below(types: RosTypes, desc: FieldDesc) -> Fields | None:
     kind, detail = desc
     if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
         inner, name = cast("FieldDesc", detail[0])
-        return Each(_fields(types, str(name))) if inner is Nodetype.NAME else None
+        return ItemFields(_fields(types, str(name))) if inner is Nodetype.NAME else None
     return _fields(types, str(detail)) if kind is Nodetype.NAME else None

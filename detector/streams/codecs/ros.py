@@ -12,7 +12,7 @@ from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.base import TypesysError
 from rosbags.typesys.store import Typestore
 
-from detector.streams.codecs.definitions import Definition, DefinitionsError, check, merged
+from detector.streams.codecs.definitions import Definition, DefinitionsError, check, merged_types
 
 HEADER = "std_msgs/msg/Header"
 TIME = "builtin_interfaces/msg/Time"
@@ -91,7 +91,7 @@ def types_with(definitions: tuple[Definition, ...]) -> RosTypes:
     if not definitions:
         return standard()
     given = standard().store
-    new = merged(definitions)
+    new = merged_types(definitions)
     check(definitions, new, given.fielddefs)
     store = Typestore()
     store.fielddefs.update({name: parts for name, parts in given.fielddefs.items() if name not in new})

@@ -19,7 +19,7 @@ from detector.actions.database.attachments import detach
 from detector.actions.database.documents import LARGEST, Documents
 from detector.actions.database.pcd import pcd
 from detector.actions.database.png import png
-from detector.actions.database.values import UnfitError, encoded
+from detector.actions.database.values import UnfitError, bson_bytes
 from detector.actions.episode import EpisodeSample
 from detector.streams.codecs import codec_for
 from tests.driving import START
@@ -92,14 +92,14 @@ ANYTHING = st.recursive(
 @settings(max_examples=40)
 @given(st.dictionaries(NAMES, ANYTHING, max_size=4))
 def test_what_a_message_holds_comes_back_as_it_was_also_beside_what_bson_does_not_know(value: dict[str, Any]) -> None:
-    assert bson.decode(encoded({"msg": value}))["msg"] == value
-    with_care = bson.decode(encoded({"msg": value, "wide": 2**63}))
+    assert bson.decode(bson_bytes({"msg": value}))["msg"] == value
+    with_care = bson.decode(bson_bytes({"msg": value, "wide": 2**63}))
     assert with_care["msg"] == value
     assert with_care["wide"] == Decimal128(str(2**63))
 
 
 def test_numbers_stay_what_they_are() -> None:
-    made = encoded({"a": math.nan, "b": math.inf, "c": 2**60, "d": 2**64 - 1, "e": 10**40, "f": np.float32(0.5)})
+    made = bson_bytes({"a": math.nan, "b": math.inf, "c": 2**60, "d": 2**64 - 1, "e": 10**40, "f": np.float32(0.5)})
     back = bson.decode(made)
     assert math.isnan(back["a"])
     assert back["b"] == math.inf
@@ -111,7 +111,7 @@ def test_numbers_stay_what_they_are() -> None:
 
 def test_numpy_names_and_texts_that_bson_does_not_know_become_something_that_it_does() -> None:
     value = {1: np.arange(3), "a\0b": np.int64(5), "text": "\ud800", "set": {1.0}, "view": memoryview(b"ab")}
-    back = bson.decode(encoded({"msg": value}))["msg"]
+    back = bson.decode(bson_bytes({"msg": value}))["msg"]
     assert back == {"1": [0, 1, 2], "a\N{SYMBOL FOR NULL}b": 5, "text": "?", "set": [1.0], "view": b"ab"}
 
 
@@ -120,7 +120,7 @@ def test_a_message_nested_deeper_than_mongodb_takes_is_refused_by_name() -> None
     for _ in range(300):
         value = [value]
     with pytest.raises(UnfitError, match="100 levels"):
-        encoded({"msg": value})
+        bson_bytes({"msg": value})
 
 
 def test_a_document_beyond_16_mb_goes_to_a_file_as_a_whole() -> None:

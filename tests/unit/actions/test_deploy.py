@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from detector.actions.deploy.file_store import FileTaskStore, write_tasks_yaml
 from detector.actions.deploy.reconciler import DemandReconciler, DeployCounts
-from detector.actions.deploy.stores import manifest, restore
+from detector.actions.deploy.stores import restore, task_manifest
 from detector.engine.episodes.demands import Demand, to_task
 from tests.unit.actions.test_demands import DEMAND
 from wayside.api.documents import load_documents
@@ -115,7 +115,7 @@ def test_a_demand_whose_end_nobody_tells_ends_now(tmp_path: Path) -> None:
 
 
 def test_nothing_is_ended_before_the_engine_has_spoken(tmp_path: Path) -> None:
-    put(tmp_path, manifest(to_task(A)))
+    put(tmp_path, task_manifest(to_task(A)))
     before = stored(tmp_path)
 
     async def drive() -> None:
@@ -146,7 +146,7 @@ def test_a_task_found_under_the_name_is_adopted_and_put_right(tmp_path: Path) ->
     async def drive() -> DeployCounts:
         async with reconciling(tmp_path, NEVER) as reconciler:
             await eventually(lambda: reconciler.looks > 0, "it has looked")
-            put(tmp_path, manifest(to_task(dataclasses.replace(A, parameters={"old": 1}))))
+            put(tmp_path, task_manifest(to_task(dataclasses.replace(A, parameters={"old": 1}))))
             reconciler.update(by_name(A), {})
             await eventually(lambda: stored(tmp_path)[A.name]["spec"]["parameters"] == A.parameters, "it is put right")
         return reconciler.counts
@@ -155,7 +155,7 @@ def test_a_task_found_under_the_name_is_adopted_and_put_right(tmp_path: Path) ->
 
 
 def test_another_holders_task_under_the_name_is_left_alone(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    foreign = manifest(to_task(A))
+    foreign = task_manifest(to_task(A))
     foreign["spec"]["requester"]["holder"] = "somebody-else"
     file = put(tmp_path, foreign)
     text = file.read_text()
@@ -181,7 +181,7 @@ def test_what_a_person_deletes_comes_back_and_what_they_end_stays_ended(tmp_path
             looks = reconciler.looks
             await eventually(lambda: reconciler.looks > looks + 1, "it has seen them live")
             (tmp_path / f"{A.name}.yaml").unlink()
-            put(tmp_path, manifest(to_task(B, end_time=3)))
+            put(tmp_path, task_manifest(to_task(B, end_time=3)))
             await eventually(lambda: A.name in ends(tmp_path), "it is back")
             looks = reconciler.looks
             await eventually(lambda: reconciler.looks > looks + 3, "it has looked")
@@ -192,7 +192,7 @@ def test_what_a_person_deletes_comes_back_and_what_they_end_stays_ended(tmp_path
 
 
 def test_a_task_that_an_earlier_run_over_the_same_data_ended_is_made_anew(tmp_path: Path) -> None:
-    put(tmp_path, manifest(to_task(A, end_time=3)))
+    put(tmp_path, task_manifest(to_task(A, end_time=3)))
 
     async def drive() -> DeployCounts:
         async with reconciling(tmp_path) as reconciler:

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from detector.actions.deploy.ledger import Ledger
-from detector.actions.deploy.steps import Step, next_step
+from detector.actions.deploy.steps import StoreChange, next_step
 from detector.actions.deploy.stores import Snapshot, StoredTask, Update
 from detector.engine.episodes.demands import Demand, to_task
 from tests.unit.actions.test_demands import DEMAND
@@ -25,15 +25,15 @@ DEMANDS = st.builds(
 STORED = st.builds(lambda demand, ended: StoredTask(to_task(demand, 5 if ended else None), 1), DEMANDS, st.booleans())
 
 
-def after(step: Step, demand: Demand | None, stored: StoredTask | None) -> StoredTask | None:
+def after(step: StoreChange, demand: Demand | None, stored: StoredTask | None) -> StoredTask | None:
     """What a store has when the step is done."""
-    if step is Step.CREATE and demand is not None and stored is None:
+    if step is StoreChange.CREATE and demand is not None and stored is None:
         return StoredTask(to_task(demand), 2)
     assert stored is not None
-    if step is Step.REPLACE:
+    if step is StoreChange.REPLACE:
         return None
     spec = stored.task.spec
-    if step is Step.END:
+    if step is StoreChange.END:
         changed = spec.model_copy(update={"end_time": "2026-01-01T00:00:00Z"})
     else:
         assert demand is not None
@@ -48,10 +48,10 @@ def test_at_most_three_steps_lead_to_what_is_demanded(
     before = stored
     for _ in range(3):
         step = next_step(demand, stored, held)
-        if step is Step.NOTHING:
+        if step is StoreChange.NOTHING:
             break
         stored = after(step, demand, stored)
-    assert next_step(demand, stored, held) is Step.NOTHING
+    assert next_step(demand, stored, held) is StoreChange.NOTHING
     if demand is None:
         assert stored is None or not stored.live
     elif held and before is not None and not before.live:
@@ -82,7 +82,7 @@ def test_what_the_store_says_late_does_not_undo_what_is_known_since() -> None:
     assert ledger.see(Snapshot({}, 4)) == [], "a list from before the creation"
     assert ledger.see(Update(DEMAND.name, None, 4)) == [], "an old deletion"
     assert ledger.see(Update(DEMAND.name, task(end=1, version=4), 4)) == [], "an old end"
-    assert ledger.next(DEMAND.name) is Step.NOTHING
+    assert ledger.next(DEMAND.name) is StoreChange.NOTHING
     assert ledger.see(Snapshot({}, 6)) == [DEMAND.name], "now it is really gone"
 
 
@@ -94,5 +94,5 @@ def test_an_end_is_remembered_until_the_task_has_ended() -> None:
     ledger.accept({}, {})
     assert ledger.end_of(DEMAND.name) == 77
     ledger.put(DEMAND.name, task(end=77, version=2))
-    assert ledger.next(DEMAND.name) is Step.NOTHING
+    assert ledger.next(DEMAND.name) is StoreChange.NOTHING
     assert ledger.end_of(DEMAND.name) is None

@@ -11,7 +11,7 @@ from detector.actions.notify import Notify
 from detector.assembly.checking import check_documents
 from tests.driving import a_detector
 from tests.guides import guide, yaml_blocks
-from wayside.api.actions.notify import Notify as Parameters
+from wayside.api.actions.notify import NotifyAction as Parameters
 from wayside.api.documents import DocumentError, load_documents
 
 GUIDE = guide("notify")

@@ -9,8 +9,16 @@ import pytest
 from hypothesis import given
 
 from detector.actions.notify.grouping import Groups
-from detector.actions.notify.notice import GROUP_TYPE, Notice, Texts, event_of_group
-from detector.actions.notify.outbox import LONGEST, LONGEST_RETRY_AFTER, Budget, Delivery, Fate, Message, Outbox
+from detector.actions.notify.notice import GROUP_TYPE, Notice, NoticeTexts, event_of_group
+from detector.actions.notify.outbox import (
+    LONGEST,
+    LONGEST_RETRY_AFTER,
+    Delivery,
+    Fate,
+    Outbox,
+    OutboxMessage,
+    RateLimit,
+)
 from tests.notifying import an_episode
 
 DELIVERED, AGAIN, REFUSED = Delivery(Fate.DELIVERED), Delivery(Fate.AGAIN), Delivery(Fate.REFUSED)
@@ -20,12 +28,12 @@ AWAY = Delivery(Fate.AGAIN, whole=True)
 def notice(episode: str, what: str = "started", **labels: str) -> Notice:
     made = an_episode(episode)
     event: Any = made.started if what == "started" else made.ended
-    return Notice(episode, event, Texts(labels=labels), created=0.0)
+    return Notice(episode, event, NoticeTexts(labels=labels), created=0.0)
 
 
-def message(episode: str, what: str = "started") -> Message:
+def message(episode: str, what: str = "started") -> OutboxMessage:
     one = notice(episode, what)
-    return Message(one.event, [one])
+    return OutboxMessage(one.event, [one])
 
 
 @given(
@@ -38,7 +46,7 @@ def test_each_message_is_settled_once_and_each_episode_in_order(
     box, now = Outbox(100, 3600.0), 0.0
     waiting = [message(episode, "started" if start else "ended") for episode, start in told]
     assert all(map(box.add, waiting))
-    settled: list[Message] = []
+    settled: list[OutboxMessage] = []
     for answer in [*answers, *([DELIVERED] * len(waiting))]:
         wait = box.wait(now)
         if wait is None:
@@ -113,7 +121,7 @@ def test_what_is_too_old_is_given_up_after_an_attempt() -> None:
 
 @given(st.integers(1, 5), st.lists(st.integers(0, 6), max_size=30))
 def test_the_budget_is_never_exceeded_in_any_stretch_of_its_time(messages: int, pauses: list[int]) -> None:
-    budget, now, sent = Budget(messages, 10.0), 0.0, []
+    budget, now, sent = RateLimit(messages, 10.0), 0.0, []
     for pause in pauses:
         now += pause
         now += budget.wait(now)

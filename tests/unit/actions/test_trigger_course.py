@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from detector.actions.trigger.course import FOREVER, Course, CourseStep, Limits
+from detector.actions.trigger.course import FOREVER, Course, CourseStep, Timeouts
 from detector.actions.trigger.orders import Order, Progress, Report
 
 RECORDING, DONE = Report(Progress.RECORDING), Report(Progress.DONE, files=("a",))
@@ -15,7 +15,7 @@ ENDING, UNKNOWN = Report(Progress.ENDING), Report(Progress.UNKNOWN)
 def a_course(
     *, maximum: float = FOREVER, give_up: float = 60, renew: float | None = 10, resumed: bool = False
 ) -> Course:
-    return Course(Order("x", {}), Limits(maximum, give_up, renew), 0, -1, resumed=resumed)
+    return Course(Order("x", {}), Timeouts(maximum, give_up, renew), 0, -1, resumed=resumed)
 
 
 def test_a_recording_is_started_said_again_stopped_and_awaited() -> None:

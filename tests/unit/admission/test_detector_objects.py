@@ -17,7 +17,7 @@ from application_manager.core.health.pods import Trouble, TroubleReason
 from application_manager.core.objects.detectors import detector_objects, detector_roles, secrets_of
 from application_manager.core.objects.poddefaults import PodDefaults, parse_user
 from application_manager.core.objects.pullpolicy import PullPolicy
-from application_manager.core.objects.rights import detector_rights, merged, rights
+from application_manager.core.objects.rights import detector_rights, merged_rules, rights
 from application_manager.core.statuses.rulestatus import detector_status
 from application_manager.core.statuses.running import NOT_RUN, running
 from tests.cluster.manifests import DETECTOR
@@ -252,10 +252,10 @@ def test_the_manager_has_all_that_it_hands_on() -> None:
             for verb in rule["verbs"]
         }
 
-    unnamed = [rule for rule in merged(rights({}, detectors=True)) if "resourceNames" not in rule]
-    assert verbs(merged(detector_rights("town"))) <= verbs(unnamed)
+    unnamed = [rule for rule in merged_rules(rights({}, detectors=True)) if "resourceNames" not in rule]
+    assert verbs(merged_rules(detector_rights("town"))) <= verbs(unnamed)
     assert not {"escalate", "bind", "*"} & {verb for _, _, verb in verbs(unnamed)}
-    assert verbs(merged(rights({}))) < verbs(unnamed)
+    assert verbs(merged_rules(rights({}))) < verbs(unnamed)
 
 
 def test_a_command_prints_the_account_of_a_detector_that_somebody_else_runs() -> None:

@@ -16,7 +16,7 @@ from application_manager.cluster.client import Client, Resource
 from application_manager.cluster.errors import ApiError
 from application_manager.core.findings.findings import Findings
 from application_manager.core.findings.reviews import LONGEST, MOST_TOLD, ReviewError, answer, read
-from application_manager.core.findings.webhooks import Place, webhook_configuration
+from application_manager.core.findings.webhooks import WebhookClientConfig, webhook_configuration
 from application_manager.core.objects.policy import Policy
 from application_manager.measures import Measures
 from tests.inprocess import InProcess
@@ -122,7 +122,7 @@ def test_of_a_kind_that_is_not_looked_at_nothing_is_kept() -> None:
 
 
 def test_the_configuration_asks_about_three_kinds_and_stands_in_nobodys_way() -> None:
-    made = webhook_configuration(Place.of_service("wayside/manager:8443"), b"PEM", ["b", "a"])
+    made = webhook_configuration(WebhookClientConfig.of_service("wayside/manager:8443"), b"PEM", ["b", "a"])
     (webhook,) = made["webhooks"]
     service = {"namespace": "wayside", "name": "manager", "port": 8443, "path": "/admission"}
     assert webhook["clientConfig"] == {"service": service, "caBundle": "UEVN"}
@@ -136,9 +136,9 @@ def test_the_configuration_asks_about_three_kinds_and_stands_in_nobodys_way() ->
 @pytest.mark.parametrize("url", ["http://a", "https://", "a:1", "https://a/b", "https://u@a", "https://a:123456"])
 def test_a_place_that_is_none_is_refused(url: str) -> None:
     with pytest.raises(ValueError, match="write https://HOST:PORT"):
-        Place.of_url(url)
+        WebhookClientConfig.of_url(url)
     with pytest.raises(ValueError, match="write NAMESPACE/NAME"):
-        Place.of_service(url)
+        WebhookClientConfig.of_service(url)
 
 
 # --- Rules and detectors are judged with each other

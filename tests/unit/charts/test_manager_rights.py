@@ -11,9 +11,9 @@ from typer.testing import CliRunner
 
 from application_manager.cli import app
 from application_manager.cluster.connection import ConfigurationError
-from application_manager.cluster.entitlement import judge
+from application_manager.cluster.entitlement import report_missing
 from application_manager.core.objects.policy import PLURALS, KindKey
-from application_manager.core.objects.rights import merged, rights, roles
+from application_manager.core.objects.rights import merged_rules, rights, roles
 from tests.guides import guide
 
 DEPLOYMENT: KindKey = ("apps/v1", "Deployment")
@@ -24,7 +24,7 @@ LEASE = ("system", "application-manager")
 def verbs(plurals: dict[KindKey, str]) -> dict[tuple[str, str], set[str]]:
     return {
         (group, resource): set(rule["verbs"])
-        for rule in merged(rights(plurals))
+        for rule in merged_rules(rights(plurals))
         for group in rule["apiGroups"]
         for resource in rule["resources"]
     }
@@ -41,7 +41,7 @@ def test_a_kind_that_is_not_allowed_is_in_no_role() -> None:
 
 
 def test_nothing_is_granted_by_a_wildcard_and_no_rights_can_be_given_on() -> None:
-    for rule in merged(rights(dict(PLURALS))):
+    for rule in merged_rules(rights(dict(PLURALS))):
         assert "*" not in str(rule)
         assert not {"escalate", "bind", "impersonate"} & set(rule["verbs"])
 
@@ -103,14 +103,14 @@ def test_a_kind_that_nobody_knows_is_looked_up_in_a_cluster(monkeypatch: pytest.
 
 def test_what_is_lacking_is_said_with_its_purpose_and_the_remedy(caplog: pytest.LogCaptureFixture) -> None:
     needed = {(each.resource, each.vital): each for each in rights({DEPLOYMENT: "deployments"})}
-    judge([(needed["deployments", False], "patch", "a")])
+    report_missing([(needed["deployments", False], "patch", "a")])
     (said,) = caplog.messages
     assert said == (
         "its account may not patch deployments of apps in namespace a: no Deployment of a template is made, changed or "
         "removed: grant what `application-manager rbac` prints"
     )
     with pytest.raises(ConfigurationError, match="may not list pods in all namespaces: why workloads do not run"):
-        judge([(needed["pods", True], "list", None)])
+        report_missing([(needed["pods", True], "list", None)])
 
 
 def test_the_guides_command_gives_what_the_guides_manager_needs() -> None:

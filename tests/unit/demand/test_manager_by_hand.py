@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from application_manager.core.conditions import Aspect
-from application_manager.core.demand.byhand import HOLD_ANNOTATION, PAUSE_ANNOTATION, aspects, is_held, is_paused
+from application_manager.core.demand.byhand import HOLD_ANNOTATION, PAUSE_ANNOTATION, is_held, is_paused, manual_aspects
 from application_manager.core.demand.decisions import Decision
 from application_manager.core.demand.demand import Standing, demand
 from application_manager.core.statuses.status import instance_status
@@ -56,9 +56,9 @@ def test_a_persons_instance_can_be_paused_too() -> None:
 
 
 def test_the_status_says_who_keeps_it_and_once_more_when_that_is_over() -> None:
-    assert list(aspects(instance())) == []
+    assert list(manual_aspects(instance())) == []
     held = annotated(HOLD_ANNOTATION, "anna, measuring")
-    (aspect,) = aspects(held)
+    (aspect,) = manual_aspects(held)
     assert (aspect.type, aspect.holds) == ("Held", True)
     assert "anna, measuring" in aspect.message
     well = Aspect("Applied", True, "Applied"), Aspect("Ready", True, "Ready")
@@ -69,5 +69,5 @@ def test_the_status_says_who_keeps_it_and_once_more_when_that_is_over() -> None:
         "Held": "True",
     }
     later = instance().model_copy(update={"status": ApplicationInstanceStatus.model_validate(status)})
-    (aspect,) = aspects(later)
+    (aspect,) = manual_aspects(later)
     assert (aspect.type, aspect.holds, aspect.reason) == ("Held", False, "NotHeld")

@@ -13,7 +13,7 @@ from detector.assembly import DetectorError, inlets
 from detector.engine.samples.sample import DecodeError
 from detector.streams.codecs.etsi import DefinitionError, EtsiDecoder
 from detector.streams.codecs.etsi.messages import BY_NAME, packaged_definitions
-from detector.streams.codecs.etsi.times import its_ms, nearest, unix_ns
+from detector.streams.codecs.etsi.times import its_ms, nearest_time, unix_ns
 from tests.driving import a_detector, a_rule
 from tests.unit.encodings.its_messages import PDUS, a_cam, encode, random_message
 from wayside.rules import RuleError, compile_rule
@@ -85,7 +85,7 @@ def test_its_time_counts_leap_seconds(milliseconds: int, unix: int) -> None:
 @pytest.mark.parametrize("late", [0, 1, 300, 32_000, -300, -32_000])
 def test_a_generation_time_is_the_one_nearest_to_the_receipt(late: int) -> None:
     sent = NOW + 123_000_000
-    assert nearest(its_ms(sent) % 65536, sent + late * 1_000_000) == sent
+    assert nearest_time(its_ms(sent) % 65536, sent + late * 1_000_000) == sent
     assert EtsiDecoder("etsi/cam").stamp_near(a_cam(milliseconds=its_ms(sent)), sent + late * 1_000_000) == sent
 
 

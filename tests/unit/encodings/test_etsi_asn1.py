@@ -16,7 +16,7 @@ from detector.engine.samples.sample import DecodeError
 from detector.streams.codecs.etsi import EtsiDecoder, OwnDefinitions
 from detector.streams.codecs.etsi.bits import Bits
 from detector.streams.codecs.etsi.bounds import span_constraints
-from detector.streams.codecs.etsi.own import parsed
+from detector.streams.codecs.etsi.own import parsed_modules
 from detector.streams.codecs.etsi.reading import Readers
 from tests.driving import a_detector
 from tests.unit.encodings.its_messages import a_cam
@@ -61,7 +61,7 @@ END
 def encoder(*texts: str) -> Any:
     tree: dict[str, Any] = {}
     for text in texts:
-        tree.update(copy.deepcopy(parsed(text)))
+        tree.update(copy.deepcopy(parsed_modules(text)))
     span_constraints(tree)
     return asn1tools.compile_dict(tree, "uper")
 

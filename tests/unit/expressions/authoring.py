@@ -8,12 +8,12 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from hypothesis import strategies as st
 
-from wayside.expressions import Environment, Expression, ExpressionError, Kind, Path
+from wayside.expressions import CelType, Environment, Expression, ExpressionError, Path
 from wayside.expressions.columns import MISSING, Graph, Program, Results, Tag, Texts, column_of, value_at
 
 FIELDS = ("a", "b", "c", "e")
-DECLARED = {"d": Kind.DOUBLE, "f": Kind.BOOL, "s": Kind.STRING}
-ENVIRONMENT = Environment({"m": Kind.DYN} | DECLARED)
+DECLARED = {"d": CelType.DOUBLE, "f": CelType.BOOL, "s": CelType.STRING}
+ENVIRONMENT = Environment({"m": CelType.DYN} | DECLARED)
 Row = Mapping[str, object]
 
 
@@ -180,10 +180,10 @@ UNARY = ("abs", "sqrt", "sin", "cos", "degrees", "radians")
 BINARY = ("smaller", "larger", "hypot", "atan2", "headingDifference", "timeToCollision")
 LIST = "['x', 0.0, true, '']"
 AUTHORS = st.integers(0, 2**32).map(Author)
-KINDS = st.sampled_from([Kind.DYN, Kind.DYN, Kind.BOOL, Kind.DOUBLE, Kind.STRING])
+KINDS = st.sampled_from([CelType.DYN, CelType.DYN, CelType.BOOL, CelType.DOUBLE, CelType.STRING])
 
 
-def compiled(source: str, kind: Kind = Kind.DYN) -> Expression | None:
+def compiled(source: str, kind: CelType = CelType.DYN) -> Expression | None:
     """None for what CEL's own check of types refuses."""
     try:
         return ENVIRONMENT.compile(source, result=kind)

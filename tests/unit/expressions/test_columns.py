@@ -25,7 +25,7 @@ from tests.unit.expressions.authoring import (
     rows_of,
     same,
 )
-from wayside.expressions import UNKNOWN, Kind, Path
+from wayside.expressions import UNKNOWN, CelType, Path
 from wayside.expressions.columns import (
     MISSING,
     NOWHERE,
@@ -43,7 +43,7 @@ from wayside.expressions.columns.functions import SCALAR, VECTORISED, calculate
 
 @given(st.integers(0, 2**32), KINDS, rows_of(ANYTHING))
 @settings(max_examples=100, deadline=None)
-def test_rows_have_the_values_that_cel_gives(seed: int, kind: Kind, rows: list[Row]) -> None:
+def test_rows_have_the_values_that_cel_gives(seed: int, kind: CelType, rows: list[Row]) -> None:
     table, author = Table(rows), Author(seed)
     for source in (author.number(3), author.truth(3), *(author.anything(2) for _ in range(4))):
         expression = compiled(source, kind)

@@ -9,10 +9,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from wayside.expressions import UNKNOWN, Environment, EvaluationError, ExpressionError, Kind, normalise
+from wayside.expressions import UNKNOWN, CelType, Environment, EvaluationError, ExpressionError, normalise
 
 ENVIRONMENT = Environment(
-    {"speed": Kind.DYN, "distance": Kind.DOUBLE, "msg": Kind.DYN, "a": Kind.MAP, "l": Kind.LIST, "b": Kind.BOOL}
+    {
+        "speed": CelType.DYN,
+        "distance": CelType.DOUBLE,
+        "msg": CelType.DYN,
+        "a": CelType.MAP,
+        "l": CelType.LIST,
+        "b": CelType.BOOL,
+    }
 )
 
 
@@ -50,7 +57,7 @@ def test_paths_are_the_literal_fields_it_reads() -> None:
 
 def test_compiling_again_costs_nothing() -> None:
     assert ENVIRONMENT.compile("distance < 1") is ENVIRONMENT.compile("distance < 1")
-    assert ENVIRONMENT.compile("distance < 1", result=Kind.BOOL) is not ENVIRONMENT.compile("distance < 1")
+    assert ENVIRONMENT.compile("distance < 1", result=CelType.BOOL) is not ENVIRONMENT.compile("distance < 1")
 
 
 @pytest.mark.parametrize(
@@ -74,8 +81,8 @@ def test_results_are_plain(source: str, expected: object) -> None:
 
 def test_maps_come_back_sorted_in_every_process() -> None:
     program = (
-        "from wayside.expressions import Environment, Kind\n"
-        'e = Environment({\'m\': Kind.MAP}).compile(\'{"k": m, "b": 1, "a": 2, "c": 3}\')\n'
+        "from wayside.expressions import CelType, Environment\n"
+        'e = Environment({\'m\': CelType.MAP}).compile(\'{"k": m, "b": 1, "a": 2, "c": 3}\')\n'
         "print(e.evaluate({'m': dict(z=1, y=2, x=3)}))\n"
     )
     outputs = {
@@ -195,20 +202,20 @@ def test_values_nested_without_end_are_an_error_not_a_crash() -> None:
 @pytest.mark.parametrize("name", ["in", "a-b", "1x", "", "null"])
 def test_a_variable_must_be_one_that_an_expression_can_name(name: str) -> None:
     with pytest.raises(ValueError, match="variable"):
-        Environment({name: Kind.DYN})
+        Environment({name: CelType.DYN})
 
 
 @pytest.mark.parametrize(
     ("source", "result", "message"),
     [
-        ("distance", Kind.BOOL, "must be a boolean, is a number"),
-        ("  'a'", Kind.BOOL, "must be a boolean, is a text"),
-        ("[1]", Kind.MAP, r"must be a map, is list\(double\)"),
-        ("null", Kind.DOUBLE, "must be a number, is null"),
-        ("b", Kind.STRING, "must be a text, is a boolean"),
+        ("distance", CelType.BOOL, "must be a boolean, is a number"),
+        ("  'a'", CelType.BOOL, "must be a boolean, is a text"),
+        ("[1]", CelType.MAP, r"must be a map, is list\(double\)"),
+        ("null", CelType.DOUBLE, "must be a number, is null"),
+        ("b", CelType.STRING, "must be a text, is a boolean"),
     ],
 )
-def test_a_result_of_the_wrong_type_is_refused_when_compiled(source: str, result: Kind, message: str) -> None:
+def test_a_result_of_the_wrong_type_is_refused_when_compiled(source: str, result: CelType, message: str) -> None:
     with pytest.raises(ExpressionError, match=message.replace("list\\(double\\)", "list<double>")) as caught:
         ENVIRONMENT.compile(source, result=result)
     assert caught.value.column == len(source) - len(source.lstrip()) + 1

@@ -4,10 +4,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wayside.expressions import Environment, ExpressionError, Kind
+from wayside.expressions import CelType, Environment, ExpressionError
 
 ENVIRONMENT = Environment(
-    {"speed": Kind.DYN, "distance": Kind.DOUBLE, "msg": Kind.DYN, "l": Kind.LIST, "braking": Kind.BOOL}
+    {"speed": CelType.DYN, "distance": CelType.DOUBLE, "msg": CelType.DYN, "l": CelType.LIST, "braking": CelType.BOOL}
 )
 
 

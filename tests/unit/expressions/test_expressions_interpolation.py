@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wayside.expressions import Environment, InterpolationError, Json, Kind, compile_template
+from wayside.expressions import CelType, Environment, InterpolationError, Json, compile_template
 
-ENVIRONMENT = Environment({"parameters": Kind.MAP, "instance": Kind.MAP})
+ENVIRONMENT = Environment({"parameters": CelType.MAP, "instance": CelType.MAP})
 VALUES: dict[str, object] = {
     "parameters": {
         "replicas": 3,

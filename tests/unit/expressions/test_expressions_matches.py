@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 
 from application_manager.core.claims.patterns import mismatch, pattern_problem
-from wayside.expressions import Environment, EvaluationError, ExpressionError, Kind
+from wayside.expressions import CelType, Environment, EvaluationError, ExpressionError
 from wayside.expressions.regex import LARGEST_PATTERN, LONGEST_INPUT, pattern_size
 
-ENVIRONMENT = Environment({"s": Kind.STRING, "msg": Kind.DYN, "items": Kind.LIST})
+ENVIRONMENT = Environment({"s": CelType.STRING, "msg": CelType.DYN, "items": CelType.LIST})
 
 
 @pytest.mark.parametrize(
@@ -23,7 +23,7 @@ ENVIRONMENT = Environment({"s": Kind.STRING, "msg": Kind.DYN, "items": Kind.LIST
     ],
 )
 def test_a_literal_pattern_matches_as_ever_and_a_long_text_has_no_answer(source: str) -> None:
-    expression = ENVIRONMENT.compile(source, result=Kind.BOOL)
+    expression = ENVIRONMENT.compile(source, result=CelType.BOOL)
 
     def outcome(text: str) -> object:
         return expression.evaluate({"s": text, "msg": {"name": text}, "items": [text]})

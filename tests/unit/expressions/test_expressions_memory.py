@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from wayside.expressions import Environment, Kind
+from wayside.expressions import CelType, Environment
 
 POLYGON = [[0.0, 0.0], [5.0, 0.0], [5.0, 5.0]]
 
@@ -42,7 +42,7 @@ def frozen() -> Iterator[None]:
     ],
 )
 def test_nothing_is_left_behind(source: str, values: dict[str, Any]) -> None:
-    expression = Environment({"msg": Kind.DYN}).compile(source)
+    expression = Environment({"msg": CelType.DYN}).compile(source)
 
     def evaluate(times: int) -> None:
         for _ in range(times):
@@ -61,12 +61,12 @@ def test_nothing_is_left_behind(source: str, values: dict[str, Any]) -> None:
 
 
 def test_arguments_and_results_stay_whole_for_those_who_keep_them() -> None:
-    expression = Environment({"msg": Kind.DYN}).compile("utf8(msg.data)")
+    expression = Environment({"msg": CelType.DYN}).compile("utf8(msg.data)")
     texts = [expression.evaluate({"msg": {"data": f"text number {number}".encode()}}) for number in range(1000)]
     gc.collect()
     assert texts == [f"text number {number}" for number in range(1000)]
     area = [list(corner) for corner in POLYGON]
-    inside = Environment({"area": Kind.DYN}).compile("inside(1.5, 1.25, area)")
+    inside = Environment({"area": CelType.DYN}).compile("inside(1.5, 1.25, area)")
     for _ in range(1000):
         assert inside.evaluate({"area": area}) is True
     assert sys.getrefcount(area) < 10

@@ -4,11 +4,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wayside.expressions import Environment, EvaluationError, ExpressionError, Kind
+from wayside.expressions import CelType, Environment, EvaluationError, ExpressionError
 from wayside.expressions.lexer import TokenKind, tokens
 from wayside.expressions.numbers import MAX_EXACT, doubled
 
-VARIABLES = {"d": Kind.DOUBLE, "x": Kind.DYN, "m": Kind.MAP, "l": Kind.LIST, "i": Kind.DOUBLE, "s": Kind.STRING}
+VARIABLES = {
+    "d": CelType.DOUBLE,
+    "x": CelType.DYN,
+    "m": CelType.MAP,
+    "l": CelType.LIST,
+    "i": CelType.DOUBLE,
+    "s": CelType.STRING,
+}
 ENVIRONMENT = Environment(VARIABLES)
 VALUES = {"d": 3.0, "x": {"l": [10, 20, 30], "n": 5, "1": "one"}, "m": {"a": 1}, "l": [1, 2, 3], "i": 1, "s": "wayside"}
 
@@ -131,7 +138,7 @@ def test_arithmetic_means_what_it_means_in_doubles(steps: list[tuple[str, str]],
         "<=": expected <= 100,
         "!=": expected != 100,
     }
-    assert ENVIRONMENT.compile(f"{source} {comparison} 100", result=Kind.BOOL).evaluate(VALUES) is order[comparison]
+    assert ENVIRONMENT.compile(f"{source} {comparison} 100", result=CelType.BOOL).evaluate(VALUES) is order[comparison]
 
 
 @pytest.mark.parametrize(

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wayside.expressions import UNKNOWN, Environment, Kind, Reason, Unknown
+from wayside.expressions import UNKNOWN, CelType, Environment, Reason, Unknown
 
-ENVIRONMENT = Environment(dict.fromkeys(("p", "q", "r", "msg"), Kind.DYN) | {"d": Kind.DOUBLE, "l": Kind.LIST})
+ENVIRONMENT = Environment(dict.fromkeys(("p", "q", "r", "msg"), CelType.DYN) | {"d": CelType.DOUBLE, "l": CelType.LIST})
 Truth = bool | None
 TRUTHS: tuple[Truth, ...] = (True, False, None)
 
@@ -163,7 +163,7 @@ def test_a_fault_of_the_expression_is_told_from_an_absent_input(source: str, val
 
 
 def test_a_boolean_that_turns_out_to_be_none_is_a_fault() -> None:
-    expression = ENVIRONMENT.compile("p", result=Kind.BOOL)
+    expression = ENVIRONMENT.compile("p", result=CelType.BOOL)
     told: list[tuple[Reason, str]] = []
     assert expression.evaluate_or_unknown({"p": 3}, lambda *why: told.append(why)) is UNKNOWN
     assert told == [(Reason.ERROR, "must be a boolean, is a number")]

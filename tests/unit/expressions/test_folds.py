@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from wayside.expressions import Environment, Kind
+from wayside.expressions import CelType, Environment
 from wayside.expressions.columns.folds import How, folded
 from wayside.expressions.syntax import Loop
 
-ENVIRONMENT = Environment({"members": Kind.LIST, "others": Kind.LIST, "limit": Kind.DOUBLE})
+ENVIRONMENT = Environment({"members": CelType.LIST, "others": CelType.LIST, "limit": CelType.DOUBLE})
 
 
 def loops(node: object) -> int:
@@ -33,7 +33,7 @@ def loops(node: object) -> int:
     ],
 )  # fmt: skip
 def test_loops_over_the_items_become_folds(source: str, how: list[How]) -> None:
-    rest, folds = folded(ENVIRONMENT.compile(source, result=Kind.BOOL), "members")
+    rest, folds = folded(ENVIRONMENT.compile(source, result=CelType.BOOL), "members")
     assert [each.how for each in folds.values()] == how
     assert loops(rest.tree) == 0
 
@@ -47,13 +47,13 @@ def test_loops_over_the_items_become_folds(source: str, how: list[How]) -> None:
     ],
 )
 def test_other_loops_stay(source: str, left: int) -> None:
-    rest, folds = folded(ENVIRONMENT.compile(source, result=Kind.BOOL), "members")
+    rest, folds = folded(ENVIRONMENT.compile(source, result=CelType.BOOL), "members")
     assert folds == {}
     assert loops(rest.tree) == left
 
 
 def test_a_fold_is_named_like_no_variable() -> None:
-    environment = Environment({"members": Kind.LIST, "fold0": Kind.DOUBLE})
-    rest, folds = folded(environment.compile("size(members) > fold0", result=Kind.BOOL), "members")
+    environment = Environment({"members": CelType.LIST, "fold0": CelType.DOUBLE})
+    rest, folds = folded(environment.compile("size(members) > fold0", result=CelType.BOOL), "members")
     assert list(folds) == ["fold0_"]
     assert rest.names == {"members", "fold0", "fold0_"}

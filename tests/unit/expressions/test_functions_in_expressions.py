@@ -11,11 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.guides import guide
-from wayside.expressions import UNKNOWN, Environment, EvaluationError, ExpressionError, Kind, Reason
-from wayside.expressions.__main__ import tables, written
+from wayside.expressions import UNKNOWN, CelType, Environment, EvaluationError, ExpressionError, Reason
+from wayside.expressions.__main__ import tables, with_tables
 from wayside.expressions.functions import FUNCTIONS
 
-ENVIRONMENT = Environment({"msg": Kind.DYN, "area": Kind.DYN, "streams": Kind.LIST, "a": Kind.MAP, "x": Kind.DOUBLE})
+ENVIRONMENT = Environment(
+    {"msg": CelType.DYN, "area": CelType.DYN, "streams": CelType.LIST, "a": CelType.MAP, "x": CelType.DOUBLE}
+)
 SQUARE = [[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 4.0]]
 
 
@@ -145,7 +147,7 @@ def calls() -> list[tuple[str, int]]:
     return [(f"{name}({', '.join(f'args[{i}]' for i in range(count))})", count) for name, count in ways]
 
 
-ARGUMENTS = Environment({"args": Kind.DYN})
+ARGUMENTS = Environment({"args": CelType.DYN})
 numbers = st.sampled_from([0.0, -0.0, 1e308, -1e308, 5e-324, 2.0**53]) | st.floats() | st.integers(-(2**70), 2**70)
 texts = st.sampled_from(["", "u8", "f64be", "x", "a.b", "\0", "position"]) | st.text(max_size=3)
 places = st.dictionaries(
@@ -175,6 +177,6 @@ def test_whatever_the_arguments_are_there_is_a_value_or_a_reason(call: tuple[str
 def test_the_tables_in_the_guides_are_those_of_the_code() -> None:
     for page, of_page in tables().items():
         text = guide(page.removesuffix(".md"))
-        assert written(text, of_page) == text, "run `make crds`"
+        assert with_tables(text, of_page) == text, "run `make crds`"
     with pytest.raises(ValueError, match="there is no table with the first column function"):
-        written("# A page\n", tables()["rules.md"])
+        with_tables("# A page\n", tables()["rules.md"])

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from wayside.geodesy import SEMI_MAJOR, cartesian, distance
+from wayside.geodesy import SEMI_MAJOR, cartesian, surface_distance
 
 QUARTER_MERIDIAN = 10_001_965.729
 """From the equator to a pole on WGS 84, in metres."""
@@ -30,7 +30,7 @@ longitudes = st.floats(-180, 180)
     ],
 )
 def test_known_distances(places: tuple[float, float, float, float], metres: float) -> None:
-    assert distance(*places) == pytest.approx(metres, abs=2e-3)
+    assert surface_distance(*places) == pytest.approx(metres, abs=2e-3)
 
 
 @pytest.mark.parametrize(
@@ -45,18 +45,18 @@ def test_known_distances(places: tuple[float, float, float, float], metres: floa
 def test_the_way_around_the_globe_has_no_seam(
     one: tuple[float, float, float, float], other: tuple[float, float, float, float]
 ) -> None:
-    assert distance(*one) == pytest.approx(distance(*other), abs=1e-3)
+    assert surface_distance(*one) == pytest.approx(surface_distance(*other), abs=1e-3)
 
 
 @given(latitudes, longitudes, latitudes, longitudes)
 def test_a_distance_is_the_same_both_ways_and_never_shorter_than_the_straight_line(
     a: float, b: float, c: float, d: float
 ) -> None:
-    length = distance(a, b, c, d)
-    assert length == pytest.approx(distance(c, d, a, b), rel=1e-9, abs=1e-6)
+    length = surface_distance(a, b, c, d)
+    assert length == pytest.approx(surface_distance(c, d, a, b), rel=1e-9, abs=1e-6)
     chord = math.dist(cartesian(a, b), cartesian(c, d))
     assert chord <= length * (1 + 1e-9) + 1e-6
     assert length <= 20_037_600  # half the globe
     if chord < 1_000:
         assert length == pytest.approx(chord, abs=1e-5)
-    assert distance(a, b, a, b) == 0
+    assert surface_distance(a, b, a, b) == 0

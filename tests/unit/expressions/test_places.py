@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 
 from tests.driving import a_detector, a_rule, a_stream
 from tests.guides import guide, yaml_blocks
-from wayside.expressions import UNKNOWN, Environment, Kind
+from wayside.expressions import UNKNOWN, CelType, Environment
 from wayside.expressions.columns import Graph, Program, Tag, Texts
-from wayside.expressions.expanding import FIELDS_AT, FIELDS_SEEN, Places
+from wayside.expressions.expanding import FIELDS_AT, FIELDS_SEEN, NamedPlaces
 from wayside.geometry import Shape, interned
 from wayside.rules import RuleError, compile_rule, own_problems, place_problems
 
@@ -41,8 +41,8 @@ ROAD_USER = {"x": 1.0, "y": 2.0, "yaw": 0.5}
 
 @cache
 def compiled(source: str, **places: Any) -> Any:
-    environment = Environment({"p": Kind.DYN, "a": Kind.MAP, "b": Kind.MAP})
-    return environment.naming(Places(SHAPES, **places)).compile(source)
+    environment = Environment({"p": CelType.DYN, "a": CelType.MAP, "b": CelType.MAP})
+    return environment.naming(NamedPlaces(SHAPES, **places)).compile(source)
 
 
 def at(name: str, field: str, x: float, y: float, **more: float) -> Any:

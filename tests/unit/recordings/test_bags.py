@@ -13,7 +13,7 @@ from detector.assembly import inlets
 from detector.replay.errors import RecordingError
 from detector.replay.message import Cut
 from detector.replay.recorded_types import with_recorded_types
-from detector.sources.supervision import SourceThread, State
+from detector.sources.supervision import SourceState, SourceThread
 from detector.streams.codecs import CdrDecoder
 from detector.streams.tally import Tally
 from tests.driving import a_detector
@@ -174,7 +174,7 @@ def test_a_bag_is_played_at_the_wanted_speed_to_its_end(bag: Path) -> None:
     arrivals = Arrivals()
     start = time.monotonic()
     thread = playing(arrivals, Tally(), paths=[str(bag)], rate=5)
-    wait_for(lambda: thread.state is State.FINISHED)
+    wait_for(lambda: thread.state is SourceState.FINISHED)
     assert time.monotonic() - start >= 0.18
     assert [key for _, key, _ in arrivals.seen] == ["vehicles/car1/pose", "vehicles/car2/pose"] * 5
 
@@ -185,7 +185,7 @@ def test_a_bag_is_played_again_and_again_until_it_is_stopped(bag: Path) -> None:
     arrivals.wait_for(lambda seen: len(seen) > 25)
     thread.request_stop()
     thread.join(PATIENCE)
-    assert thread.state is State.STOPPED
+    assert thread.state is SourceState.STOPPED
 
 
 def test_stopping_does_not_wait_for_a_pause_in_the_recording(tmp_path: Path) -> None:
@@ -198,7 +198,7 @@ def test_stopping_does_not_wait_for_a_pause_in_the_recording(tmp_path: Path) -> 
     arrivals.wait_for(lambda seen: len(seen) == 1)
     thread.request_stop()
     thread.join(PATIENCE)  # far less than the pause
-    assert thread.state is State.STOPPED
+    assert thread.state is SourceState.STOPPED
 
 
 def test_a_recording_that_is_not_there_is_waited_for(bag: Path, tmp_path: Path) -> None:
@@ -207,5 +207,5 @@ def test_a_recording_that_is_not_there_is_waited_for(bag: Path, tmp_path: Path) 
     thread = playing(arrivals, tally, paths=[str(later)], rate=1000)
     wait_for(lambda: "later.bag: no such file" in thread.last_error)
     later.write_bytes(bag.read_bytes())
-    wait_for(lambda: thread.state is State.FINISHED)
+    wait_for(lambda: thread.state is SourceState.FINISHED)
     assert len(arrivals.seen) == 10

@@ -20,7 +20,15 @@ from zstandard import ZstdError
 
 from detector.engine.samples.sample import Arrival
 from detector.replay import json_lines, mcap_chunks, parts
-from detector.replay.batches import MAXIMUM_BYTES, MAXIMUM_MESSAGES, Batch, Channel, batched, merged, messages_of
+from detector.replay.batches import (
+    MAXIMUM_BYTES,
+    MAXIMUM_MESSAGES,
+    Batch,
+    Channel,
+    batched,
+    merged_batches,
+    messages_of,
+)
 from detector.replay.errors import DAMAGE, RecordingError
 from detector.replay.message import Cut, Message
 from detector.replay.recordings import open_recordings
@@ -199,7 +207,7 @@ def test_several_recordings_are_merged_as_message_by_message(
         for number, (times, places, in_order) in enumerate(recordings)
     ]
     expected = heapq.merge(*(messages_of(cut_at(*each)) for each in given), key=attrgetter("time"))
-    assert list(messages_of(merged([cut_at(*each) for each in given]))) == list(expected)
+    assert list(messages_of(merged_batches([cut_at(*each) for each in given]))) == list(expected)
 
 
 LINE = st.one_of(

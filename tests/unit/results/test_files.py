@@ -19,13 +19,13 @@ from detector.commands.replay import replay_files
 from detector.engine.timing.timeline import ORDER
 from detector.replay.intake_writer import IntakeWriter
 from detector.results import installed
-from detector.results.channels import path_of
+from detector.results.channels import message_path
 from detector.results.episodes import TIMES
-from detector.results.kinds import Kind, chosen
+from detector.results.kinds import ResultKind, chosen
 from tests.unit.results.drives import SECOND, START, arrivals, documents, write
 from wayside.times import format_time, parse_time
 
-ALL = chosen([Kind.ALL])
+ALL = chosen([ResultKind.ALL])
 HAIR = 1e-6
 
 
@@ -98,7 +98,7 @@ def logged(results: Results, rule: str, subject: str, signal: str) -> dict[int, 
     found = {}
     for time, message in results.messages[f"/wayside/{rule}/{subject}"]:
         value = message
-        for step in path_of(signal):
+        for step in message_path(signal):
             value = value.get(step, {}) if isinstance(value, dict) else {}
         found[time] = None if value == {} else value
     return found
@@ -273,7 +273,7 @@ def test_a_missing_package_is_named_before_the_replay(tmp_path: Path, monkeypatc
     recording, detector, rules = write(tmp_path)
     monkeypatch.setattr(installed, "find_spec", lambda name: None)
     with pytest.raises(installed.MissingExtraError, match=r"mcap needs foxglove: pip install 'wayside\[results\]'"):
-        replay_files([recording], tmp_path / "out", detector, [rules], as_one=False, kinds=frozenset({Kind.MCAP}))
+        replay_files([recording], tmp_path / "out", detector, [rules], as_one=False, kinds=frozenset({ResultKind.MCAP}))
     assert not (tmp_path / "out").exists()
 
 

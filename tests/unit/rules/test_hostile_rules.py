@@ -10,7 +10,7 @@ import pytest
 from detector.actions.secrets import secret_problems
 from detector.assembly import RuleIndex, inlets
 from tests.driving import Drive, a_detector, a_rule, arrival
-from wayside.expressions import Environment, ExpressionError, Kind
+from wayside.expressions import CelType, Environment, ExpressionError
 from wayside.rules import RuleError
 
 TEN = "[1,2,3,4,5,6,7,8,9,10]"
@@ -30,7 +30,7 @@ def multiplied(start: str, times: int, levels: int) -> str:
 
 @pytest.mark.parametrize("start", ["'" + "a" * 500 + "'", "v", "[1]", "client"])
 def test_an_expression_that_multiplies_a_value_without_end_is_refused(start: str) -> None:
-    environment = Environment({"v": Kind.DYN, "client": Kind.STRING})
+    environment = Environment({"v": CelType.DYN, "client": CelType.STRING})
     with pytest.raises(ExpressionError, match="more than 1000 copies") as caught:
         environment.compile(f"size({multiplied(start, 4, 5)}) > 1")
     assert "join less" in str(caught.value)
@@ -47,7 +47,7 @@ def test_an_expression_that_multiplies_a_value_without_end_is_refused(start: str
     ],
 )
 def test_what_people_write_is_not(harmless: str) -> None:
-    Environment({"v": Kind.DYN, "client": Kind.STRING}).compile(harmless)
+    Environment({"v": CelType.DYN, "client": CelType.STRING}).compile(harmless)
 
 
 def test_a_loop_without_end_is_an_error_of_its_rule_and_harms_no_other() -> None:

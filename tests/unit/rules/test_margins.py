@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from detector.results.episodes import Episode
-from detector.results.nearest import nearest
+from detector.results.episodes import EpisodeRow
+from detector.results.nearest import nearest_moments
 from detector.results.series import Series, SubjectTrace
 from tests.driving import POSITION, Drive, a_detector, a_rule, at, place, speed
-from wayside.expressions import UNKNOWN, Environment, Kind
+from wayside.expressions import UNKNOWN, CelType, Environment
 from wayside.rules import RuleError, compile_rule
 from wayside.rules.margins import margin_of
 
@@ -48,10 +48,10 @@ def test_a_margin_is_what_rtamt_gives(formula: str, rows: list[tuple[float, floa
     columns = dict(zip(NAMES, map(list, zip(*rows, strict=True)), strict=True))
     expected = [margin for _, margin in reference.evaluate({"time": [*range(len(rows))], **columns})]
     source = margin_of(a_rule(signals=SIGNALS, when=formula, margin=dict.fromkeys(NAMES, 1)).spec)
-    expression = Environment(dict.fromkeys(NAMES, Kind.DYN)).compile(source)
+    expression = Environment(dict.fromkeys(NAMES, CelType.DYN)).compile(source)
     found = [expression.evaluate(dict(zip(NAMES, row, strict=True))) for row in rows]
     assert found == pytest.approx(expected)
-    held = Environment(dict.fromkeys(NAMES, Kind.DYN)).compile(formula)
+    held = Environment(dict.fromkeys(NAMES, CelType.DYN)).compile(formula)
     for margin, row in zip(expected, rows, strict=True):
         if margin:
             assert held.evaluate(dict(zip(NAMES, row, strict=True))) is (margin > 0)
@@ -59,7 +59,7 @@ def test_a_margin_is_what_rtamt_gives(formula: str, rows: list[tuple[float, floa
 
 def test_what_is_unknown_leaves_the_margin_unknown() -> None:
     source = margin_of(a_rule(signals=SIGNALS, when="a > 1 || b > 1", margin={"a": 1, "b": 2}).spec)
-    expression = Environment(dict.fromkeys(NAMES, Kind.DYN)).compile(source)
+    expression = Environment(dict.fromkeys(NAMES, CelType.DYN)).compile(source)
     assert expression.evaluate({"a": 2.0, "b": 7.0}) == 3.0
     assert expression.evaluate_or_unknown({"a": 2.0}) is UNKNOWN
     assert expression.evaluate_or_unknown({"a": 2.0, "b": math.nan}) is UNKNOWN
@@ -110,6 +110,6 @@ def test_what_nearly_happened_is_listed_by_margin_without_the_way_into_an_episod
     values = [-5.0, -0.5, -2.0, -4.0, -0.25, 1.0, 2.0, -1.0, -3.0, -1.5, math.nan, -2.0]
     series = Series(np.array([at(second) for second in range(len(values))], np.int64), np.array(values))
     trace = SubjectTrace("r", "car", ("car",), {"margin": series})
-    episode = Episode("", "r", "car", ("car",), None, "e", at(5), at(5), at(7), "Until", False)
-    found = nearest("", {"r": rule}, [trace], [episode])
+    episode = EpisodeRow("", "r", "car", ("car",), None, "e", at(5), at(5), at(7), "Until", False)
+    found = nearest_moments("", {"r": rule}, [trace], [episode])
     assert [(near.time, near.margin) for near in found] == [(at(1), -0.5), (at(9), -1.5), (at(11), -2.0)]

@@ -11,7 +11,7 @@ import yaml
 from tests.driving import a_detector, a_rule, a_stream
 from tests.guides import guide, yaml_blocks
 from wayside.api.eventrule import Aggregate
-from wayside.expressions import UNKNOWN, Environment, Kind
+from wayside.expressions import UNKNOWN, CelType, Environment
 from wayside.rules import CompiledRule, compile_rule
 
 GUIDE = guide("rules")
@@ -49,7 +49,7 @@ def test_an_example_is_accepted(example: dict[str, Any]) -> None:
 def test_unknowns_are_as_the_table_says() -> None:
     table = GUIDE.split("with `u` unknown:", 1)[1].split("\n## ", 1)[0]
     rows = re.findall(r"^\| `(.*)` \| (\w+) \|$", table, re.MULTILINE)
-    environment = Environment({"u": Kind.DYN, "m": Kind.MAP})
+    environment = Environment({"u": CelType.DYN, "m": CelType.MAP})
     found = {source: environment.compile(source).evaluate_or_unknown({"m": {"u": None}}) for source, _ in rows}
     wanted: dict[str, object] = {"unknown": UNKNOWN, "true": True, "false": False, "1": 1.0}
     assert found == {source: wanted[text] for source, text in rows}

@@ -12,7 +12,7 @@ import pytest
 from detector.assembly.checking import check_documents
 from detector.plugins.instances import LocalHost
 from detector.plugins.registry import OFFERS
-from detector.plugins.values import plain
+from detector.plugins.values import plain_value
 from tests.driving import POSITION, START, a_detector, a_stream, arrival, at
 from tests.plugins.rules import PluginDrive, plugin_rule, plugins
 from wayside.api import EventRule
@@ -212,21 +212,21 @@ def test_other_parameters_are_another_rule() -> None:
     ],
 )
 def test_plain_values_pass_as_doubles(value: Any, made: Any) -> None:
-    assert plain(value) == made
-    assert type(plain(value)) is type(made)
+    assert plain_value(value) == made
+    assert type(plain_value(value)) is type(made)
 
 
 @pytest.mark.parametrize("value", [{1, 2}, b"x", object(), {1: 2}, np.zeros(3)])
 def test_other_values_are_refused(value: Any) -> None:
     with pytest.raises(TypeError, match=f"the value is a {type(value).__name__}"):
-        plain(value)
+        plain_value(value)
 
 
 def test_an_endless_value_is_refused() -> None:
     loop: list[Any] = []
     loop.append(loop)
     with pytest.raises(TypeError, match="nested more than"):
-        plain(loop)
+        plain_value(loop)
 
 
 def test_streams_and_queries_are_there(tmp_path: Path) -> None:

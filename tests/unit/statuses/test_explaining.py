@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import Any
 
-from application_manager.commands.explanationtext import text
+from application_manager.commands.explanationtext import explanation_text
 from application_manager.core.statuses.explaining import Found, explain, serving
 from application_manager.core.statuses.explanation import Explanation
 from tests.guides import guide
@@ -158,14 +158,14 @@ def test_the_text_says_what_each_task_does_and_whose_values_lost_and_why() -> No
         task("thin", {"rateHz": 2}, operation="Reconfigure"),
         task("rest", {"region": "north"}, operation="Suspend", priority=5),
     ]
-    lines = [each.strip() for each in text(explained("scene-a", tasks)).splitlines()]
+    lines = [each.strip() for each in explanation_text(explained("scene-a", tasks)).splitlines()]
     assert "scene-a (scene of car1+car2, Deploy, priority 3) Counts" in lines
     assert "thin (by a person, Reconfigure, priority 0) Counts" in lines
     assert "rest (by a person, Suspend, priority 5) Counts" in lines
     assert "20 of scene-a (car1+car2) is outbid: a task that reconfigures lies over it" in lines
     assert "2 of thin is it" in lines
     assert not [each for each in lines if " of rest " in each], "its parameters only say which instance it means"
-    of_all = text(explained("thin", tasks)).splitlines()
+    of_all = explanation_text(explained("thin", tasks)).splitlines()
     assert "instances: it is for all of the template" in of_all
 
 
@@ -181,13 +181,13 @@ def test_a_sum_that_is_held_at_its_bound_says_what_it_would_be() -> None:
     spec = {"parameters": {"uplink": {"type": "number", "maximum": 100, "merge": "Sum"}}}
     tasks = [task("one", {"uplink": 60}), task("two", {"uplink": 70})]
     found = Found([template(**spec)], tasks, [])
-    told = text(explain(found, task="one", instance=serving(found, tasks[0], NOW), now=NOW))
+    told = explanation_text(explain(found, task="one", instance=serving(found, tasks[0], NOW), now=NOW))
     assert "  uplink = 100 (merge Sum): the sum of 2 values, 130, is held at the maximum of 100\n" in told
 
 
 def test_what_is_over_does_not_push_what_counts_out_of_sight() -> None:
     over = [emitted(f"over-{number:02}", {"region": "north"}, ended=True, created=-60) for number in range(30)]
-    told = text(explained(None, [*over, TASKS[0]])).splitlines()
+    told = explanation_text(explained(None, [*over, TASKS[0]])).splitlines()
     listed = told.index(f"tasks of instance {NAME}")
     assert told[listed + 1].startswith("  scene-a (scene of car1+car2, Deploy")
     assert "  and 11 more: -o json lists all" in told
@@ -198,7 +198,7 @@ def test_the_guide_shows_what_is_printed() -> None:
     found = explained(objects={("apps/v1", "Deployment", NAME): DEPLOYMENT}, pods=[POD], leases={"town": lease})
     shown = re.search(r"```console\n\$ application-manager explain scene-a\n(.*?)```", guide("manager"), re.DOTALL)
     assert shown is not None
-    assert shown[1] == text(found)
+    assert shown[1] == explanation_text(found)
 
 
 def test_an_explanation_as_json_reads_back() -> None:

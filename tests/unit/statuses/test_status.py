@@ -10,15 +10,15 @@ import msgspec
 import pytest
 from rich.console import Console
 
-from detector.assembly import Refusal
-from detector.commands.inquiry import inquire
+from detector.assembly import RefusedRule
+from detector.commands.inquiry import query_selected
 from detector.engine.samples.intake import Intake
 from detector.engine.samples.sample import Arrival
 from detector.findings.losses import Losses
 from detector.live.evaluator import Evaluator
 from detector.status.explaining import Watching
 from detector.status.keeping import StatusKeeper
-from detector.status.model import CertificateStatus, Explanation, RuleState, Status, read_status, to_json
+from detector.status.model import CertificateStatus, RuleExplanation, RuleState, Status, read_status, to_json
 from detector.status.table import status_view
 from detector.streams.answering import Answering
 from detector.streams.querying import NoAnswerError, query_detectors
@@ -116,7 +116,9 @@ def test_with_clock_data_latencies_are_from_the_stamp_to_the_receipt() -> None:
 
 def test_a_rule_that_is_refused_or_disabled_says_so() -> None:
     kept = Kept(Drive(a_detector(), a_rule("off", when="true", enabled=False)))
-    kept.keeper.refused([Refusal(a_rule("bad", when="1"), (RuleProblem(("spec", "when"), "no boolean"),), kept=False)])
+    kept.keeper.refused(
+        [RefusedRule(a_rule("bad", when="1"), (RuleProblem(("spec", "when"), "no boolean"),), kept=False)]
+    )
     status = kept.take(until=1)
     assert [(rule.name, rule.state) for rule in status.rules] == [
         ("bad", RuleState.REFUSED),
@@ -205,13 +207,13 @@ def test_questions_reach_a_detector_by_name_or_any_and_refusals_come_back(endpoi
 def test_the_detectors_file_tells_where_it_listens(endpoint: str, tmp_path: Path) -> None:
     file = tmp_path / "detector.yaml"
     file.write_text(a_detector(zenoh={"listen": [endpoint]}).model_dump_json(by_alias=True, exclude_none=True))
-    (answer,) = inquire("status", {}, file, None, None, 30)
+    (answer,) = query_selected("status", {}, file, None, None, 30)
     assert answer.key == "wayside/detectors/d/status"
 
 
 def explained(
     drive: Drive, rule: str, subject: str | None = None, *, until: float, sent: Sequence[Arrival] = ()
-) -> Explanation:
+) -> RuleExplanation:
     watching = Watching(drive.engine, rule, subject)
     assert not watching.is_over()
     drive.take(*sent, until=until)

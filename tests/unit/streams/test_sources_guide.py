@@ -6,7 +6,7 @@ import pytest
 import yaml
 
 from detector.assembly import inlets
-from detector.sources.registry import source_problems
+from detector.sources.registry import source_plugin_problems
 from tests.driving import a_detector
 from tests.guides import guide, yaml_blocks
 
@@ -18,4 +18,4 @@ def test_an_example_has_nothing_wrong(spec: dict[str, Any]) -> None:
     streams = spec.pop("streams")
     detector = a_detector(*streams, **spec)
     inlets(detector)
-    assert [*source_problems(detector)] == []
+    assert [*source_plugin_problems(detector)] == []

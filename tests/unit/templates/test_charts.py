@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from application_manager.core.objects.charts import ChartFailure, ChartObjects, ChartRequest, ChartSource, parse
+from application_manager.core.objects.charts import ChartFailure, ChartObjects, ChartRequest, ChartSource, parse_chart
 from application_manager.core.objects.policy import Policy
 from application_manager.core.objects.rendering import ChartPending, Renderer, RenderError, Rendering
 from tests.unit.manager_objects import instance, template
@@ -28,13 +28,13 @@ spec: {ports: [{port: 80}]}
 
 
 def objects(text: str) -> ChartObjects:
-    outcome = parse(SOURCE, text)
+    outcome = parse_chart(SOURCE, text)
     assert isinstance(outcome, ChartObjects), outcome
     return outcome
 
 
 def refusal(text: str) -> str:
-    outcome = parse(SOURCE, text)
+    outcome = parse_chart(SOURCE, text)
     assert isinstance(outcome, ChartFailure), outcome
     return outcome.message
 

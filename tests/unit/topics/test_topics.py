@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from detector.commands.cli import app
 from detector.commands.topics.proposal import proposals
-from detector.commands.topics.survey import Topic, encoding_of, shape_of
+from detector.commands.topics.survey import Topic, encoding_of, topic_shape
 from tests.ros_messages import cdr, odometry
 from wayside.api.stream import Encoding
 
@@ -100,7 +100,7 @@ def test_encodings_that_a_recording_does_not_name_are_found_by_looking() -> None
     assert encoding_of(topic("a", b'{"v": 1}')) is Encoding.JSON
     assert encoding_of(topic("a", cbor2.dumps({"v": 1}))) is Encoding.CBOR
     assert encoding_of(topic("a", b"\xff\xd8\xff\xe0", b"\x01\x02\x03")) is Encoding.RAW
-    assert shape_of(topic("a", b"\x01\x02\x03")) is None
+    assert topic_shape(topic("a", b"\x01\x02\x03")) is None
 
 
 @pytest.mark.parametrize(

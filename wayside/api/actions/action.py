@@ -9,12 +9,12 @@ from pydantic import Field, model_validator
 
 from wayside.api.actions.database import DatabaseAction
 from wayside.api.actions.deploy import Deploy
-from wayside.api.actions.notify import Notify
-from wayside.api.actions.plugin import ActionPlugin
-from wayside.api.actions.record import Record
-from wayside.api.actions.trigger import Trigger
+from wayside.api.actions.notify import NotifyAction
+from wayside.api.actions.record import RecordAction
+from wayside.api.actions.trigger import TriggerAction
 from wayside.api.actions.window import Window
 from wayside.api.base import JsonValue, Model, ObjectName, validations
+from wayside.api.plugin import ActionPlugin
 
 _KINDS = ("deploy", "record", "database", "trigger", "notify", "plugin")
 _ONE = f"give exactly one of {', '.join(_KINDS[:-1])} and {_KINDS[-1]}"
@@ -31,14 +31,16 @@ class Action(Model):
     deploy: Deploy | None = Field(
         default=None, description="Emits an ApplicationTask that holds while the episode lasts."
     )
-    record: Record | None = Field(
+    record: RecordAction | None = Field(
         default=None, description="Records the samples around the episode as rosbag2 with MCAP files."
     )
-    trigger: Trigger | None = Field(default=None, description="Makes another system record while the episode lasts.")
+    trigger: TriggerAction | None = Field(
+        default=None, description="Makes another system record while the episode lasts."
+    )
     database: DatabaseAction | None = Field(
         default=None, description="Writes the samples around the episode to the Detector's database (MongoDB)."
     )
-    notify: Notify | None = Field(
+    notify: NotifyAction | None = Field(
         default=None, description="Sends notifications over HTTP, to an Alertmanager or on a Zenoh key."
     )
     plugin: ActionPlugin | None = Field(default=None, description="Runs an action of an installed package.")

@@ -11,7 +11,7 @@ from typing import Annotated
 from pydantic import Field, model_validator
 
 from wayside.api.access import Access, Tls
-from wayside.api.base import Model, ObjectName, PositiveDuration, validations
+from wayside.api.base import Model, ObjectName, PositiveDuration, map_list, validations
 
 _VARIABLE = r"^WAYSIDE_[A-Z0-9_]+$"
 _TOKEN = r"^[A-Za-z0-9!#$%&'*+.^_`|~-]+$"  # noqa: S105  RFC 9110, section 5.6.2: what a header's name is made of
@@ -73,7 +73,7 @@ class HttpAccess(Model):
         default_factory=list,
         max_length=32,
         description="Additional headers of each request.",
-        json_schema_extra={"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
+        json_schema_extra=map_list("name"),
     )
     timeout: PositiveDuration = Field(
         default=PositiveDuration("10s"),

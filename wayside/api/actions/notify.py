@@ -9,7 +9,7 @@ from typing import Annotated
 from pydantic import Field, model_validator
 
 from wayside.api.actions.http import HttpAccess, HttpUrl, SecretKey
-from wayside.api.base import Duration, Identifier, JsonValue, Model, PositiveDuration, validations
+from wayside.api.base import SET_LIST, Duration, Identifier, JsonValue, Model, PositiveDuration, validations
 
 _TLS_ONCE = "give tls or tlsSecretName, not both"
 _URL_ONCE = "give exactly one of url and urlSecretKeyRef"
@@ -97,7 +97,7 @@ class Grouping(Model):
         max_length=8,
         description="The names of labels. Events with the same values of these labels share a message. Default: all "
         "events of the rule share messages.",
-        json_schema_extra={"x-kubernetes-list-type": "set"},
+        json_schema_extra=SET_LIST,
     )
     maximum: int = Field(
         default=20,
@@ -114,7 +114,7 @@ class Rate(Model):
     per: PositiveDuration = Field(default=PositiveDuration("1m"), description="The period.")
 
 
-class Notify(Model):
+class NotifyAction(Model):
     """Sends notifications of the rule's episodes."""
 
     model_config = validations(
@@ -132,7 +132,7 @@ class Notify(Model):
         min_length=1,
         max_length=2,
         description="The events that cause a notification. Default: Started and Ended.",
-        json_schema_extra={"x-kubernetes-list-type": "set"},
+        json_schema_extra=SET_LIST,
     )
     title: Template | None = Field(
         default=None, description="The title of the message, with ${…}; the summary of an alert."
@@ -162,7 +162,7 @@ class Notify(Model):
     )
 
     @model_validator(mode="after")
-    def _coherent(self) -> Notify:
+    def _coherent(self) -> NotifyAction:
         if sum(getattr(self, kind) is not None for kind in _TARGETS) != 1:
             raise ValueError(_ONE_TARGET)
         if self.alertmanager is not None and (self.grouping is not None or self.events is not None):

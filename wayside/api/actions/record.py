@@ -28,7 +28,7 @@ class Split(Model):
     duration: PositiveDuration | None = Field(default=None, description="The maximum time span of a file.")
 
 
-class Record(Window):
+class RecordAction(Window):
     """Records the window as rosbag2 with MCAP files, in the Detector's `recordings` folder."""
 
     templates_in: ClassVar[tuple[str, ...]] = ("metadata",)

@@ -11,6 +11,7 @@ from pydantic import Field, field_validator, model_validator
 from wayside.api.actions.http import TLS_ONCE, HttpAccess, HttpUrl
 from wayside.api.actions.window import WindowClients
 from wayside.api.base import (
+    SET_LIST,
     ClientName,
     Duration,
     JsonValue,
@@ -51,7 +52,7 @@ class TriggerDetector(Model):
         min_length=1,
         max_length=128,
         description="The streams of the other detector. Default: all that it records on request.",
-        json_schema_extra={"x-kubernetes-list-type": "set"},
+        json_schema_extra=SET_LIST,
     )
     clients: WindowClients = Field(
         default=WindowClients.ALL,
@@ -61,7 +62,7 @@ class TriggerDetector(Model):
         default_factory=list,
         max_length=64,
         description="With `clients: Subjects`: additional clients.",
-        json_schema_extra={"x-kubernetes-list-type": "set"},
+        json_schema_extra=SET_LIST,
     )
     before: Duration = Field(
         default=Duration("0s"),
@@ -183,7 +184,7 @@ _SYSTEMS = ("detector", "ros2", "http")
 _ONE = f"give exactly one of {', '.join(_SYSTEMS[:-1])} and {_SYSTEMS[-1]}"
 
 
-class Trigger(Model):
+class TriggerAction(Model):
     """Makes another system record, from the start of the episode to its end."""
 
     model_config = validations(
@@ -208,7 +209,7 @@ class Trigger(Model):
     )
 
     @model_validator(mode="after")
-    def _one_system(self) -> Trigger:
+    def _one_system(self) -> TriggerAction:
         if sum(getattr(self, each) is not None for each in _SYSTEMS) != 1:
             raise ValueError(_ONE)
         return self

@@ -6,7 +6,7 @@ from enum import StrEnum
 
 from pydantic import Field
 
-from wayside.api.base import ClientName, Duration, Model, ObjectName
+from wayside.api.base import SET_LIST, ClientName, Duration, Model, ObjectName
 
 
 class WindowClients(StrEnum):
@@ -24,7 +24,7 @@ class Window(Model):
         min_length=1,
         max_length=128,
         description="The streams. Latched streams are always included. Default: all streams of the Detector.",
-        json_schema_extra={"x-kubernetes-list-type": "set"},
+        json_schema_extra=SET_LIST,
     )
     clients: WindowClients = Field(
         default=WindowClients.SUBJECTS,
@@ -34,7 +34,7 @@ class Window(Model):
         default_factory=list,
         max_length=64,
         description="Additional clients, such as a roadside unit that observes the scene.",
-        json_schema_extra={"x-kubernetes-list-type": "set"},
+        json_schema_extra=SET_LIST,
     )
     before: Duration = Field(
         default=Duration("0s"),

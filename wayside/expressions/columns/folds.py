@@ -12,7 +12,7 @@ from __future__ import annotations
 import enum
 from typing import Final, NamedTuple
 
-from wayside.expressions.cel import Expression, Kind
+from wayside.expressions.cel import CelType, Expression
 from wayside.expressions.columns.lowering import Part
 from wayside.expressions.syntax import Call, Collection, Constant, Loop, Name, Node, Select
 
@@ -44,7 +44,7 @@ class Folded(NamedTuple):
     folds: dict[str, Fold]
 
 
-_KINDS: Final = {How.ANY: Kind.BOOL, How.ALL: Kind.BOOL, How.COUNT: Kind.DOUBLE}
+_KINDS: Final = {How.ANY: CelType.BOOL, How.ALL: CelType.BOOL, How.COUNT: CelType.DOUBLE}
 
 
 def folded(expression: Expression, items: str) -> Folded:
@@ -60,7 +60,7 @@ def _without_loops(node: Node, items: str, whole: Expression, folds: dict[str, F
         how, variable, predicate, one = found
         part = None
         if predicate is not None:
-            part = Part(predicate, {**whole.kinds, variable: Kind.DYN}, Kind.BOOL)
+            part = Part(predicate, {**whole.kinds, variable: CelType.DYN}, CelType.BOOL)
         name = f"fold{len(folds)}"
         while name in whole.kinds:
             name += "_"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from wayside.expressions.cel import Expression
-from wayside.expressions.columns.lowering import Leaves, Part, RefusedError, lower
+from wayside.expressions.columns.lowering import Leaves, LoweringError, Part, lower
 from wayside.expressions.columns.nodes import Nodes
 
 
@@ -19,6 +19,6 @@ class Graph(Nodes):
         before = len(self.nodes)
         try:
             return lower(self, expression, leaf)
-        except RefusedError:
+        except LoweringError:
             self.forget(before)
             return None

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Hashable, Mapping
 from typing import Final, NamedTuple
 
-from wayside.expressions.cel import Expression, Kind
+from wayside.expressions.cel import CelType, Expression
 from wayside.expressions.columns.functions import about_place, takes_columns
 from wayside.expressions.columns.nodes import Holds, Nodes, Op
 from wayside.expressions.columns.values import Tag
@@ -20,7 +20,7 @@ _ORDER: Final = {"_<_": (Op.LESS, False), "_<=_": (Op.LESS_EQUAL, False)} | {
     "_>_": (Op.LESS, True), "_>=_": (Op.LESS_EQUAL, True),
 }  # fmt: skip
 """The operation, and whether its operands change places."""
-_DECLARED: Final = {Kind.DOUBLE: Tag.NUMBER, Kind.BOOL: Tag.BOOLEAN, Kind.STRING: Tag.TEXT}
+_DECLARED: Final = {CelType.DOUBLE: Tag.NUMBER, CelType.BOOL: Tag.BOOLEAN, CelType.STRING: Tag.TEXT}
 _MOST_ELEMENTS: Final = 256
 """Of a list after `in`: each is one comparison for each row."""
 
@@ -31,7 +31,7 @@ class Constant(NamedTuple):
     value: bool | float | str
 
 
-class RefusedError(Exception):
+class LoweringError(Exception):
     """The columns cannot take this expression."""
 
 
@@ -39,9 +39,9 @@ class Part(NamedTuple):
     """A part of an expression, or one that was put together of parts."""
 
     tree: Node
-    kinds: Mapping[str, Kind]
+    kinds: Mapping[str, CelType]
     """Of the variables that it may read."""
-    result: Kind
+    result: CelType
 
     @property
     def names(self) -> frozenset[str]:
@@ -54,7 +54,7 @@ Leaves = Callable[[Path], Hashable | Constant | None]
 
 
 def lower(graph: Nodes, expression: Expression | Part, leaf: Leaves) -> int:
-    """The node of the expression's result. Raises RefusedError where there is none."""
+    """The node of the expression's result. Raises LoweringError where there is none."""
     return _Lowering(graph, expression, leaf).root()
 
 
@@ -71,15 +71,15 @@ class _Lowering:
         found = self._lower(self._tree)
         holds = self._holds(found)
         match self._expression.result, holds:
-            case (Kind.DYN, _) | (Kind.DOUBLE, Holds.NUMBERS) | (Kind.STRING, Holds.TEXTS):
+            case (CelType.DYN, _) | (CelType.DOUBLE, Holds.NUMBERS) | (CelType.STRING, Holds.TEXTS):
                 return found
-            case Kind.BOOL, _:
+            case CelType.BOOL, _:
                 return self._graph.truth(found)
-            case Kind.DOUBLE, Holds.ANY:
+            case CelType.DOUBLE, Holds.ANY:
                 return self._graph.node(Op.NUMBER, Holds.NUMBERS, (found,))
-            case Kind.STRING, Holds.ANY:
+            case CelType.STRING, Holds.ANY:
                 return self._graph.node(Op.TEXT, Holds.ANY, (found,))
-        raise RefusedError
+        raise LoweringError
 
     def _holds(self, node: int) -> Holds:
         return self._graph.nodes[node].holds
@@ -124,34 +124,34 @@ class _Lowering:
                 return self._graph.node(
                     Op.CALL, Holds.NUMBERS, tuple(self._number(each) for each in given), (name, len(given))
                 )
-        raise RefusedError
+        raise LoweringError
 
     def _given(self, path: Path) -> int:
         found = self._named(path)
-        kind = self._expression.kinds[str(path[0])] if len(path) == 1 else Kind.DYN
+        kind = self._expression.kinds[str(path[0])] if len(path) == 1 else CelType.DYN
         if isinstance(found, Constant):
-            expected = {bool: Kind.BOOL, str: Kind.STRING}.get(type(found.value), Kind.DOUBLE)
-            if kind not in (Kind.DYN, expected):
-                raise RefusedError
+            expected = {bool: CelType.BOOL, str: CelType.STRING}.get(type(found.value), CelType.DOUBLE)
+            if kind not in (CelType.DYN, expected):
+                raise LoweringError
             return self._constant(found.value.replace("\0", "␀") if isinstance(found.value, str) else found.value)
         node = self._graph.leaf(found)
-        if kind is Kind.DYN:
+        if kind is CelType.DYN:
             return node
         if kind not in _DECLARED:
-            raise RefusedError
+            raise LoweringError
         return self._graph.node(Op.EXPECT, Holds.ANY, (node,), _DECLARED[kind])
 
     def _named(self, path: Path) -> Hashable | Constant:
         found = self._leaf(path)
         if found is None:
-            raise RefusedError
+            raise LoweringError
         return found
 
     def _constant(self, value: bool | float | str) -> int:
         if isinstance(value, str):
             _check_text(value)
         elif math.isnan(value) or (type(value) is int and type(integer(value)) is int):
-            raise RefusedError
+            raise LoweringError
         return self._graph.constant(value)
 
     def _has(self, path: Path) -> int:
@@ -164,7 +164,7 @@ class _Lowering:
     def _number(self, node: Node) -> int:
         found = self._lower(node)
         if self._holds(found) not in (Holds.NUMBERS, Holds.ANY):
-            raise RefusedError
+            raise LoweringError
         return found
 
     def _truth(self, node: Node) -> int:
@@ -179,7 +179,7 @@ class _Lowering:
         first, second = self._lower(a), self._lower(b)
         kinds = {self._holds(first), self._holds(second)}
         if Holds.TEXTS in kinds or kinds == {Holds.NUMBERS, Holds.TRUTHS}:
-            raise RefusedError
+            raise LoweringError
         return self._graph.node(op, Holds.TRUTHS, (second, first) if turned else (first, second))
 
     def _equal(self, a: Node, b: Node) -> int:
@@ -190,13 +190,13 @@ class _Lowering:
     def _in(self, sought: Node, elements: tuple[Node, ...]) -> int:
         literals = [each.value for each in elements if isinstance(each, Literal)]
         if not elements or len(literals) < len(elements) or len(elements) > _MOST_ELEMENTS:
-            raise RefusedError
+            raise LoweringError
         self._check_not_null(sought)
         what = self._lower(sought)
         found: list[int] = []
         for value in literals:
             if not isinstance(value, bool | float | str):
-                raise RefusedError
+                raise LoweringError
             found.append(self._graph.node(Op.EQUAL, Holds.TRUTHS, (what, self._constant(value))))
         while len(found) > 1:  # as a tree, so that it is not deep
             rest = found[len(found) & ~1 :]
@@ -219,13 +219,13 @@ class _Lowering:
             case _:
                 path = path_of(node, self._names)
                 if path is not None and isinstance(path[-1], int):
-                    raise RefusedError
+                    raise LoweringError
 
 
 def _check_text(text: str) -> None:
     if "\0" in text:
-        raise RefusedError
+        raise LoweringError
     try:
         text.encode()
     except UnicodeEncodeError:
-        raise RefusedError from None
+        raise LoweringError from None

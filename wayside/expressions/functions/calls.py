@@ -39,7 +39,7 @@ class _Method(ctypes.Structure):
 
 
 class _Noted(threading.local):
-    """The arguments and results of the calls on this thread since `settle`."""
+    """The arguments and results of the calls on this thread since `drop_lost_references`."""
 
     def __init__(self) -> None:
         self.arguments: list[Arguments] = []
@@ -68,7 +68,7 @@ def called_by_cel(function: Callable[[Arguments], object]) -> Callable[..., obje
     return cast("Callable[..., object]", _new_function(ctypes.addressof(_METHOD), call, None))
 
 
-def settle() -> None:
+def drop_lost_references() -> None:
     """The outermost evaluation on this thread is over, and its outcome gone: drop the references that CEL lost."""
     noted = _noted
     if not noted.arguments:

@@ -55,7 +55,7 @@ _YIELDS = {
 
 
 @dataclass(frozen=True, slots=True)
-class Parameter:
+class FunctionParameter:
     """A parameter. Its name contains the unit if its meaning does not imply it."""
 
     name: str
@@ -66,7 +66,7 @@ class Parameter:
 class Signature:
     """One way to call a function."""
 
-    parameters: tuple[Parameter, ...]
+    parameters: tuple[FunctionParameter, ...]
     implementation: Callable[..., object]
 
 
@@ -143,6 +143,6 @@ def function(name: str, yields: Yields, summary: str, *ways: tuple[Callable[...,
     )
 
 
-def _parameter(text: str) -> Parameter:
+def _parameter(text: str) -> FunctionParameter:
     name, _, takes = text.partition(":")
-    return Parameter(name, Takes(takes) if takes else Takes.NUMBER)
+    return FunctionParameter(name, Takes(takes) if takes else Takes.NUMBER)

@@ -18,7 +18,7 @@ def wgs84_distance(latitude1: float, longitude1: float, latitude2: float, longit
     """Metres along the ellipsoid between two places given in degrees."""
     _check(latitude1, longitude1)
     _check(latitude2, longitude2)
-    return geodesy.distance(latitude1, longitude1, latitude2, longitude2)
+    return geodesy.surface_distance(latitude1, longitude1, latitude2, longitude2)
 
 
 def wgs84_bearing(latitude1: float, longitude1: float, latitude2: float, longitude2: float) -> float:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from wayside.api.actions.action import Action
-from wayside.api.actions.notify import Notify
+from wayside.api.actions.notify import NotifyAction
 from wayside.api.operation import Operation
 from wayside.api.scheme import TypeOfAction
 
@@ -69,5 +69,5 @@ def types(action: Action) -> Types:
 
 def delay_ns(action: Action) -> int:
     """How long the action waits before it does anything, in nanoseconds."""
-    notify: Notify | None = action.notify
+    notify: NotifyAction | None = action.notify
     return 0 if notify is None or notify.grouping is None else notify.grouping.wait.ns

@@ -10,7 +10,7 @@ from wayside.api import Detector, EventRule
 from wayside.api.base import Duration
 from wayside.api.classification import Classification
 from wayside.api.eventrule import Signal
-from wayside.api.scheme import SCHEME, Dimension, Value
+from wayside.api.scheme import SCHEME, CharacteristicValue, Dimension
 from wayside.rules.compiled import CompiledRule
 from wayside.rules.problems import RuleProblem
 
@@ -27,17 +27,17 @@ class Case:
     others: Mapping[str, EventRule]
     """The rules that it may name, by name."""
 
-    def given(self, values: type[Value]) -> list[Value]:
+    def given(self, values: type[CharacteristicValue]) -> list[CharacteristicValue]:
         """The values of the classification in the dimension; empty if it has none."""
         classification = self.rule.spec.classification or Classification()
         return classification.values_of(_dimension(values))
 
-    def only(self, *values: Value) -> bool:
+    def only(self, *values: CharacteristicValue) -> bool:
         """Whether the classification has values in the dimension, and only these."""
         given = self.given(type(values[0]))
         return bool(given) and set(given) <= set(values)
 
-    def against(self, value: Value, fact: str) -> RuleProblem:
+    def against(self, value: CharacteristicValue, fact: str) -> RuleProblem:
         """The warning that a given value contradicts the fact; the fact also contains the remedy."""
         dimension = _dimension(type(value))
         index = self.given(type(value)).index(value)
@@ -45,7 +45,7 @@ class Case:
             ("spec", "classification", dimension.name, index), f"{value.explained()} contradicts the rule: {fact}"
         )
 
-    def lacks(self, values: type[Value], fact: str) -> RuleProblem:
+    def lacks(self, values: type[CharacteristicValue], fact: str) -> RuleProblem:
         """The warning that a value is missing in a dimension; the fact names the value."""
         return RuleProblem(("spec", "classification", _dimension(values).name), fact)
 
@@ -87,5 +87,5 @@ def span(nanoseconds: int) -> str:
     return str(Duration(f"{nanoseconds // 10**6}ms"))
 
 
-def _dimension(values: type[Value]) -> Dimension:
+def _dimension(values: type[CharacteristicValue]) -> Dimension:
     return next(dimension for dimension in SCHEME if dimension.values is values)

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from wayside.api import Detector, EventRule
 from wayside.api.scheme import (
     ActingEntity,
+    CharacteristicValue,
     DetectionAlgorithm,
     EventDetectionEntity,
     Incidence,
@@ -21,7 +22,6 @@ from wayside.api.scheme import (
     TimeSensitivity,
     TypeOfAction,
     TypeOfParticipants,
-    Value,
 )
 from wayside.rules.compiled import CompiledRule, FleetSubject, PairSubject
 from wayside.rules.contradictions.acting import delay_ns, types
@@ -46,7 +46,7 @@ class Contradiction:
 
     check: str
     """The name of its finding."""
-    dimension: type[Value]
+    dimension: type[CharacteristicValue]
     description: str
     """When there is a warning, for people."""
     find: Callable[[Case], Iterator[RuleProblem]]
@@ -194,7 +194,7 @@ def _unnamed_action(case: Case) -> Iterator[RuleProblem]:
 
 def _unaccounted_type(case: Case) -> Iterator[RuleProblem]:
     actions = case.rule.spec.actions
-    possible = frozenset[Value]().union(*(types(action).possible for action in actions))
+    possible = frozenset[CharacteristicValue]().union(*(types(action).possible for action in actions))
     for value in case.given(TypeOfAction) if actions else ():  # without actions, another system acts on the events
         if value not in possible:
             listed = ", ".join(f"spec.actions[{index}].{each.field}" for index, each in enumerate(actions))

@@ -12,7 +12,7 @@ from detector.engine.samples.sample import DecodeError
 from detector.streams.codecs.etsi.asn1 import DefinitionError
 from detector.streams.codecs.etsi.bits import Bits
 from detector.streams.codecs.etsi.members import message_members
-from detector.streams.codecs.etsi.messages import BY_NAME, BY_NUMBER, KINDS, PREFIX, Kind, definitions, reader
+from detector.streams.codecs.etsi.messages import BY_NAME, BY_NUMBER, KINDS, PREFIX, MessageKind, definitions, reader
 from detector.streams.codecs.etsi.own import OwnDefinitions, own_definitions, read_module
 from detector.streams.codecs.etsi.packets import message_in
 
@@ -59,7 +59,7 @@ class EtsiDecoder:
         except (LookupError, TypeError):  # the user's definitions have its time elsewhere, or not at all
             return None
 
-    def _read(self, payload: bytes) -> tuple[Kind, dict[str, Any]]:
+    def _read(self, payload: bytes) -> tuple[MessageKind, dict[str, Any]]:
         data = message_in(payload)
         if len(data) <= _HEADER:
             raise DecodeError(f"{len(data)} bytes: an ITS message has more than {_HEADER}")
@@ -83,11 +83,11 @@ class EtsiDecoder:
         return kind, message
 
 
-def _is_defined(kind: Kind, own: OwnDefinitions | None) -> bool:
+def _is_defined(kind: MessageKind, own: OwnDefinitions | None) -> bool:
     return bool(kind.packaged) or (own is not None and own.type(kind.types) is not None)
 
 
-def _kind(type_name: str) -> Kind:
+def _kind(type_name: str) -> MessageKind:
     kind = BY_NAME.get(type_name.removeprefix(PREFIX))
     if kind is None or not type_name.startswith(PREFIX):
         known = ", ".join(PREFIX + name for name in BY_NAME)

@@ -55,7 +55,7 @@ def _number(end: Any, node: Mapping[str, Any], trees: Mapping[str, Any]) -> int 
     if end.lstrip("-").isdigit():
         return int(end)
     named = named_numbers(aliases(str(node.get("type", "")), trees), trees) | dict(node.get("named-numbers", {}))
-    return named[end] if end in named else value_of(end, trees)
+    return named[end] if end in named else named_number(end, trees)
 
 
 def type_tree(name: str, trees: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -78,7 +78,7 @@ def named_numbers(names: list[str], trees: Mapping[str, Any]) -> dict[str, int]:
     return next((dict(tree["named-numbers"]) for tree in found if "named-numbers" in tree), {})
 
 
-def value_of(name: str, trees: Mapping[str, Any]) -> int | None:
+def named_number(name: str, trees: Mapping[str, Any]) -> int | None:
     """The number that the modules give that name."""
     for tree in trees.values():
         found = tree["values"].get(name)

@@ -25,7 +25,7 @@ def _milliseconds(seconds: float) -> int:
 
 
 def _generation(part: str) -> Stamp:
-    return lambda message, received: times.nearest(round(message[part]["generationDeltaTime"] * 1000), received)
+    return lambda message, received: times.nearest_time(round(message[part]["generationDeltaTime"] * 1000), received)
 
 
 def _denm(message: Mapping[str, Any], received: int) -> int | None:
@@ -50,7 +50,7 @@ def _none(message: Mapping[str, Any], received: int) -> int | None:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Kind:
+class MessageKind:
     """One kind of message."""
 
     name: str
@@ -67,7 +67,7 @@ _RELEASE_1 = "ITS_r1318"
 _INFRASTRUCTURE = "ITS_IS"
 
 KINDS = tuple(
-    Kind(name, number, types, {version: (package, module) for version, package in packages.items()}, stamp)
+    MessageKind(name, number, types, {version: (package, module) for version, package in packages.items()}, stamp)
     for name, number, types, module, packages, stamp in (
         ("denm", 1, ("DENM",), "DENM_PDU_Descriptions", {1: _RELEASE_1, 2: "ITS_DENM_3"}, _denm),
         ("cam", 2, ("CAM",), "CAM_PDU_Descriptions", {1: _RELEASE_1, 2: "ITS_CAM_2"}, _generation("cam")),
@@ -83,7 +83,7 @@ BY_NUMBER = {kind.number: kind for kind in KINDS}
 
 
 @cache
-def packaged_definitions(kind: Kind) -> Mapping[int, Type]:
+def packaged_definitions(kind: MessageKind) -> Mapping[int, Type]:
     """The kind's type by protocol version, as the extra brings it.
 
     Raises DefinitionError where the extra is not installed.
@@ -95,7 +95,7 @@ def packaged_definitions(kind: Kind) -> Mapping[int, Type]:
     return {version: made[place] for version, place in kind.packaged.items()}
 
 
-def definitions(kind: Kind, own: OwnDefinitions | None) -> Mapping[int, Type]:
+def definitions(kind: MessageKind, own: OwnDefinitions | None) -> Mapping[int, Type]:
     """The kind's type by protocol version: the user's where their definitions have it.
 
     Messages of the first version, which are read otherwise, stay with the definitions that come with the extra. Raises
@@ -117,4 +117,14 @@ def reader(definition: Type) -> Read:
     return Readers().reader(definition)
 
 
-__all__ = ["BY_NAME", "BY_NUMBER", "KINDS", "PREFIX", "DefinitionError", "Kind", "Stamp", "definitions", "reader"]
+__all__ = [
+    "BY_NAME",
+    "BY_NUMBER",
+    "KINDS",
+    "PREFIX",
+    "DefinitionError",
+    "MessageKind",
+    "Stamp",
+    "definitions",
+    "reader",
+]

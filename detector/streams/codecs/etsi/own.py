@@ -38,7 +38,7 @@ class OwnDefinitions:
         self._trees: dict[str, _Tree] = {}
         self._rows: dict[str, list[tuple[str, str]]] = {}
         for text in texts:
-            self._trees.update(copy.deepcopy(parsed(text)))
+            self._trees.update(copy.deepcopy(parsed_modules(text)))
             self._rows.update(_object_sets(text))
         bounds.span_constraints(self._trees)
         self._types = _compiled(self._trees)
@@ -137,7 +137,7 @@ class OwnDefinitions:
     def _table(self, object_set: str) -> dict[int, asn1.Type]:
         table: dict[int, asn1.Type] = {}
         for type_name, value in self._rows.get(object_set, ()):
-            number = int(value) if value.isdigit() else bounds.value_of(value, self._trees)
+            number = int(value) if value.isdigit() else bounds.named_number(value, self._trees)
             kind = self.type([type_name])
             if number is not None and kind is not None:
                 table[number] = kind
@@ -145,7 +145,7 @@ class OwnDefinitions:
 
 
 @lru_cache(maxsize=64)
-def parsed(text: str) -> dict[str, Any]:
+def parsed_modules(text: str) -> dict[str, Any]:
     """The modules in the text. Raises DefinitionError, with line and column, where it is no ASN.1."""
     tools = _asn1tools()
     try:
@@ -164,7 +164,7 @@ def read_module(module: Asn1Module) -> str:
             text = Path(module.file or "").read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError) as error:
             raise asn1.DefinitionError(f"cannot read {module.file}: {error}") from error
-    parsed(text)
+    parsed_modules(text)
     return text
 
 

@@ -43,7 +43,7 @@ def its_ms(unix: int) -> int:
     return (unix - (EPOCH - leaps) * _SECOND) // _MILLISECOND
 
 
-def nearest(remainder: int, near: int) -> int:
+def nearest_time(remainder: int, near: int) -> int:
     """The Unix time nearest to `near` whose ITS time leaves the remainder modulo 65 536 ms."""
     reference = its_ms(near)
     ahead = (remainder - reference) % WRAP
