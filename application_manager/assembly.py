@@ -38,10 +38,10 @@ from application_manager.work.statuses import StatusWriter
 from application_manager.work.suspending import Suspending
 from application_manager.work.tasks import TaskWork
 from application_manager.work.templates import TemplateWork
-from application_manager.work.workqueue import Key, WorkQueue
 from application_manager.workers.answers import AnswerCache
 from application_manager.workers.claiming import Claiming
 from application_manager.workers.pool import Pool
+from wayside.kubernetes.workqueue import Key, WorkQueue
 from wayside.tracing import Tracing
 
 _JUDGING_PAUSE = (
@@ -87,20 +87,21 @@ class Assembly:
             measures.registry.register(LostSpans(traced))
         self.recorder = Recorder(client, measures)
         applier = self.applier = Applier(client, self.cache.store, resources)
+        measure = measures.reconciled
         self._instances: WorkQueue[Name] = WorkQueue(
-            "instance", self._reconcile_instance, _INSTANCE_WORKERS, measures=measures, share=_INSTANCE_SHARE
+            "instance", self._reconcile_instance, _INSTANCE_WORKERS, measure=measure, share=_INSTANCE_SHARE
         )
         self._statuses: WorkQueue[Name] = WorkQueue(
-            "instance status", self._say_instance, _STATUS_WORKERS, self._instances, measures, share=_STATUS_SHARE
+            "instance status", self._say_instance, _STATUS_WORKERS, self._instances, measure, share=_STATUS_SHARE
         )
         self._tasks: WorkQueue[Name] = WorkQueue(
-            "task", self._reconcile_task, _STATUS_WORKERS, self._instances, measures, share=_STATUS_SHARE
+            "task", self._reconcile_task, _STATUS_WORKERS, self._instances, measure, share=_STATUS_SHARE
         )
         self._templates: WorkQueue[Name] = WorkQueue(
-            "template", self._reconcile_template, _JUDGING_WORKERS, self._instances, measures, share=1
+            "template", self._reconcile_template, _JUDGING_WORKERS, self._instances, measure, share=1
         )
         self._rules: WorkQueue[RuleKey] = WorkQueue(
-            "rule", self._reconcile_rule, _JUDGING_WORKERS, self._instances, measures, share=1
+            "rule", self._reconcile_rule, _JUDGING_WORKERS, self._instances, measure, share=1
         )
         self.detector_index = DetectorIndex(options.detectors)
         detectors = DetectorWork(
@@ -111,7 +112,7 @@ class Assembly:
             SidecarEvents(self.cache, self.detector_index, self.recorder),
         )
         self._detector_work = detectors
-        self.detectors: WorkQueue[Name] = WorkQueue("detector", self._reconcile_detector, 1, self._instances, measures)
+        self.detectors: WorkQueue[Name] = WorkQueue("detector", self._reconcile_detector, 1, self._instances, measure)
         queues = (self._instances, self._statuses, self._tasks, self._templates, self._rules, self.detectors)
         measures.registry.register(Overview(self.cache, lambda: [(each.name, *each.depth) for each in queues]))
         self.publisher = Publisher(options.zenoh)
@@ -119,7 +120,7 @@ class Assembly:
             "configuration",
             ConfigurationWork(self.cache, client, applier, self.publisher).reconcile,
             _CONFIGURATION_WORKERS,
-            measures=measures,
+            measure=measure,
         )
         self.queues = (*queues, self._configurations)
         self.pool = Pool(measures, options.cpu_time)

@@ -11,11 +11,11 @@ from application_manager.cache.cluster_cache import OWN_KINDS, POD, TASK
 from application_manager.cluster.client import Client, Resource
 from application_manager.cluster.connection import ConfigurationError
 from application_manager.cluster.entitlement import judge, missing_rights
-from application_manager.cluster.errors import ApiError
 from application_manager.cluster.leadership import LeaseKey
 from application_manager.cluster.repeating import until_answered
 from application_manager.core.objects.policy import KindKey, Policy, kind_text
 from application_manager.core.objects.rights import lease_rights, reading, rights
+from wayside.kubernetes.errors import ApiError
 
 log = logging.getLogger(__name__)
 

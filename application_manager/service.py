@@ -25,7 +25,6 @@ from application_manager.assembly import Assembly
 from application_manager.cache.cluster_cache import DETECTOR, OWN_KINDS, POD
 from application_manager.cluster.client import Client, Resource
 from application_manager.cluster.connection import ConfigurationError, load_configuration
-from application_manager.cluster.errors import ApiError
 from application_manager.cluster.grants import Grants
 from application_manager.cluster.leadership import RENEWAL_TIMEOUT, Leadership
 from application_manager.cluster.pacing import Pacing, Share
@@ -44,6 +43,7 @@ from application_manager.watching.operator import watch
 from application_manager.watching.pulse import Pulse
 from application_manager.work.acting import acting, ended
 from wayside.api.applicationtemplate import TemplateManager
+from wayside.kubernetes.errors import ApiError
 from wayside.tracing import Tracing, tracing
 
 log = logging.getLogger(__name__)

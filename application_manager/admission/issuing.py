@@ -24,9 +24,9 @@ from application_manager.admission.authority import AUTHORITY, VALID, issued, wr
 from application_manager.admission.reviewing import Serving
 from application_manager.cluster.client import Client, Object, Resource
 from application_manager.cluster.connection import ConfigurationError
-from application_manager.cluster.errors import ApiError
 from application_manager.cluster.repeating import repeatedly, until_answered
 from application_manager.core.findings.webhooks import Place
+from wayside.kubernetes.errors import ApiError
 from wayside.servingcertificate import CERTIFICATE, KEY
 
 EVERY = 10.0  # s between two looks at the Secret

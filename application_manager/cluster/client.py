@@ -21,13 +21,13 @@ import aiohttp
 import msgspec
 from kubernetes.aio.client import ApiClient, Configuration
 
-from application_manager.cluster.errors import ApiError, NotActive, NotGranted, Unreachable
 from application_manager.cluster.fence import FencedRequest, writing
 from application_manager.cluster.pacing import Pacing
 from application_manager.core.objects.ownership import FIELD_MANAGER
 from application_manager.core.objects.policy import KindKey
 from application_manager.core.objects.rights import REMEDY
 from application_manager.measures import NO_ANSWER, Measures
+from wayside.kubernetes.errors import ApiError, NotActive, NotGranted, Unreachable
 
 Object = dict[str, Any]
 """A Kubernetes object, as JSON."""

@@ -15,10 +15,10 @@ import time
 from dataclasses import dataclass
 
 from application_manager.cluster.client import LEASES, Client
-from application_manager.cluster.errors import ApiError, Unreachable
 from application_manager.cluster.podaccount import FOLDER
 from application_manager.core.holders.leading import DEADLINE, LOOK_EVERY, RENEW_EVERY, Candidate
 from application_manager.measures import Measures
+from wayside.kubernetes.errors import ApiError, Unreachable
 from wayside.leases import holder_of
 
 LEASE_NAME = "application-manager"

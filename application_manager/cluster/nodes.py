@@ -10,8 +10,8 @@ import logging
 import time
 
 from application_manager.cluster.client import Client, Resource
-from application_manager.cluster.errors import ApiError, Unreachable
 from application_manager.core.health.placement import Nodes
+from wayside.kubernetes.errors import ApiError, Unreachable
 
 NODES = Resource("v1", "Node", "nodes", namespaced=False)
 FRESH = 2.0  # s for which an answer is used again

@@ -15,7 +15,7 @@ from collections import Counter
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
-from application_manager.core.turns import Turns
+from wayside.kubernetes.turns import Turns
 
 AT_ONCE = 24
 """Requests that are under way at the same time, of all queues together; watches are apart."""

@@ -8,7 +8,7 @@ from collections.abc import Awaitable, Callable
 from typing import TypeVar
 
 from application_manager.cluster.connection import ConfigurationError
-from application_manager.cluster.errors import ApiError, Unreachable
+from wayside.kubernetes.errors import ApiError, Unreachable
 
 _FAILURES = (ApiError, Unreachable, ConfigurationError)
 

@@ -14,13 +14,13 @@ import yaml
 
 from application_manager.cluster.client import Client, Resource
 from application_manager.cluster.connection import ConfigurationError, load_configuration
-from application_manager.cluster.errors import ApiError, Unreachable
 from application_manager.core.findings.injections import detector_of, injection
 from application_manager.core.objects.poddefaults import PodDefaults
 from application_manager.core.objects.sidecars import added, has_sidecar
 from wayside import commandline
 from wayside.api import API_VERSION, Detector
 from wayside.api.documents import parse_object
+from wayside.kubernetes.errors import ApiError, Unreachable
 from wayside.manifests import to_yaml
 
 _DETECTORS = Resource(API_VERSION, "Detector", Detector.plural)

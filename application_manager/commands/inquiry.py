@@ -11,7 +11,6 @@ from kubernetes.aio.config import ConfigException, list_kube_config_contexts
 
 from application_manager.cluster.client import LEASES, Client, Object, Resource
 from application_manager.cluster.connection import load_configuration
-from application_manager.cluster.errors import ApiError, Unreachable
 from application_manager.core.claims.claims import InvalidTemplate
 from application_manager.core.objects.labelling import INSTANCE_LABEL
 from application_manager.core.statuses.explaining import Found, explain, serving
@@ -19,6 +18,7 @@ from application_manager.core.statuses.explanation import Explanation
 from wayside.api import API_VERSION, ApplicationInstance, ApplicationTask, ApplicationTemplate, Kind
 from wayside.api.documents import parse_object
 from wayside.inputerror import InputError
+from wayside.kubernetes.errors import ApiError, Unreachable
 from wayside.leases import lease_name
 
 Model = TypeVar("Model", bound=Kind)

@@ -11,13 +11,13 @@ from pydantic import TypeAdapter, ValidationError
 
 from application_manager.cluster.client import Client
 from application_manager.cluster.connection import ConfigurationError, load_configuration
-from application_manager.cluster.errors import ApiError, Unreachable
 from application_manager.cluster.leadership import LEASE_NAME, lease_key
 from application_manager.core.findings.webhooks import certificate_secret
 from application_manager.core.objects.detectors import detector_roles, sidecar_roles
 from application_manager.core.objects.policy import PLURALS, KindKey, Policy, kind_text
 from application_manager.core.objects.rights import roles
 from wayside.api.base import ObjectName
+from wayside.kubernetes.errors import ApiError, Unreachable
 from wayside.manifests import to_yaml
 
 

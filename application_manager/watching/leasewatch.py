@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 from application_manager.cache.cluster_cache import ClusterCache
 from application_manager.cluster.client import LEASES, Client, Resource
-from application_manager.cluster.errors import ApiError, Unreachable
 from application_manager.core.holders.leases import HolderKey
 from application_manager.core.objects.policy import Name
+from wayside.kubernetes.errors import ApiError, Unreachable
 from wayside.leases import lease_name
 
 LOOK_EVERY = 1.0  # s

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 from application_manager.cache.cluster_cache import ClusterCache
 from application_manager.cache.store import name_of
 from application_manager.cluster.client import LEASES, Client, Resource
-from application_manager.cluster.errors import ApiError, Unreachable
 from application_manager.cluster.repeating import until_answered
 from application_manager.core.objects.labelling import INSTANCE_LABEL
 from application_manager.core.objects.policy import Name
 from application_manager.measures import Measures
 from application_manager.watching.router import Router
+from wayside.kubernetes.errors import ApiError, Unreachable
 
 log = logging.getLogger(__name__)
 

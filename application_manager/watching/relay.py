@@ -17,7 +17,7 @@ from typing import Any
 from kopf._cogs.clients import fetching, watching
 
 from application_manager.cluster.client import Object
-from application_manager.cluster.errors import ApiError, Unreachable
+from wayside.kubernetes.errors import ApiError, Unreachable
 
 Handler = Callable[[Object], None]
 Relist = Callable[[Any, str | None, str], Awaitable[None]]

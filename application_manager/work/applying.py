@@ -16,7 +16,6 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from application_manager.cache.store import Store
 from application_manager.cluster.client import Client, Object, Resource
-from application_manager.cluster.errors import ApiError
 from application_manager.core.conditions import Aspect
 from application_manager.core.health.refusals import (
     ADMISSION_REFUSED,
@@ -38,6 +37,7 @@ from application_manager.core.objects.ownership import (
 from application_manager.core.objects.policy import KindKey
 from application_manager.core.objects.rendering import Manifest, Rendering, object_key, owned
 from wayside.api import ApplicationInstance, Kind
+from wayside.kubernetes.errors import ApiError
 
 _WORST_FIRST = ("ObjectExists", APPLY_REFUSED, ADMISSION_REFUSED, QUOTA_EXCEEDED, "Waiting")
 _WORKLOADS = frozenset({"Deployment", "StatefulSet", "DaemonSet", "Job", "CronJob", "Pod"})

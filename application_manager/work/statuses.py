@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from application_manager.cluster.client import Client, Object, Resource
-from application_manager.cluster.errors import ApiError
 from application_manager.core.statuses.status import difference
 from application_manager.work.recorder import Recorder
 from wayside.api.base import Condition, Kind
+from wayside.kubernetes.errors import ApiError
 
 
 class Status(Protocol):

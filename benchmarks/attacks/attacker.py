@@ -18,10 +18,10 @@ from typing import Any
 
 from application_manager.cluster.client import Client
 from application_manager.cluster.connection import load_configuration
-from application_manager.cluster.errors import ApiError
 from benchmarks.manager_memory import large as small
 from benchmarks.task_to_deployment import AT_ONCE, TASKS, TEMPLATE, TEMPLATES, task
 from tests.worker_jobs import TEXT
+from wayside.kubernetes.errors import ApiError
 
 LARGE = 1_000_000  # bytes of a large task
 TEXT_LENGTH = 60_000  # of each of its values: the API server takes no more than 65,536

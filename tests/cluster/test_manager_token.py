@@ -12,11 +12,11 @@ import yaml
 from kubernetes.aio.client import Configuration
 
 from application_manager.cluster.client import LEASES, Client
-from application_manager.cluster.errors import ApiError
 from application_manager.cluster.podaccount import use_pod_account
 from tests.cluster.api import Api
 from tests.cluster.controlplane import ControlPlane
 from tests.cluster.waiting import PATIENCE
+from wayside.kubernetes.errors import ApiError
 
 
 def test_a_token_that_is_not_taken_any_more_is_replaced_by_the_files_new_one(

@@ -13,7 +13,6 @@ from kubernetes.aio.client import Configuration
 from application_manager.admission.admission import Admission
 from application_manager.cache.cluster_cache import DETECTOR, EVENT_RULE, TEMPLATE, ClusterCache
 from application_manager.cluster.client import Client, Resource
-from application_manager.cluster.errors import ApiError
 from application_manager.core.findings.findings import Findings
 from application_manager.core.findings.reviews import LONGEST, MOST_TOLD, ReviewError, answer, read
 from application_manager.core.findings.webhooks import Place, webhook_configuration
@@ -23,6 +22,7 @@ from tests.inprocess import InProcess
 from tests.unit.manager_objects import template
 from tests.unit.templates.test_findings import counting, deploying, detector, rule
 from wayside.api import API_VERSION, Kind
+from wayside.kubernetes.errors import ApiError
 
 WRONG = Findings(("spec.when: is wrong",), ("it is early",))
 

@@ -11,7 +11,6 @@ from kubernetes.aio.client import Configuration
 from application_manager.cache.cluster_cache import ClusterCache
 from application_manager.cache.store import Entry
 from application_manager.cluster.client import LEASES, Client, Resource
-from application_manager.cluster.errors import ApiError
 from application_manager.core.holders.leases import (
     RAREST_LOOK,
     HealthyTime,
@@ -21,6 +20,7 @@ from application_manager.core.holders.leases import (
 from application_manager.core.objects.policy import Policy
 from application_manager.watching.leasewatch import LeaseWatch
 from tests.unit.manager_objects import task, template
+from wayside.kubernetes.errors import ApiError
 from wayside.leases import DEFAULT_DURATION, lease_name
 
 KEY = ("site", "det")

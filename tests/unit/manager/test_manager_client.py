@@ -13,8 +13,8 @@ from kubernetes.aio.client import Configuration
 
 from application_manager.cluster import fence
 from application_manager.cluster.client import LEASES, Client
-from application_manager.cluster.errors import ApiError, NotActive, Unreachable
 from application_manager.cluster.pacing import Pacing
+from wayside.kubernetes.errors import ApiError, NotActive, Unreachable
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 BODY = {"metadata": {"namespace": "n", "name": "x", "resourceVersion": "1"}}

@@ -13,7 +13,6 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from application_manager.cache.cluster_cache import ClusterCache
 from application_manager.cluster.connection import ConfigurationError
-from application_manager.cluster.errors import ApiError
 from application_manager.core.objects.policy import Policy
 from application_manager.core.statuses.allowance import BURST, REFILL, Allowance
 from application_manager.headroom import Headroom
@@ -23,9 +22,10 @@ from application_manager.observability.pages import STALLED_AFTER, pages, stalle
 from application_manager.observability.tracing import LostSpans
 from application_manager.watching.pulse import Pulse
 from application_manager.work.recorder import Reason
-from application_manager.work.workqueue import WorkQueue
 from tests.guides import guide
 from tests.unit.manager_objects import instance, task, template
+from wayside.kubernetes.errors import ApiError
+from wayside.kubernetes.workqueue import WorkQueue
 from wayside.tracing import Tracing
 
 GUIDE = guide("manager")
@@ -97,7 +97,7 @@ def test_a_queue_tells_how_long_its_work_took_and_what_failed() -> None:
             else:
                 finished.set()
 
-        queue = WorkQueue("task", work, 1, measures=measures)
+        queue = WorkQueue("task", work, 1, measure=measures.reconciled)
         queue.add("a")
         running = asyncio.create_task(queue.run())
         async with asyncio.timeout(60):

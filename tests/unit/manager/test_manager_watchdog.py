@@ -13,7 +13,7 @@ from application_manager import watchdog
 from application_manager.measures import Measures
 from application_manager.observability.pages import stalled
 from application_manager.watchdog import STALLED
-from application_manager.work.workqueue import WorkQueue
+from wayside.kubernetes.workqueue import WorkQueue
 
 
 def ended_by(stall: watchdog.Stall, *, hangs: bool = False, silent: float = 3600.0) -> str | None:

@@ -16,12 +16,11 @@ import time
 from collections import Counter
 from collections.abc import Awaitable, Callable, Hashable
 from contextlib import suppress
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
-from application_manager.cluster.errors import ApiError, NotGranted, Unreachable
-from application_manager.core.turns import Turns
-from application_manager.measures import Measures
 from wayside.backoff import pause_after
+from wayside.kubernetes.errors import ApiError, NotGranted, Unreachable
+from wayside.kubernetes.turns import Turns
 
 Key = TypeVar("Key", bound=Hashable)
 
@@ -32,6 +31,13 @@ _YIELDING = 0.25  # s that a worker waits for the keys of a namespace in the que
 _SHORTEST_DELAY = 0.1  # s, so that a time that is nearly there does not spin
 
 log = logging.getLogger(__name__)
+
+
+class Measure(Protocol):
+    """Takes the time of each reconciliation, in seconds, and whether it failed and is retried."""
+
+    def __call__(self, queue: str, seconds: float, *, failed: bool) -> None:
+        """A queue's work on one key ended."""
 
 
 class WorkQueue(Generic[Key]):
@@ -47,7 +53,7 @@ class WorkQueue(Generic[Key]):
         work: Callable[[Key], Awaitable[None]],
         concurrency: int,
         after: WorkQueue[Any] | None = None,
-        measures: Measures | None = None,
+        measure: Measure | None = None,
         share: int | None = None,
     ) -> None:
         """Make it.
@@ -57,11 +63,11 @@ class WorkQueue(Generic[Key]):
             work: reconciles a key.
             concurrency: how many keys are worked on at a time.
             after: the queue that goes first.
-            measures: counts each reconciliation.
+            measure: gets each reconciliation.
             share: how many keys of one namespace are worked on at a time; None: any number.
         """
         self.name = name
-        self._measures = measures or Measures()
+        self._measure = measure
         self._after = after
         self._work = work
         self._concurrency = concurrency
@@ -74,12 +80,22 @@ class WorkQueue(Generic[Key]):
         self._failures: Counter[Key] = Counter()
         self._timers: dict[Key, asyncio.TimerHandle] = {}
         self._wake = asyncio.Event()
+        self._idle = asyncio.Event()
+        self._idle.set()
         self._ending = False
 
     @property
     def depth(self) -> tuple[int, int]:
         """How many keys wait for a worker, and how many for their time."""
         return len(self._queued), len(self._timers)
+
+    def __len__(self) -> int:
+        """Number of keys that wait for a worker, or that a worker processes."""
+        return len(self._queued) + len(self._running)
+
+    async def idle(self) -> None:
+        """Wait until no key waits for a worker and none is processed; keys that wait for their time do not count."""
+        await self._idle.wait()
 
     def stuck(self, limit: float) -> str | None:
         """The key that a worker is at for longer than this number of seconds, in words; any thread may call it."""
@@ -97,6 +113,7 @@ class WorkQueue(Generic[Key]):
             self._queued.add(key)
             self._waiting.add(_namespace(key), key)
             self._wake.set()
+            self._idle.clear()
 
     def add_at(self, key: Key, when: float) -> None:
         """Enqueue the key at `when`, in seconds since 1970; the earliest time counts."""
@@ -143,16 +160,22 @@ class WorkQueue(Generic[Key]):
             try:
                 await self._once(key)
             finally:
-                del self._running[key]
-                self._at_work[namespace] -= 1
-                if not self._at_work[namespace]:
-                    del self._at_work[namespace]
-                if self._share is not None:
-                    self._wake.set()  # another worker may have let this namespace wait
-            if key in self._again:
-                self._again.discard(key)
-                self.add(key)
+                self._leave(key, namespace)
             _heed_cancellation()
+
+    def _leave(self, key: Key, namespace: str) -> None:
+        """Note that the key is not processed any more."""
+        del self._running[key]
+        self._at_work[namespace] -= 1
+        if not self._at_work[namespace]:
+            del self._at_work[namespace]
+        if self._share is not None:
+            self._wake.set()  # another worker may have let this namespace wait
+        if key in self._again:
+            self._again.discard(key)
+            self.add(key)
+        if not len(self):
+            self._idle.set()
 
     async def _take(self) -> Key | None:
         """Wait for the key whose turn it is; None at the end."""
@@ -196,7 +219,8 @@ class WorkQueue(Generic[Key]):
         else:
             failed = False
             self._failures.pop(key, None)
-        self._measures.reconciled(self.name, time.monotonic() - began, failed=failed)
+        if self._measure is not None:
+            self._measure(self.name, time.monotonic() - began, failed=failed)
 
     def _pause(self, key: Key, at_least: float | None) -> float:
         self._failures[key] += 1

@@ -9,9 +9,9 @@ from contextlib import asynccontextmanager
 
 import pytest
 
-from application_manager.cluster.errors import ApiError, Unreachable
-from application_manager.work import workqueue
-from application_manager.work.workqueue import WorkQueue
+from wayside.kubernetes import workqueue
+from wayside.kubernetes.errors import ApiError, Unreachable
+from wayside.kubernetes.workqueue import WorkQueue
 
 
 @asynccontextmanager
@@ -75,6 +75,28 @@ async def test_a_key_asked_for_while_it_runs_is_worked_on_once_more_and_never_tw
         more.set()
         await twice.wait()
     assert started == 2
+
+
+@in_a_loop
+async def test_it_is_idle_only_when_no_key_waits_and_none_is_worked_on() -> None:
+    begun, more = asyncio.Event(), asyncio.Event()
+
+    async def work(key: str) -> None:
+        begun.set()
+        await more.wait()
+
+    queue = WorkQueue("q", work, 1)
+    await queue.idle()
+    async with running(queue):
+        queue.add("a")
+        idle = asyncio.create_task(queue.idle())
+        await begun.wait()
+        queue.add("b")
+        queue.add("a")
+        assert (len(queue), idle.done()) == (2, False)
+        more.set()
+        await idle
+        assert len(queue) == 0
 
 
 @pytest.mark.parametrize("error", [Unreachable("gone"), ApiError(503, "busy"), ValueError("a defect")])
