@@ -13,7 +13,6 @@ from application_manager.cache.cluster_cache import DETECTOR, INSTANCE, TASK, TE
 from application_manager.cache.detector_index import DetectorIndex
 from application_manager.charts.chartcache import ChartCache
 from application_manager.charts.chartdesk import ChartDesk
-from application_manager.cluster.client import Client, Resource
 from application_manager.cluster.failedpods import FailedPodsLook
 from application_manager.cluster.nodes import NodeLook
 from application_manager.core.demand.decisions import Decision
@@ -41,6 +40,8 @@ from application_manager.work.templates import TemplateWork
 from application_manager.workers.answers import AnswerCache
 from application_manager.workers.claiming import Claiming
 from application_manager.workers.pool import Pool
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.resources import Resource
 from wayside.kubernetes.workqueue import Key, WorkQueue
 from wayside.tracing import Tracing
 

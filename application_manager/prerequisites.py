@@ -8,14 +8,15 @@ from collections.abc import Mapping
 from functools import partial
 
 from application_manager.cache.cluster_cache import OWN_KINDS, POD, TASK
-from application_manager.cluster.client import Client, Resource
-from application_manager.cluster.connection import ConfigurationError
 from application_manager.cluster.entitlement import judge, missing_rights
 from application_manager.cluster.leadership import LeaseKey
-from application_manager.cluster.repeating import until_answered
 from application_manager.core.objects.policy import KindKey, Policy, kind_text
 from application_manager.core.objects.rights import lease_rights, reading, rights
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.connection import ConfigurationError
 from wayside.kubernetes.errors import ApiError
+from wayside.kubernetes.repeating import until_answered
+from wayside.kubernetes.resources import Resource
 
 log = logging.getLogger(__name__)
 

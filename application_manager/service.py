@@ -23,12 +23,9 @@ from application_manager.admission.issuing import issuing
 from application_manager.admission.reviewing import Desk, webhook
 from application_manager.assembly import Assembly
 from application_manager.cache.cluster_cache import DETECTOR, OWN_KINDS, POD
-from application_manager.cluster.client import Client, Resource
-from application_manager.cluster.connection import ConfigurationError, load_configuration
+from application_manager.cluster.client import manager_client
 from application_manager.cluster.grants import Grants
 from application_manager.cluster.leadership import RENEWAL_TIMEOUT, Leadership
-from application_manager.cluster.pacing import Pacing, Share
-from application_manager.cluster.repeating import until_answered
 from application_manager.core.findings.webhooks import INJECTION_PATH, PATH
 from application_manager.core.objects.policy import KindKey
 from application_manager.measures import Measures
@@ -43,7 +40,12 @@ from application_manager.watching.operator import watch
 from application_manager.watching.pulse import Pulse
 from application_manager.work.acting import acting, ended
 from wayside.api.applicationtemplate import TemplateManager
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.connection import ConfigurationError, load_configuration
 from wayside.kubernetes.errors import ApiError
+from wayside.kubernetes.pacing import Pacing, Share
+from wayside.kubernetes.repeating import until_answered
+from wayside.kubernetes.resources import Resource
 from wayside.tracing import Tracing, tracing
 
 log = logging.getLogger(__name__)
@@ -57,8 +59,8 @@ async def serve(options: Options) -> None:
             or the port for metrics is taken.
     """
     measures, traced = Measures(), tracing("wayside-application-manager")
-    client = Client(await load_configuration(), measures, pacing=Pacing(share=Share()))
-    renewals = Client(await load_configuration(), measures, timeout=RENEWAL_TIMEOUT)  # not held up by all else
+    client = manager_client(await load_configuration(), measures, pacing=Pacing(share=Share()))
+    renewals = manager_client(await load_configuration(), measures, timeout=RENEWAL_TIMEOUT)  # not held up by all else
     leadership = Leadership(renewals, options.lease, measures)
     client.may_act = leadership.remaining
     try:

@@ -19,9 +19,9 @@ from contextvars import ContextVar
 from types import FrameType
 from typing import Any
 
-from application_manager.cluster.client import Resource
 from benchmarks.reconcile import NAMESPACE, Server, assembly
 from benchmarks.task_to_deployment import task
+from wayside.kubernetes.resources import Resource
 from wayside.kubernetes.workqueue import WorkQueue
 
 PACKAGE = "application_manager."

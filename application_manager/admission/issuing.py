@@ -22,11 +22,12 @@ from cryptography.hazmat.primitives.serialization import Encoding
 
 from application_manager.admission.authority import AUTHORITY, VALID, issued, written
 from application_manager.admission.reviewing import Serving
-from application_manager.cluster.client import Client, Object, Resource
-from application_manager.cluster.connection import ConfigurationError
-from application_manager.cluster.repeating import repeatedly, until_answered
 from application_manager.core.findings.webhooks import Place
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.connection import ConfigurationError
 from wayside.kubernetes.errors import ApiError
+from wayside.kubernetes.repeating import repeatedly, until_answered
+from wayside.kubernetes.resources import Object, Resource
 from wayside.servingcertificate import CERTIFICATE, KEY
 
 EVERY = 10.0  # s between two looks at the Secret

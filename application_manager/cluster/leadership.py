@@ -14,18 +14,17 @@ import socket
 import time
 from dataclasses import dataclass
 
-from application_manager.cluster.client import LEASES, Client
-from application_manager.cluster.podaccount import FOLDER
 from application_manager.core.holders.leading import DEADLINE, LOOK_EVERY, RENEW_EVERY, Candidate
 from application_manager.measures import Measures
-from wayside.kubernetes.errors import ApiError, Unreachable
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.errors import ApiError, RequestError, Unreachable
+from wayside.kubernetes.podaccount import pod_namespace
+from wayside.kubernetes.resources import LEASES
 from wayside.leases import holder_of
 
 LEASE_NAME = "application-manager"
 RENEWAL_TIMEOUT = 3.0
 """Seconds for one request about the Lease, so that a renewal that hangs leaves time for another."""
-
-_NAMESPACE_FILE = FOLDER / "namespace"
 
 log = logging.getLogger(__name__)
 
@@ -58,8 +57,7 @@ def lease_key(given: str | None, namespaces: tuple[str, ...]) -> LeaseKey:
             f"{given!r} cannot be the managers' Lease: write NAME or NAMESPACE/NAME; wayside-… are detectors'"
         )
     if not namespace:
-        own = os.environ.get("POD_NAMESPACE") or (_NAMESPACE_FILE.read_text() if _NAMESPACE_FILE.is_file() else "")
-        namespace = own.strip() or next(iter(sorted(namespaces)), "default")
+        namespace = os.environ.get("POD_NAMESPACE") or pod_namespace() or next(iter(sorted(namespaces)), "default")
     return LeaseKey(namespace, name)
 
 
@@ -141,7 +139,7 @@ class Leadership:
         while True:
             try:
                 await self.look()
-            except (ApiError, Unreachable) as error:
+            except RequestError as error:
                 left = self.remaining()
                 until = f"; acting for {left:.0f} s more" if left > 0 else ""
                 self._log(

@@ -12,15 +12,16 @@ from typing import Any
 import typer
 import yaml
 
-from application_manager.cluster.client import Client, Resource
-from application_manager.cluster.connection import ConfigurationError, load_configuration
+from application_manager.cluster.client import manager_client
 from application_manager.core.findings.injections import detector_of, injection
 from application_manager.core.objects.poddefaults import PodDefaults
 from application_manager.core.objects.sidecars import added, has_sidecar
 from wayside import commandline
 from wayside.api import API_VERSION, Detector
 from wayside.api.documents import parse_object
-from wayside.kubernetes.errors import ApiError, Unreachable
+from wayside.kubernetes.connection import ConfigurationError, load_configuration
+from wayside.kubernetes.errors import RequestError
+from wayside.kubernetes.resources import Resource
 from wayside.manifests import to_yaml
 
 _DETECTORS = Resource(API_VERSION, "Detector", Detector.plural)
@@ -122,7 +123,7 @@ async def _looked_up(documents: list[Manifest], known: _Known) -> _Known:
     listed = ", ".join(sorted(name for _, name in wanted))
     otherwise = "give its file by -f, or a kubeconfig of the cluster that has it"
     try:
-        client = Client(await load_configuration())
+        client = manager_client(await load_configuration())
     except ConfigurationError as error:
         raise ConfigurationError(f"Detector {listed} is in none of the files: {error}: {otherwise}") from error
     try:
@@ -130,7 +131,7 @@ async def _looked_up(documents: list[Manifest], known: _Known) -> _Known:
             raw = await client.get(_DETECTORS, namespace, name)
             if raw is not None and (found := _detector(raw)) is not None:
                 known.found[namespace, name] = found
-    except (ApiError, Unreachable) as error:
+    except RequestError as error:
         raise ConfigurationError(f"Detector {listed} cannot be looked up: {error}: {otherwise}") from error
     finally:
         await client.close()

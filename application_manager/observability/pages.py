@@ -12,8 +12,8 @@ from typing import Protocol
 from aiohttp import web
 
 from application_manager.cluster.certificate import follow
-from application_manager.cluster.connection import ConfigurationError
 from application_manager.measures import Measures
+from wayside.kubernetes.connection import ConfigurationError
 from wayside.servingcertificate import ServingCertificate
 
 FOLDER_OPTION = "--metrics-certificates"

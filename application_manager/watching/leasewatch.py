@@ -9,10 +9,11 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from application_manager.cache.cluster_cache import ClusterCache
-from application_manager.cluster.client import LEASES, Client, Resource
 from application_manager.core.holders.leases import HolderKey
 from application_manager.core.objects.policy import Name
-from wayside.kubernetes.errors import ApiError, Unreachable
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.errors import ApiError, RequestError, Unreachable
+from wayside.kubernetes.resources import LEASES, Resource
 from wayside.leases import lease_name
 
 LOOK_EVERY = 1.0  # s
@@ -86,7 +87,7 @@ class LeaseWatch:
         async with gate:
             try:
                 raw = await self.client.get(LEASES, key[0], lease_name(key[1]))
-            except (ApiError, Unreachable) as error:
+            except RequestError as error:
                 return error
         self.cache.leases.observe(key, raw, self.cache.healthy.elapsed)
         for instance in instances:

@@ -21,7 +21,6 @@ from application_manager.cache.cluster_cache import (
     ClusterCache,
 )
 from application_manager.cache.store import Entry, kind_of, name_of
-from application_manager.cluster.client import Object
 from application_manager.core.health.readiness import not_ready
 from application_manager.core.objects.configuration import CONFIG_MAP, config_map_name
 from application_manager.core.objects.labelling import INSTANCE_LABEL
@@ -31,6 +30,7 @@ from application_manager.work.applying import Applier
 from application_manager.work.rulework import RuleKey
 from wayside.api import ApplicationInstance
 from wayside.api.applicationtemplate import ApplicationTemplateStatus
+from wayside.kubernetes.resources import Object
 from wayside.leases import holder_of
 
 Enqueue = Callable[[Name], None]

@@ -8,7 +8,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from application_manager.cache.cluster_cache import ClusterCache
-from application_manager.cluster.client import Client, Object, Resource
 from application_manager.core.claims.claims import Claim, Refused, template_of_all
 from application_manager.core.claims.operations import Standing, Verdict, gathered
 from application_manager.core.conditions import changed
@@ -23,7 +22,9 @@ from application_manager.work.statuses import StatusWriter
 from wayside.api import ApplicationTask
 from wayside.api.applicationtask import ApplicationTaskStatus
 from wayside.api.documents import parse_object
+from wayside.kubernetes.client import Client
 from wayside.kubernetes.errors import ApiError
+from wayside.kubernetes.resources import Object, Resource
 from wayside.times import parse_seconds
 
 _SHED = Verdict(

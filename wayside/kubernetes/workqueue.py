@@ -19,7 +19,7 @@ from contextlib import suppress
 from typing import Any, Generic, Protocol, TypeVar
 
 from wayside.backoff import pause_after
-from wayside.kubernetes.errors import ApiError, NotGranted, Unreachable
+from wayside.kubernetes.errors import NotGranted, RequestError
 from wayside.kubernetes.turns import Turns
 
 Key = TypeVar("Key", bound=Hashable)
@@ -208,8 +208,8 @@ class WorkQueue(Generic[Key]):
             await self._work(key)
         except NotGranted:
             self._failures.pop(key, None)  # once the namespace is granted, all its keys are enqueued
-        except (ApiError, Unreachable) as error:
-            pause = self._pause(key, error.retry_after if isinstance(error, ApiError) else None)
+        except RequestError as error:
+            pause = self._pause(key, error.retry_after)
             log.warning("%s %s: %s; again in %.1f s", self.name, _text(key), error, pause)
             self._add_after(key, pause)
         except Exception:  # a defect in one key's work must not stop the others; it is logged, and tried again

@@ -29,14 +29,13 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from detector.cluster.api import Api, JsonObject, Resource
-from detector.cluster.errors import AlreadyExistsError, ApiError, ConflictError, NotFoundError
 from wayside.backoff import Backoff
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.errors import ApiError, RequestError
+from wayside.kubernetes.resources import LEASES, Object
 from wayside.leases import DEFAULT_DURATION, HOLDER_LEASE_LABEL, lease_name
 
 _log = logging.getLogger(__name__)
-
-LEASES = Resource("coordination.k8s.io/v1", "leases")
 
 _RELEASE_DEADLINE = 2.0
 """Seconds that the end of the process may wait for an API server that does not answer."""
@@ -76,7 +75,7 @@ class HolderLease:
 
     def __init__(
         self,
-        api: Api,
+        client: Client,
         namespace: str,
         holder: str,
         identity: Identity | None = None,
@@ -88,7 +87,7 @@ class HolderLease:
         """Prepare.
 
         Args:
-            api: the connection.
+            client: for the API server.
             namespace: the detector's.
             holder: whose sign of life it is.
             identity: which process this is. Default: found out.
@@ -97,7 +96,7 @@ class HolderLease:
             now: seconds since the epoch, for what is written; nothing is computed from it.
         """
         self.name = lease_name(holder)
-        self._api = api
+        self._client = client
         self._namespace = namespace
         self._identity = identity or Identity.of_this_process()
         self._duration = duration
@@ -122,7 +121,7 @@ class HolderLease:
             try:
                 delay = await self._once()
                 self._backoff.succeed()
-            except ApiError as error:
+            except RequestError as error:
                 if not self._backoff.failures:
                     _log.warning("cannot renew the Lease %s; retrying with backoff: %s", self.name, error)
                 self.failures += 1
@@ -137,23 +136,24 @@ class HolderLease:
 
     async def _once(self) -> float:
         """Acquire or renew, or find that another process holds it; the seconds until the next time."""
-        try:
-            lease = await self._api.get(LEASES, self._namespace, self.name)
-        except NotFoundError:
+        lease = await self._client.get(LEASES, self._namespace, self.name)
+        if lease is None:
             return await self._write(None)
         holder = str(lease["spec"].get("holderIdentity") or "")
         if self._identity.succeeds(holder) or self._lapsed(lease):
             return await self._write(lease)
         return self._other(holder, lease)
 
-    async def _write(self, lease: JsonObject | None) -> float:
+    async def _write(self, lease: Object | None) -> float:
         body = self._renewed(lease)
         try:
             if lease is None:
-                await self._api.create(LEASES, self._namespace, body)
+                await self._client.create(LEASES, body)
             else:
-                await self._api.replace(LEASES, self._namespace, self.name, body)
-        except (AlreadyExistsError, ConflictError, NotFoundError):
+                await self._client.replace(LEASES, body)
+        except ApiError as error:
+            if error.code not in (404, 409):
+                raise
             return 0.1  # another process was faster: read it again
         if not self.held.is_set():
             _log.info("holding the Lease %s as %s", self.name, self._identity.text)
@@ -161,7 +161,7 @@ class HolderLease:
         self.held.set()
         return self._duration / 3
 
-    def _renewed(self, lease: JsonObject | None) -> JsonObject:
+    def _renewed(self, lease: Object | None) -> Object:
         moment = datetime.fromtimestamp(self._now(), UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
         spec = dict(lease["spec"]) if lease else {}
         if spec.get("holderIdentity") != self._identity.text:
@@ -172,13 +172,13 @@ class HolderLease:
             "leaseDurationSeconds": round(self._duration),
             "renewTime": moment,
         }
-        metadata: JsonObject = dict(lease["metadata"]) if lease else {"name": self.name}
+        metadata: Object = dict(lease["metadata"]) if lease else {"name": self.name, "namespace": self._namespace}
         metadata["labels"] = {**(metadata.get("labels") or {}), HOLDER_LEASE_LABEL: "true"}
         if self._identity.owner:
             metadata["ownerReferences"] = [self._identity.owner]
         return {"apiVersion": LEASES.api_version, "kind": "Lease", "metadata": metadata, "spec": spec}
 
-    def _lapsed(self, lease: JsonObject) -> bool:
+    def _lapsed(self, lease: Object) -> bool:
         """Whether we have seen the Lease unchanged for its duration."""
         version, now = lease["metadata"]["resourceVersion"], self._monotonic()
         if self._seen is None or self._seen[0] != version:
@@ -186,7 +186,7 @@ class HolderLease:
             return False
         return now - self._seen[1] >= float(lease["spec"].get("leaseDurationSeconds") or self._duration)
 
-    def _other(self, holder: str, lease: JsonObject) -> float:
+    def _other(self, holder: str, lease: Object) -> float:
         duration = lease["spec"].get("leaseDurationSeconds") or self._duration
         if self.held.is_set():
             self.held.clear()
@@ -219,12 +219,12 @@ class HolderLease:
         if not self.held.is_set():
             return
         self.held.clear()
-        with suppress(ApiError, TimeoutError):  # then it lapses
+        with suppress(RequestError, TimeoutError):  # then it lapses
             async with asyncio.timeout(_RELEASE_DEADLINE):
-                lease = await self._api.get(LEASES, self._namespace, self.name)
-                if lease["spec"].get("holderIdentity") == self._identity.text:
+                lease = await self._client.get(LEASES, self._namespace, self.name)
+                if lease is not None and lease["spec"].get("holderIdentity") == self._identity.text:
                     lease["spec"]["holderIdentity"] = None
-                    await self._api.replace(LEASES, self._namespace, self.name, lease)
+                    await self._client.replace(LEASES, lease)
 
 
 def _machine() -> str:

@@ -12,7 +12,6 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from application_manager.cache.cluster_cache import ClusterCache
-from application_manager.cluster.connection import ConfigurationError
 from application_manager.core.objects.policy import Policy
 from application_manager.core.statuses.allowance import BURST, REFILL, Allowance
 from application_manager.headroom import Headroom
@@ -24,6 +23,7 @@ from application_manager.watching.pulse import Pulse
 from application_manager.work.recorder import Reason
 from tests.guides import guide
 from tests.unit.manager_objects import instance, task, template
+from wayside.kubernetes.connection import ConfigurationError
 from wayside.kubernetes.errors import ApiError
 from wayside.kubernetes.workqueue import WorkQueue
 from wayside.tracing import Tracing

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import AsyncGenerator, Mapping
+from collections.abc import AsyncGenerator
 from contextlib import aclosing
 from dataclasses import dataclass
 
-from detector.cluster.api import Api, JsonObject, Resource
-from detector.cluster.errors import ApiError, GoneError, UnavailableError
 from wayside.backoff import Backoff
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.errors import ApiError, RequestError
+from wayside.kubernetes.resources import Object, Resource
 
 _log = logging.getLogger(__name__)
 
@@ -27,7 +28,7 @@ _PAUSE = 0.1
 class Listed:
     """All existing objects; any other object known before is deleted."""
 
-    objects: list[JsonObject]
+    objects: list[Object]
     version: int
     """The resource version of the list: changes of an object with a greater one are newer than the list."""
 
@@ -36,21 +37,21 @@ class Listed:
 class Changed:
     """An object was created or changed."""
 
-    object: JsonObject
+    object: Object
 
 
 @dataclass(frozen=True)
 class Deleted:
     """An object is gone; its last state."""
 
-    object: JsonObject
+    object: Object
 
 
 Change = Listed | Changed | Deleted
 
 
-def version_of(obj: JsonObject) -> int:
-    """An object's or a list's resource version; the API guarantees that they are integers that only grow."""
+def version_of(obj: Object) -> int:
+    """An object's resource version; the API guarantees that they are integers that only grow."""
     return int(obj["metadata"]["resourceVersion"])
 
 
@@ -59,25 +60,29 @@ class Reflector:
 
     def __init__(
         self,
-        api: Api,
+        client: Client,
         resource: Resource,
         namespace: str,
-        selectors: Mapping[str, str] | None = None,
+        *,
+        labels: str = "",
+        fields: str = "",
         resync: float = 30.0,
     ) -> None:
         """Prepare.
 
         Args:
-            api: the connection.
+            client: for the API server.
             resource: which kind.
             namespace: where.
-            selectors: `labelSelector`, `fieldSelector`, or none.
+            labels: only what this label selector matches.
+            fields: only what this field selector matches.
             resync: seconds after which all is listed again, even if nothing seems to be missing.
         """
-        self._api = api
+        self._client = client
         self._resource = resource
         self._namespace = namespace
-        self._selectors = selectors or {}
+        self._labels = labels
+        self._fields = fields
         self._resync = resync
         self._backoff = Backoff(0.1, 5.0)
         self.lists = 0
@@ -89,20 +94,28 @@ class Reflector:
         """The list, then its changes. Never ends and raises nothing; errors are logged, counted and retried."""
         while True:
             try:
-                listed = await self._api.list(self._resource, self._namespace, self._selectors)
+                objects, version = await self._client.list(
+                    self._resource, self._namespace, labels=self._labels, fields=self._fields
+                )
                 self._recovered()
-                yield Listed(listed["items"], version_of(listed))
-                async with aclosing(self._watch(listed["metadata"]["resourceVersion"])) as changes:
+                yield Listed(objects, int(version))
+                async with aclosing(self._watch(version)) as changes:
                     async for change in changes:
                         yield change
                 await asyncio.sleep(_PAUSE)  # do not flood a server that ends each watch at once with lists
-            except GoneError:
-                await asyncio.sleep(_PAUSE)  # its history is gone, but the server is there
-            except ApiError as error:
-                await asyncio.sleep(self._failed(error))
+            except RequestError as error:
+                gone = isinstance(error, ApiError) and error.code == 410  # its history, but the server is there
+                await asyncio.sleep(_PAUSE if gone else self._failed(error))
 
     async def _watch(self, since: str) -> AsyncGenerator[Change, None]:
-        events = self._api.watch(self._resource, self._namespace, self._selectors, since, self._resync)
+        events = self._client.watch(
+            self._resource,
+            self._namespace,
+            labels=self._labels,
+            fields=self._fields,
+            since=since,
+            seconds=self._resync,
+        )
         async with aclosing(events):
             async for event in events:
                 kind = Deleted if event["type"] == "DELETED" else Changed
@@ -114,7 +127,7 @@ class Reflector:
             _log.info("reading the %s of namespace %s again", self._resource.plural, self._namespace)
         self._backoff.succeed()
 
-    def _failed(self, error: ApiError) -> float:
+    def _failed(self, error: RequestError) -> float:
         if not self._backoff.failures:
             self.outages += 1
             _log.warning(
@@ -123,4 +136,4 @@ class Reflector:
                 self._namespace,
                 error,
             )
-        return self._backoff.fail(error.retry_after if isinstance(error, UnavailableError) else 0.0)
+        return self._backoff.fail(error.retry_after or 0.0)

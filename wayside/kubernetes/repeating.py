@@ -7,10 +7,10 @@ import logging
 from collections.abc import Awaitable, Callable
 from typing import TypeVar
 
-from application_manager.cluster.connection import ConfigurationError
-from wayside.kubernetes.errors import ApiError, Unreachable
+from wayside.kubernetes.connection import ConfigurationError
+from wayside.kubernetes.errors import ApiError, RequestError
 
-_FAILURES = (ApiError, Unreachable, ConfigurationError)
+_FAILURES = (RequestError, ConfigurationError)
 
 PAUSE = 1.0  # s between two attempts, unless the API server requests more
 
@@ -33,14 +33,13 @@ async def until_answered(request: Callable[[], Awaitable[Answer]], pause: float 
     while True:
         try:
             answer = await request()
-        except (ApiError, Unreachable) as error:
+        except RequestError as error:
             if isinstance(error, ApiError) and (error.permanent or error.code == 401):
                 raise
             if not waiting:
                 log.warning("%s; retrying until the API server answers", error)
             waiting = True
-            at_least = error.retry_after if isinstance(error, ApiError) else None
-            await asyncio.sleep(max(pause, at_least or 0.0))
+            await asyncio.sleep(max(pause, error.retry_after or 0.0))
         else:
             if waiting:
                 log.info("the API server answers")

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from kubernetes.aio.client import Configuration
 
-from application_manager.cluster import podaccount
-from application_manager.cluster.podaccount import AccountError, use_pod_account
+from wayside.kubernetes import podaccount
+from wayside.kubernetes.podaccount import AccountError, use_pod_account
 
 
 @pytest.fixture

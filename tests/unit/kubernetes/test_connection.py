@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from application_manager.cluster.connection import ConfigurationError, load_configuration
+from wayside.kubernetes.connection import ConfigurationError, load_configuration
 
 VALID = """
 apiVersion: v1

@@ -11,10 +11,12 @@ import pytest
 from aiohttp import web
 from kubernetes.aio.client import Configuration
 
-from application_manager.cluster import fence
-from application_manager.cluster.client import LEASES, Client
-from application_manager.cluster.pacing import Pacing
+from application_manager.cluster.client import manager_client
+from wayside.kubernetes import fence
+from wayside.kubernetes.client import Client
 from wayside.kubernetes.errors import ApiError, NotActive, Unreachable
+from wayside.kubernetes.pacing import Pacing
+from wayside.kubernetes.resources import LEASES
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 BODY = {"metadata": {"namespace": "n", "name": "x", "resourceVersion": "1"}}
@@ -28,7 +30,7 @@ async def serving(handle: Handler, **arguments: object) -> AsyncIterator[Client]
     await runner.setup()
     await web.TCPSite(runner, "127.0.0.1", 0).start()
     configuration = Configuration(host=f"http://127.0.0.1:{runner.addresses[0][1]}")
-    client = Client(configuration, **arguments)  # type: ignore[arg-type]
+    client = manager_client(configuration, **arguments)  # type: ignore[arg-type]
     try:
         yield client
     finally:
@@ -78,7 +80,7 @@ def test_a_refusal_without_a_time_is_the_callers_matter() -> None:
 
 
 def test_an_api_server_that_always_asks_to_wait_is_said_in_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("application_manager.cluster.client._PATIENCE", 1.5)
+    monkeypatch.setattr("wayside.kubernetes.client._PATIENCE", 1.5)
 
     async def handle(_: web.Request) -> web.Response:
         return refused(429, 1)

@@ -1,4 +1,4 @@
-"""The account of the pod that the manager runs in: its token is a file that the kubelet replaces while we run.
+"""The account of the pod that the program runs in: its token is a file that the kubelet replaces while we run.
 
 The kubelet renews the token long before it ends (after 80 % of its life), and the API server may stop taking the old
 one at any time. So the file is read again before a request that is made a second or more after the last reading.
@@ -47,6 +47,12 @@ def use_pod_account(configuration: Configuration, folder: Path = FOLDER) -> None
 
     settings: Any = configuration  # whose type has no hook
     settings.refresh_api_key_hook = refresh
+
+
+def pod_namespace(folder: Path = FOLDER) -> str:
+    """The namespace of the pod; empty outside a pod."""
+    file = folder / "namespace"
+    return file.read_text().strip() if file.is_file() else ""
 
 
 class _Token:

@@ -7,7 +7,7 @@ from contextlib import suppress
 
 import pytest
 
-from application_manager.cluster.pacing import Pacing, Share
+from wayside.kubernetes.pacing import Pacing, Share
 
 QUICK = 0.004  # s that a write takes at an idle API server
 PERIOD = 300.0  # s for which the quickest time is remembered, at least
