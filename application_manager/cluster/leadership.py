@@ -14,15 +14,27 @@ import socket
 import time
 from dataclasses import dataclass
 
-from application_manager.core.holders.leading import DEADLINE, LOOK_EVERY, RENEW_EVERY, Candidate
 from application_manager.measures import Measures
 from wayside.kubernetes.client import Client
 from wayside.kubernetes.errors import ApiError, RequestError, Unreachable
+from wayside.kubernetes.leases import LeaseCandidate, holder_of
 from wayside.kubernetes.podaccount import pod_namespace
 from wayside.kubernetes.resources import LEASES
-from wayside.leases import holder_of
 
 LEASE_NAME = "application-manager"
+DURATION = 12
+"""Seconds that a Lease must be observed unchanged before another manager takes it."""
+
+DEADLINE = 10.0
+"""Seconds after the sending of the last renewal in which its manager may act. What remains of the duration is for a
+connection to be opened, and for clocks that run at different speeds."""
+
+RENEW_EVERY = 2.0
+"""Seconds between two renewals."""
+
+LOOK_EVERY = 1.0
+"""Seconds between two looks of a standby, or two attempts where one failed."""
+
 RENEWAL_TIMEOUT = 3.0
 """Seconds for one request about the Lease, so that a renewal that hangs leaves time for another."""
 
@@ -75,7 +87,7 @@ class Leadership:
         self._client = client
         self._key = key
         self._measures = measures
-        self._candidate = Candidate(identity or own_identity())
+        self._candidate = LeaseCandidate(identity or own_identity(), DURATION, DEADLINE)
         self._changed = asyncio.Event()
         self._logged = ""
         self._was_active = False

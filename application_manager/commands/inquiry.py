@@ -20,8 +20,8 @@ from wayside.inputerror import InputError
 from wayside.kubernetes.client import Client
 from wayside.kubernetes.connection import load_configuration
 from wayside.kubernetes.errors import RequestError
+from wayside.kubernetes.leases import lease_name
 from wayside.kubernetes.resources import LEASES, Object, Resource
-from wayside.leases import lease_name
 
 Model = TypeVar("Model", bound=Kind)
 

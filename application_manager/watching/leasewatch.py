@@ -13,8 +13,8 @@ from application_manager.core.holders.leases import HolderKey
 from application_manager.core.objects.policy import Name
 from wayside.kubernetes.client import Client
 from wayside.kubernetes.errors import ApiError, RequestError, Unreachable
+from wayside.kubernetes.leases import lease_name
 from wayside.kubernetes.resources import LEASES, Resource
-from wayside.leases import lease_name
 
 LOOK_EVERY = 1.0  # s
 _AT_ONCE = 8  # Leases read at once: few, since what runs goes before

@@ -30,8 +30,8 @@ from application_manager.work.applying import Applier
 from application_manager.work.rulework import RuleKey
 from wayside.api import ApplicationInstance
 from wayside.api.applicationtemplate import ApplicationTemplateStatus
+from wayside.kubernetes.leases import holder_of
 from wayside.kubernetes.resources import Object
-from wayside.leases import holder_of
 
 Enqueue = Callable[[Name], None]
 

@@ -30,7 +30,7 @@ from tests.cluster.namespaces import new_namespace
 from tests.cluster.processes import Processes
 from tests.cluster.waiting import wait_until
 from wayside.kubernetes.connection import load_configuration
-from wayside.leases import HOLDER_LEASE_LABEL
+from wayside.kubernetes.leases import HOLDER_LEASE_LABEL
 
 KINDS = ("apps/v1/Deployment", "v1/ConfigMap")
 ALLOWED = [word for each in KINDS for word in ("--allowed-kinds", each)]

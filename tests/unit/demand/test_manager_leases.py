@@ -21,8 +21,8 @@ from application_manager.watching.leasewatch import LeaseWatch
 from tests.unit.manager_objects import task, template
 from wayside.kubernetes.client import Client
 from wayside.kubernetes.errors import ApiError
+from wayside.kubernetes.leases import DEFAULT_DURATION, lease_name
 from wayside.kubernetes.resources import LEASES, Resource
-from wayside.leases import DEFAULT_DURATION, lease_name
 
 KEY = ("site", "det")
 

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from application_manager.cluster.leadership import lease_key
-from application_manager.core.holders.leading import DEADLINE, DURATION, Candidate
+from application_manager.cluster.leadership import DEADLINE, DURATION, lease_key
+from wayside.kubernetes.leases import LeaseCandidate
 
 NAME, NAMESPACE = "application-manager", "wayside"
 HORIZON = 200.0  # s of simulated time
@@ -42,7 +42,12 @@ class Server:
 
 
 def manager(
-    candidate: Candidate, offset: float, server: Server, delay: Callable[[], float], now: list[float], spans: list[Any]
+    candidate: LeaseCandidate,
+    offset: float,
+    server: Server,
+    delay: Callable[[], float],
+    now: list[float],
+    spans: list[Any],
 ) -> Iterator[float]:
     """One manager as `leadership` is: yields for how long nothing happens to it."""
     while True:
@@ -73,7 +78,7 @@ def test_never_two_may_act(delays: list[float]) -> None:
     server, now, spans = Server(), [0.0], []
     pauses = itertools.cycle(delays)
     running = {
-        name: manager(Candidate(name), offset, server, lambda: next(pauses), now, spans)
+        name: manager(LeaseCandidate(name, DURATION, DEADLINE), offset, server, lambda: next(pauses), now, spans)
         for name, offset in CLOCKS.items()
     }
     due = [(0.01 * index, name) for index, name in enumerate(running)]
@@ -85,14 +90,18 @@ def test_never_two_may_act(delays: list[float]) -> None:
             assert one[2] <= other[1] or other[2] <= one[1], (one, other)
 
 
-def stored(candidate: Candidate, server: Server, now: float) -> None:
+def stored(candidate: LeaseCandidate, server: Server, now: float) -> None:
     lease = server.write(candidate.draft(NAME, NAMESPACE, now))
     assert lease is not None
     candidate.took(lease, now, now)
 
 
 def test_a_standby_takes_the_lease_once_it_has_seen_it_unchanged_for_its_duration() -> None:
-    server, first, second = Server(), Candidate("first"), Candidate("second")
+    server, first, second = (
+        Server(),
+        LeaseCandidate("first", DURATION, DEADLINE),
+        LeaseCandidate("second", DURATION, DEADLINE),
+    )
     stored(first, server, 0.0)
     assert first.remaining(1.0) == DEADLINE - 1.0
     second.observe(server.lease, 1000.0)
@@ -104,7 +113,11 @@ def test_a_standby_takes_the_lease_once_it_has_seen_it_unchanged_for_its_duratio
 
 
 def test_a_released_lease_is_taken_at_once() -> None:
-    server, first, second = Server(), Candidate("first"), Candidate("second")
+    server, first, second = (
+        Server(),
+        LeaseCandidate("first", DURATION, DEADLINE),
+        LeaseCandidate("second", DURATION, DEADLINE),
+    )
     stored(first, server, 0.0)
     second.observe(server.lease, 0.0)
     released = first.released(1.0)
@@ -116,20 +129,20 @@ def test_a_released_lease_is_taken_at_once() -> None:
     assert server.lease is not None
     assert server.lease["spec"]["leaseTransitions"] == 1
     assert second.released(2.0) is not None
-    assert Candidate("third").released(2.0) is None
+    assert LeaseCandidate("third", DURATION, DEADLINE).released(2.0) is None
 
 
 def test_a_container_that_starts_again_in_its_pod_need_not_wait_for_itself() -> None:
-    server, again = Server(), Candidate("pod")
-    stored(Candidate("pod"), server, 0.0)
+    server, again = Server(), LeaseCandidate("pod", DURATION, DEADLINE)
+    stored(LeaseCandidate("pod", DURATION, DEADLINE), server, 0.0)
     again.observe(server.lease, 0.5)
     assert again.may_take(0.5)
 
 
 def test_a_lease_that_vanishes_is_not_taken_before_its_manager_must_have_noticed() -> None:
-    server, second = Server(), Candidate("second")
+    server, second = Server(), LeaseCandidate("second", DURATION, DEADLINE)
     assert second.may_take(0.0), "where none was ever seen"
-    stored(Candidate("first"), server, 0.0)
+    stored(LeaseCandidate("first", DURATION, DEADLINE), server, 0.0)
     second.observe(server.lease, 0.0)
     second.observe(None, 5.0)
     assert not second.may_take(5.0 + DURATION - 0.1)
@@ -137,7 +150,11 @@ def test_a_lease_that_vanishes_is_not_taken_before_its_manager_must_have_noticed
 
 
 def test_one_whose_lease_was_taken_may_not_act_however_much_time_it_thinks_it_has() -> None:
-    server, first, second = Server(), Candidate("first"), Candidate("second")
+    server, first, second = (
+        Server(),
+        LeaseCandidate("first", DURATION, DEADLINE),
+        LeaseCandidate("second", DURATION, DEADLINE),
+    )
     stored(first, server, 0.0)
     second.observe(server.lease, 0.0)
     stored(second, server, DURATION)

@@ -1,10 +1,11 @@
-"""Which of several managers is active: one Lease, judged by each on its own monotonic clock. Pure.
+"""Leases: the names of holders' ones, and which of several processes holds one. Pure.
 
-The active one renews the Lease and may act for `DEADLINE` seconds after it *sent* its last renewal that was taken. A
-standby takes the Lease once it has itself *observed it unchanged* for its duration, or at once where it was released.
-Since a renewal is sent before anyone can observe it and the deadline is shorter than the duration, the old one has
-stopped before a new one begins, whatever their clocks show and however long either stood still: every write of the
-Lease carries the resourceVersion that was read, so only one of two can succeed. No time written by others is believed.
+Each process judges a Lease on its own monotonic clock. The holder renews the Lease and may act until a deadline after
+it *sent* its last renewal that was taken. Another process takes the Lease once it has itself *observed it unchanged*
+for its duration, or at once where it was released. Since a renewal is sent before anyone can observe it and the
+deadline is shorter than the duration, the old one has stopped before a new one begins, whatever their clocks show and
+however long either stood still: every write of the Lease carries the resourceVersion that was read, so only one of two
+can succeed. No time written by others is believed.
 """
 
 from __future__ import annotations
@@ -15,33 +16,44 @@ from typing import Any
 
 from wayside.times import format_seconds
 
-DURATION = 12
-"""Seconds that a Lease must be observed unchanged before another manager takes it; whole, as the API has it."""
+PREFIX = "wayside-"
+"""The prefix of the names of all holders' Leases."""
 
-DEADLINE = 10.0
-"""Seconds after the sending of the last renewal in which its manager may act. What remains of the duration is for a
-connection to be opened, and for clocks that run at different speeds."""
+HOLDER_LEASE_LABEL = "wayside.dev/holder-lease"
+"""On all holders' Leases, with the value `true`: the manager watches these alone, and not those of every node."""
 
-RENEW_EVERY = 2.0
-"""Seconds between two renewals."""
-
-LOOK_EVERY = 1.0
-"""Seconds between two looks of a standby, or two attempts where one failed."""
+DEFAULT_DURATION = 15.0
+"""The default duration of a Lease, in seconds, if the Lease does not specify one."""
 
 _ANCIENT = float("-inf")
 
 
+def lease_name(holder: str) -> str:
+    """The name of the holder's Lease."""
+    return PREFIX + holder
+
+
+def holder_of(name: str) -> str | None:
+    """Whose Lease has this name; None where it is no holder's."""
+    return name.removeprefix(PREFIX) if name.startswith(PREFIX) else None
+
+
 @dataclass(slots=True)
-class Candidate:
-    """What one manager knows of the Lease, and until when it may act. Times are seconds of its monotonic clock.
+class LeaseCandidate:
+    """What one process knows of the Lease, and until when it may act. Times are seconds of its monotonic clock.
 
     Attributes:
         identity: who it is; a container that is started again in its pod is the same, since the former has ended.
+        duration: seconds that a Lease must be observed unchanged before another process takes it; whole, as the API
+            has it.
+        deadline: seconds after the sending of the last renewal in which the process may act.
         holder: who held the Lease when it was seen last; empty: nobody, or nothing was seen yet.
         until: when its time is over, unless it renews.
     """
 
     identity: str
+    duration: int
+    deadline: float
     holder: str = ""
     until: float = _ANCIENT
     _seen: Mapping[str, Any] | None = None
@@ -73,21 +85,26 @@ class Candidate:
         if self.holder == self.identity:
             return True
         if self._seen is None:
-            # One that vanished may have a manager that has not noticed; where none was ever seen, there is none.
-            return not self._was_held or now - self._since >= DURATION
-        return not self.holder or now - self._since >= float(_spec(self._seen).get("leaseDurationSeconds") or DURATION)
+            # One that vanished may have a holder that has not noticed; where none was ever seen, there is none.
+            return not self._was_held or now - self._since >= self.duration
+        return not self.holder or now - self._since >= self.lasts
+
+    @property
+    def lasts(self) -> float:
+        """The duration of the Lease as it was seen last."""
+        return float(_spec(self._seen).get("leaseDurationSeconds") or self.duration)
 
     def draft(self, name: str, namespace: str, time: float) -> dict[str, Any]:
-        """The Lease to write, held by this manager; `time` in seconds since 1970 is for people to read."""
+        """The Lease to write, held by this process; `time` in seconds since 1970 is for people to read."""
         spec, metadata = dict(_spec(self._seen)), self._metadata() or {"name": name, "namespace": namespace}
         if spec.get("holderIdentity") != self.identity or "acquireTime" not in spec:
             spec["acquireTime"] = _micro(time)
             spec["leaseTransitions"] = int(spec.get("leaseTransitions") or 0) + (1 if self._seen is not None else 0)
-        spec |= {"holderIdentity": self.identity, "leaseDurationSeconds": DURATION, "renewTime": _micro(time)}
+        spec |= {"holderIdentity": self.identity, "leaseDurationSeconds": self.duration, "renewTime": _micro(time)}
         return _lease(metadata, spec)
 
     def released(self, time: float) -> dict[str, Any] | None:
-        """The Lease to write so that a standby takes it at once; None where it is not this manager's."""
+        """The Lease to write so that a standby takes it at once; None where it is not this process's."""
         if self._seen is None or self.holder != self.identity:
             return None
         spec = {key: value for key, value in _spec(self._seen).items() if key != "holderIdentity"}
@@ -97,7 +114,7 @@ class Candidate:
         """Note that the Lease, as drafted and sent at `sent`, was stored."""
         self.observe(stored, now)
         if self.holder == self.identity:
-            self.until = sent + DEADLINE
+            self.until = sent + self.deadline
 
     def _metadata(self) -> dict[str, Any]:
         """As read, so that labels stay, and with the resourceVersion; empty where there is no Lease."""
