@@ -15,6 +15,7 @@ import yaml
 from application_manager.cluster.client import manager_client
 from application_manager.core.findings.injections import detector_of, injection
 from application_manager.core.objects.poddefaults import PodDefaults
+from application_manager.core.objects.podspecs import POD_TEMPLATES, pod_template, with_pod_template
 from application_manager.core.objects.sidecars import added, has_sidecar
 from wayside import commandline
 from wayside.api import API_VERSION, Detector
@@ -25,16 +26,6 @@ from wayside.kubernetes.resources import Resource
 from wayside.manifests import to_yaml
 
 _DETECTORS = Resource(API_VERSION, "Detector", Detector.plural)
-_TEMPLATES = {
-    "Pod": (),
-    "PodTemplate": ("template",),
-    **dict.fromkeys(
-        ("Deployment", "StatefulSet", "DaemonSet", "ReplicaSet", "ReplicationController", "Job"), ("spec", "template")
-    ),
-    "CronJob": ("spec", "jobTemplate", "spec", "template"),
-}
-"""Where the pod, or the template of pods, is in a manifest of the kind."""
-
 _NO_IMAGE = "Detector {} names no image: give --detector-image, or its spec.pod.image"
 
 Manifest = dict[str, Any]
@@ -84,8 +75,7 @@ class _Injector:
         """The manifest with its detector, where it requests one."""
         if raw.get("kind") == "List":
             return raw | {"items": [self.manifest(each) for each in raw.get("items") or ()]}
-        path = _TEMPLATES.get(str(raw.get("kind")))
-        return raw if path is None else _replaced(raw, path, lambda pod: self._pod(raw, pod))
+        return with_pod_template(raw, lambda pod: self._pod(raw, pod))
 
     def _pod(self, raw: Manifest, pod: Manifest) -> Manifest:
         name = detector_of(pod.get("metadata"))
@@ -103,14 +93,6 @@ class _Injector:
         if found.why_not is not None:
             self.refusals.append(f"{raw['kind']} {(raw.get('metadata') or {}).get('name', '')}: {found.why_not}")
         return pod if found.addition is None else pod | {"spec": added(spec, found.addition)}
-
-
-def _replaced(raw: Manifest, path: tuple[str, ...], change: Any) -> Manifest:
-    """The manifest with what is at the path changed; as it is where nothing is there."""
-    if not path:
-        return dict(change(raw))
-    inner = raw.get(path[0])
-    return raw | {path[0]: _replaced(inner, path[1:], change)} if isinstance(inner, dict) else raw
 
 
 async def _looked_up(documents: list[Manifest], known: _Known) -> _Known:
@@ -144,20 +126,10 @@ def _wanted(raw: Manifest, default: str) -> Iterator[tuple[str, str]]:
         for each in raw.get("items") or ():
             yield from _wanted(each, default)
         return
-    for pod in _pods(raw):
-        name = detector_of(pod.get("metadata"))
-        if name is not None and not has_sidecar(pod.get("spec") or {}):
-            yield _namespace(raw, default), name
-
-
-def _pods(raw: Manifest) -> Iterator[Manifest]:
-    """The pod, or the template of pods, of the manifest."""
-    path = _TEMPLATES.get(str(raw.get("kind")))
-    inner: Any = None if path is None else raw
-    for step in path or ():
-        inner = inner.get(step) if isinstance(inner, dict) else None
-    if isinstance(inner, dict):
-        yield inner
+    pod = pod_template(raw) if raw.get("kind") in POD_TEMPLATES else {}
+    name = detector_of(pod.get("metadata"))
+    if name is not None and not has_sidecar(pod.get("spec") or {}):
+        yield _namespace(raw, default), name
 
 
 def _namespace(raw: Mapping[str, Any], default: str) -> str:
