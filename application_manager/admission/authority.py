@@ -17,7 +17,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from wayside.kubernetes.connection import ConfigurationError
-from wayside.servingcertificate import CERTIFICATE, KEY
+from wayside.process.servingcertificate import CERTIFICATE, KEY
 
 AUTHORITY = "ca.crt"
 VALID = datetime.timedelta(days=365)

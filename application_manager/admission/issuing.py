@@ -28,7 +28,7 @@ from wayside.kubernetes.connection import ConfigurationError
 from wayside.kubernetes.errors import ApiError
 from wayside.kubernetes.repeating import repeatedly, until_answered
 from wayside.kubernetes.resources import Object, Resource
-from wayside.servingcertificate import CERTIFICATE, KEY
+from wayside.process.servingcertificate import CERTIFICATE, KEY
 
 EVERY = 10.0  # s between two looks at the Secret
 _RENEWED_AT = 1 / 3  # of its life that is left

@@ -17,13 +17,13 @@ from application_manager.core.findings.injections import detector_of, injection
 from application_manager.core.objects.poddefaults import PodDefaults
 from application_manager.core.objects.podspecs import POD_TEMPLATES, pod_template, with_pod_template
 from application_manager.core.objects.sidecars import added, has_sidecar
-from wayside import commandline
 from wayside.api import API_VERSION, Detector
 from wayside.api.documents import parse_object
 from wayside.kubernetes.connection import ConfigurationError, load_configuration
 from wayside.kubernetes.errors import RequestError
 from wayside.kubernetes.resources import Resource
 from wayside.manifests import to_yaml
+from wayside.process import commandline
 
 _DETECTORS = Resource(API_VERSION, "Detector", Detector.plural)
 _NO_IMAGE = "Detector {} names no image: give --detector-image, or its spec.pod.image"

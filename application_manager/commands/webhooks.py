@@ -9,9 +9,9 @@ from pathlib import Path
 import typer
 
 from application_manager.core.findings.webhooks import Place, injection_configuration, webhook_configuration
-from wayside import commandline
 from wayside.kubernetes.connection import ConfigurationError
 from wayside.manifests import to_yaml
+from wayside.process import commandline
 
 
 def print_webhooks(

@@ -14,7 +14,7 @@ from aiohttp import web
 from application_manager.cluster.certificate import follow
 from application_manager.measures import Measures
 from wayside.kubernetes.connection import ConfigurationError
-from wayside.servingcertificate import ServingCertificate
+from wayside.process.servingcertificate import ServingCertificate
 
 FOLDER_OPTION = "--metrics-certificates"
 

@@ -37,8 +37,8 @@ from detector.topics.survey import survey
 from detector.tracing import episode_traces
 from wayside.api import ApplicationTask, Detector, EventRule
 from wayside.api.documents import Document, Problem
-from wayside.commandline import refuse
 from wayside.findings import Finding, ignored_by
+from wayside.process.commandline import refuse
 
 CLIPS = "clips"
 """The folder of what record actions write, in the output."""

@@ -15,8 +15,8 @@ from detector.topics.listing import lines, yaml_of
 from detector.topics.proposal import proposals
 from detector.topics.survey import Survey, survey
 from wayside.api.zenoh import Zenoh, ZenohMode
-from wayside.commandline import refuse
 from wayside.inputerror import InputError
+from wayside.process.commandline import refuse
 
 
 class NothingHeardError(InputError, ValueError):

@@ -22,7 +22,7 @@ from detector.topics.proposal import Proposal, detector_document, proposals
 from detector.topics.survey import survey
 from wayside.api import Detector, EventRule
 from wayside.api.wording import messages
-from wayside.commandline import refuse
+from wayside.process.commandline import refuse
 from wayside.rules import RuleError, compile_rule
 
 _WIDE = 40

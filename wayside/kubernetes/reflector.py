@@ -13,10 +13,10 @@ from collections.abc import AsyncGenerator
 from contextlib import aclosing
 from dataclasses import dataclass
 
-from wayside.backoff import Backoff
 from wayside.kubernetes.client import Client
 from wayside.kubernetes.errors import ApiError, RequestError
 from wayside.kubernetes.resources import Object, Resource
+from wayside.process.backoff import Backoff
 
 _log = logging.getLogger(__name__)
 

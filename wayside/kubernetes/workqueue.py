@@ -18,9 +18,9 @@ from collections.abc import Awaitable, Callable, Hashable
 from contextlib import suppress
 from typing import Any, Generic, Protocol, TypeVar
 
-from wayside.backoff import pause_after
 from wayside.kubernetes.errors import NotGranted, RequestError
 from wayside.kubernetes.turns import Turns
+from wayside.process.backoff import pause_after
 
 Key = TypeVar("Key", bound=Hashable)
 

@@ -26,7 +26,7 @@ from wayside.expressions import (
     compile_template,
 )
 from wayside.expressions.expanding import POSITION, Places
-from wayside.geometry import Shape
+from wayside.geo.geometry import Shape
 from wayside.rules.actions import canonical, compile_actions
 from wayside.rules.compiled import (
     CompiledDeploy,

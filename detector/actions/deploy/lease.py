@@ -28,11 +28,11 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from wayside.backoff import Backoff
 from wayside.kubernetes.client import Client
 from wayside.kubernetes.errors import ApiError, RequestError
 from wayside.kubernetes.leases import DEFAULT_DURATION, HOLDER_LEASE_LABEL, LeaseCandidate, lease_name
 from wayside.kubernetes.resources import LEASES
+from wayside.process.backoff import Backoff
 
 _log = logging.getLogger(__name__)
 

@@ -30,8 +30,8 @@ from detector.actions.deploy.stores import (
 from detector.engine.episodes.demands import Demand, to_task
 from detector.engine.episodes.plain import plain
 from detector.tracing import EpisodeTraces
-from wayside.backoff import Backoff
 from wayside.kubernetes.workqueue import WorkQueue
+from wayside.process.backoff import Backoff
 
 _log = logging.getLogger(__name__)
 

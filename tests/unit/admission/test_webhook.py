@@ -20,9 +20,9 @@ from application_manager.core.findings.webhooks import PATH
 from application_manager.measures import Measures
 from tests.ports import free_port
 from tests.unit.manager_objects import DEPLOYMENT
-from wayside import commandline
 from wayside.kubernetes.connection import ConfigurationError
-from wayside.servingcertificate import CertificateError, ServingCertificate
+from wayside.process import commandline
+from wayside.process.servingcertificate import CertificateError, ServingCertificate
 
 Ask = Callable[..., Awaitable[tuple[int, str]]]
 

@@ -15,11 +15,11 @@ from detector.catalog.catalog import Catalog, CatalogEntry, ChoiceError, catalog
 from detector.catalog.markdown import markdown_view
 from detector.catalog.page import page
 from detector.cli import app
-from wayside import commandline
 from wayside.api.classification import Classification
 from wayside.api.documents import DocumentError
 from wayside.api.scheme import SCHEME
 from wayside.kubernetes.connection import ConfigurationError
+from wayside.process import commandline
 
 HOSTILE = "</script><b>x</b> | `a` **b** \"'&\n## heading"
 ACTIONS = next(dimension for dimension in SCHEME if dimension.name == "typeOfAction")

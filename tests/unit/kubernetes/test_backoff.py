@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from wayside.backoff import Backoff
+from wayside.process.backoff import Backoff
 
 
 def test_delays_double_up_to_the_cap_and_start_over_after_a_success() -> None:

@@ -14,11 +14,11 @@ from prometheus_client.parser import text_string_to_metric_families
 from application_manager.cache.cluster_cache import ClusterCache
 from application_manager.core.objects.policy import Policy
 from application_manager.core.statuses.allowance import BURST, REFILL, Allowance
-from application_manager.headroom import Headroom
 from application_manager.measures import PREFIX, Measures
 from application_manager.observability.overview import Overview
 from application_manager.observability.pages import STALLED_AFTER, pages, stalled
 from application_manager.observability.tracing import LostSpans
+from application_manager.running.headroom import Headroom
 from application_manager.watching.pulse import Pulse
 from application_manager.work.recorder import Reason
 from tests.guides import guide
@@ -26,7 +26,7 @@ from tests.unit.manager_objects import instance, task, template
 from wayside.kubernetes.connection import ConfigurationError
 from wayside.kubernetes.errors import ApiError
 from wayside.kubernetes.workqueue import WorkQueue
-from wayside.tracing import Tracing
+from wayside.process.tracing import Tracing
 
 GUIDE = guide("manager")
 

@@ -7,7 +7,7 @@ from typing import cast
 
 import pytest
 
-from application_manager.prerequisites import recent_enough
+from application_manager.running.prerequisites import recent_enough
 from wayside.kubernetes.client import Client
 from wayside.kubernetes.connection import ConfigurationError
 

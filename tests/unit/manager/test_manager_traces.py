@@ -21,7 +21,7 @@ from tests.unit.manager_objects import task, template
 from wayside.api import ApplicationTask
 from wayside.kubernetes.client import Client
 from wayside.kubernetes.resources import Object, Resource
-from wayside.tracing import tracing
+from wayside.process.tracing import tracing
 
 APP, TASK = ("site", "app"), ("site", "t")
 CONFIG = {"apiVersion": "v1", "kind": "ConfigMap", "metadata": {"name": "a"}}

@@ -21,7 +21,6 @@ from application_manager.admission.admission import Admission
 from application_manager.admission.injecting import Injecting
 from application_manager.admission.issuing import issuing
 from application_manager.admission.reviewing import Desk, webhook
-from application_manager.assembly import Assembly
 from application_manager.cache.cluster_cache import DETECTOR, OWN_KINDS, POD
 from application_manager.cluster.client import manager_client
 from application_manager.cluster.grants import Grants
@@ -30,9 +29,10 @@ from application_manager.core.findings.webhooks import INJECTION_PATH, PATH
 from application_manager.core.objects.policy import KindKey
 from application_manager.measures import Measures
 from application_manager.observability.pages import pages, stalled
-from application_manager.options import Options
-from application_manager.prerequisites import discovered, entitled, recent_enough, selectable
-from application_manager.watchdog import SILENT, watchdog
+from application_manager.running.assembly import Assembly
+from application_manager.running.options import Options
+from application_manager.running.prerequisites import discovered, entitled, recent_enough, selectable
+from application_manager.running.watchdog import SILENT, watchdog
 from application_manager.watching.detectorwatch import DetectorWatch
 from application_manager.watching.leasewatch import LeaseWatch
 from application_manager.watching.listing import Listing
@@ -46,7 +46,7 @@ from wayside.kubernetes.errors import ApiError
 from wayside.kubernetes.pacing import Pacing, Share
 from wayside.kubernetes.repeating import until_answered
 from wayside.kubernetes.resources import Resource
-from wayside.tracing import Tracing, tracing
+from wayside.process.tracing import Tracing, tracing
 
 log = logging.getLogger(__name__)
 

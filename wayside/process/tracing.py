@@ -14,10 +14,10 @@ import os
 import threading
 from typing import TYPE_CHECKING
 
-from wayside.tracecontext import Span, TraceContext
+from wayside.process.tracecontext import Span, TraceContext
 
 if TYPE_CHECKING:
-    from wayside.spans import Exporting
+    from wayside.process.spans import Exporting
 
 ENDPOINTS = ("OTEL_EXPORTER_OTLP_TRACES_ENDPOINT", "OTEL_EXPORTER_OTLP_ENDPOINT")
 PROTOCOLS = ("OTEL_EXPORTER_OTLP_TRACES_PROTOCOL", "OTEL_EXPORTER_OTLP_PROTOCOL")
@@ -88,7 +88,7 @@ def tracing(service: str, *, export: bool = True) -> Tracing | None:
         )
         return None
     try:
-        from wayside.spans import Exporting  # noqa: PLC0415  only who sends traces has the extra, and owes the time
+        from wayside.process.spans import Exporting  # noqa: PLC0415  only who sends traces has the extra, and owes the time
     except ImportError as error:
         log.warning(
             "no traces are sent, though %s is set: %s; pip install 'wayside[otel]', or unset it", endpoint, error

@@ -14,8 +14,8 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from wayside import geodesy
-from wayside.geometry import DOUBT, FARTHEST, Point, Shape, contains, shape_of
+from wayside.geo import geodesy
+from wayside.geo.geometry import DOUBT, FARTHEST, Point, Shape, contains, shape_of
 
 Doubles = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -15,7 +15,7 @@ from opentelemetry.sdk.trace.export import BatchSpanProcessor, SpanExporter, Spa
 from opentelemetry.sdk.trace.id_generator import IdGenerator, RandomIdGenerator
 from opentelemetry.sdk.trace.sampling import Decision
 
-from wayside.tracecontext import Span, TraceContext
+from wayside.process.tracecontext import Span, TraceContext
 
 _QUEUE = 2048
 """The SDK's default for OTEL_BSP_MAX_QUEUE_SIZE."""

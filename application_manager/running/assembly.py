@@ -17,11 +17,11 @@ from application_manager.cluster.failedpods import FailedPodsLook
 from application_manager.cluster.nodes import NodeLook
 from application_manager.core.demand.decisions import Decision
 from application_manager.core.objects.policy import KindKey, Name
-from application_manager.headroom import Headroom
 from application_manager.measures import Measures
 from application_manager.observability.overview import Overview
 from application_manager.observability.tracing import LostSpans, TaskTraces
-from application_manager.options import Options
+from application_manager.running.headroom import Headroom
+from application_manager.running.options import Options
 from application_manager.watching.router import Router
 from application_manager.work.applying import Applier
 from application_manager.work.configurations import ConfigurationWork
@@ -43,7 +43,7 @@ from application_manager.workers.pool import Pool
 from wayside.kubernetes.client import Client
 from wayside.kubernetes.resources import Resource
 from wayside.kubernetes.workqueue import Key, WorkQueue
-from wayside.tracing import Tracing
+from wayside.process.tracing import Tracing
 
 _JUDGING_PAUSE = (
     0.3  # s from a change of a template, rule or detector to its status: changes that come together are one
