@@ -26,9 +26,9 @@ from application_manager.commands.options import (
 )
 from application_manager.commands.printing import detector_rbac, inject, rbac, webhooks
 from application_manager.core.objects.pullpolicy import PullPolicy
-from wayside import commandline
-from wayside.beginning import importing
 from wayside.inputerror import InputError
+from wayside.process import commandline
+from wayside.process.beginning import importing
 
 app = typer.Typer(
     add_completion=False,
@@ -228,9 +228,9 @@ def run(
 
         from application_manager.charts.chartcache import default_folder
         from application_manager.charts.helm import HelmRunner
-        from application_manager.headroom import container_limit
-        from application_manager.options import Options
-        from application_manager.service import serve
+        from application_manager.running.headroom import container_limit
+        from application_manager.running.options import Options
+        from application_manager.running.service import serve
         from application_manager.work.publishing import settings
 
     options = Options(

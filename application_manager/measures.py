@@ -10,8 +10,6 @@ import time
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector, generate_latest
 
 PREFIX = "wayside_manager_"
-NO_ANSWER = "none"
-"""The code of a request that the API server did not answer."""
 
 _SERVICE = (0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 60, 120, 300, 600)  # s from an event to what follows
 _WORK = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 15)  # s of a request or a reconciliation
@@ -77,7 +75,7 @@ class Measures:
         self._failures.labels("watch").inc()
 
     def requested(self, method: str, seconds: float, code: str) -> None:
-        """The API server answered with an HTTP status, or NO_ANSWER."""
+        """The API server answered with an HTTP status, or `none`."""
         self._requests.labels(method).observe(seconds)
         if not code.startswith(("2", "3")):
             self._errors.labels(code).inc()

@@ -20,11 +20,12 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
-from application_manager.cluster.client import Client
-from application_manager.cluster.connection import load_configuration
+from application_manager.cluster.client import manager_client
 from benchmarks.task_to_deployment import TASKS, TEMPLATE, TEMPLATES, fresh_namespaces, task
 from tests.cluster.controlplane import ControlPlane
 from tests.cluster.crds import CRDS
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.connection import load_configuration
 
 TARGET = 300  # MiB that the large tasks may take more than the small ones, at the largest; 40 of them are 40 MB
 SETTLED = 8.0  # s after the last status: two resyncs
@@ -49,7 +50,7 @@ def resident(pid: int, field: str) -> float:
 
 async def fill(manager: subprocess.Popen[bytes], namespace: str, count: int, size: int) -> tuple[float, float, float]:
     """Make the tasks and wait until all have a status; MiB before, at the largest and at the end."""
-    client = Client(await load_configuration())
+    client = manager_client(await load_configuration())
     try:
         await client.create(TEMPLATES, {**TEMPLATE, "metadata": {"name": "app", "namespace": namespace}})
         await client.create(TASKS, task(namespace, "first"))

@@ -23,14 +23,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
-from application_manager.assembly import Assembly
-from application_manager.cluster.client import Client, Resource
 from application_manager.core.claims.claims import instance_name
 from application_manager.measures import Measures
-from application_manager.options import Options
+from application_manager.running.assembly import Assembly
+from application_manager.running.options import Options
 from benchmarks.task_to_deployment import DEPLOYMENTS, INSTANCES, TASKS, TEMPLATE, TEMPLATES, task
 from tests.unit.manager.memory_server import MemoryServer
 from wayside.api import API_VERSION
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.resources import Resource
 
 NAMESPACE = "site"
 PARTS = ("application_manager", "benchmarks", "tests", "wayside")

@@ -28,14 +28,16 @@ from typing import Any
 
 import aiohttp
 
-from application_manager.cluster.client import Client, Resource
-from application_manager.cluster.connection import load_configuration
+from application_manager.cluster.client import manager_client
 from application_manager.core.claims.claims import instance_name
 from application_manager.core.objects.policy import Policy
 from application_manager.core.objects.rendering import Renderer, owned
 from tests.cluster.controlplane import ControlPlane
 from tests.cluster.crds import CRDS
 from wayside.api import API_VERSION, ApplicationInstance, ApplicationTemplate
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.connection import load_configuration
+from wayside.kubernetes.resources import Resource
 
 TASKS = Resource(API_VERSION, "ApplicationTask", "applicationtasks")
 INSTANCES = Resource(API_VERSION, "ApplicationInstance", "applicationinstances")
@@ -173,7 +175,7 @@ def cpu_seconds(pid: int) -> float:
 async def measure(sequential: int, burst: int, manager: subprocess.Popen[bytes], namespaces: tuple[str, str]) -> float:
     """Measure and print; the sequential ratio of p50."""
     ours, theirs = namespaces
-    client = Client(await load_configuration())
+    client = manager_client(await load_configuration())
     raw, seen = Raw(client, theirs), Seen()
     await client.create(TEMPLATES, {**TEMPLATE, "metadata": {"name": "app", "namespace": ours}})
     async with seen.watching(client, ours):
@@ -231,7 +233,7 @@ async def managed_burst(client: Client, seen: Seen, namespace: str, regions: lis
 
 async def fresh_namespaces() -> tuple[str, str]:
     """Two new namespaces: the manager's, and that of the raw calls."""
-    client = Client(await load_configuration())
+    client = manager_client(await load_configuration())
     stamp = f"{time.time_ns():x}"
     names = (f"bench-managed-{stamp}", f"bench-raw-{stamp}")
     for name in names:

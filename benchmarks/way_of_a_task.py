@@ -19,10 +19,10 @@ from contextvars import ContextVar
 from types import FrameType
 from typing import Any
 
-from application_manager.cluster.client import Resource
-from application_manager.work.workqueue import WorkQueue
 from benchmarks.reconcile import NAMESPACE, Server, assembly
 from benchmarks.task_to_deployment import task
+from wayside.kubernetes.resources import Resource
+from wayside.kubernetes.workqueue import WorkQueue
 
 PACKAGE = "application_manager."
 MOST = 2  # visits of a module

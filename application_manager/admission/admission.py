@@ -17,8 +17,6 @@ from typing import Any
 
 from application_manager.cache.cluster_cache import DETECTOR, EVENT_RULE, TEMPLATE, ClusterCache
 from application_manager.cache.surroundings import surroundings
-from application_manager.cluster.client import Client, Object, Resource
-from application_manager.cluster.errors import ApiError, Unreachable
 from application_manager.core.findings.checks import BROKEN_RULE, INVALID_RULE
 from application_manager.core.findings.findings import Findings
 from application_manager.core.findings.reviews import Request, ReviewError, Weight, answer, read
@@ -34,6 +32,9 @@ from wayside.api.base import Kind
 from wayside.api.documents import parse_object
 from wayside.api.pod import DetectorMode
 from wayside.findings import Finding
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.errors import ApiError, Unreachable
+from wayside.kubernetes.resources import Object, Resource
 from wayside.rules import depends
 
 AT_ONCE = 8

@@ -16,8 +16,8 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from application_manager.cluster.connection import ConfigurationError
-from wayside.servingcertificate import CERTIFICATE, KEY
+from wayside.kubernetes.connection import ConfigurationError
+from wayside.process.servingcertificate import CERTIFICATE, KEY
 
 AUTHORITY = "ca.crt"
 VALID = datetime.timedelta(days=365)

@@ -13,8 +13,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from application_manager.cache.cluster_cache import DETECTOR, ClusterCache
-from application_manager.cluster.client import Client, Object, Resource
-from application_manager.cluster.errors import ApiError, Unreachable
 from application_manager.core.findings.injections import (
     Injection,
     PodRequest,
@@ -26,6 +24,9 @@ from application_manager.core.findings.injections import (
 from application_manager.core.objects.poddefaults import PodDefaults
 from application_manager.measures import Measures
 from wayside.api import Detector
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.errors import ApiError, Unreachable
+from wayside.kubernetes.resources import Object, Resource
 
 LOOKING_UP = 3.0  # s for requests to the API server, which waits for us meanwhile
 

@@ -22,12 +22,13 @@ from cryptography.hazmat.primitives.serialization import Encoding
 
 from application_manager.admission.authority import AUTHORITY, VALID, issued, write_whole
 from application_manager.admission.reviewing import Serving
-from application_manager.cluster.client import Client, Object, Resource
-from application_manager.cluster.connection import ConfigurationError
-from application_manager.cluster.errors import ApiError
-from application_manager.cluster.repeating import repeatedly, until_answered
 from application_manager.core.findings.webhooks import WebhookClientConfig
-from wayside.servingcertificate import CERTIFICATE, KEY
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.connection import ConfigurationError
+from wayside.kubernetes.errors import ApiError
+from wayside.kubernetes.repeating import repeatedly, until_answered
+from wayside.kubernetes.resources import Object, Resource
+from wayside.process.servingcertificate import CERTIFICATE, KEY
 
 EVERY = 10.0  # s between two looks at the Secret
 _RENEWED_AT = 1 / 3  # of its life that is left

@@ -19,11 +19,11 @@ import msgspec
 from aiohttp import web
 
 from application_manager.cluster.certificate import follow
-from application_manager.cluster.connection import ConfigurationError
 from application_manager.core.findings.reviews import ReviewError
 from application_manager.core.findings.webhooks import certificate_secret
 from application_manager.measures import Measures
-from wayside.servingcertificate import ServingCertificate
+from wayside.kubernetes.connection import ConfigurationError
+from wayside.process.servingcertificate import ServingCertificate
 
 AT_ONCE = 32
 """Questions of one kind that are answered at the same time; those beyond get 503 at once."""

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from application_manager.cluster.client import Object
 from application_manager.core.conditions import Aspect
 from application_manager.core.health.pods import Trouble, summary, trouble
 from application_manager.core.objects.detectors import DETECTOR_LABEL
 from application_manager.core.objects.poddefaults import PodDefaults
 from application_manager.core.objects.policy import Name
 from application_manager.core.objects.sidecars import SIDECAR_LABEL
+from wayside.kubernetes.resources import Object
 
 
 @dataclass

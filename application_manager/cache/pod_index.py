@@ -7,10 +7,10 @@ are nearly all, nothing is kept here.
 from __future__ import annotations
 
 from application_manager.cache.store import name_of
-from application_manager.cluster.client import Object
 from application_manager.core.health.pods import Trouble, summary, trouble
 from application_manager.core.objects.labelling import INSTANCE_LABEL
 from application_manager.core.objects.policy import Name
+from wayside.kubernetes.resources import Object
 
 
 class PodIndex:

@@ -10,7 +10,6 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Set
 from dataclasses import dataclass
 
-from application_manager.cluster.client import Object
 from application_manager.core.claims.parameters import size_problem
 from application_manager.core.objects import trimming
 from application_manager.core.objects.ownership import FIELD_MANAGER
@@ -18,6 +17,7 @@ from application_manager.core.objects.policy import KindKey, Name
 from wayside.api import ApplicationTask
 from wayside.api.base import Kind
 from wayside.api.documents import parse_object
+from wayside.kubernetes.resources import Object
 
 _TOMBSTONES = 10_000  # uids of deleted objects that are remembered; the oldest are forgotten
 

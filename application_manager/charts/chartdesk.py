@@ -26,7 +26,7 @@ from application_manager.core.objects.charts import (
     ChartSource,
 )
 from application_manager.core.objects.policy import Name
-from wayside.backoff import pause_after
+from wayside.process.backoff import pause_after
 
 FIRST_PAUSE = 5.0  # s after a failure, doubled with each further one
 LONGEST_PAUSE = 300.0  # s

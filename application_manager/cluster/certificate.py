@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 
-from wayside.servingcertificate import EVERY, ServingCertificate
+from wayside.process.servingcertificate import EVERY, ServingCertificate
 
 
 async def follow(certificate: ServingCertificate) -> None:

@@ -6,9 +6,10 @@ import asyncio
 import logging
 from collections.abc import Collection, Iterable
 
-from application_manager.cluster.client import Client, Resource
-from application_manager.cluster.connection import ConfigurationError
 from application_manager.core.objects.rights import REMEDY, Right
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.connection import ConfigurationError
+from wayside.kubernetes.resources import Resource
 
 _REVIEWS = Resource("authorization.k8s.io/v1", "SelfSubjectAccessReview", "selfsubjectaccessreviews", namespaced=False)
 _SHOWN = 10  # of rights that lack, in one message

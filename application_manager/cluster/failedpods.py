@@ -8,9 +8,10 @@ from __future__ import annotations
 import logging
 import time
 
-from application_manager.cluster.client import EVENTS, Client, Object
-from application_manager.cluster.errors import ApiError, Unreachable
 from application_manager.core.health.refusals import FAILED_CREATE
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.errors import ApiError, Unreachable
+from wayside.kubernetes.resources import EVENTS, Object
 
 FORBIDDEN_FOR = 60.0  # s until Events are listed again
 _NEWEST = 50  # Events of one workload that are read; their number is bounded by the API server keeping them for an hour

@@ -11,10 +11,10 @@ import asyncio
 import logging
 from collections.abc import Callable
 
-from application_manager.cluster.client import Client
 from application_manager.cluster.entitlement import may
-from application_manager.cluster.repeating import repeatedly
 from application_manager.core.objects.rights import granting
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.repeating import repeatedly
 
 LOOK_EVERY = 5.0  # s between two questions about a namespace, while something is to be written there
 

@@ -14,18 +14,29 @@ import socket
 import time
 from dataclasses import dataclass
 
-from application_manager.cluster.client import LEASES, Client
-from application_manager.cluster.errors import ApiError, Unreachable
-from application_manager.cluster.podaccount import FOLDER
-from application_manager.core.holders.leading import DEADLINE, LOOK_EVERY, RENEW_EVERY, LeaseCandidate
 from application_manager.measures import Measures
-from wayside.leases import holder_of
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.errors import ApiError, RequestError, Unreachable
+from wayside.kubernetes.leases import LeaseCandidate, holder_of
+from wayside.kubernetes.podaccount import pod_namespace
+from wayside.kubernetes.resources import LEASES
 
 LEASE_NAME = "application-manager"
+DURATION = 12
+"""Seconds that a Lease must be observed unchanged before another manager takes it."""
+
+DEADLINE = 10.0
+"""Seconds after the sending of the last renewal in which its manager may act. What remains of the duration is for a
+connection to be opened, and for clocks that run at different speeds."""
+
+RENEW_EVERY = 2.0
+"""Seconds between two renewals."""
+
+LOOK_EVERY = 1.0
+"""Seconds between two looks of a standby, or two attempts where one failed."""
+
 RENEWAL_TIMEOUT = 3.0
 """Seconds for one request about the Lease, so that a renewal that hangs leaves time for another."""
-
-_NAMESPACE_FILE = FOLDER / "namespace"
 
 log = logging.getLogger(__name__)
 
@@ -58,8 +69,7 @@ def lease_key(given: str | None, namespaces: tuple[str, ...]) -> LeaseKey:
             f"{given!r} cannot be the managers' Lease: write NAME or NAMESPACE/NAME; wayside-… are detectors'"
         )
     if not namespace:
-        own = os.environ.get("POD_NAMESPACE") or (_NAMESPACE_FILE.read_text() if _NAMESPACE_FILE.is_file() else "")
-        namespace = own.strip() or next(iter(sorted(namespaces)), "default")
+        namespace = os.environ.get("POD_NAMESPACE") or pod_namespace() or next(iter(sorted(namespaces)), "default")
     return LeaseKey(namespace, name)
 
 
@@ -77,7 +87,7 @@ class Leadership:
         self._client = client
         self._key = key
         self._measures = measures
-        self._candidate = LeaseCandidate(identity or own_identity())
+        self._candidate = LeaseCandidate(identity or own_identity(), DURATION, DEADLINE)
         self._changed = asyncio.Event()
         self._logged = ""
         self._was_active = False
@@ -141,7 +151,7 @@ class Leadership:
         while True:
             try:
                 await self.look()
-            except (ApiError, Unreachable) as error:
+            except RequestError as error:
                 left = self.remaining()
                 until = f"; acting for {left:.0f} s more" if left > 0 else ""
                 self._log(

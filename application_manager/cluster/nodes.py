@@ -9,9 +9,10 @@ import asyncio
 import logging
 import time
 
-from application_manager.cluster.client import Client, Resource
-from application_manager.cluster.errors import ApiError, Unreachable
 from application_manager.core.health.placement import Nodes
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.errors import ApiError, Unreachable
+from wayside.kubernetes.resources import Resource
 
 NODES = Resource("v1", "Node", "nodes", namespaced=False)
 FRESH = 2.0  # s for which an answer is used again

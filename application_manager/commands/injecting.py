@@ -12,28 +12,20 @@ from typing import Any
 import typer
 import yaml
 
-from application_manager.cluster.client import Client, Resource
-from application_manager.cluster.connection import ConfigurationError, load_configuration
-from application_manager.cluster.errors import ApiError, Unreachable
+from application_manager.cluster.client import manager_client
 from application_manager.core.findings.injections import detector_of, injection
 from application_manager.core.objects.poddefaults import PodDefaults
+from application_manager.core.objects.podspecs import POD_TEMPLATES, pod_template, with_pod_template
 from application_manager.core.objects.sidecars import added, has_sidecar
-from wayside import commandline
 from wayside.api import API_VERSION, Detector
 from wayside.api.documents import parse_object
+from wayside.kubernetes.connection import ConfigurationError, load_configuration
+from wayside.kubernetes.errors import RequestError
+from wayside.kubernetes.resources import Resource
 from wayside.manifests import to_yaml
+from wayside.process import commandline
 
 _DETECTORS = Resource(API_VERSION, "Detector", Detector.plural)
-_TEMPLATES = {
-    "Pod": (),
-    "PodTemplate": ("template",),
-    **dict.fromkeys(
-        ("Deployment", "StatefulSet", "DaemonSet", "ReplicaSet", "ReplicationController", "Job"), ("spec", "template")
-    ),
-    "CronJob": ("spec", "jobTemplate", "spec", "template"),
-}
-"""Where the pod, or the template of pods, is in a manifest of the kind."""
-
 _NO_IMAGE = "Detector {} names no image: give --detector-image, or its spec.pod.image"
 
 Manifest = dict[str, Any]
@@ -83,8 +75,7 @@ class _Injector:
         """The manifest with its detector, where it requests one."""
         if raw.get("kind") == "List":
             return raw | {"items": [self.manifest(each) for each in raw.get("items") or ()]}
-        path = _TEMPLATES.get(str(raw.get("kind")))
-        return raw if path is None else _replaced(raw, path, lambda pod: self._pod(raw, pod))
+        return with_pod_template(raw, lambda pod: self._pod(raw, pod))
 
     def _pod(self, raw: Manifest, pod: Manifest) -> Manifest:
         name = detector_of(pod.get("metadata"))
@@ -104,14 +95,6 @@ class _Injector:
         return pod if found.addition is None else pod | {"spec": added(spec, found.addition)}
 
 
-def _replaced(raw: Manifest, path: tuple[str, ...], change: Any) -> Manifest:
-    """The manifest with what is at the path changed; as it is where nothing is there."""
-    if not path:
-        return dict(change(raw))
-    inner = raw.get(path[0])
-    return raw | {path[0]: _replaced(inner, path[1:], change)} if isinstance(inner, dict) else raw
-
-
 async def _looked_up(documents: list[Manifest], known: _Known) -> _Known:
     """Look up in the cluster what the files do not have."""
     wanted = {
@@ -122,7 +105,7 @@ async def _looked_up(documents: list[Manifest], known: _Known) -> _Known:
     listed = ", ".join(sorted(name for _, name in wanted))
     otherwise = "give its file by -f, or a kubeconfig of the cluster that has it"
     try:
-        client = Client(await load_configuration())
+        client = manager_client(await load_configuration())
     except ConfigurationError as error:
         raise ConfigurationError(f"Detector {listed} is in none of the files: {error}: {otherwise}") from error
     try:
@@ -130,7 +113,7 @@ async def _looked_up(documents: list[Manifest], known: _Known) -> _Known:
             raw = await client.get(_DETECTORS, namespace, name)
             if raw is not None and (found := _detector(raw)) is not None:
                 known.found[namespace, name] = found
-    except (ApiError, Unreachable) as error:
+    except RequestError as error:
         raise ConfigurationError(f"Detector {listed} cannot be looked up: {error}: {otherwise}") from error
     finally:
         await client.close()
@@ -143,20 +126,10 @@ def _wanted(raw: Manifest, default: str) -> Iterator[tuple[str, str]]:
         for each in raw.get("items") or ():
             yield from _wanted(each, default)
         return
-    for pod in _pods(raw):
-        name = detector_of(pod.get("metadata"))
-        if name is not None and not has_sidecar(pod.get("spec") or {}):
-            yield _namespace(raw, default), name
-
-
-def _pods(raw: Manifest) -> Iterator[Manifest]:
-    """The pod, or the template of pods, of the manifest."""
-    path = _TEMPLATES.get(str(raw.get("kind")))
-    inner: Any = None if path is None else raw
-    for step in path or ():
-        inner = inner.get(step) if isinstance(inner, dict) else None
-    if isinstance(inner, dict):
-        yield inner
+    pod = pod_template(raw) if raw.get("kind") in POD_TEMPLATES else {}
+    name = detector_of(pod.get("metadata"))
+    if name is not None and not has_sidecar(pod.get("spec") or {}):
+        yield _namespace(raw, default), name
 
 
 def _namespace(raw: Mapping[str, Any], default: str) -> str:

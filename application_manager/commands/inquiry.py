@@ -9,9 +9,7 @@ from typing import Any, TypeVar
 
 from kubernetes.aio.config import ConfigException, list_kube_config_contexts
 
-from application_manager.cluster.client import LEASES, Client, Object, Resource
-from application_manager.cluster.connection import load_configuration
-from application_manager.cluster.errors import ApiError, Unreachable
+from application_manager.cluster.client import manager_client
 from application_manager.core.claims.claims import InvalidTemplate
 from application_manager.core.objects.labelling import INSTANCE_LABEL
 from application_manager.core.statuses.explaining import Found, explain, serving
@@ -19,7 +17,11 @@ from application_manager.core.statuses.explanation import Explanation
 from wayside.api import API_VERSION, ApplicationInstance, ApplicationTask, ApplicationTemplate, Kind
 from wayside.api.documents import parse_object
 from wayside.inputerror import InputError
-from wayside.leases import lease_name
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.connection import load_configuration
+from wayside.kubernetes.errors import RequestError
+from wayside.kubernetes.leases import lease_name
+from wayside.kubernetes.resources import LEASES, Object, Resource
 
 Model = TypeVar("Model", bound=Kind)
 
@@ -49,10 +51,10 @@ async def inquire(subject: str, namespace: str | None) -> Explanation:
         InquiryError: there is no such object, or the API server refuses to return it.
         ConfigurationError: there is no cluster.
     """
-    client = Client(await load_configuration())
+    client = manager_client(await load_configuration())
     try:
         return await _inquire(client, subject, namespace or _namespace_of_context())
-    except (ApiError, Unreachable) as error:
+    except RequestError as error:
         raise InquiryError(f"the API server does not answer: {error}") from error
     finally:
         await client.close()

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from application_manager.core.objects.pullpolicy import PullPolicy
-from wayside import commandline
+from wayside.process import commandline
 
 if TYPE_CHECKING:
     from application_manager.admission.reviewing import Serving

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from wayside.beginning import importing
+from wayside.process.beginning import importing
 
 
 def webhooks(

@@ -9,15 +9,15 @@ from collections.abc import Sequence
 import typer
 from pydantic import TypeAdapter, ValidationError
 
-from application_manager.cluster.client import Client
-from application_manager.cluster.connection import ConfigurationError, load_configuration
-from application_manager.cluster.errors import ApiError, Unreachable
+from application_manager.cluster.client import manager_client
 from application_manager.cluster.leadership import LEASE_NAME, lease_key
 from application_manager.core.findings.webhooks import certificate_secret
 from application_manager.core.objects.detectors import detector_roles, sidecar_roles
 from application_manager.core.objects.policy import PLURALS, KindKey, Policy, kind_text
 from application_manager.core.objects.rights import roles
 from wayside.api.base import ObjectName
+from wayside.kubernetes.connection import ConfigurationError, load_configuration
+from wayside.kubernetes.errors import RequestError
 from wayside.manifests import to_yaml
 
 
@@ -111,7 +111,7 @@ async def _asked(kinds: list[KindKey]) -> dict[KindKey, str]:
     listed = ", ".join(map(kind_text, kinds))
     remedy = "run this with the kubeconfig of a cluster that has it"
     try:
-        client = Client(await load_configuration())
+        client = manager_client(await load_configuration())
     except ConfigurationError as error:
         raise ConfigurationError(f"what roles call {listed} only a cluster knows: {error}") from error
     try:
@@ -126,7 +126,7 @@ async def _asked(kinds: list[KindKey]) -> dict[KindKey, str]:
                 raise ConfigurationError(f"{kind_text(kind)} is not namespaced and can never be allowed")
             found[kind] = resource.plural
         return found
-    except (ApiError, Unreachable) as error:
+    except RequestError as error:
         raise ConfigurationError(f"the cluster does not know what roles call {listed}: {error}: {remedy}") from error
     finally:
         await client.close()

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import typer
 
-from application_manager.cluster.connection import ConfigurationError
 from application_manager.core.findings.webhooks import (
     WebhookClientConfig,
     injection_configuration,
     webhook_configuration,
 )
-from wayside import commandline
+from wayside.kubernetes.connection import ConfigurationError
 from wayside.manifests import to_yaml
+from wayside.process import commandline
 
 
 def print_webhooks(

@@ -12,9 +12,9 @@ from typing import Protocol
 from aiohttp import web
 
 from application_manager.cluster.certificate import follow
-from application_manager.cluster.connection import ConfigurationError
 from application_manager.measures import Measures
-from wayside.servingcertificate import ServingCertificate
+from wayside.kubernetes.connection import ConfigurationError
+from wayside.process.servingcertificate import ServingCertificate
 
 FOLDER_OPTION = "--metrics-certificates"
 

@@ -1,4 +1,4 @@
-"""The spans of what is done for tasks, where traces are on (see `wayside.tracing`), and the task has a trace.
+"""The spans of what is done for tasks, where traces are on (see `wayside.process.tracing`), and the task has a trace.
 
 A task that an instance serves for the first time gets `reconcile`, with `apply` in it, and `ready` once its workloads
 are. Each is in the task's own trace; where an instance serves several tasks, `reconcile` is linked to the others.
@@ -22,9 +22,9 @@ from application_manager.core.objects.policy import Name
 from application_manager.measures import PREFIX
 from wayside.api import ApplicationTask
 from wayside.api.applicationtask import TRACEPARENT_ANNOTATION, ApplicationTaskStatus
+from wayside.process.tracecontext import Attribute, Span, TraceContext, parse_traceparent
+from wayside.process.tracing import Tracing
 from wayside.times import parse_seconds
-from wayside.tracecontext import Attribute, Span, TraceContext, parse_traceparent
-from wayside.tracing import Tracing
 
 _REMEMBERED = 10_000
 """Tasks that are not ready yet; beyond it the oldest are forgotten, and their `ready` has the task as its parent."""

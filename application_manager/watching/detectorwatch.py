@@ -11,11 +11,12 @@ from dataclasses import dataclass
 
 from application_manager.cache.cluster_cache import DETECTOR, ClusterCache
 from application_manager.cache.detector_index import DetectorIndex
-from application_manager.cluster.client import Client, Object, Resource
-from application_manager.cluster.repeating import repeatedly
 from application_manager.core.objects.detectors import KINDS, SELECTOR
 from application_manager.core.objects.policy import Name
 from application_manager.core.objects.sidecars import SIDECAR_LABEL
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.repeating import repeatedly
+from wayside.kubernetes.resources import Object, Resource
 
 LOOK_EVERY = 3.0  # s
 _KINDS = tuple(Resource(*each) for each in KINDS)

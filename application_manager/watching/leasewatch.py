@@ -9,11 +9,12 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from application_manager.cache.cluster_cache import ClusterCache
-from application_manager.cluster.client import LEASES, Client, Resource
-from application_manager.cluster.errors import ApiError, Unreachable
 from application_manager.core.holders.leases import HolderKey
 from application_manager.core.objects.policy import Name
-from wayside.leases import lease_name
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.errors import ApiError, RequestError, Unreachable
+from wayside.kubernetes.leases import lease_name
+from wayside.kubernetes.resources import LEASES, Resource
 
 LOOK_EVERY = 1.0  # s
 _AT_ONCE = 8  # Leases read at once: few, since what runs goes before
@@ -86,7 +87,7 @@ class LeaseWatch:
         async with gate:
             try:
                 raw = await self.client.get(LEASES, key[0], lease_name(key[1]))
-            except (ApiError, Unreachable) as error:
+            except RequestError as error:
                 return error
         self.cache.leases.observe(key, raw, self.cache.healthy.elapsed)
         for instance in instances:

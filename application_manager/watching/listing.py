@@ -10,13 +10,14 @@ from dataclasses import dataclass
 
 from application_manager.cache.cluster_cache import ClusterCache
 from application_manager.cache.store import name_of
-from application_manager.cluster.client import LEASES, Client, Resource
-from application_manager.cluster.errors import ApiError, Unreachable
-from application_manager.cluster.repeating import until_answered
 from application_manager.core.objects.labelling import INSTANCE_LABEL
 from application_manager.core.objects.policy import Name
 from application_manager.measures import Measures
 from application_manager.watching.router import Router
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.errors import RequestError
+from wayside.kubernetes.repeating import until_answered
+from wayside.kubernetes.resources import LEASES, Resource
 
 log = logging.getLogger(__name__)
 
@@ -58,7 +59,7 @@ class Listing:
             began = time.monotonic()
             try:
                 await self._everything()
-            except (ApiError, Unreachable) as error:
+            except RequestError as error:
                 log.warning("resync: %s", error)
                 self.measures.resynced(well=False)
             else:

@@ -13,12 +13,12 @@ from typing import Any
 
 import kopf
 
-from application_manager.cluster.client import LEASES, Resource
 from application_manager.core.objects.labelling import INSTANCE_LABEL
 from application_manager.watching.pulse import NEVER, Pulse, pulsing
 from application_manager.watching.relay import Handler, Relist, relaying
-from wayside.backoff import Backoff
-from wayside.leases import HOLDER_LEASE_LABEL
+from wayside.kubernetes.leases import HOLDER_LEASE_LABEL
+from wayside.kubernetes.resources import LEASES, Resource
+from wayside.process.backoff import Backoff
 
 _FIRST_PAUSE, _LONGEST_PAUSE = 0.1, 1.0  # s between attempts to reach the API server
 

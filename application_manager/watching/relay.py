@@ -16,8 +16,8 @@ from typing import Any
 
 from kopf._cogs.clients import fetching, watching
 
-from application_manager.cluster.client import Object
-from application_manager.cluster.errors import ApiError, Unreachable
+from wayside.kubernetes.errors import RequestError
+from wayside.kubernetes.resources import Object
 
 Handler = Callable[[Object], None]
 Relist = Callable[[Any, str | None, str], Awaitable[None]]
@@ -66,7 +66,7 @@ def relaying(observe: Handler, vanished: Handler, relist: Relist, failed: Callab
             break
         try:
             await relist(resource, namespace, labels)
-        except (ApiError, Unreachable) as error:
+        except RequestError as error:
             log.warning("cannot list %s; retrying with backoff: %s", resource.plural, error)
             raise TimeoutError from error  # on which kopf retries the list
         yield [], version

@@ -21,7 +21,6 @@ from application_manager.cache.cluster_cache import (
     ClusterCache,
 )
 from application_manager.cache.store import Entry, kind_of, name_of
-from application_manager.cluster.client import Object
 from application_manager.core.health.readiness import not_ready
 from application_manager.core.objects.configuration import CONFIG_MAP, config_map_name
 from application_manager.core.objects.labelling import INSTANCE_LABEL
@@ -31,7 +30,8 @@ from application_manager.work.applying import Applier
 from application_manager.work.rulework import RuleKey
 from wayside.api import ApplicationInstance
 from wayside.api.applicationtemplate import ApplicationTemplateStatus
-from wayside.leases import holder_of
+from wayside.kubernetes.leases import holder_of
+from wayside.kubernetes.resources import Object
 
 Enqueue = Callable[[Name], None]
 

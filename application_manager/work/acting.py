@@ -13,8 +13,8 @@ import time
 from collections.abc import Coroutine, Sequence
 from typing import Any, Protocol
 
-from application_manager.cluster.client import Client
 from application_manager.cluster.leadership import Leadership
+from wayside.kubernetes.client import Client
 
 FINISHING = 3.0
 """Seconds that what is under way at the end is given; the next start does what is given up then."""

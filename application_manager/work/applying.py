@@ -15,8 +15,6 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 
 from application_manager.cache.store import Store
-from application_manager.cluster.client import Client, Object, Resource
-from application_manager.cluster.errors import ApiError
 from application_manager.core.conditions import Aspect
 from application_manager.core.health.refusals import (
     ADMISSION_REFUSED,
@@ -38,6 +36,9 @@ from application_manager.core.objects.ownership import (
 from application_manager.core.objects.policy import KindKey
 from application_manager.core.objects.rendering import Manifest, Rendering, object_key, owned
 from wayside.api import ApplicationInstance, Kind
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.errors import ApiError
+from wayside.kubernetes.resources import Object, Resource
 
 _WORST_FIRST = ("ObjectExists", APPLY_REFUSED, ADMISSION_REFUSED, QUOTA_EXCEEDED, "Waiting")
 _WORKLOADS = frozenset({"Deployment", "StatefulSet", "DaemonSet", "Job", "CronJob", "Pod"})

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from application_manager.core.objects.policy import Name
-from wayside.backoff import pause_after
+from wayside.process.backoff import pause_after
 
 FIRST_PAUSE = 1.0  # s, doubled with every refusal of the same
 LONGEST_PAUSE = 30.0  # s

@@ -10,8 +10,6 @@ import logging
 from dataclasses import dataclass
 
 from application_manager.cache.cluster_cache import ClusterCache
-from application_manager.cluster.client import Client, Object, Resource
-from application_manager.cluster.errors import ApiError
 from application_manager.core.objects import following
 from application_manager.core.objects.configuration import CONFIG_MAP, config_map_name
 from application_manager.core.objects.ownership import controller_uid
@@ -19,6 +17,9 @@ from application_manager.core.objects.policy import Name
 from application_manager.work.applying import Applier
 from application_manager.work.publishing import Publisher
 from wayside.api import ApplicationInstance
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.errors import ApiError
+from wayside.kubernetes.resources import Object, Resource
 
 PODS = Resource("v1", "Pod", "pods")
 

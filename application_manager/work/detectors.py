@@ -14,8 +14,6 @@ from dataclasses import dataclass, field
 
 from application_manager.cache.cluster_cache import DETECTOR, ClusterCache
 from application_manager.cache.detector_index import DetectorIndex
-from application_manager.cluster.client import Client, Resource
-from application_manager.cluster.errors import ApiError
 from application_manager.core.conditions import Aspect
 from application_manager.core.findings.rulefindings import detector_findings
 from application_manager.core.objects.detectors import KINDS, Manifest, detector_objects
@@ -28,6 +26,9 @@ from application_manager.work.applying import apply_owned
 from application_manager.work.sidecars import SidecarEvents
 from wayside.api import Detector
 from wayside.api.pod import DetectorMode
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.errors import ApiError
+from wayside.kubernetes.resources import Resource
 
 _RESOURCES = {each[1]: Resource(*each) for each in KINDS}
 

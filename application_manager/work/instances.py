@@ -14,8 +14,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 from application_manager.cache.cluster_cache import ClusterCache, Record
-from application_manager.cluster.client import Client, Object, Resource
-from application_manager.cluster.errors import ApiError
 from application_manager.core.claims.sizes import TOO_LARGE
 from application_manager.core.conditions import Aspect, find
 from application_manager.core.demand import drafting
@@ -32,6 +30,9 @@ from application_manager.work.recorder import Reason, Recorder
 from application_manager.work.suspending import Suspending
 from wayside.api import ApplicationInstance
 from wayside.api.documents import parse_object
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.errors import ApiError
+from wayside.kubernetes.resources import Object, Resource
 
 log = logging.getLogger(__name__)
 

@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from application_manager.cache.cluster_cache import ClusterCache, Record, Served
-from application_manager.cluster.client import Object, Resource
 from application_manager.cluster.failedpods import FailedPodsLook
 from application_manager.cluster.nodes import NodeLook
 from application_manager.core.conditions import Aspect
@@ -31,6 +30,7 @@ from application_manager.work.recorder import Reason
 from application_manager.work.statuses import StatusWriter
 from wayside.api import ApplicationInstance
 from wayside.api.applicationinstance import ApplicationInstanceStatus
+from wayside.kubernetes.resources import Object, Resource
 
 _TROUBLES_SHOWN = 3
 _SETTLING = 2.0  # s

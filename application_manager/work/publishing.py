@@ -21,9 +21,9 @@ from pathlib import Path
 
 import zenoh
 
-from application_manager.cluster.connection import ConfigurationError
 from application_manager.core.objects.policy import Name
-from wayside.backoff import Backoff
+from wayside.kubernetes.connection import ConfigurationError
+from wayside.process.backoff import Backoff
 
 _ALL = "wayside/instances/*/*/configuration"
 _FIRST_PAUSE, _LONGEST_PAUSE = 0.2, 2.0  # s between attempts to reach the network

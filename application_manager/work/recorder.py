@@ -21,15 +21,16 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-from application_manager.cluster.client import EVENTS, Client
-from application_manager.cluster.errors import ApiError, Unreachable
 from application_manager.core.conditions import changed
 from application_manager.core.health.pods import TroubleReason
 from application_manager.core.statuses.allowance import Allowance
 from application_manager.core.statuses.conclusions import READY, STALLED
-from application_manager.core.turns import Turns
 from application_manager.measures import Measures
 from wayside.api.base import Condition, Kind
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.errors import ApiError, Unreachable
+from wayside.kubernetes.resources import EVENTS
+from wayside.kubernetes.turns import Turns
 from wayside.times import format_seconds
 
 COMPONENT = "wayside.dev/application-manager"

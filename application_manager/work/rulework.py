@@ -9,7 +9,6 @@ from application_manager.cache.cluster_cache import EVENT_RULE, ClusterCache
 from application_manager.cache.detector_index import DetectorIndex
 from application_manager.cache.store import Entry
 from application_manager.cache.surroundings import surroundings
-from application_manager.cluster.client import Resource
 from application_manager.core.objects.policy import KindKey, Name
 from application_manager.core.statuses.rulestatus import DETECTOR_INVALID, RULE_INVALID, unreadable_status
 from application_manager.work.statuses import StatusWriter
@@ -19,6 +18,7 @@ from wayside.api import Detector, EventRule
 from wayside.api.base import Kind, Metadata
 from wayside.api.detector import DetectorStatus
 from wayside.api.eventrule import EventRuleStatus
+from wayside.kubernetes.resources import Resource
 
 RuleKey = tuple[KindKey, Name]
 """An EventRule or a Detector."""

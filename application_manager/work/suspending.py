@@ -10,14 +10,15 @@ import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from application_manager.cluster.client import Client, Object, Resource
-from application_manager.cluster.errors import ApiError
 from application_manager.core.objects.ownership import controller_uid
 from application_manager.core.objects.rendering import Rendering
 from application_manager.core.objects.suspension import ObjectKey
 from application_manager.work.applying import Applier
 from wayside.api import ApplicationInstance
 from wayside.api.applicationinstance import SuspendedReplicas
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.errors import ApiError
+from wayside.kubernetes.resources import Object, Resource
 
 _ATTEMPTS = 5  # at a scale, where somebody else keeps changing the object
 

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from application_manager.cache.cluster_cache import ClusterCache
-from application_manager.cluster.client import Client, Object, Resource
-from application_manager.cluster.errors import ApiError
-from application_manager.core.claims.claims import Claim, Refused, template_of_all
-from application_manager.core.claims.operations import Standing, Verdict, gathered
+from application_manager.core.claims.claims import Claim, Refused
+from application_manager.core.claims.operations import Standing, Verdict
 from application_manager.core.conditions import changed
-from application_manager.core.demand.demand import finished
-from application_manager.core.demand.fallback import FALLEN_BACK, turned
+from application_manager.core.demand.demand import finished, verdict_of
 from application_manager.core.objects import trimming
 from application_manager.core.objects.policy import Name
 from application_manager.core.statuses.status import Service, finished_since, task_status, together
@@ -24,6 +21,9 @@ from application_manager.work.statuses import StatusWriter
 from wayside.api import ApplicationTask
 from wayside.api.applicationtask import ApplicationTaskStatus
 from wayside.api.documents import parse_object
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.errors import ApiError
+from wayside.kubernetes.resources import Object, Resource
 from wayside.times import parse_seconds
 
 _SHED = Verdict(
@@ -132,32 +132,23 @@ class TaskWork:
         if verdict is not None:
             return verdict, None
         claimed = self.cache.claims.claim(name)
-        if claimed is not None and (template := template_of_all(claimed.instance)) is not None:
-            return self._of_all(name, claimed, (name[0], template))
-        served = self.cache.served.get((name[0], claimed.instance)) if claimed is not None else None
-        if served is None or name[1] not in served.verdicts:
+        if claimed is None:
             return None
-        instead = served.fallback.instance_of(name[1]) if served.fallback is not None else None
-        other = self.cache.served.get((name[0], instead)) if instead is not None else None
-        others = other.verdicts if other is not None else {}
-        verdict = turned(served.verdicts[name[1]], name[1], served.fallback, others)
-        serves = other if other is not None and verdict.reason == FALLEN_BACK else served
-        return verdict, serves.service
+        served = self.cache.served
+        decided = {each[1]: served[each] for each in self._decided(name[0], claimed) if each in served}
+        found = verdict_of(claimed, decided, decided)
+        if found is None:
+            return None
+        services = [decided[each].service for each in found.serving]
+        return found.verdict, together(services) if services else None
 
-    def _of_all(self, name: Name, claimed: Claim, template: Name) -> tuple[Verdict, Service | None] | None:
-        """What became of a task that means all instances of a template, from the verdict of each."""
-        alone = self.cache.served.get((name[0], claimed.instance))
-        if alone is None or name[1] not in alone.verdicts:
-            return None
-        each = {
-            instance[1]: served
-            for instance in self.cache.meant((name[0], claimed.instance))
-            if (served := self.cache.served.get(instance)) is not None and served is not alone
-        }
-        parts = {instance: served.verdicts[name[1]] for instance, served in each.items() if name[1] in served.verdicts}
-        verdict = gathered(claimed, parts, alone.verdicts[name[1]])
-        serving = [each[instance].service for instance, part in parts.items() if part.standing is Standing.COUNTS]
-        return verdict, together(serving) if serving else None
+    def _decided(self, namespace: str, claimed: Claim) -> Iterator[Name]:
+        """The instances whose decisions the verdict of a claim takes."""
+        yield from self.cache.meant((namespace, claimed.instance))
+        served = self.cache.served.get((namespace, claimed.instance))
+        instead = served.fallback.instance_of(claimed.task.name) if served and served.fallback else None
+        if instead is not None:
+            yield namespace, instead
 
     async def _expire(self, name: Name) -> None:
         task = self.cache.task(name)

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 
 from application_manager.cache.cluster_cache import TEMPLATE, ClusterCache
 from application_manager.cache.overlap_index import Turn
-from application_manager.cluster.client import Resource
 from application_manager.core.claims.claims import InvalidTemplate
 from application_manager.core.findings.findings import Findings
 from application_manager.core.objects.policy import Name
@@ -19,6 +18,7 @@ from application_manager.workers.jobs import TemplateJob
 from application_manager.workers.pool import ExceededError, Runs
 from wayside.api.applicationtemplate import ApplicationTemplateStatus, TemplateManager
 from wayside.api.base import Kind, Metadata
+from wayside.kubernetes.resources import Resource
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 from application_manager.workers.pool import ExceededError, JobError, Pool, unpickled
 from application_manager.workers.process import Job
-from wayside.backoff import pause_after
+from wayside.process.backoff import pause_after
 
 KEPT = 64 * 1024 * 1024  # bytes of answers
 FIRST_PAUSE = 60.0  # s until what was ended is tried again, doubled with each further time

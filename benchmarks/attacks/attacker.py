@@ -16,12 +16,13 @@ import os
 from collections.abc import Iterator
 from typing import Any
 
-from application_manager.cluster.client import Client
-from application_manager.cluster.connection import load_configuration
-from application_manager.cluster.errors import ApiError
+from application_manager.cluster.client import manager_client
 from benchmarks.manager_memory import large as small
 from benchmarks.task_to_deployment import AT_ONCE, TASKS, TEMPLATE, TEMPLATES, task
 from tests.worker_jobs import TEXT
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.connection import load_configuration
+from wayside.kubernetes.errors import ApiError
 
 LARGE = 1_000_000  # bytes of a large task
 TEXT_LENGTH = 60_000  # of each of its values: the API server takes no more than 65,536
@@ -89,7 +90,7 @@ class Attacker:
 
 async def attack(namespace: str, bombs: int, flood: int, larges: int) -> None:
     """Attack until the flood is over."""
-    client = Client(await load_configuration())
+    client = manager_client(await load_configuration())
     attacker = Attacker(client, namespace)
     every = max(1, flood // max(1, larges))
 

@@ -25,11 +25,13 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 
-from application_manager.cluster.client import Client, Resource
-from application_manager.cluster.connection import load_configuration
+from application_manager.cluster.client import manager_client
 from application_manager.core.claims.claims import instance_name
 from benchmarks.attacks.cluster import LOUD, QUIET, SYSTEM, Cluster, small_cluster
 from benchmarks.task_to_deployment import PATIENCE, TASKS, TEMPLATE, Seen, cpu_seconds, task
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.connection import load_configuration
+from wayside.kubernetes.resources import Resource
 
 CONFIG_MAPS = Resource("v1", "ConfigMap", "configmaps")
 SLOWER = 2.0  # times that a task may take under attack, 95th percentile
@@ -145,7 +147,7 @@ def largest(pid: int) -> float:
 async def measure(options: argparse.Namespace, cluster: Cluster, manager: int) -> list[str]:
     """Measure and print; what was missed."""
     os.environ["KUBECONFIG"] = str(cluster.tenants[QUIET])
-    client, seen = Client(await load_configuration()), Seen()
+    client, seen = manager_client(await load_configuration()), Seen()
     measured = Measured(client, seen)
     programs = {**cluster.programs, "manager": manager}
     attacker: subprocess.Popen[bytes] | None = None

@@ -23,8 +23,7 @@ from pathlib import Path
 
 import yaml
 
-from application_manager.cluster.client import Client
-from application_manager.cluster.connection import load_configuration
+from application_manager.cluster.client import manager_client
 from benchmarks import intake_rate, pairs_speed
 from benchmarks.manager_memory import resident
 from benchmarks.sidecar_cost import Cost, cost
@@ -46,6 +45,7 @@ from tests.cluster.controlplane import ControlPlane
 from tests.cluster.crds import CRDS
 from tests.ports import free_endpoint
 from wayside.api.zenoh import Zenoh, ZenohMode
+from wayside.kubernetes.connection import load_configuration
 
 REGION_RULES = 10
 """Of a regional detector; each has a window of 1 to 5 s and is evaluated once a second."""
@@ -239,7 +239,7 @@ def manager(tasks: int) -> dict[str, float]:
 
 
 async def _serve(plane: ControlPlane, process: subprocess.Popen[bytes], namespace: str, count: int) -> dict[str, float]:
-    client, seen, api = Client(await load_configuration()), Seen(), plane.api(namespace)
+    client, seen, api = manager_client(await load_configuration()), Seen(), plane.api(namespace)
     spec = json.loads(json.dumps(TEMPLATE["spec"]))
     spec["manifests"][0]["spec"]["replicas"] = 1
     await client.create(TEMPLATES, {**TEMPLATE, "metadata": {"name": "app", "namespace": namespace}, "spec": spec})

@@ -1,4 +1,4 @@
-"""The spans of episodes and of their tasks, where traces are on (see `wayside.tracing`).
+"""The spans of episodes and of their tasks, where traces are on (see `wayside.process.tracing`).
 
 The span of an episode is exported when the episode ends. Its ids follow from the episode's id, so its event and its
 tasks carry them from the start, and a detector that takes the episode up again ends the same span.
@@ -18,8 +18,8 @@ from detector.engine.episodes.demands import Demand
 from detector.engine.episodes.events import Event
 from wayside.api import ApplicationTask
 from wayside.api.applicationtask import TRACEPARENT_ANNOTATION
-from wayside.tracecontext import Attribute, Span, TraceContext, episode_context
-from wayside.tracing import Tracing, tracing
+from wayside.process.tracecontext import Attribute, Span, TraceContext, episode_context
+from wayside.process.tracing import Tracing, tracing
 
 
 class EpisodeTraces:

@@ -15,7 +15,7 @@ from xml.etree import ElementTree
 
 from wayside.api import Detector
 from wayside.api.place import MapFile, Projection
-from wayside.geometry import Point, Shape, interned
+from wayside.geo.geometry import Point, Shape, interned
 from wayside.rules import KnownPlaces, RuleProblem, places_of, shape_problems
 
 _CRS84: Final = ("urn:ogc:def:crs:OGC:1.3:CRS84", "urn:ogc:def:crs:OGC::CRS84", "urn:ogc:def:crs:EPSG::4326")

@@ -17,10 +17,10 @@ from detector.commands import inquiry, recordings
 from detector.commands.catalog.command import command as catalog_command
 from detector.commands.mine_command import mine
 from detector.results.kinds import ResultKind, chosen
-from wayside import commandline
-from wayside.beginning import importing
-from wayside.commandline import leave, refuse
 from wayside.inputerror import InputError
+from wayside.process import commandline
+from wayside.process.beginning import importing
+from wayside.process.commandline import leave, refuse
 
 if TYPE_CHECKING:
     from detector.live.running import View

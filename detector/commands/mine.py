@@ -20,7 +20,7 @@ from detector.mining.summary import Summary, show, summary_of
 from detector.mining.workers import LocalWorkers, Workers
 from detector.resources.files import load_rules
 from detector.results.installed import check_package
-from wayside.commandline import refuse
+from wayside.process.commandline import refuse
 
 _WIDTH = 160
 """Columns of a table that goes into a pipe or a file."""

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from detector.commands.inquiry import Connect, DetectorFile, Name, Timeout, query_selected
-from wayside.beginning import importing
-from wayside.commandline import refuse
+from wayside.process.beginning import importing
+from wayside.process.commandline import refuse
 
 if TYPE_CHECKING:
     from detector.actions.trigger.requests import RecordingReport, RecordingRequest

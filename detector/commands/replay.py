@@ -37,8 +37,8 @@ from detector.results.variants import comparisons, show_variants, write_variants
 from detector.results.writing import Look, Looking, check_installed, show_summary, write_results
 from wayside.api import ApplicationTask, Detector, EventRule
 from wayside.api.documents import Document, Problem
-from wayside.commandline import refuse
 from wayside.findings import Finding, ignored_by
+from wayside.process.commandline import refuse
 
 CLIPS = "clips"
 """The folder of what record actions write, in the output."""

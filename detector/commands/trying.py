@@ -22,7 +22,7 @@ from detector.results.series import Series, SeriesKind, Trace
 from detector.results.tracing import Tracer
 from wayside.api import Detector, EventRule
 from wayside.api.wording import messages
-from wayside.commandline import refuse
+from wayside.process.commandline import refuse
 from wayside.rules import RuleError, compile_rule
 
 _WIDE = 40

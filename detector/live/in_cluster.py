@@ -15,12 +15,12 @@ from detector.actions.deploy.lease import HolderLease
 from detector.actions.deploy.reconciler import DemandReconciler
 from detector.actions.deploy.stores import TaskStore
 from detector.actions.tracing import EpisodeTraces
-from detector.cluster.connection import connect
 from detector.live.restoring import what_was_open
 from detector.live.running import Running, View
 from detector.live.state import state_file
-from detector.resources.kubernetes import ClusterRules
+from detector.resources.kubernetes import PROGRAM, ClusterRules
 from detector.status.server import PagesAddress
+from wayside.kubernetes.connection import connect
 
 Result = TypeVar("Result")
 _OTHERWISE = "run without a cluster, with --detector FILE and --rules FILE"
@@ -40,12 +40,12 @@ async def run_in_cluster(
     """Run the Detector of that name, and emit its tasks as the holder, until it is to stop.
 
     Raises:
-        NoClusterError, DetectorError, NetworkError, OSError: it cannot start; the message gives the reason.
+        ConfigurationError, DetectorError, NetworkError, OSError: it cannot start; the message gives the reason.
     """
-    async with connect(namespace, otherwise=_OTHERWISE) as cluster:
-        rules = ClusterRules(cluster.api, cluster.namespace, name)
-        lease = HolderLease(cluster.api, cluster.namespace, holder)
-        store = KubernetesTaskStore(cluster.api, cluster.namespace, holder)
+    async with connect(PROGRAM, namespace, otherwise=_OTHERWISE) as cluster:
+        rules = ClusterRules(cluster.client, cluster.namespace, name)
+        lease = HolderLease(cluster.client, cluster.namespace, holder)
+        store = KubernetesTaskStore(cluster.client, cluster.namespace, holder)
         reconciler = DemandReconciler(store, permitted=lease.held, traces=traces)
         async with asyncio.TaskGroup() as group:
             group.create_task(lease.run())

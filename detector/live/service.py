@@ -63,7 +63,7 @@ async def run(options: RunOptions) -> None:
     """Run until SIGTERM or SIGINT.
 
     Raises:
-        DocumentError, DetectorError, NetworkError, NoClusterError, OSError: it cannot start; the message gives the
+        DocumentError, DetectorError, NetworkError, ConfigurationError, OSError: it cannot start; the message gives the
         reason.
     """
     tune_garbage_collection()

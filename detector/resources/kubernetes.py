@@ -7,21 +7,25 @@ import logging
 from collections.abc import AsyncGenerator
 from typing import Generic, TypeVar
 
-from detector.cluster.api import Api, JsonObject, Resource
-from detector.cluster.reflector import Change, Changed, Deleted, Reflector, Replaced
 from detector.resources.selection import RuleSet, select
 from wayside.api import API_VERSION, Detector, EventRule, Kind
 from wayside.api.documents import parse_object
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.reflector import Change, Changed, Deleted, Reflector, Replaced
+from wayside.kubernetes.resources import Object, Resource
 
 _log = logging.getLogger(__name__)
 
-DETECTORS = Resource(API_VERSION, Detector.plural)
-EVENT_RULES = Resource(API_VERSION, EventRule.plural)
+PROGRAM = "wayside-detector"
+"""The name of the detector for the API server."""
+
+DETECTORS = Resource(API_VERSION, Detector.__name__, Detector.plural)
+EVENT_RULES = Resource(API_VERSION, EventRule.__name__, EventRule.plural)
 
 _COALESCING = 0.05
 """Seconds: changes of one `kubectl apply` take effect together."""
 
-Object = TypeVar("Object", bound=Kind)
+Parsed = TypeVar("Parsed", bound=Kind)
 
 
 class ClusterRules:
@@ -31,15 +35,15 @@ class ClusterRules:
     that cannot be read (e.g. one of a newer version) is reported and left out; the others are not affected.
     """
 
-    def __init__(self, api: Api, namespace: str, detector_name: str, resync: float = 30.0) -> None:
+    def __init__(self, client: Client, namespace: str, detector_name: str, resync: float = 30.0) -> None:
         """Prepare; `resync`: seconds after which all is listed again, even if nothing seems to be missing."""
         self._name = detector_name
         self._where = f"namespace {namespace}"
         self._detectors = _Known(Detector)
         self._rules = _Known(EventRule)
-        only = {"fieldSelector": f"metadata.name={detector_name}"}
-        self._detector_source = Reflector(api, DETECTORS, namespace, only, resync)
-        self._rule_source = Reflector(api, EVENT_RULES, namespace, None, resync)
+        only = f"metadata.name={detector_name}"
+        self._detector_source = Reflector(client, DETECTORS, namespace, fields=only, resync=resync)
+        self._rule_source = Reflector(client, EVENT_RULES, namespace, resync=resync)
         self._changed = asyncio.Event()
         self._missing = False
 
@@ -76,7 +80,7 @@ class ClusterRules:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
 
-    async def _take(self, reflector: Reflector, known: _Known[Object]) -> None:
+    async def _take(self, reflector: Reflector, known: _Known[Parsed]) -> None:
         try:
             async for change in reflector.follow():
                 known.take(change)
@@ -99,12 +103,12 @@ class ClusterRules:
         return select(detector, self._rules.objects.values())
 
 
-class _Known(Generic[Object]):
+class _Known(Generic[Parsed]):
     """The objects of one kind, by name."""
 
-    def __init__(self, kind: type[Object]) -> None:
+    def __init__(self, kind: type[Parsed]) -> None:
         self._kind = kind
-        self.objects: dict[str, Object] = {}
+        self.objects: dict[str, Parsed] = {}
         self.unreadable: dict[str, str] = {}
         self.listed = False
 
@@ -123,7 +127,7 @@ class _Known(Generic[Object]):
             case Deleted(obj):
                 self._remove(obj["metadata"]["name"])
 
-    def _put(self, obj: JsonObject) -> None:
+    def _put(self, obj: Object) -> None:
         name = obj["metadata"]["name"]
         # The status is the manager's business, and a newer manager's may have fields that we do not know.
         read = {key: value for key, value in obj.items() if key != "status"}

@@ -15,7 +15,7 @@ from detector.streams.tally import Cause, Tally
 from wayside.api import Detector
 from wayside.api.source import DataSource
 from wayside.api.stream import Stream
-from wayside.backoff import Backoff
+from wayside.process.backoff import Backoff
 
 log = logging.getLogger(__name__)
 

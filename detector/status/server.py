@@ -12,7 +12,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
-from wayside.servingcertificate import EVERY, ServingCertificate
+from wayside.process.servingcertificate import EVERY, ServingCertificate
 
 Page = Callable[[], tuple[bool, bytes]]
 """Whether all is well, and the text."""

@@ -13,8 +13,8 @@ import zenoh
 from detector.access.credentials import Material, read_material
 from detector.access.mounted import AccessError
 from wayside.api.zenoh import Zenoh, ZenohMode
-from wayside.backoff import Backoff
 from wayside.inputerror import InputError
+from wayside.process.backoff import Backoff
 
 log = logging.getLogger(__name__)
 

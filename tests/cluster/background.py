@@ -10,9 +10,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
-from detector.cluster.api import Api
-from detector.cluster.connection import connect
 from tests.cluster.waiting import PATIENCE
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.connection import connect
 
 Result = TypeVar("Result")
 
@@ -20,7 +20,7 @@ Result = TypeVar("Result")
 class Background:
     """Runs coroutines with one connection to the API server."""
 
-    def __init__(self, loop: asyncio.AbstractEventLoop, api: Api):
+    def __init__(self, loop: asyncio.AbstractEventLoop, api: Client):
         self.loop = loop
         self.api = api
 
@@ -53,9 +53,9 @@ def background(kubeconfig: Path) -> Iterator[Background]:
         loop.close()
 
 
-async def _connection(kubeconfig: Path) -> AsyncGenerator[Api, None]:
-    async with connect(kubeconfig=kubeconfig) as cluster:
-        yield cluster.api
+async def _connection(kubeconfig: Path) -> AsyncGenerator[Client, None]:
+    async with connect("wayside-detector", kubeconfig=kubeconfig) as cluster:
+        yield cluster.client
 
 
 async def _cancel_others() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -13,6 +14,7 @@ from application_manager.core.objects.detectors import detector_roles, object_na
 from tests.cluster.api import Api, ApiError, Object
 from tests.cluster.controlplane import ControlPlane
 from tests.cluster.managed_world import task
+from tests.cluster.test_manager_memory import event, with_spec
 from tests.cluster.waiting import wait_until
 from tests.helm import ensure_tools
 from tests.helm.wayside_chart import Helm
@@ -139,6 +141,33 @@ def test_a_standalone_detector_touches_only_its_own_tasks_and_its_own_lease(appl
     refuses("create the Lease wayside-harbour", lambda: town.create(lease("wayside-harbour")))
     refuses("create the Lease application-manager", lambda: town.create(lease("application-manager")))
     town.create(lease("somebody-elses"))  # no holder's: the roles' matter
+
+
+def test_a_task_that_is_too_large_in_total_is_refused_with_its_field_and_an_old_one_can_end(applied: Api) -> None:
+    texts = {f"p{index}": "x" * 60_000 for index in range(10)}  # each is within the bounds of the CRD
+    lists = {f"x{index}": [f"v{item:05}" for item in range(4000)] for index in range(28)}
+    applied.create(with_spec(task("before"), parameters=texts))
+
+    def refused(name: str, **spec: object) -> str:
+        try:
+            applied.create(with_spec(task(name), **spec))
+        except ApiError as error:
+            return f"{error.code} {error.message}"
+        applied.delete("ApplicationTask", name)
+        return ""
+
+    wait_until(lambda: refused("texts", parameters=texts), bool, what="the policy is in force")
+    assert re.search(
+        r"422 .*: spec\.parameters: Too long: the spec of a task has 600\d{3} characters and may have at most 524288: "
+        "shorten the values, or refer to a file",
+        refused("texts", parameters=texts),
+    )
+    assert "spec.event.values: Too long" in refused("lists", event=event(lists))
+    within = dict(list(texts.items())[:8])
+    assert not refused("within", parameters=within)
+    applied.patch("ApplicationTask", "before", {"spec": {"endTime": "2026-01-01T00:00:00Z"}})
+    with pytest.raises(ApiError, match=r"spec\.parameters: Too long"):
+        applied.patch("ApplicationTask", "before", {"spec": {"parameters": {"p0": "y" * 60_000}}})
 
 
 def test_a_sidecar_holds_only_for_the_pod_that_its_token_is_bound_to(applied: Api, account: Account) -> None:

@@ -18,7 +18,7 @@ from tests.cluster.api import Api, Object
 from tests.cluster.background import Background, background
 from tests.cluster.controlplane import ControlPlane
 from tests.cluster.waiting import PATIENCE, wait_until
-from wayside.leases import HOLDER_LEASE_LABEL
+from wayside.kubernetes.leases import HOLDER_LEASE_LABEL
 
 NAME = "wayside-intersection-a"
 LONG = 600  # s: a Lease that lasts longer than any wait here

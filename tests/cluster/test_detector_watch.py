@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import suppress
 
 import pytest
 
-from detector.cluster.api import JsonObject, Resource
-from detector.cluster.errors import GoneError, UnavailableError
-from detector.cluster.reflector import Change, Changed, Deleted, Reflector, Replaced
 from tests.cluster.api import Api
 from tests.cluster.background import Background, background
 from tests.cluster.controlplane import ControlPlane
 from tests.cluster.waiting import wait_until
+from wayside.kubernetes.errors import ApiError, Unreachable
+from wayside.kubernetes.reflector import Change, Changed, Deleted, Reflector, Replaced
+from wayside.kubernetes.resources import Object, Resource
 
-CONFIG_MAPS = Resource("v1", "configmaps")
-MARKED = {"labelSelector": "test=yes"}
+CONFIG_MAPS = Resource("v1", "ConfigMap", "configmaps")
+MARKED = "test=yes"
 
 
 @pytest.fixture
@@ -31,7 +30,7 @@ class Following:
     def __init__(self, loop: Background, namespace: str, resync: float = 600.0):
         self.changes: list[Change] = []
         self.data: dict[str, str] = {}
-        self.reflector = Reflector(loop.api, CONFIG_MAPS, namespace, MARKED, resync)
+        self.reflector = Reflector(loop.api, CONFIG_MAPS, namespace, labels=MARKED, resync=resync)
         loop.start(self._follow())
 
     async def _follow(self) -> None:
@@ -49,11 +48,11 @@ class Following:
         wait_until(lambda: dict(self.data), lambda found: found == data, what=f"known: {data}")
 
 
-def name(obj: JsonObject) -> str:
+def name(obj: Object) -> str:
     return str(obj["metadata"]["name"])
 
 
-def config_map(named: str, x: str, marked: str = "yes") -> JsonObject:
+def config_map(named: str, x: str, marked: str = "yes") -> Object:
     metadata = {"name": named, "labels": {"test": marked}}
     return {"apiVersion": "v1", "kind": "ConfigMap", "metadata": metadata, "data": {"x": x}}
 
@@ -110,9 +109,15 @@ def test_history_that_the_server_no_longer_has_is_told_as_such(
 
     async def watch() -> None:
         while True:
-            with suppress(UnavailableError):  # it asks to come back while it reads what there is
-                async for _ in loop.api.watch(CONFIG_MAPS, namespace, MARKED, old, 2.0):
+            try:
+                async for _ in loop.api.watch(CONFIG_MAPS, namespace, labels=MARKED, since=old, seconds=2.0):
                     pass
+            except Unreachable:
+                pass
+            except ApiError as error:
+                if error.permanent:
+                    raise  # else it asks to come back while it reads what there is
 
-    with pytest.raises(GoneError, match="too old resource version"):
+    with pytest.raises(ApiError, match="too old resource version") as gone:
         loop.call(watch())
+    assert gone.value.code == 410

@@ -26,7 +26,7 @@ from tests.cluster.processes import Process, Processes
 from tests.cluster.test_manager_metrics import scraped
 from tests.cluster.waiting import wait_until
 from tests.ports import free_port
-from wayside.leases import HOLDER_LEASE_LABEL
+from wayside.kubernetes.leases import HOLDER_LEASE_LABEL
 from wayside.times import parse_seconds
 
 NORTH = instance_name("app", "north")

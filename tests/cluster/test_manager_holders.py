@@ -15,7 +15,7 @@ from tests.cluster.managed_world import condition, task, template, wait_settled
 from tests.cluster.processes import Process
 from tests.cluster.repeating import repeated
 from tests.cluster.waiting import wait_until
-from wayside.leases import HOLDER_LEASE_LABEL
+from wayside.kubernetes.leases import HOLDER_LEASE_LABEL
 
 NORTH = instance_name("app", "north")
 LOST = {"det": LeaseView(1000.0)}

@@ -11,8 +11,7 @@ from collections.abc import Callable
 import pytest
 
 from application_manager.cache.cluster_cache import ClusterCache
-from application_manager.cluster.client import Client, Object, Resource
-from application_manager.cluster.connection import load_configuration
+from application_manager.cluster.client import manager_client
 from application_manager.core.claims.claims import instance_name
 from application_manager.core.demand.decisions import Decision
 from application_manager.core.objects.policy import Name, Policy
@@ -25,6 +24,9 @@ from tests.cluster.api import Api
 from tests.cluster.managed_world import deployment, task, template
 from tests.inprocess import objects
 from wayside.api import API_VERSION
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.connection import load_configuration
+from wayside.kubernetes.resources import Object, Resource
 
 INSTANCES = Resource(API_VERSION, "ApplicationInstance", "applicationinstances")
 TASKS = Resource(API_VERSION, "ApplicationTask", "applicationtasks")
@@ -64,7 +66,7 @@ def reconcile(api: Api, known: list[Object]) -> None:
     """Reconcile the instance once, knowing only these objects."""
 
     async def run() -> None:
-        client = Client(await load_configuration())
+        client = manager_client(await load_configuration())
         try:
             router, work = work_on(ClusterCache(Policy()), client)
             for raw in known:

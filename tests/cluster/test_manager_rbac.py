@@ -14,8 +14,7 @@ from urllib.parse import parse_qs, urlsplit
 import pytest
 import yaml
 
-from application_manager.cluster.client import Client
-from application_manager.cluster.connection import load_configuration
+from application_manager.cluster.client import manager_client
 from application_manager.cluster.entitlement import missing_rights
 from application_manager.core.claims.claims import instance_name
 from application_manager.core.objects.policy import PLURALS as ALL_PLURALS
@@ -30,7 +29,8 @@ from tests.cluster.manifests import DETECTOR, EVENT_RULE
 from tests.cluster.namespaces import new_namespace
 from tests.cluster.processes import Processes
 from tests.cluster.waiting import wait_until
-from wayside.leases import HOLDER_LEASE_LABEL
+from wayside.kubernetes.connection import load_configuration
+from wayside.kubernetes.leases import HOLDER_LEASE_LABEL
 
 KINDS = ("apps/v1/Deployment", "v1/ConfigMap")
 ALLOWED = [word for each in KINDS for word in ("--allowed-kinds", each)]
@@ -301,7 +301,7 @@ def test_each_verb_that_lacks_is_noticed(
 
     def lacks() -> list[Verb]:
         async def ask() -> list[Verb]:
-            client = Client(await load_configuration())
+            client = manager_client(await load_configuration())
             try:
                 found = await missing_rights(client, needed, [namespace])
                 found += await missing_rights(client, lease_rights("application-manager"), [namespace])

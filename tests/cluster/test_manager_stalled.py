@@ -6,7 +6,7 @@ import os
 import signal
 from pathlib import Path
 
-from application_manager.watchdog import STALLED
+from application_manager.running.watchdog import STALLED
 from tests import programs
 from tests.cluster.api import Api
 from tests.cluster.managed_world import start_manager, task, template, wait_settled

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from application_manager.cluster.leadership import DURATION
 from application_manager.core.claims.claims import instance_name
-from application_manager.core.holders.leading import DURATION
 from tests.cluster.api import Api
 from tests.cluster.controlplane import ControlPlane
 from tests.cluster.faulty_proxy import Proxy, faulty_proxy

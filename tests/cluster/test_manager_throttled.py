@@ -6,13 +6,13 @@ import itertools
 import time
 from concurrent.futures import ThreadPoolExecutor
 
-from application_manager.cluster.pacing import AT_ONCE, MOST_WRITES
 from tests.cluster.api import Api
 from tests.cluster.controlplane import ControlPlane
 from tests.cluster.faulty_proxy import Seen, faulty_proxy
 from tests.cluster.managed_world import start_manager, task, template, wait_settled
 from tests.cluster.processes import Processes
 from tests.cluster.waiting import wait_until
+from wayside.kubernetes.pacing import AT_ONCE, MOST_WRITES
 
 WATCHERS = 8  # requests of watches that (re)list, and those about the Lease: apart from the bound
 BURST = 100  # tasks: many times what may run at once

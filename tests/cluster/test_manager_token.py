@@ -11,12 +11,13 @@ import pytest
 import yaml
 from kubernetes.aio.client import Configuration
 
-from application_manager.cluster.client import LEASES, Client
-from application_manager.cluster.errors import ApiError
-from application_manager.cluster.podaccount import use_pod_account
+from application_manager.cluster.client import manager_client
 from tests.cluster.api import Api
 from tests.cluster.controlplane import ControlPlane
 from tests.cluster.waiting import PATIENCE
+from wayside.kubernetes.errors import ApiError
+from wayside.kubernetes.podaccount import use_pod_account
+from wayside.kubernetes.resources import LEASES
 
 
 def test_a_token_that_is_not_taken_any_more_is_replaced_by_the_files_new_one(
@@ -47,7 +48,7 @@ def test_a_token_that_is_not_taken_any_more_is_replaced_by_the_files_new_one(
     async def scenario() -> None:
         configuration = Configuration()
         use_pod_account(configuration, tmp_path)
-        client = Client(configuration)
+        client = manager_client(configuration)
 
         async def until(*, taken: bool) -> None:
             async with asyncio.timeout(PATIENCE):

@@ -8,7 +8,7 @@ import signal
 from pathlib import Path
 
 from application_manager.core.claims.claims import instance_name
-from application_manager.watchdog import STALLED
+from application_manager.running.watchdog import STALLED
 from tests import programs
 from tests.cluster.api import Api
 from tests.cluster.controlplane import ControlPlane

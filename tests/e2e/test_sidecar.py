@@ -14,7 +14,7 @@ from tests.e2e.released import MANAGER, PATIENCE, RELEASE, available, image_valu
 from tests.e2e.wayside_in_cluster import RESTRICTED, ZENOH_PORT
 from tests.e2e.workloads import deployment, wait_available
 from tests.helm.wayside_chart import CHART, Helm
-from wayside.beginning import ENDED
+from wayside.process.beginning import ENDED
 
 DETECTOR = "on-board"
 ASKS = {"wayside.dev/detector": DETECTOR}

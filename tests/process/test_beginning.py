@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from wayside.beginning import ENDED
+from wayside.process.beginning import ENDED
 
 WHILE_IT_IMPORTS = """
 import os, signal, sys, threading

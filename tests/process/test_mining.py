@@ -30,7 +30,7 @@ from detector.results.kinds import ResultKind
 from tests import s3
 from tests.cluster.waiting import wait_until
 from tests.fleets import HARSH, write_fleet, write_mcap
-from wayside import commandline
+from wayside.process import commandline
 
 pytestmark = pytest.mark.xdist_group("mining")  # one fleet for all
 

@@ -16,8 +16,8 @@ from detector.engine.episodes.events import Event
 from detector.engine.episodes.rendering import Rendered
 from tests.otlp import Receiver
 from tests.ports import free_ports
-from wayside.tracecontext import Span, TraceContext, episode_context, parse_traceparent
-from wayside.tracing import tracing
+from wayside.process.tracecontext import Span, TraceContext, episode_context, parse_traceparent
+from wayside.process.tracing import tracing
 
 CONTEXTS = st.builds(TraceContext, st.integers(1, 2**128 - 1), st.integers(1, 2**64 - 1), st.booleans())
 
@@ -25,7 +25,7 @@ CONTEXTS = st.builds(TraceContext, st.integers(1, 2**128 - 1), st.integers(1, 2*
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """No variable of the machine counts, spans are handed over soon, and the end waits until they are."""
-    monkeypatch.setattr("wayside.tracing._PATIENCE", 60.0)
+    monkeypatch.setattr("wayside.process.tracing._PATIENCE", 60.0)
     for name in ("ENDPOINT", "TRACES_ENDPOINT", "PROTOCOL", "TRACES_PROTOCOL"):
         monkeypatch.delenv(f"OTEL_EXPORTER_OTLP_{name}", raising=False)
     monkeypatch.delenv("OTEL_SDK_DISABLED", raising=False)
@@ -65,8 +65,8 @@ def test_an_episode_has_one_trace_and_its_tasks_a_span_each(one: str, other: str
 
 def test_without_an_endpoint_there_are_no_traces_and_nothing_is_imported() -> None:
     script = (
-        "import sys, detector.live.service, application_manager.service\n"
-        "from wayside.tracing import tracing\n"
+        "import sys, detector.live.service, application_manager.running.service\n"
+        "from wayside.process.tracing import tracing\n"
         "assert tracing('x') is None\n"
         "assert not [name for name in sys.modules if name.startswith('opentelemetry')]\n"
     )
@@ -88,7 +88,7 @@ def test_a_protocol_that_is_not_spoken_and_a_missing_extra_are_said(
     assert tracing("x") is None
     assert "OTEL_EXPORTER_OTLP_PROTOCOL is grpc, and only http/protobuf is supported" in caplog.text
     monkeypatch.setenv("OTEL_EXPORTER_OTLP_PROTOCOL", "http/protobuf")
-    monkeypatch.setitem(sys.modules, "wayside.spans", None)  # as if it could not be imported
+    monkeypatch.setitem(sys.modules, "wayside.process.spans", None)  # as if it could not be imported
     assert tracing("x") is None
     assert "pip install 'wayside[otel]'" in caplog.text
 

@@ -9,7 +9,7 @@ from typing import Final
 
 from wayside.expressions.expanding import FIELDS_AT, FIELDS_SEEN
 from wayside.expressions.functions import FUNCTIONS
-from wayside.geometry import Shape
+from wayside.geo.geometry import Shape
 
 _POINTS: Final = ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0))
 _KINDS: Final[Mapping[str, Shape]] = {

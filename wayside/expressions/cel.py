@@ -44,7 +44,7 @@ from wayside.expressions.syntax import (
     paths,
 )
 from wayside.expressions.unknown import UNKNOWN, Reason, Unknown
-from wayside.geometry import Shape
+from wayside.geo.geometry import Shape
 
 Value = None | bool | int | float | str | bytes | list["Value"] | dict[str | int | bool, "Value"]
 """The result of an expression: plain data. An int is always beyond 2^53."""

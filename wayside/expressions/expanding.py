@@ -17,7 +17,7 @@ from typing import Final, NamedTuple, NoReturn
 
 from wayside.expressions.errors import ExpressionError, position
 from wayside.expressions.lexer import Token, TokenKind, tokens
-from wayside.geometry import Shape
+from wayside.geo.geometry import Shape
 
 AT: Final = "at"
 SEEN_FROM: Final = "seenFrom"

@@ -10,7 +10,7 @@ from wayside.api.eventrule import Aggregate
 from wayside.api.model import ModelImage, ModelPoints, ModelSource
 from wayside.api.operation import Operation
 from wayside.expressions import CompiledTemplate, Expression
-from wayside.geometry import Shape
+from wayside.geo.geometry import Shape
 from wayside.rules.parameters import NO_PARAMETERS, Parameters
 
 

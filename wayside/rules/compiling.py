@@ -25,7 +25,7 @@ from wayside.expressions import (
     compile_template,
 )
 from wayside.expressions.expanding import POSITION, NamedPlaces
-from wayside.geometry import Shape
+from wayside.geo.geometry import Shape
 from wayside.rules.actions import canonical_json, compile_actions, compile_deploys
 from wayside.rules.compiled import (
     CompiledPlugin,

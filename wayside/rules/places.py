@@ -12,7 +12,7 @@ from wayside.api.eventrule import EventRuleSpec, Signal
 from wayside.api.place import CoordinateFrame, Place
 from wayside.api.stream import Stream
 from wayside.expressions.expanding import SEEN_FROM, NamedPlaces
-from wayside.geometry import FARTHEST, Point, Shape, crossing, interned
+from wayside.geo.geometry import FARTHEST, Point, Shape, crossing, interned
 from wayside.rules.problems import RuleProblem
 
 _MOTION: Final = {False: ("yaw", "speed"), True: ("heading", "speed")}

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Protocol
 
 from application_manager.core.claims.claims import (
     Claim,
@@ -28,7 +29,7 @@ from application_manager.core.demand.deciding import (
     request,
 )
 from application_manager.core.demand.decisions import Decision
-from application_manager.core.demand.fallback import Fallback, fallback_of, turned
+from application_manager.core.demand.fallback import FALLEN_BACK, Fallback, fallback_of, turned
 from application_manager.core.demand.lingering import written_deadline
 from application_manager.core.demand.places import Placement
 from application_manager.core.demand.placing import limits
@@ -81,23 +82,19 @@ def demand(
     indexes = _Snapshot(by_name, {each.name: each for each in instances}, claims, leases, limit)
     found = {name: decide(name, indexes, now).decision for name in indexes.names(now)}
     decisions = {name: each for name, each in found.items() if each is not None}
-    for settled in decisions.values():
-        own = {name: each for name, each in settled.verdicts.items() if name not in settled.borrowed}
-        verdicts |= {name: _turned(each, name, settled, decisions) for name, each in own.items()}
     changes = [each.next_change for each in decisions.values() if each.next_change is not None]
+    decided: dict[str, Decided] = {**decisions}
     for name in {each.instance for each in claims if template_of_all(each.instance) is not None}:
         alone = decide(name, indexes, now).decision
-        if alone is None:
-            continue
-        for each in indexes.claims(name):
-            parts = {
-                decision.name: decision.verdicts[each.task.name]
-                for decision in decisions.values()
-                if decision.template == each.template and each.task.name in decision.verdicts
-            }
-            verdicts[each.task.name] = gathered(each, parts, alone.verdicts[each.task.name])
-        if alone.next_change is not None:
-            changes.append(alone.next_change)
+        if alone is not None:
+            decided[name] = alone
+            changes += [] if alone.next_change is None else [alone.next_change]
+    for each in claims:
+        template = template_of_all(each.instance)
+        meant = [] if template is None else [name for name, of in decisions.items() if of.template == template]
+        found_verdict = verdict_of(each, decided, meant)
+        if found_verdict is not None:
+            verdicts[each.task.name] = found_verdict.verdict
     shown = {name: each for name, each in decisions.items() if each.wanted or indexes.instance(name) is not None}
     waiting = {name: each for name, each in decisions.items() if name not in shown}
     return Outcome(shown, verdicts, min(changes, default=None), waiting)
@@ -171,9 +168,47 @@ class _Snapshot:
         return self._placement
 
 
-def _turned(verdict: Verdict, task: str, settled: Decision, decisions: Mapping[str, Decision]) -> Verdict:
-    other = decisions.get(settled.fallback.instance_of(task) or "") if settled.fallback is not None else None
-    return turned(verdict, task, settled.fallback, other.verdicts if other is not None else {})
+class Decided(Protocol):
+    """What was decided of an instance, or of the tasks for all instances of a template, as far as verdicts go."""
+
+    @property
+    def verdicts(self) -> Mapping[str, Verdict]:
+        """By task."""
+
+    @property
+    def fallback(self) -> Fallback | None:
+        """What its tasks turn to while it is not ready."""
+
+
+@dataclass(frozen=True, slots=True)
+class TaskVerdict:
+    """The verdict of a task that claims something, and the names of the instances that serve it."""
+
+    verdict: Verdict
+    serving: tuple[str, ...]
+
+
+def verdict_of(claimed: Claim, decided: Mapping[str, Decided], meant: Iterable[str]) -> TaskVerdict | None:
+    """What became of the task of a claim; None where its instance was not decided yet.
+
+    Args:
+        claimed: the claim.
+        decided: by instance, and by the names that stand for all instances of a template.
+        meant: the instances of the template, where the task means them all.
+    """
+    task, own = claimed.task.name, decided.get(claimed.instance)
+    if own is None or task not in own.verdicts:
+        return None
+    if template_of_all(claimed.instance) is not None:
+        found = {name: decided[name].verdicts for name in meant if name in decided and name != claimed.instance}
+        parts = {name: verdicts[task] for name, verdicts in found.items() if task in verdicts}
+        serving = tuple(name for name, each in parts.items() if each.standing is Standing.COUNTS)
+        return TaskVerdict(gathered(claimed, parts, own.verdicts[task]), serving)
+    instead = own.fallback.instance_of(task) if own.fallback is not None else None
+    other = decided.get(instead) if instead is not None else None
+    verdict = turned(own.verdicts[task], task, own.fallback, other.verdicts if other is not None else {})
+    serves = instead if instead is not None and verdict.reason == FALLEN_BACK else claimed.instance
+    return TaskVerdict(verdict, (serves,))
 
 
 def claim_or_verdict(template: ApplicationTemplate | InvalidTemplate | None, task: ApplicationTask) -> Claim | Verdict:

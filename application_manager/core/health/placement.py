@@ -12,6 +12,7 @@ from functools import partial
 from typing import Any
 
 from application_manager.core.health.pods import Trouble, TroubleReason
+from application_manager.core.objects.podspecs import pod_spec
 
 Labels = Mapping[str, str]
 Nodes = Mapping[str, Labels]
@@ -51,19 +52,6 @@ def misplaced(live: Mapping[str, Any], nodes: Nodes) -> Trouble | None:
     what = f"{live['kind']} {live['metadata']['name']}"
     message = f"{what} fits no node: {words}. Correct the value, or label a node"
     return Trouble(TroubleReason.UNSCHEDULABLE, message)
-
-
-def pod_spec(live: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The spec of the object's pods; empty where it makes none."""
-    spec: Any = live.get("spec") or {}
-    match live.get("kind"):
-        case "Pod":
-            return dict(spec)
-        case "Deployment" | "StatefulSet" | "DaemonSet" | "Job":
-            return _at(spec, "template", "spec")
-        case "CronJob":
-            return _at(spec, "jobTemplate", "spec", "template", "spec")
-    return {}
 
 
 def _at(value: Any, *path: str) -> Mapping[str, Any]:

@@ -9,7 +9,7 @@ from application_manager.core.claims.operations import Standing, Verdict
 from application_manager.core.holders.leases import LeaseView
 from wayside.api import ApplicationTask, ApplicationTemplate
 from wayside.api.applicationtemplate import Lifecycle, LossPolicy
-from wayside.leases import lease_name
+from wayside.kubernetes.leases import lease_name
 from wayside.times import parse_seconds
 
 HOLDER_LOST = "HolderLost"

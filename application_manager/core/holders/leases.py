@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from wayside.leases import DEFAULT_DURATION
+from wayside.kubernetes.leases import DEFAULT_DURATION
 
 RAREST_LOOK = 5.0  # s between two looks at a Lease that is long overdue; a renewal also comes by watching
 _RARER = 0.25  # of the time that a Lease is overdue: what a lapse may be noticed late by, in proportion

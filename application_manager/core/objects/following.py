@@ -13,6 +13,7 @@ from typing import Any
 
 from application_manager.core.claims import values
 from application_manager.core.objects.configuration import config_map_name
+from application_manager.core.objects.podspecs import pod_template
 
 ANNOTATION = "wayside.dev/configuration"
 """On a pod: `fingerprint` of the configuration that was announced to it last."""
@@ -29,7 +30,7 @@ def fingerprint(files: Mapping[str, str]) -> str:
 
 def selectors(objects: Iterable[Object]) -> tuple[str, ...]:
     """Label selectors that together cover the pods of these workloads; one that is empty covers all."""
-    found = {_selector(each) for each in objects if _pod_template(each) is not None}
+    found = {_selector(each) for each in objects if pod_template(each)}
     return ("",) if "" in found else tuple(sorted(found))
 
 
@@ -59,19 +60,5 @@ def _selector(workload: Object) -> str:
 
 
 def _labels(workload: Object) -> Mapping[str, str]:
-    labels: Mapping[str, str] = ((_pod_template(workload) or {}).get("metadata") or {}).get("labels") or {}
+    labels: Mapping[str, str] = (pod_template(workload).get("metadata") or {}).get("labels") or {}
     return labels
-
-
-def _pod_template(workload: Object) -> Object | None:
-    """What the workload's pods are made of; a pod is its own."""
-    spec = workload.get("spec") or {}
-    found: Object | None
-    match workload.get("kind"):
-        case "Pod":
-            found = workload
-        case "CronJob":
-            found = ((spec.get("jobTemplate") or {}).get("spec") or {}).get("template")
-        case _:
-            found = spec.get("template")
-    return found if isinstance(found, Mapping) else None

@@ -5,49 +5,40 @@ Pods have the instance's label alone: it never changes while the instance lives,
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
+from application_manager.core.objects.podspecs import with_pod_template
 from wayside.api import ApplicationInstance
 from wayside.api.base import MANAGED_BY, MANAGED_BY_LABEL
 
 INSTANCE_LABEL = "wayside.dev/instance"
 TEMPLATE_LABEL = "wayside.dev/template"
 
-_POD_TEMPLATES: dict[tuple[str, str], tuple[str, ...]] = {
-    ("apps/v1", "Deployment"): ("spec", "template"),
-    ("apps/v1", "StatefulSet"): ("spec", "template"),
-    ("apps/v1", "DaemonSet"): ("spec", "template"),
-    ("batch/v1", "Job"): ("spec", "template"),
-    ("batch/v1", "CronJob"): ("spec", "jobTemplate", "spec", "template"),
-}
-
 Manifest = dict[str, Any]
 
 
 def labelled(manifest: Manifest, instance: ApplicationInstance) -> Manifest:
-    """The manifest in the instance's namespace and with its labels, and those of its pods in place."""
+    """The manifest in the instance's namespace and with its labels, and its pod template with the instance's."""
     metadata = manifest["metadata"]
     own = {
         MANAGED_BY_LABEL: MANAGED_BY,
         INSTANCE_LABEL: instance.name,
         TEMPLATE_LABEL: instance.spec.template_name,
     }
-    _label_pods(manifest, instance)
+    made = (
+        manifest if manifest["kind"] == "Pod" else with_pod_template(manifest, partial(_labelled_pods, instance.name))
+    )
     return {
-        **manifest,
+        **made,
         "metadata": {**metadata, "namespace": instance.namespace, "labels": {**(metadata.get("labels") or {}), **own}},
     }
 
 
-def _label_pods(manifest: Manifest, instance: ApplicationInstance) -> None:
-    """Label the manifest's pod template, in place; what is of a wrong shape the API server refuses, as it stands."""
-    path = _POD_TEMPLATES.get((manifest["apiVersion"], manifest["kind"]))
-    here: Any = manifest
-    for part in path or ("",):
-        here = here.get(part) if isinstance(here, dict) else None
-    if not isinstance(here, dict):
-        return
-    metadata = here.get("metadata") or {}
+def _labelled_pods(instance: str, template: Manifest) -> Manifest:
+    """The pod template with the instance's label; what is of a wrong shape the API server refuses, as it stands."""
+    metadata = template.get("metadata") or {}
     labels = (metadata.get("labels") or {}) if isinstance(metadata, dict) else None
-    if isinstance(labels, dict):
-        here["metadata"] = {**metadata, "labels": {**labels, INSTANCE_LABEL: instance.name}}
+    if not isinstance(labels, dict):
+        return template
+    return {**template, "metadata": {**metadata, "labels": {**labels, INSTANCE_LABEL: instance}}}

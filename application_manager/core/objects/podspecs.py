@@ -6,24 +6,50 @@ Service), so what has `containers` is a pod's spec wherever it stands.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-_KNOWN: Mapping[str, tuple[str, ...]] = {
-    "Pod": ("spec",),
-    "Deployment": ("spec", "template", "spec"),
-    "StatefulSet": ("spec", "template", "spec"),
-    "DaemonSet": ("spec", "template", "spec"),
-    "Job": ("spec", "template", "spec"),
-    "CronJob": ("spec", "jobTemplate", "spec", "template", "spec"),
+_USUAL = ("spec", "template")
+POD_TEMPLATES: Mapping[str, tuple[str, ...]] = {
+    "Pod": (),
+    "PodTemplate": ("template",),
+    **dict.fromkeys(("Deployment", "StatefulSet", "DaemonSet", "ReplicaSet", "ReplicationController", "Job"), _USUAL),
+    "CronJob": ("spec", "jobTemplate", "spec", "template"),
 }
-"""Where these have theirs, also where it has no containers yet."""
+"""Where the pod, or the template of pods, is in a manifest of the kind."""
 
 _CONTAINERS = ("containers", "initContainers")
 _ACCOUNTS = ("serviceAccountName", "serviceAccount")
 _TEXTS = {"ConfigMap": ("data", "binaryData"), "Secret": ("data", "stringData")}
 """Fields whose keys are the user's own."""
+
+
+def pod_template(manifest: Mapping[str, Any]) -> Mapping[str, Any]:
+    """What the pods of a manifest are made of, in an unknown kind at `spec.template`; empty where there is none."""
+    here: Any = manifest
+    for part in POD_TEMPLATES.get(str(manifest.get("kind")), _USUAL):
+        here = here.get(part) if isinstance(here, Mapping) else None
+    return here if isinstance(here, Mapping) else {}
+
+
+def pod_spec(manifest: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The spec of a manifest's pods; empty where there is none."""
+    spec = pod_template(manifest).get("spec")
+    return spec if isinstance(spec, Mapping) else {}
+
+
+def with_pod_template(manifest: dict[str, Any], change: Callable[[dict[str, Any]], dict[str, Any]]) -> dict[str, Any]:
+    """The manifest with its pod template changed; as it is where it has none, or is of an unknown kind."""
+    path = POD_TEMPLATES.get(str(manifest.get("kind")))
+    return manifest if path is None else _changed(manifest, path, change)
+
+
+def _changed(value: dict[str, Any], path: tuple[str, ...], change: Callable[[dict[str, Any]], Any]) -> dict[str, Any]:
+    if not path:
+        return dict(change(value))
+    inner = value.get(path[0])
+    return value | {path[0]: _changed(inner, path[1:], change)} if isinstance(inner, dict) else value
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +71,8 @@ class NamedAccount:
 def pods_and_accounts(manifest: dict[str, Any]) -> Iterator[PodSpec | NamedAccount]:
     """All of them, each with its field; what is metadata, or the text of a ConfigMap or Secret, is neither."""
     kind = str(manifest.get("kind"))
-    known = ".".join(_KNOWN.get(kind, ()))
+    path = POD_TEMPLATES.get(kind)
+    known = "" if path is None else ".".join((*path, "spec"))
     for field, value in manifest.items():
         if field != "metadata" and field not in _TEXTS.get(kind, ()):
             yield from _within(field, value, known)

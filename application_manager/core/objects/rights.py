@@ -13,7 +13,7 @@ from typing import Any
 from application_manager.core.objects.policy import KindKey
 from application_manager.core.objects.suspension import SCALED
 from wayside.api import API_VERSION
-from wayside.leases import lease_name
+from wayside.kubernetes.leases import lease_name
 
 _GROUP = API_VERSION.partition("/")[0]
 _LEASES = "coordination.k8s.io"

@@ -19,7 +19,7 @@ from detector.actions.database.queue import Queue
 from detector.actions.database.server import DatabaseUnavailableError, Server, WriteRefusedError
 from detector.actions.database.spool import Spool
 from detector.actions.database.work import Write
-from wayside.backoff import Backoff
+from wayside.process.backoff import Backoff
 
 _log = logging.getLogger(__name__)
 

@@ -18,26 +18,27 @@ from detector.actions.deploy.stores import (
     belongs_to,
     task_manifest,
 )
-from detector.cluster.api import Api, JsonObject, Resource
-from detector.cluster.errors import AlreadyExistsError, ApiError, NotFoundError, UnavailableError
-from detector.cluster.reflector import Changed, Deleted, Reflector, Replaced, version_of
 from detector.engine.episodes.demands import holder_label
 from wayside.api import API_VERSION, ApplicationTask
 from wayside.api.applicationtask import HOLDER_LABEL
 from wayside.api.base import JsonValue
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.errors import ApiError, RequestError
+from wayside.kubernetes.reflector import Changed, Deleted, Reflector, Replaced, version_of
+from wayside.kubernetes.resources import Object, Resource
 from wayside.times import format_time
 
 _log = logging.getLogger(__name__)
 
-TASKS = Resource(API_VERSION, ApplicationTask.plural)
+TASKS = Resource(API_VERSION, ApplicationTask.__name__, ApplicationTask.plural)
 
 
 class KubernetesTaskStore:
     """The tasks of one holder in one namespace. Others' tasks are neither seen nor touched."""
 
-    def __init__(self, api: Api, namespace: str, holder: str, resync: float = 30.0) -> None:
+    def __init__(self, client: Client, namespace: str, holder: str, resync: float = 30.0) -> None:
         """Prepare; `resync`: seconds after which all is listed again, even if nothing seems to be missing."""
-        self._api = api
+        self._client = client
         self._namespace = namespace
         self._holder = holder
         self._resync = resync
@@ -45,13 +46,13 @@ class KubernetesTaskStore:
 
     async def follow(self) -> AsyncGenerator[Snapshot | Update, None]:
         """See `TaskStore`."""
-        selectors = {"labelSelector": f"{HOLDER_LABEL}={holder_label(self._holder)}"}
-        reflector = Reflector(self._api, TASKS, self._namespace, selectors, self._resync)
+        own = f"{HOLDER_LABEL}={holder_label(self._holder)}"
+        reflector = Reflector(self._client, TASKS, self._namespace, labels=own, resync=self._resync)
         async for change in reflector.follow():
             match change:
                 case Replaced(objects, version):
-                    own = (self._own(obj) for obj in objects)
-                    yield Snapshot({stored.task.name: stored for stored in own if stored}, version)
+                    found = (self._own(obj) for obj in objects)
+                    yield Snapshot({stored.task.name: stored for stored in found if stored}, version)
                 case Changed(obj):
                     if stored := self._own(obj):
                         yield Update(stored.task.name, stored, stored.version)
@@ -62,15 +63,15 @@ class KubernetesTaskStore:
     async def get(self, name: str) -> StoredTask | None:
         """See `TaskStore`."""
         with _store_errors():
-            try:
-                return self._own(await self._api.get(TASKS, self._namespace, name))
-            except NotFoundError:
-                return None
+            found = await self._client.get(TASKS, self._namespace, name)
+        return None if found is None else self._own(found)
 
     async def create(self, task: ApplicationTask) -> StoredTask:
         """See `TaskStore`."""
         with _store_errors():
-            return _stored(await self._api.create(TASKS, self._namespace, task_manifest(task)))
+            body = task_manifest(task)
+            body["metadata"]["namespace"] = self._namespace
+            return _stored(await self._client.create(TASKS, body))
 
     async def set_parameters(self, stored: StoredTask, parameters: Mapping[str, JsonValue]) -> StoredTask:
         """See `TaskStore`."""
@@ -84,19 +85,16 @@ class KubernetesTaskStore:
         """See `TaskStore`."""
         metadata = stored.task.metadata
         with _store_errors():
-            await self._api.delete(TASKS, self._namespace, metadata.name, metadata.uid)
+            await self._client.delete(TASKS, self._namespace, metadata.name, metadata.uid)
 
     async def _set(self, stored: StoredTask, field: str, value: JsonValue) -> StoredTask:
         # A JSON patch, since a merge patch would keep what is no longer in a nested map.
         metadata = stored.task.metadata
-        patch = [
-            {"op": "test", "path": "/metadata/uid", "value": metadata.uid},
-            {"op": "add", "path": f"/spec/{field}", "value": value},
-        ]
+        add = {"op": "add", "path": f"/spec/{field}", "value": value}
         with _store_errors():
-            return _stored(await self._api.patch(TASKS, self._namespace, metadata.name, patch))
+            return _stored(await self._client.patch(TASKS, self._namespace, metadata.name, metadata.uid, [add]))
 
-    def _own(self, obj: JsonObject) -> StoredTask | None:
+    def _own(self, obj: Object) -> StoredTask | None:
         """The task if it is the holder's and can be read; one of a newer version is ignored, and logged once."""
         try:
             stored = _stored(obj)
@@ -109,7 +107,7 @@ class KubernetesTaskStore:
         return stored if belongs_to(stored.task, self._holder) else None
 
 
-def _stored(obj: JsonObject) -> StoredTask:
+def _stored(obj: Object) -> StoredTask:
     # The status is the manager's business, and a newer manager's may have fields that we do not know.
     read = {key: value for key, value in obj.items() if key != "status"}
     shape = {"apiVersion": API_VERSION, "kind": ApplicationTask.__name__}  # items of a list come without
@@ -120,11 +118,11 @@ def _stored(obj: JsonObject) -> StoredTask:
 def _store_errors() -> Iterator[None]:
     try:
         yield
-    except UnavailableError as error:
-        raise StoreUnavailableError(error.reason, str(error), error.retry_after) from error
-    except AlreadyExistsError as error:
-        raise TaskExistsError(error.reason, str(error)) from error
-    except ApiError as error:
-        raise TaskRefusedError(error.reason, str(error)) from error
+    except RequestError as error:
+        if isinstance(error, ApiError) and error.exists:
+            raise TaskExistsError(error.reason, str(error)) from error
+        if isinstance(error, ApiError) and (error.permanent or error.code == 409):
+            raise TaskRefusedError(error.reason, str(error)) from error
+        raise StoreUnavailableError(error.reason, str(error), error.retry_after or 0.0) from error
     except ValidationError as error:
         raise TaskRefusedError("Unreadable", f"cannot read the stored ApplicationTask: {error}") from error

@@ -26,17 +26,15 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 
-from detector.cluster.api import Api, JsonObject, Resource
-from detector.cluster.errors import AlreadyExistsError, ApiError, ConflictError, NotFoundError
-from wayside.backoff import Backoff
-from wayside.leases import DEFAULT_DURATION, HOLDER_LEASE_LABEL, lease_name
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.errors import ApiError, RequestError
+from wayside.kubernetes.leases import DEFAULT_DURATION, HOLDER_LEASE_LABEL, LeaseCandidate, lease_name
+from wayside.kubernetes.resources import LEASES
+from wayside.process.backoff import Backoff
 
 _log = logging.getLogger(__name__)
-
-LEASES = Resource("coordination.k8s.io/v1", "leases")
 
 _RELEASE_DEADLINE = 2.0
 """Seconds that the end of the process may wait for an API server that does not answer."""
@@ -76,7 +74,7 @@ class HolderLease:
 
     def __init__(
         self,
-        api: Api,
+        client: Client,
         namespace: str,
         holder: str,
         identity: ProcessIdentity | None = None,
@@ -88,7 +86,7 @@ class HolderLease:
         """Prepare.
 
         Args:
-            api: the connection.
+            client: for the API server.
             namespace: the detector's.
             holder: whose sign of life it is.
             identity: which process this is. Default: found out.
@@ -97,13 +95,13 @@ class HolderLease:
             now: seconds since the epoch, for what is written; nothing is computed from it.
         """
         self.name = lease_name(holder)
-        self._api = api
+        self._client = client
         self._namespace = namespace
         self._identity = identity or ProcessIdentity.of_this_process()
         self._duration = duration
         self._monotonic = monotonic
         self._now = now
-        self._seen: tuple[str, float] | None = None
+        self._candidate = LeaseCandidate(self._identity.text, round(duration), duration)
         self._refused_by = ""
         self._backoff = Backoff(0.2, duration / 3)
         self._stopping = asyncio.Event()
@@ -122,7 +120,7 @@ class HolderLease:
             try:
                 delay = await self._once()
                 self._backoff.succeed()
-            except ApiError as error:
+            except RequestError as error:
                 if not self._backoff.failures:
                     _log.warning("cannot renew the Lease %s; retrying with backoff: %s", self.name, error)
                 self.failures += 1
@@ -137,57 +135,34 @@ class HolderLease:
 
     async def _once(self) -> float:
         """Acquire or renew, or find that another process holds it; the seconds until the next time."""
-        try:
-            lease = await self._api.get(LEASES, self._namespace, self.name)
-        except NotFoundError:
-            return await self._write(None)
-        holder = str(lease["spec"].get("holderIdentity") or "")
-        if self._identity.succeeds(holder) or self._lapsed(lease):
-            return await self._write(lease)
-        return self._other(holder, lease)
+        candidate, lease = self._candidate, await self._client.get(LEASES, self._namespace, self.name)
+        candidate.observe(lease, self._monotonic())
+        if lease is None or self._identity.succeeds(candidate.holder) or candidate.may_take(self._monotonic()):
+            return await self._write(new=lease is None)
+        return self._other()
 
-    async def _write(self, lease: JsonObject | None) -> float:
-        body = self._renewed(lease)
+    async def _write(self, *, new: bool) -> float:
+        body = self._candidate.draft(self.name, self._namespace, self._now())
+        metadata = body["metadata"]
+        metadata["labels"] = {**(metadata.get("labels") or {}), HOLDER_LEASE_LABEL: "true"}
+        if self._identity.owner:
+            metadata["ownerReferences"] = [self._identity.owner]
+        sent = self._monotonic()
         try:
-            if lease is None:
-                await self._api.create(LEASES, self._namespace, body)
-            else:
-                await self._api.replace(LEASES, self._namespace, self.name, body)
-        except (AlreadyExistsError, ConflictError, NotFoundError):
+            stored = await (self._client.create if new else self._client.replace)(LEASES, body)
+        except ApiError as error:
+            if error.code not in (404, 409):
+                raise
             return 0.1  # another process was faster: read it again
+        self._candidate.took(stored, sent, self._monotonic())
         if not self.held.is_set():
             _log.info("holding the Lease %s as %s", self.name, self._identity.text)
         self._refused_by = ""
         self.held.set()
         return self._duration / 3
 
-    def _renewed(self, lease: JsonObject | None) -> JsonObject:
-        moment = datetime.fromtimestamp(self._now(), UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
-        spec = dict(lease["spec"]) if lease else {}
-        if spec.get("holderIdentity") != self._identity.text:
-            spec["acquireTime"] = moment
-            spec["leaseTransitions"] = spec.get("leaseTransitions", -1) + 1
-        spec |= {
-            "holderIdentity": self._identity.text,
-            "leaseDurationSeconds": round(self._duration),
-            "renewTime": moment,
-        }
-        metadata: JsonObject = dict(lease["metadata"]) if lease else {"name": self.name}
-        metadata["labels"] = {**(metadata.get("labels") or {}), HOLDER_LEASE_LABEL: "true"}
-        if self._identity.owner:
-            metadata["ownerReferences"] = [self._identity.owner]
-        return {"apiVersion": LEASES.api_version, "kind": "Lease", "metadata": metadata, "spec": spec}
-
-    def _lapsed(self, lease: JsonObject) -> bool:
-        """Whether we have seen the Lease unchanged for its duration."""
-        version, now = lease["metadata"]["resourceVersion"], self._monotonic()
-        if self._seen is None or self._seen[0] != version:
-            self._seen = (version, now)
-            return False
-        return now - self._seen[1] >= float(lease["spec"].get("leaseDurationSeconds") or self._duration)
-
-    def _other(self, holder: str, lease: JsonObject) -> float:
-        duration = lease["spec"].get("leaseDurationSeconds") or self._duration
+    def _other(self) -> float:
+        holder = self._candidate.holder
         if self.held.is_set():
             self.held.clear()
             _log.error(
@@ -209,7 +184,7 @@ class HolderLease:
                 self.name,
                 holder,
                 self._identity.text,
-                duration,
+                self._candidate.lasts,
             )
         self._refused_by = holder
         return min(1.0, self._duration / 3)
@@ -219,12 +194,12 @@ class HolderLease:
         if not self.held.is_set():
             return
         self.held.clear()
-        with suppress(ApiError, TimeoutError):  # then it lapses
+        with suppress(RequestError, TimeoutError):  # then it lapses
             async with asyncio.timeout(_RELEASE_DEADLINE):
-                lease = await self._api.get(LEASES, self._namespace, self.name)
-                if lease["spec"].get("holderIdentity") == self._identity.text:
-                    lease["spec"]["holderIdentity"] = None
-                    await self._api.replace(LEASES, self._namespace, self.name, lease)
+                self._candidate.observe(await self._client.get(LEASES, self._namespace, self.name), self._monotonic())
+                draft = self._candidate.released(self._now())
+                if draft is not None:
+                    await self._client.replace(LEASES, draft)
 
 
 def _machine() -> str:

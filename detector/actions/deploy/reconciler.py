@@ -18,7 +18,6 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 
 from detector.actions.deploy.ledger import Ledger
-from detector.actions.deploy.queue import WorkQueue
 from detector.actions.deploy.steps import StoreChange, differences
 from detector.actions.deploy.stores import (
     Snapshot,
@@ -31,7 +30,8 @@ from detector.actions.deploy.stores import (
 from detector.actions.tracing import EpisodeTraces
 from detector.engine.episodes.demands import Demand, to_task
 from detector.engine.episodes.plain import plain
-from wayside.backoff import Backoff
+from wayside.kubernetes.workqueue import WorkQueue
+from wayside.process.backoff import Backoff
 
 _log = logging.getLogger(__name__)
 
@@ -79,13 +79,13 @@ class DemandReconciler:
         self._traces = traces
         self._store = store
         self._now = now
-        self._slots = asyncio.Semaphore(concurrency)
         self._permitted = permitted
         self._lock = threading.Lock()
         self._handed: tuple[Mapping[str, Demand], dict[str, int]] | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._ledger = Ledger()
-        self._queue = WorkQueue()
+        self._queue: WorkQueue[str] = WorkQueue("task", self._reconcile, concurrency)
+        self._probing = asyncio.Lock()
         self._away = Backoff(0.1, 5.0)
         self._reachable = asyncio.Event()
         self._pause = 0.0
@@ -123,12 +123,12 @@ class DemandReconciler:
             self._loop = asyncio.get_running_loop()
         self._accept()
         async with asyncio.TaskGroup() as group:
-            working = [group.create_task(self._follow()), group.create_task(self._work())]
+            working = [group.create_task(self._follow()), group.create_task(self._queue.run())]
             await self._stopping.wait()
             self._accept()
             with suppress(TimeoutError):
                 async with asyncio.timeout(self._deadline if self._may_change() else 0.0):
-                    await self._queue.empty()
+                    await self._queue.idle()
             if self.pending:
                 _log.warning("%d tasks are not reconciled yet; the next start completes them", self.pending)
             for task in working:
@@ -160,20 +160,17 @@ class DemandReconciler:
         for name in names:
             self._queue.add(name)
 
-    async def _work(self) -> None:
-        async with asyncio.TaskGroup() as group:
-            while True:
-                name = await self._queue.take()
-                if self._permitted is not None:
-                    await self._permitted.wait()
+    async def _reconcile(self, name: str) -> None:
+        if self._permitted is not None:
+            await self._permitted.wait()
+        if self._away.failures:
+            async with self._probing:  # one task alone finds out whether the store is back
                 if self._away.failures:
-                    # One task alone finds out whether the store is back.
                     with suppress(TimeoutError):
                         await asyncio.wait_for(self._reachable.wait(), self._pause)
                     await self._attend(name)
-                else:
-                    await self._slots.acquire()
-                    group.create_task(self._attend(name)).add_done_callback(lambda _: self._slots.release())
+                    return
+        await self._attend(name)
 
     async def _attend(self, name: str) -> None:
         """Take the steps that a task needs, one after the other."""
@@ -190,8 +187,6 @@ class DemandReconciler:
             self._queue.add(name)
         except TaskRefusedError as error:
             self._refused(step, name, error)
-        finally:
-            self._queue.done(name)
 
     async def _take(self, step: StoreChange, name: str) -> None:
         demand, stored = (self._ledger.demands or {}).get(name), (self._ledger.stored or {}).get(name)

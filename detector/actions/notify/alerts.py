@@ -13,7 +13,7 @@ from typing import Any
 
 from detector.actions.notify.notice import NoticeTexts
 from detector.actions.notify.outbox import FIRST, LONGEST, LONGEST_RETRY_AFTER, Delivery, Fate
-from wayside.backoff import Backoff
+from wayside.process.backoff import Backoff
 from wayside.times import format_time
 
 BATCH = 100

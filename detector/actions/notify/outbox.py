@@ -13,7 +13,7 @@ from enum import Enum
 from typing import Any
 
 from detector.actions.notify.notice import Notice
-from wayside.backoff import Backoff
+from wayside.process.backoff import Backoff
 
 FIRST, LONGEST = 1.0, 300.0
 """Seconds until the second attempt, and between two attempts at most."""

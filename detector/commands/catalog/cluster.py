@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from detector.cluster.connection import connect
-from detector.cluster.errors import ApiError, NoClusterError
 from detector.commands.catalog.catalog import CatalogEntry, Read, entry
-from detector.resources.kubernetes import EVENT_RULES
+from detector.resources.kubernetes import EVENT_RULES, PROGRAM
 from wayside.api import API_VERSION, EventRule
 from wayside.api.documents import parse_object
+from wayside.kubernetes.connection import ConfigurationError, connect
+from wayside.kubernetes.errors import RequestError
+
+_OTHERWISE = "give either files or folders with EventRules, or --cluster"
 
 
 async def read_cluster(namespace: str | None) -> Read:
@@ -18,20 +20,20 @@ async def read_cluster(namespace: str | None) -> Read:
         namespace: default: the kubeconfig context's, or the pod's own.
 
     Raises:
-        NoClusterError: there is neither a kubeconfig nor a pod's account, or the API server does not let us list.
+        ConfigurationError: there is neither a kubeconfig nor a pod's account, or the API server does not let us list.
     """
     entries: list[CatalogEntry] = []
     unreadable: list[str] = []
-    async with connect(namespace, otherwise="give either files or folders with EventRules, or --cluster") as cluster:
+    async with connect(PROGRAM, namespace, otherwise=_OTHERWISE) as cluster:
         try:
-            listed = await cluster.api.list(EVENT_RULES, cluster.namespace, {})
-        except ApiError as error:
-            raise NoClusterError(
+            listed, _ = await cluster.client.list(EVENT_RULES, cluster.namespace)
+        except RequestError as error:
+            raise ConfigurationError(
                 f"cannot list the EventRules of namespace {cluster.namespace}: {error}. Check that "
                 "KUBECONFIG points to the right cluster, and that its account may list "
                 "eventrules.wayside.dev there"
             ) from error
-        for each in listed["items"]:
+        for each in listed:
             # The status is the manager's business, and a newer manager's may have fields that we do not know.
             read = {name: value for name, value in each.items() if name != "status"}
             try:

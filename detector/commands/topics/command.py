@@ -15,8 +15,8 @@ from detector.commands.topics.survey import Survey, survey
 from detector.replay.errors import RecordingError
 from detector.replay.gathering import Recording, intake_file_of, recordings_of
 from wayside.api.zenoh import Zenoh, ZenohMode
-from wayside.commandline import refuse
 from wayside.inputerror import InputError
+from wayside.process.commandline import refuse
 
 
 class NothingHeardError(InputError, ValueError):

@@ -11,8 +11,8 @@ from detector.engine.buffering.messages import Messages
 from detector.engine.buffering.possible import Possible
 from detector.engine.counters import RuleCounters
 from detector.engine.samples.sample import Sample
-from wayside import geodesy
 from wayside.expressions import UNKNOWN, Expression, Unknown, Value
+from wayside.geo import geodesy
 from wayside.rules import CompiledPosition
 
 Place = tuple[float, ...]

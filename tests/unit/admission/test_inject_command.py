@@ -11,7 +11,7 @@ from typer.testing import CliRunner, Result
 
 from application_manager.cli import EXPECTED, app
 from application_manager.core.objects.sidecars import CONTAINER
-from wayside import commandline
+from wayside.process import commandline
 
 DETECTOR = """
 apiVersion: wayside.dev/v1alpha1

@@ -12,8 +12,6 @@ from kubernetes.aio.client import Configuration
 
 from application_manager.admission.admission import Admission
 from application_manager.cache.cluster_cache import DETECTOR, EVENT_RULE, TEMPLATE, ClusterCache
-from application_manager.cluster.client import Client, Resource
-from application_manager.cluster.errors import ApiError
 from application_manager.core.findings.findings import Findings
 from application_manager.core.findings.reviews import LONGEST, MOST_TOLD, ReviewError, answer, read
 from application_manager.core.findings.webhooks import WebhookClientConfig, webhook_configuration
@@ -23,6 +21,9 @@ from tests.inprocess import InProcess
 from tests.unit.manager_objects import template
 from tests.unit.templates.test_findings import counting, deploying, detector, rule
 from wayside.api import API_VERSION, Kind
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.errors import ApiError
+from wayside.kubernetes.resources import Resource
 
 WRONG = Findings(("spec.when: is wrong",), ("it is early",))
 
@@ -148,7 +149,7 @@ class Cluster(Client):
     """An API server with these objects; it is away where there are none."""
 
     def __init__(self, *objects: Kind) -> None:
-        super().__init__(Configuration())
+        super().__init__(Configuration(), "test", field_manager="test")
         self.objects = objects
 
     async def list(

@@ -15,14 +15,14 @@ import yaml
 from application_manager.admission.authority import make_certificates
 from application_manager.admission.reviewing import AT_ONCE, LARGEST, Desk, Serving, webhook
 from application_manager.cli import EXPECTED, app
-from application_manager.cluster.connection import ConfigurationError
 from application_manager.core.findings.reviews import ReviewError
 from application_manager.core.findings.webhooks import PATH
 from application_manager.measures import Measures
 from tests.ports import free_port
 from tests.unit.manager_objects import DEPLOYMENT
-from wayside import commandline
-from wayside.servingcertificate import CertificateError, ServingCertificate
+from wayside.kubernetes.connection import ConfigurationError
+from wayside.process import commandline
+from wayside.process.servingcertificate import CertificateError, ServingCertificate
 
 Ask = Callable[..., Awaitable[tuple[int, str]]]
 

@@ -11,15 +11,15 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from detector.cluster.errors import NoClusterError
 from detector.commands.catalog.catalog import Catalog, CatalogEntry, ChoiceError, catalog, choose
 from detector.commands.catalog.markdown import markdown_view
 from detector.commands.catalog.page import page
 from detector.commands.cli import app
-from wayside import commandline
 from wayside.api.classification import Classification
 from wayside.api.documents import DocumentError
 from wayside.api.scheme import SCHEME
+from wayside.kubernetes.connection import ConfigurationError
+from wayside.process import commandline
 
 HOSTILE = "</script><b>x</b> | `a` **b** \"'&\n## heading"
 ACTIONS = next(dimension for dimension in SCHEME if dimension.name == "typeOfAction")
@@ -171,7 +171,7 @@ def rules(tmp_path: Path) -> Path:
 
 
 def run(*arguments: str) -> int:
-    return commandline.run(app, "detector", (DocumentError, NoClusterError, OSError), ["catalog", *arguments])
+    return commandline.run(app, "detector", (DocumentError, ConfigurationError, OSError), ["catalog", *arguments])
 
 
 def test_the_command_prints_a_table_of_all_values(rules: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -223,6 +223,6 @@ def test_without_an_api_server_it_is_said_what_else_this_command_can_do(
     monkeypatch.setenv("KUBECONFIG", str(tmp_path / "nowhere"))
     assert run("--cluster") == 2
     told = capsys.readouterr().err
-    assert "no API server" in told
+    assert "there is no such file" in told
     assert "give either files or folders with EventRules, or --cluster" in told
     assert "--detector" not in told

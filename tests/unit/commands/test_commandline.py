@@ -7,7 +7,7 @@ import typer
 
 import application_manager.cli
 import detector.commands.cli
-from wayside import commandline
+from wayside.process import commandline
 
 APPS = [
     pytest.param(application_manager.cli.app, ["render", "--tasks", "x"], "--templates", id="application-manager"),

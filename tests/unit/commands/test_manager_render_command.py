@@ -12,7 +12,7 @@ import yaml
 
 from application_manager.cli import EXPECTED, app
 from tests.unit.manager_objects import DEPLOYMENT
-from wayside import commandline
+from wayside.process import commandline
 
 TEMPLATE: dict[str, Any] = {
     "apiVersion": "wayside.dev/v1alpha1",

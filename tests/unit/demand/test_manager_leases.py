@@ -10,8 +10,6 @@ from kubernetes.aio.client import Configuration
 
 from application_manager.cache.cluster_cache import ClusterCache
 from application_manager.cache.store import Entry
-from application_manager.cluster.client import LEASES, Client, Resource
-from application_manager.cluster.errors import ApiError
 from application_manager.core.holders.leases import (
     RAREST_LOOK,
     HealthyTime,
@@ -21,7 +19,10 @@ from application_manager.core.holders.leases import (
 from application_manager.core.objects.policy import Policy
 from application_manager.watching.leasewatch import LeaseWatch
 from tests.unit.manager_objects import task, template
-from wayside.leases import DEFAULT_DURATION, lease_name
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.errors import ApiError
+from wayside.kubernetes.leases import DEFAULT_DURATION, lease_name
+from wayside.kubernetes.resources import LEASES, Resource
 
 KEY = ("site", "det")
 
@@ -148,7 +149,7 @@ def test_a_lease_that_cannot_be_read_does_not_keep_the_others_from_being_read() 
     asked: list[tuple[str, str]] = []
 
     async def read() -> None:
-        client = _OneUnreadable(Configuration())
+        client = _OneUnreadable(Configuration(), "test", field_manager="test")
         await LeaseWatch(cache, client, LEASES, (), asked.append).read_due()
         await client.close()
 

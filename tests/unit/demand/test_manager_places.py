@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from application_manager.cache.cluster_cache import INSTANCE, TASK, TEMPLATE, ClusterCache
-from application_manager.cluster.client import Client
 from application_manager.core.claims.claims import instance_name
 from application_manager.core.demand.decisions import Decision
 from application_manager.core.demand.demand import Outcome, demand
@@ -19,6 +18,7 @@ from tests.unit.demand.test_limits import limited
 from tests.unit.manager_objects import NOW, instance, task, template
 from wayside.api import ApplicationInstance, ApplicationTask, ApplicationTemplate, Kind
 from wayside.api.base import API_VERSION
+from wayside.kubernetes.client import Client
 from wayside.times import format_seconds
 
 TEMPLATES, REGIONS = ("app", "map"), "abc"

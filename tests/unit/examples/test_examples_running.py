@@ -18,7 +18,7 @@ from examples.running.playing import Played, play
 from examples.running.recording import write_recording
 from examples.running.scenario import Episode, Moment, Scenario
 from tests.guides import guide
-from wayside import commandline
+from wayside.process import commandline
 
 
 @pytest.fixture(scope="module", params=use_cases())

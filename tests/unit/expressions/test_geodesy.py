@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from wayside.geodesy import SEMI_MAJOR, cartesian, surface_distance
+from wayside.geo.geodesy import SEMI_MAJOR, cartesian, surface_distance
 
 QUARTER_MERIDIAN = 10_001_965.729
 """From the equator to a pole on WGS 84, in metres."""

@@ -19,7 +19,7 @@ from tests.guides import guide, yaml_blocks
 from wayside.expressions import UNKNOWN, CelType, Environment
 from wayside.expressions.columns import Graph, Program, Tag, Texts
 from wayside.expressions.expanding import FIELDS_AT, FIELDS_SEEN, NamedPlaces
-from wayside.geometry import Shape, interned
+from wayside.geo.geometry import Shape, interned
 from wayside.rules import RuleError, compile_rule, own_problems, place_problems
 
 STAR = ((0.0, 0.0), (8.0, 1.0), (5.0, 4.0), (9.0, 9.0), (4.0, 6.0), (0.0, 9.0), (2.0, 4.0))

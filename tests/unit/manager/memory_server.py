@@ -8,8 +8,6 @@ from typing import cast
 
 from application_manager.cache.cluster_cache import ClusterCache
 from application_manager.cache.store import Entry
-from application_manager.cluster.client import Client, Object, Resource
-from application_manager.cluster.errors import ApiError
 from application_manager.core.objects.policy import Name, Policy
 from application_manager.work.applying import Applier
 from application_manager.work.instances import InstanceWork
@@ -18,6 +16,9 @@ from application_manager.work.suspending import Suspending
 from tests.inprocess import objects
 from wayside.api import ApplicationTask, Kind
 from wayside.api.base import API_VERSION
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.errors import ApiError
+from wayside.kubernetes.resources import Object, Resource
 
 CONFIG_MAPS = Resource("v1", "ConfigMap", "configmaps")
 INSTANCES = Resource(API_VERSION, "ApplicationInstance", "applicationinstances")

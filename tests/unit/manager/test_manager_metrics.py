@@ -12,21 +12,21 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from application_manager.cache.cluster_cache import ClusterCache
-from application_manager.cluster.connection import ConfigurationError
-from application_manager.cluster.errors import ApiError
 from application_manager.core.objects.policy import Policy
 from application_manager.core.statuses.allowance import BURST, REFILL, Allowance
-from application_manager.headroom import Headroom
 from application_manager.measures import PREFIX, Measures
 from application_manager.observability.overview import Overview
 from application_manager.observability.pages import STALLED_AFTER, pages, stalled
 from application_manager.observability.tracing import LostSpans
+from application_manager.running.headroom import Headroom
 from application_manager.watching.pulse import Pulse
 from application_manager.work.recorder import Reason
-from application_manager.work.workqueue import WorkQueue
 from tests.guides import guide
 from tests.unit.manager_objects import instance, task, template
-from wayside.tracing import Tracing
+from wayside.kubernetes.connection import ConfigurationError
+from wayside.kubernetes.errors import ApiError
+from wayside.kubernetes.workqueue import WorkQueue
+from wayside.process.tracing import Tracing
 
 GUIDE = guide("manager")
 
@@ -97,7 +97,7 @@ def test_a_queue_tells_how_long_its_work_took_and_what_failed() -> None:
             else:
                 finished.set()
 
-        queue = WorkQueue("task", work, 1, measures=measures)
+        queue = WorkQueue("task", work, 1, measure=measures.reconciled)
         queue.add("a")
         running = asyncio.create_task(queue.run())
         async with asyncio.timeout(60):

@@ -7,9 +7,9 @@ from typing import cast
 
 import pytest
 
-from application_manager.cluster.client import Client
-from application_manager.cluster.connection import ConfigurationError
-from application_manager.prerequisites import recent_enough
+from application_manager.running.prerequisites import recent_enough
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.connection import ConfigurationError
 
 
 class Server:

@@ -15,10 +15,10 @@ from typing import Any
 import pytest
 import zenoh
 
-from application_manager.cluster.connection import ConfigurationError
 from application_manager.work.publishing import Publisher, key_of, settings
 from tests.networks import PATIENCE, router, wait_for
 from tests.ports import free_endpoint, free_port
+from wayside.kubernetes.connection import ConfigurationError
 
 NAME = ("site", "fusion")
 KEY = "wayside/instances/site/fusion/configuration"

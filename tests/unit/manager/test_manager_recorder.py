@@ -8,11 +8,11 @@ from typing import Any, cast
 
 import pytest
 
-from application_manager.cluster.client import Client
-from application_manager.cluster.errors import ApiError
 from application_manager.work import recorder
 from application_manager.work.recorder import Reason, Recorder
 from tests.unit.manager_objects import NOW, task
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.errors import ApiError
 
 
 class Refusing:

@@ -12,9 +12,9 @@ import kopf
 import pytest
 from kopf._cogs.clients import api, watching
 
-from application_manager.cluster.errors import Unreachable
 from application_manager.measures import Measures
 from application_manager.watching.relay import relaying
+from wayside.kubernetes.errors import Unreachable
 
 RESOURCE = SimpleNamespace(plural="applicationtasks", get_url=lambda **_: "")
 Event = tuple[str, str]

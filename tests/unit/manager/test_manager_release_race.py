@@ -7,10 +7,10 @@ from collections.abc import AsyncIterator
 from typing import Any
 
 from application_manager.cache.cluster_cache import INSTANCE, ClusterCache
-from application_manager.cluster.client import Resource
 from application_manager.core.objects.policy import Name
 from tests.unit.manager.memory_server import a_world, raw, work_on
 from tests.unit.manager_objects import NOW, instance, task, template
+from wayside.kubernetes.resources import Resource
 
 NAME = ("site", "app-0000000000")
 KEYED = {"key": "${parameters.place}", "parameters": {"place": {"type": "string"}}}

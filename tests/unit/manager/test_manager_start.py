@@ -7,8 +7,8 @@ import logging
 
 import pytest
 
-from application_manager.cluster.errors import ApiError, Unreachable
-from application_manager.cluster.repeating import until_answered
+from wayside.kubernetes.errors import ApiError, Unreachable
+from wayside.kubernetes.repeating import until_answered
 
 
 def asked(*failures: Exception) -> str:

@@ -10,7 +10,6 @@ import pytest
 
 from application_manager.cache.cluster_cache import ClusterCache
 from application_manager.cache.store import Entry
-from application_manager.cluster.client import Client, Object, Resource
 from application_manager.measures import Measures
 from application_manager.observability.tracing import TaskTraces
 from application_manager.work.recorder import Recorder
@@ -20,7 +19,9 @@ from tests.otlp import Received, Receiver
 from tests.unit.manager.memory_server import CONFIG_MAPS, TASKS, MemoryServer, a_world, raw, work_on
 from tests.unit.manager_objects import task, template
 from wayside.api import ApplicationTask
-from wayside.tracing import tracing
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.resources import Object, Resource
+from wayside.process.tracing import tracing
 
 APP, TASK = ("site", "app"), ("site", "t")
 CONFIG = {"apiVersion": "v1", "kind": "ConfigMap", "metadata": {"name": "a"}}

@@ -9,11 +9,11 @@ import threading
 
 import pytest
 
-from application_manager import watchdog
 from application_manager.measures import Measures
 from application_manager.observability.pages import stalled
-from application_manager.watchdog import STALLED
-from application_manager.work.workqueue import WorkQueue
+from application_manager.running import watchdog
+from application_manager.running.watchdog import STALLED
+from wayside.kubernetes.workqueue import WorkQueue
 
 
 def ended_by(stall: watchdog.Stall, *, hangs: bool = False, silent: float = 3600.0) -> str | None:
@@ -51,7 +51,7 @@ def test_one_that_works_is_left_alone() -> None:
 def test_the_process_ends_with_a_line_and_where_it_hangs() -> None:
     program = """
 import asyncio, time
-from application_manager.watchdog import watchdog
+from application_manager.running.watchdog import watchdog
 def hanging(): time.sleep(600)
 async def main():
     async with watchdog(lambda: None, 2.0, step=0.05):

@@ -15,8 +15,8 @@ from detector.engine.episodes.events import Event
 from detector.replay.comparing import compare
 from tests import onnx_models
 from tests.driving import START, a_detector, a_rule, at
-from wayside.commandline import run
 from wayside.inputerror import InputError
+from wayside.process.commandline import run
 
 
 def episodes(rule: str, *spans: tuple[float, float | None], subject: str = "car") -> list[Event]:

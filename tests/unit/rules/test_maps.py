@@ -15,8 +15,8 @@ import pytest
 
 from detector.assembly import DetectorError, inlets
 from tests.driving import a_detector, a_rule, a_stream
-from wayside.geometry import Shape
-from wayside.positions import positions_at
+from wayside.geo.geometry import Shape
+from wayside.geo.positions import positions_at
 from wayside.rules import RuleError, compile_rule, own_problems
 
 LATITUDE, LONGITUDE = 52.0, 10.0

@@ -9,7 +9,6 @@ import pytest
 from kubernetes.aio.client import Configuration
 
 from application_manager.cache.cluster_cache import ClusterCache
-from application_manager.cluster.client import Client, Resource
 from application_manager.core.objects.policy import Policy
 from application_manager.core.statuses.rulestatus import detector_status, rule_status
 from application_manager.work.recorder import Recorder
@@ -19,6 +18,8 @@ from tests.inprocess import InProcess
 from tests.unit.manager_objects import NOW
 from wayside.api import API_VERSION, Detector, EventRule
 from wayside.findings import Finding
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.resources import Resource
 
 
 def rule(**spec: Any) -> EventRule:
@@ -142,7 +143,7 @@ def test_what_passed_the_api_server_and_is_none_is_told_so_in_its_status(kind: s
             return {**raw, "metadata": {**raw["metadata"], "resourceVersion": str(len(written) + 1)}, "status": status}
 
     async def reconcile_twice() -> None:
-        client = Accepting(Configuration())
+        client = Accepting(Configuration(), "test", field_manager="test")
         resources = {(API_VERSION, kind): Resource(API_VERSION, kind, f"{kind.lower()}s")}
         work = RuleWork(cache, StatusWriter(client, Recorder(client), observe), resources, InProcess())
         await work.reconcile(((API_VERSION, kind), ("site", "odd")))

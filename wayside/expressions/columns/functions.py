@@ -15,8 +15,8 @@ import numpy as np
 from wayside.expressions.columns.values import Bools, Doubles
 from wayside.expressions.functions import FUNCTIONS, OF_FIELDS
 from wayside.expressions.functions.declaring import Takes, Yields
-from wayside.geometry import Shape
-from wayside.positions import AT, positions_at
+from wayside.geo.geometry import Shape
+from wayside.geo.positions import AT, positions_at
 
 Called = tuple[str, int] | tuple[str, int, Shape]
 """A function, how many numbers it takes, and perhaps the place that it is about."""

@@ -13,7 +13,7 @@ from wayside.expressions.columns.values import Tag
 from wayside.expressions.projection import integer
 from wayside.expressions.syntax import Call, Collection, Node, Path, Select, path_of
 from wayside.expressions.syntax import Constant as Literal
-from wayside.geometry import shape_of
+from wayside.geo.geometry import shape_of
 
 _ARITHMETIC: Final = {"_+_": Op.ADD, "_-_": Op.SUBTRACT, "_*_": Op.MULTIPLY, "_/_": Op.DIVIDE}
 _ORDER: Final = {"_<_": (Op.LESS, False), "_<=_": (Op.LESS_EQUAL, False)} | {

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import math
 
-from wayside import geodesy
 from wayside.expressions.functions.declaring import Yields, function
 from wayside.expressions.functions.members import pair, place, sequence
-from wayside.geometry import Point, contains
+from wayside.geo import geodesy
+from wayside.geo.geometry import Point, contains
 
 
 def wgs84_distance(latitude1: float, longitude1: float, latitude2: float, longitude2: float) -> float:

@@ -10,8 +10,8 @@ import math
 from collections.abc import Callable
 from typing import Final
 
-from wayside import geodesy
 from wayside.expressions.functions.declaring import Yields, function
+from wayside.geo import geodesy
 
 OF_PLACES: Final = {
     "at_inside": "u v place:text",
@@ -25,7 +25,7 @@ OF_PLACES: Final = {
 
 def _at(name: str) -> Callable[..., float]:
     def calculated(*given: object) -> float:
-        from wayside.positions import at_one  # noqa: PLC0415  numpy is loaded by those who evaluate
+        from wayside.geo.positions import at_one  # noqa: PLC0415  numpy is loaded by those who evaluate
 
         *numbers, key = given
         return at_one(name, str(key), *numbers)  # type: ignore[arg-type]  # CEL has checked the types

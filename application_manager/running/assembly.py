@@ -1,0 +1,269 @@
+"""Wires the queues to their work.
+
+Events come in through the router, which enqueues keys. The work of a queue writes, notes in the cache what it did, and
+enqueues what depends on it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+
+from application_manager.cache.cluster_cache import DETECTOR, INSTANCE, TASK, TEMPLATE, ClusterCache
+from application_manager.cache.detector_index import DetectorIndex
+from application_manager.charts.chartcache import ChartCache
+from application_manager.charts.chartdesk import ChartDesk
+from application_manager.cluster.failedpods import FailedPodsLook
+from application_manager.cluster.nodes import NodeLook
+from application_manager.core.demand.decisions import Decision
+from application_manager.core.objects.policy import KindKey, Name
+from application_manager.measures import Measures
+from application_manager.observability.overview import Overview
+from application_manager.observability.tracing import LostSpans, TaskTraces
+from application_manager.running.headroom import Headroom
+from application_manager.running.options import Options
+from application_manager.watching.router import Router
+from application_manager.work.applying import Applier
+from application_manager.work.configurations import ConfigurationWork
+from application_manager.work.detectors import DetectorWork
+from application_manager.work.instances import InstanceWork
+from application_manager.work.instancestatus import InstanceStatusWork
+from application_manager.work.publishing import Publisher
+from application_manager.work.recorder import Recorder
+from application_manager.work.rendering import Renderings
+from application_manager.work.rulework import RuleKey, RuleWork
+from application_manager.work.sidecars import SidecarEvents
+from application_manager.work.statuses import StatusWriter
+from application_manager.work.suspending import Suspending
+from application_manager.work.tasks import TaskWork
+from application_manager.work.templates import TemplateWork
+from application_manager.workers.answers import AnswerCache
+from application_manager.workers.claiming import Claiming
+from application_manager.workers.pool import Pool
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.resources import Resource
+from wayside.kubernetes.workqueue import Key, WorkQueue
+from wayside.process.tracing import Tracing
+
+_JUDGING_PAUSE = (
+    0.3  # s from a change of a template, rule or detector to its status: changes that come together are one
+)
+_INSTANCE_WORKERS = 16
+_INSTANCE_SHARE = 6  # of these for one namespace: more requests at once make each take longer, also those of others
+_CONFIGURATION_WORKERS = 4
+_JUDGING_WORKERS = 4  # one a namespace: they mostly wait for worker processes
+_STATUS_WORKERS = 4
+_STATUS_SHARE = 2  # few: what runs goes before its status
+
+
+class Assembly:
+    """All queues of a manager.
+
+    Attributes:
+        cache: the objects of the cluster.
+        detector_index: what is known of Detectors that are run.
+        recorder: posts Events.
+        applier: applies manifests.
+        publisher: publishes configurations.
+        router: takes events.
+        charts: renders charts.
+        pool: runs users' expressions.
+        detectors: the queue of Detectors that are run.
+        queues: all of them.
+    """
+
+    def __init__(
+        self,
+        client: Client,
+        options: Options,
+        resources: dict[KindKey, Resource],
+        measures: Measures,
+        traced: Tracing | None,
+    ) -> None:
+        headroom = Headroom(options.memory_limit)
+        measures.registry.register(headroom)
+        self.cache = ClusterCache(options.policy, options.max_instances, headroom.tight, options.tasks)
+        self._traces = None if traced is None else TaskTraces(traced, self.cache)
+        if traced is not None:
+            measures.registry.register(LostSpans(traced))
+        self.recorder = Recorder(client, measures)
+        applier = self.applier = Applier(client, self.cache.store, resources)
+        measure = measures.reconciled
+        self._instances: WorkQueue[Name] = WorkQueue(
+            "instance", self._reconcile_instance, _INSTANCE_WORKERS, measure=measure, share=_INSTANCE_SHARE
+        )
+        self._statuses: WorkQueue[Name] = WorkQueue(
+            "instance status", self._say_instance, _STATUS_WORKERS, self._instances, measure, share=_STATUS_SHARE
+        )
+        self._tasks: WorkQueue[Name] = WorkQueue(
+            "task", self._reconcile_task, _STATUS_WORKERS, self._instances, measure, share=_STATUS_SHARE
+        )
+        self._templates: WorkQueue[Name] = WorkQueue(
+            "template", self._reconcile_template, _JUDGING_WORKERS, self._instances, measure, share=1
+        )
+        self._rules: WorkQueue[RuleKey] = WorkQueue(
+            "rule", self._reconcile_rule, _JUDGING_WORKERS, self._instances, measure, share=1
+        )
+        self.detector_index = DetectorIndex(options.detectors)
+        detectors = DetectorWork(
+            self.cache,
+            client,
+            self.detector_index,
+            lambda name: self._rules.add((DETECTOR, name)),
+            SidecarEvents(self.cache, self.detector_index, self.recorder),
+        )
+        self._detector_work = detectors
+        self.detectors: WorkQueue[Name] = WorkQueue("detector", self._reconcile_detector, 1, self._instances, measure)
+        queues = (self._instances, self._statuses, self._tasks, self._templates, self._rules, self.detectors)
+        measures.registry.register(Overview(self.cache, lambda: [(each.name, *each.depth) for each in queues]))
+        self.publisher = Publisher(options.zenoh)
+        self._configurations: WorkQueue[Name] = WorkQueue(
+            "configuration",
+            ConfigurationWork(self.cache, client, applier, self.publisher).reconcile,
+            _CONFIGURATION_WORKERS,
+            measure=measure,
+        )
+        self.queues = (*queues, self._configurations)
+        self.pool = Pool(measures, options.cpu_time)
+        self._answers = AnswerCache(self.pool)
+        self._claiming = Claiming(self._answers, self._claimed)
+        self.cache.claims.claim_of = self._claiming
+        self.router = Router(
+            self.cache,
+            applier,
+            self._instances.add,
+            self._tasks.add,
+            _soon(self._templates),
+            self._judge,
+            self._configurations.add,
+        )
+        self.cache.claims.settled = self.router.settled
+        self.cache.claims.moved = self.router.claimed
+        self.cache.overlap.every = options.resync
+        self.cache.overlap.resumed = lambda _: self.router.everything()
+        statuses = StatusWriter(client, self.recorder, self.router.observe)
+        self._status_work = InstanceStatusWork(
+            cache=self.cache,
+            statuses=statuses,
+            applier=applier,
+            instances=resources[INSTANCE],
+            task_changed=self._tasks.add,
+            nodes=NodeLook(client),
+            failed_pods=FailedPodsLook(client),
+            again=self._statuses.add_at,
+        )
+        cache = ChartCache(options.helm, options.chart_cache, options.chart_folder)
+        self.charts = ChartDesk(options.helm, cache, self._instances.add_at)
+        self._renderings = Renderings(
+            self.cache,
+            self._answers,
+            self.charts.outcome,
+            lambda name, _: self._instances.add(name),
+            self._templates.add,
+        )
+        self._instance_work = InstanceWork(
+            cache=self.cache,
+            client=client,
+            applier=applier,
+            recorder=self.recorder,
+            suspending=Suspending(client, applier, resources[INSTANCE], self.router.observe),
+            instances=resources[INSTANCE],
+            tasks=resources[TASK],
+            again=self._instances.add_at,
+            enqueue=self._instances.add,
+            done=self._statuses.add,
+            absent=self._absent,
+            not_made=self._status_work.report_not_made,
+            observe=self.router.observe,
+            configured=self._configurations.add,
+            objects=self._renderings.objects,
+        )
+        self._task_work = TaskWork(
+            cache=self.cache,
+            client=client,
+            statuses=statuses,
+            tasks=resources[TASK],
+            templates=resources[TEMPLATE],
+            ttl=options.ttl_after_finished,
+            again=self._tasks.add_at,
+            observe=self.router.observe,
+            measures=measures,
+            traces=self._traces,
+        )
+        self._template_work = TemplateWork(
+            cache=self.cache,
+            statuses=statuses,
+            templates=resources[TEMPLATE],
+            pool=self.pool,
+            again=self._templates.add_at,
+        )
+        self._rule_work = RuleWork(
+            cache=self.cache,
+            statuses=statuses,
+            resources=resources,
+            pool=self.pool,
+            detectors=self.detector_index,
+        )
+
+    async def close(self) -> None:
+        """End what works in the background."""
+        await self._answers.close()
+        await self.pool.close()
+        await self.charts.close()
+
+    def _absent(self, name: Name, decision: Decision | None) -> None:
+        self._renderings.forget(name)
+        self._status_work.report(name, decision, None)
+
+    def _claimed(self, name: Name) -> None:
+        self.router.claimed(name)
+
+    def begin_anew(self, children: Iterable[Resource]) -> None:
+        """Forget what we did: others may have acted since. `children` are the kinds of what templates create."""
+        self.cache.forget_work()
+        self.publisher.forget()
+        self.applier.begin(
+            entry.raw for each in children for _, entry in self.cache.store.all((each.api_version, each.kind))
+        )
+
+    def publish_all(self) -> None:
+        """Ask for the configurations of all instances to be published."""
+        for name, _ in self.cache.store.all(INSTANCE):
+            self._configurations.add(name)
+
+    async def _reconcile_instance(self, name: Name) -> None:
+        if self.cache.overlap.yields(name[0]):
+            return
+        if self._traces is None:
+            await self._instance_work.reconcile(name)
+        else:
+            await self._traces.reconciling(name, self._instance_work.reconcile)
+
+    async def _say_instance(self, name: Name) -> None:
+        if not self.cache.overlap.yields(name[0]):
+            await self._status_work.reconcile(name)
+
+    async def _reconcile_task(self, name: Name) -> None:
+        if not self.cache.overlap.yields(name[0]):
+            await self._task_work.reconcile(name)
+
+    async def _reconcile_template(self, name: Name) -> None:
+        await self._template_work.reconcile(name)
+
+    async def _reconcile_detector(self, name: Name) -> None:
+        if not self.cache.overlap.yields(name[0]):
+            await self._detector_work.reconcile(name)
+
+    async def _reconcile_rule(self, key: RuleKey) -> None:
+        if not self.cache.overlap.yields(key[1][0]):
+            await self._rule_work.reconcile(key)
+
+    def _judge(self, key: RuleKey) -> None:
+        """Ask for a rule or Detector to be judged, soon; a Detector's objects are looked after before."""
+        self._rules.add_at(key, time.time() + _JUDGING_PAUSE)
+        if key[0] == DETECTOR:
+            self.detectors.add(key[1])
+
+
+def _soon(queue: WorkQueue[Key]) -> Callable[[Key], None]:
+    return lambda key: queue.add_at(key, time.time() + _JUDGING_PAUSE)

@@ -1,0 +1,96 @@
+"""The checks before the manager starts: the kinds that it needs, and its rights."""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Mapping
+from functools import partial
+
+from application_manager.cache.cluster_cache import OWN_KINDS, POD, TASK
+from application_manager.cluster.entitlement import missing_rights, report_missing
+from application_manager.cluster.leadership import LeaseKey
+from application_manager.core.objects.policy import KindKey, Policy, kind_text
+from application_manager.core.objects.rights import lease_rights, read_only, rights
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.connection import ConfigurationError
+from wayside.kubernetes.errors import ApiError
+from wayside.kubernetes.repeating import until_answered
+from wayside.kubernetes.resources import Resource
+
+log = logging.getLogger(__name__)
+
+
+OLDEST = (1, 31)
+"""The oldest Kubernetes that works: 1.30 drops `selectableFields` of CRDs, by which an instance's tasks are listed."""
+
+
+async def recent_enough(client: Client) -> str:
+    """The API server's version. Raises ConfigurationError where it is older than `OLDEST`."""
+    version = await until_answered(client.server_version)
+    found = re.match(r"v?(\d+)\.(\d+)", version)
+    if found is not None and (int(found[1]), int(found[2])) < OLDEST:
+        raise ConfigurationError(
+            f"the API server is Kubernetes {version}, and {'.'.join(map(str, OLDEST))} is the oldest that works: older "
+            "ones drop selectableFields of custom resources, so no application would be released; upgrade the cluster"
+        )
+    return version
+
+
+async def selectable(client: Client, resources: Mapping[KindKey, Resource], namespaces: tuple[str, ...]) -> None:
+    """Look whether tasks can be listed by their template: CRDs of an older release, or a proxy, may not have it.
+
+    Raises ConfigurationError where not.
+    """
+    namespace = next(iter(sorted(namespaces)), None)
+    try:
+        await until_answered(partial(client.list, resources[TASK], namespace, fields="spec.templateName=none"))
+    except ApiError as error:
+        if error.code != 400:
+            raise
+        raise ConfigurationError(
+            f"ApplicationTasks cannot be selected by spec.templateName ({error.message}), so no application would ever "
+            "be released: run kubectl apply -f crds/ on Kubernetes 1.31 or newer"
+        ) from None
+
+
+async def discovered(client: Client, policy: Policy) -> dict[KindKey, Resource]:
+    """Where our own kinds and those of the policy live; a kind that the cluster lacks is left out, and logged.
+
+    Raises ConfigurationError where one of our own lacks, or one that is allowed is not namespaced.
+    """
+    found: dict[KindKey, Resource] = {}
+    for version in sorted({each[0] for each in (*OWN_KINDS, POD, *policy.kinds)}):
+        found |= await until_answered(partial(client.discover, version))
+    missing = [kind_text(kind) for kind in OWN_KINDS if kind not in found]
+    if missing:
+        raise ConfigurationError(f"the cluster has no kind {', '.join(missing)}: run kubectl apply -f crds/")
+    for kind in sorted(policy.kinds):
+        if kind not in found:
+            log.warning("the cluster has no kind %s: templates that use it fail", kind_text(kind))
+        elif not found[kind].namespaced:
+            raise ConfigurationError(f"{kind_text(kind)} is not namespaced and can never be allowed")
+    return found
+
+
+async def entitled(
+    client: Client,
+    policy: Policy,
+    resources: Mapping[KindKey, Resource],
+    namespaces: tuple[str, ...],
+    lease: LeaseKey,
+    *,
+    detectors: bool = False,
+) -> None:
+    """Look whether the account has the rights that it needs, and report those that are missing.
+
+    Of all namespaces it needs to read: in which ones it may write, is queried when something is to be written there.
+    `detectors`: whether the manager runs detectors too. Raises ConfigurationError where nothing works without.
+    """
+    plurals = {kind: resources[kind].plural for kind in policy.kinds if kind in resources}
+    needed_there = rights(plurals, detectors=detectors)
+    for needed, where in (
+        (needed_there if namespaces else read_only(needed_there), namespaces),
+        (lease_rights(lease.name), (lease.namespace,)),
+    ):
+        report_missing(await until_answered(partial(missing_rights, client, needed, where)))

@@ -1,0 +1,290 @@
+"""The running manager: what watches, what works and what answers, started in order and stopped at once.
+
+The order matters: all objects are listed before anything is decided, so that nothing is stopped for want of knowing
+what demands it. Then the watches and the periodic looks run side by side, and while this manager is the active one the
+queues too (`acting`); if one of them ends, all do. A standby knows all that the active one knows, and does nothing.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import signal
+from collections.abc import Coroutine
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import kopf
+
+from application_manager.admission.admission import Admission
+from application_manager.admission.injecting import Injecting
+from application_manager.admission.issuing import issuing
+from application_manager.admission.reviewing import Desk, webhook
+from application_manager.cache.cluster_cache import DETECTOR, OWN_KINDS, POD
+from application_manager.cluster.client import manager_client
+from application_manager.cluster.grants import Grants
+from application_manager.cluster.leadership import RENEWAL_TIMEOUT, Leadership
+from application_manager.core.findings.webhooks import INJECTION_PATH, PATH
+from application_manager.core.objects.policy import KindKey
+from application_manager.measures import Measures
+from application_manager.observability.pages import pages, stalled
+from application_manager.running.assembly import Assembly
+from application_manager.running.options import Options
+from application_manager.running.prerequisites import discovered, entitled, recent_enough, selectable
+from application_manager.running.watchdog import SILENT, watchdog
+from application_manager.watching.detectorwatch import DetectorWatch
+from application_manager.watching.leasewatch import LeaseWatch
+from application_manager.watching.listing import Listing
+from application_manager.watching.operator import watch
+from application_manager.watching.pulse import Pulse
+from application_manager.work.acting import acting, ended
+from wayside.api.applicationtemplate import TemplateManager
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.connection import ConfigurationError, load_configuration
+from wayside.kubernetes.errors import ApiError
+from wayside.kubernetes.pacing import Pacing, Share
+from wayside.kubernetes.repeating import until_answered
+from wayside.kubernetes.resources import Resource
+from wayside.process.tracing import Tracing, tracing
+
+log = logging.getLogger(__name__)
+
+
+async def serve(options: Options) -> None:
+    """Run the manager until SIGTERM or SIGINT.
+
+    Raises:
+        ConfigurationError: there is no cluster, it lacks our CRDs, or refuses what the manager needs, such as listing;
+            or the port for metrics is taken.
+    """
+    measures, traced = Measures(), tracing("wayside-application-manager")
+    client = manager_client(await load_configuration(), measures, pacing=Pacing(share=Share()))
+    renewals = manager_client(await load_configuration(), measures, timeout=RENEWAL_TIMEOUT)  # not held up by all else
+    leadership = Leadership(renewals, options.lease, measures)
+    client.may_act = leadership.remaining
+    try:
+        version = await recent_enough(client)
+        resources = await discovered(client, options.policy)
+        runs = options.detectors is not None
+        await entitled(client, options.policy, resources, options.namespaces, options.lease, detectors=runs)
+        await selectable(client, resources, options.namespaces)
+        helm = replace(options.helm, kube_version=version)
+        async with issuing(renewals, options.admission):
+            await Manager(client, replace(options, helm=helm), resources, measures, leadership, traced).run()
+    except ApiError as error:
+        raise ConfigurationError(
+            f"the API server refuses what the manager needs: {error}; check the account and its rights"
+        ) from error
+    finally:
+        await client.close()
+        await renewals.close()
+        if traced is not None:
+            traced.close()
+
+
+class Manager:
+    """All parts of one manager."""
+
+    def __init__(
+        self,
+        client: Client,
+        options: Options,
+        resources: dict[KindKey, Resource],
+        measures: Measures,
+        leadership: Leadership,
+        traced: Tracing | None = None,
+    ) -> None:
+        self._leadership = leadership
+        self._client = client
+        self._measures = measures
+        self._options = options
+        work = self._work = Assembly(client, options, resources, measures, traced)
+        own = [resources[kind] for kind in OWN_KINDS]
+        # Pods always: those of workloads show why they do not run.
+        children = [resources[kind] for kind in sorted({*options.policy.kinds, POD}) if kind in resources]
+        self._listing = Listing(
+            cache=work.cache,
+            client=client,
+            router=work.router,
+            own=own,
+            children=children,
+            namespaces=options.namespaces,
+            every=options.resync,
+            measures=measures,
+        )
+        work.cache.overlap.own = self._own_lease
+        self._pulse = Pulse(options.watch_timeout, lambda: work.cache.healthy.elapsed)
+        measures.registry.register(self._pulse)
+        self._detector_watch = DetectorWatch(
+            work.cache, client, work.detector_index, options.namespaces, work.detectors.add
+        )
+        self._grants = Grants(client, work.router.everything)
+        if not options.namespaces:
+            client.may_write = self._grants.may_write
+        self._leases = LeaseWatch(work.cache, client, own[0], options.namespaces, work.router.look_at)
+        self._admission = Admission(
+            cache=work.cache,
+            client=client,
+            resources=resources,
+            observe=work.router.observe,
+            measures=measures,
+            pool=work.pool,
+            namespaces=options.namespaces,
+            defaults=options.detectors,
+        )
+        self._injecting = Injecting(
+            cache=work.cache,
+            client=client,
+            detectors=resources[DETECTOR],
+            observe=work.router.observe,
+            measures=measures,
+            defaults=options.detectors,
+        )
+
+    async def run(self) -> None:
+        """Run until SIGTERM or SIGINT."""
+        stop = asyncio.Event()
+        watching = asyncio.Event()
+        desks = {
+            path: Desk(review, watching.is_set, self._measures)
+            for path, review in ((PATH, self._admission.review), (INJECTION_PATH, self._injecting.review))
+        }
+        _on_signals(stop)
+        limit = self._options.stalled_after
+        stall = stalled(self._measures, self._options.resync, self._work.queues, limit)
+
+        def healthy() -> str | None:
+            return stall() or self._pulse.dead()
+
+        ready = partial(self._lacks, watching)
+        async with (
+            watchdog(healthy, min(SILENT, limit)),
+            pages(
+                self._options.metrics_port,
+                self._measures,
+                healthy,
+                ready,
+                lambda: self._leadership.role,
+                self._options.metrics_certificates,
+            ),
+            webhook(self._options.admission, desks),
+        ):
+            try:
+                if await _until(stop, self._first()):
+                    await self._watch_and_act(watching, stop)
+                else:
+                    await self._leadership.release()
+            finally:
+                await self._work.close()
+
+    async def _first(self) -> None:
+        """Learn whether we are active, then list everything, so that who is active decides on what it saw since."""
+        await until_answered(self._leadership.look)
+        await self._listing.first()
+
+    def _lacks(self, watching: asyncio.Event) -> str | None:
+        if not watching.is_set() or not self._pulse.begun("applicationtasks"):
+            return "not everything is listed and watched yet"
+        return None if self._work.cache.healthy.reached else "the API server does not answer"
+
+    async def _watch_and_act(self, watching: asyncio.Event, stop: asyncio.Event) -> None:
+        tasks = [
+            asyncio.create_task(self._watch(watching), name="watches"),
+            asyncio.create_task(self._leases.run(), name="leases"),
+            asyncio.create_task(self._listing.resync(watching), name="resync"),
+            asyncio.create_task(self._detector_watch.run(), name="detectors"),
+            asyncio.create_task(self._leadership.run(), name="leadership"),
+            asyncio.create_task(self._grants.run(), name="grants"),
+            asyncio.create_task(self._act(stop), name="acting"),
+            asyncio.create_task(self._announce(watching, stop), name="signals"),
+        ]
+        try:
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            await ended(*tasks)
+        for task in done:
+            task.result()
+        log.info("stopped")
+
+    async def _act(self, stop: asyncio.Event) -> None:
+        """Act while we are active, until `stop` is set."""
+        await acting(
+            self._leadership,
+            self._client,
+            self._work.queues,
+            (self._work.publisher, self._work.recorder),
+            self._begin,
+            stop,
+        )
+
+    async def _begin(self, *, again: bool) -> None:
+        """Get ready to act. Where others may have acted since we looked, what we know comes from the cluster alone."""
+        if again:  # else it is listed since the Lease is ours
+            self._work.begin_anew(self._listing.children)
+            await self._listing.first()
+            self._work.publish_all()
+        self._work.cache.claims.begin()
+
+    async def _announce(self, watching: asyncio.Event, stop: asyncio.Event) -> None:
+        await watching.wait()
+        _on_signals(stop)  # kopf has put its own handlers in their place, which wait for tasks of ours
+        where = f"namespaces {', '.join(self._options.namespaces)}" if self._options.namespaces else "all namespaces"
+        log.info("watching %s", where)
+        await asyncio.Event().wait()  # `_act` is who ends all, once nothing is written any more
+
+    async def _watch(self, watching: asyncio.Event) -> None:
+        await watch(
+            self._listing.own,
+            self._listing.children,
+            observe=self._work.router.observe,
+            vanished=self._work.router.vanished,
+            relist=self._relist,
+            failed=self._measures.unhandled,
+            connect=self._connection,
+            namespaces=self._options.namespaces,
+            ready=watching,
+            pulse=self._pulse,
+        )
+
+    def _own_lease(self) -> TemplateManager | None:
+        found = self._leadership.lease
+        return TemplateManager(lease=found[0], since=found[1]) if found is not None else None
+
+    async def _relist(self, resource: Any, namespace: str | None, labels: str) -> None:
+        await self._listing.again(resource.group, resource.plural, namespace, labels)
+
+    async def _connection(self) -> kopf.ConnectionInfo:
+        configuration = self._client.configuration
+        token = await configuration.get_api_key_with_prefix("BearerToken", alias="authorization")
+        scheme, _, credentials = (token or "").partition(" ")
+        return kopf.ConnectionInfo(
+            server=configuration.host,
+            ca_path=configuration.ssl_ca_cert,
+            ca_data=None if configuration.ssl_ca_cert else configuration.ca_cert_data,
+            insecure=not configuration.verify_ssl,
+            scheme=scheme if credentials else None,
+            token=credentials or scheme or None,
+            certificate_path=configuration.cert_file,
+            private_key_path=configuration.key_file,
+        )
+
+
+def _on_signals(stop: asyncio.Event) -> None:
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, stop.set)
+
+
+async def _until(stop: asyncio.Event, work: Coroutine[None, None, None]) -> bool:
+    """Do the work unless `stop` is set; whether it was done."""
+    working = asyncio.create_task(work)
+    stopping = asyncio.create_task(stop.wait())
+    await asyncio.wait((working, stopping), return_when=asyncio.FIRST_COMPLETED)
+    stopping.cancel()
+    if not working.done():
+        working.cancel()
+        await asyncio.gather(working, return_exceptions=True)
+        return False
+    working.result()
+    return True

@@ -1,1 +1,0 @@
-"""The Kubernetes API as the detector uses it: one connection, typed errors, and lists that are kept current."""

@@ -1,0 +1,83 @@
+"""What a request to the API server may raise."""
+
+from __future__ import annotations
+
+_BAD_MANIFEST = "failed to create typed patch object"
+_TRANSIENT = frozenset({401, 408, 409, 429})  # 401: a token that was just renewed is read again with the next request
+
+
+class RequestError(Exception):
+    """A request to the API server failed.
+
+    Attributes:
+        reason: one word, as the API server gives it.
+        retry_after: seconds to wait that the API server requests; None where it requests none.
+        permanent: whether repeating the request is in vain.
+    """
+
+    reason = "Unknown"
+    retry_after: float | None = None
+    permanent = False
+
+
+class Unreachable(RequestError):  # noqa: N818  a state of the world
+    """The API server gave no answer."""
+
+    reason = "NoAnswer"
+
+
+class NotActive(Unreachable):
+    """Another manager is active, or may be: nothing is written."""
+
+    def __init__(self) -> None:
+        super().__init__("this manager is not the active one and writes nothing")
+
+
+class NotGranted(Unreachable):
+    """The account may not write in this namespace: nothing is written there, and nothing needs to be tried again."""
+
+    def __init__(self, namespace: str) -> None:
+        super().__init__(f"namespace {namespace} is not granted to this manager, which writes nothing there")
+
+
+class ApiError(RequestError):
+    """The API server refused.
+
+    Attributes:
+        code: the HTTP status.
+        message: the API server's message.
+        causes: the reasons of the causes, such as NamespaceTerminating.
+    """
+
+    def __init__(
+        self,
+        code: int,
+        message: str,
+        retry_after: float | None = None,
+        causes: tuple[str, ...] = (),
+        reason: str = "Unknown",
+    ) -> None:
+        super().__init__(f"{message} (HTTP {code})")
+        self.code = code
+        self.message = message
+        self.retry_after = retry_after
+        self.causes = causes
+        self.reason = reason
+        self.permanent = _BAD_MANIFEST in message if code >= 500 else code not in _TRANSIENT
+        """A bad request, or a manifest of the wrong types (HTTP 500)."""
+
+    @property
+    def exists(self) -> bool:
+        """Whether there is an object of the name already."""
+        return self.code == 409 and self.reason == "AlreadyExists"
+
+    @property
+    def terminating(self) -> bool:
+        """Whether the namespace is going or gone."""
+        gone = self.code == 404 and self.message.startswith("namespaces ")
+        return gone or "NamespaceTerminating" in self.causes
+
+    @property
+    def replaced(self) -> bool:
+        """Whether the object has another uid than the request requires: it was replaced by a namesake."""
+        return self.code == 409 and "UID in precondition" in self.message

@@ -1,0 +1,139 @@
+"""A list of objects that is kept current: list, watch from there, and list again whenever in doubt.
+
+A watch may lose its connection, or the server the history that it needs (410); and no watch proves that nothing was
+missed. So each watch lasts one resync period only, and whatever ends it, a fresh list follows. What the world looked
+like in the meantime does not matter: the list is the current state.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import AsyncGenerator
+from contextlib import aclosing
+from dataclasses import dataclass
+
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.errors import ApiError, RequestError
+from wayside.kubernetes.resources import Object, Resource
+from wayside.process.backoff import Backoff
+
+_log = logging.getLogger(__name__)
+
+_PAUSE = 0.1
+"""Seconds between the end of a watch and the next list."""
+
+
+@dataclass(frozen=True)
+class Replaced:
+    """All existing objects; any other object known before is deleted."""
+
+    objects: list[Object]
+    version: int
+    """The resource version of the list: changes of an object with a greater one are newer than the list."""
+
+
+@dataclass(frozen=True)
+class Changed:
+    """An object was created or changed."""
+
+    object: Object
+
+
+@dataclass(frozen=True)
+class Deleted:
+    """An object is gone; its last state."""
+
+    object: Object
+
+
+Change = Replaced | Changed | Deleted
+
+
+def version_of(obj: Object) -> int:
+    """An object's resource version; the API guarantees that they are integers that only grow."""
+    return int(obj["metadata"]["resourceVersion"])
+
+
+class Reflector:
+    """Follows the objects of one kind in one namespace, for as long as one iterates."""
+
+    def __init__(
+        self,
+        client: Client,
+        resource: Resource,
+        namespace: str,
+        *,
+        labels: str = "",
+        fields: str = "",
+        resync: float = 30.0,
+    ) -> None:
+        """Prepare.
+
+        Args:
+            client: for the API server.
+            resource: which kind.
+            namespace: where.
+            labels: only what this label selector matches.
+            fields: only what this field selector matches.
+            resync: seconds after which all is listed again, even if nothing seems to be missing.
+        """
+        self._client = client
+        self._resource = resource
+        self._namespace = namespace
+        self._labels = labels
+        self._fields = fields
+        self._resync = resync
+        self._backoff = Backoff(0.1, 5.0)
+        self.lists = 0
+        """Lists so far."""
+        self.outages = 0
+        """How often the server stopped answering or refused."""
+
+    async def follow(self) -> AsyncGenerator[Change, None]:
+        """The list, then its changes. Never ends and raises nothing; errors are logged, counted and retried."""
+        while True:
+            try:
+                objects, version = await self._client.list(
+                    self._resource, self._namespace, labels=self._labels, fields=self._fields
+                )
+                self._recovered()
+                yield Replaced(objects, int(version))
+                async with aclosing(self._watch(version)) as changes:
+                    async for change in changes:
+                        yield change
+                await asyncio.sleep(_PAUSE)  # do not flood a server that ends each watch at once with lists
+            except RequestError as error:
+                gone = isinstance(error, ApiError) and error.code == 410  # its history, but the server is there
+                await asyncio.sleep(_PAUSE if gone else self._failed(error))
+
+    async def _watch(self, since: str) -> AsyncGenerator[Change, None]:
+        events = self._client.watch(
+            self._resource,
+            self._namespace,
+            labels=self._labels,
+            fields=self._fields,
+            since=since,
+            seconds=self._resync,
+        )
+        async with aclosing(events):
+            async for event in events:
+                kind = Deleted if event["type"] == "DELETED" else Changed
+                yield kind(event["object"])
+
+    def _recovered(self) -> None:
+        self.lists += 1
+        if self._backoff.failures:
+            _log.info("reading the %s of namespace %s again", self._resource.plural, self._namespace)
+        self._backoff.succeed()
+
+    def _failed(self, error: RequestError) -> float:
+        if not self._backoff.failures:
+            self.outages += 1
+            _log.warning(
+                "cannot read the %s of namespace %s; retrying with backoff: %s",
+                self._resource.plural,
+                self._namespace,
+                error,
+            )
+        return self._backoff.fail(error.retry_after or 0.0)

@@ -1,0 +1,66 @@
+"""Requests to the API server that are repeated: until it answers, or again and again."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Awaitable, Callable
+from typing import TypeVar
+
+from wayside.kubernetes.connection import ConfigurationError
+from wayside.kubernetes.errors import ApiError, RequestError
+
+_FAILURES = (RequestError, ConfigurationError)
+
+PAUSE = 1.0  # s between two attempts, unless the API server requests more
+
+Answer = TypeVar("Answer")
+
+log = logging.getLogger(__name__)
+
+
+async def until_answered(request: Callable[[], Awaitable[Answer]], pause: float = PAUSE) -> Answer:
+    """The answer, however long it takes; logs once that the API server is away, overloaded or starting.
+
+    Args:
+        request: sends the request once.
+        pause: seconds between two attempts.
+
+    Raises:
+        ApiError: what another attempt cannot change, such as missing rights or credentials.
+    """
+    waiting = False
+    while True:
+        try:
+            answer = await request()
+        except RequestError as error:
+            if isinstance(error, ApiError) and (error.permanent or error.code == 401):
+                raise
+            if not waiting:
+                log.warning("%s; retrying until the API server answers", error)
+            waiting = True
+            await asyncio.sleep(max(pause, error.retry_after or 0.0))
+        else:
+            if waiting:
+                log.info("the API server answers")
+            return answer
+
+
+async def repeatedly(look: Callable[[], Awaitable[object]], every: float, problem: str) -> None:
+    """Look again and again, until cancelled. A failure is logged once for each reason, and retried at the next look.
+
+    Args:
+        look: looks once.
+        every: seconds between two looks.
+        problem: what cannot be done, for the log; empty where somebody else reports failures.
+    """
+    reported = ""
+    while True:
+        try:
+            await look()
+            reported = ""
+        except _FAILURES as error:
+            if problem and str(error) != reported:
+                log.warning("%s: %s", problem, error)
+            reported = str(error)
+        await asyncio.sleep(every)

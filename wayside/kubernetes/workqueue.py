@@ -1,0 +1,246 @@
+"""Keys to reconcile: each at most once at a time, several at once, again after a failure.
+
+Namespaces take turns, and none may have all workers where a `share` is given: a flood of keys in one delays no other.
+
+A key that is added while it waits is not added again; added while it runs, it runs once more afterwards. So
+there are never more entries than objects, and the queue needs no other bound. A failure is tried again after a growing,
+jittered pause, or after what the API server requests.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+import time
+from collections import Counter
+from collections.abc import Awaitable, Callable, Hashable
+from contextlib import suppress
+from typing import Any, Generic, Protocol, TypeVar
+
+from wayside.kubernetes.errors import NotGranted, RequestError
+from wayside.kubernetes.turns import Turns
+from wayside.process.backoff import pause_after
+
+Key = TypeVar("Key", bound=Hashable)
+
+FIRST_PAUSE = 0.2  # s, doubled with every failure of the key
+LONGEST_PAUSE = 10.0  # s
+_TURN = 0.05  # s until it is looked again whether the queue before this one has keys of a namespace
+_YIELDING = 0.25  # s that a worker waits for the keys of a namespace in the queue before this one
+_SHORTEST_DELAY = 0.1  # s, so that a time that is nearly there does not spin
+
+log = logging.getLogger(__name__)
+
+
+class Measure(Protocol):
+    """Takes the time of each reconciliation, in seconds, and whether it failed and is retried."""
+
+    def __call__(self, queue: str, seconds: float, *, failed: bool) -> None:
+        """A queue's work on one key ended."""
+
+
+class WorkQueue(Generic[Key]):
+    """Runs `work(key)` for every key added, on `concurrency` workers.
+
+    While keys of a namespace wait in the queue `after`, those of the namespace in this one are slowed down to four a
+    second and worker.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        work: Callable[[Key], Awaitable[None]],
+        concurrency: int,
+        after: WorkQueue[Any] | None = None,
+        measure: Measure | None = None,
+        share: int | None = None,
+    ) -> None:
+        """Make it.
+
+        Args:
+            name: for logs and metrics.
+            work: reconciles a key.
+            concurrency: how many keys are worked on at a time.
+            after: the queue that goes first.
+            measure: gets each reconciliation.
+            share: how many keys of one namespace are worked on at a time; None: any number.
+        """
+        self.name = name
+        self._measure = measure
+        self._after = after
+        self._work = work
+        self._concurrency = concurrency
+        self._share = share
+        self._waiting: Turns[Key] = Turns()
+        self._at_work: Counter[str] = Counter()  # keys by namespace
+        self._queued: set[Key] = set()
+        self._running: dict[Key, float] = {}  # and since when, on the monotonic clock
+        self._again: set[Key] = set()
+        self._failures: Counter[Key] = Counter()
+        self._timers: dict[Key, asyncio.TimerHandle] = {}
+        self._wake = asyncio.Event()
+        self._idle = asyncio.Event()
+        self._idle.set()
+        self._ending = False
+
+    @property
+    def depth(self) -> tuple[int, int]:
+        """How many keys wait for a worker, and how many for their time."""
+        return len(self._queued), len(self._timers)
+
+    def __len__(self) -> int:
+        """Number of keys that wait for a worker, or that a worker processes."""
+        return len(self._queued) + len(self._running)
+
+    async def idle(self) -> None:
+        """Wait until no key waits for a worker and none is processed; keys that wait for their time do not count."""
+        await self._idle.wait()
+
+    def stuck(self, limit: float) -> str | None:
+        """The key that a worker is at for longer than this number of seconds, in words; any thread may call it."""
+        now = time.monotonic()
+        for key, began in list(self._running.items()):
+            if now - began > limit:
+                return f"{self.name} {_text(key)} is worked on for {now - began:.0f} s"
+        return None
+
+    def add(self, key: Key) -> None:
+        """Enqueue the key."""
+        if key in self._running:
+            self._again.add(key)
+        elif key not in self._queued:
+            self._queued.add(key)
+            self._waiting.add(_namespace(key), key)
+            self._wake.set()
+            self._idle.clear()
+
+    def add_at(self, key: Key, when: float) -> None:
+        """Enqueue the key at `when`, in seconds since 1970; the earliest time counts."""
+        self._add_after(key, max(_SHORTEST_DELAY, when - time.time()))
+
+    def _add_after(self, key: Key, delay: float) -> None:
+        loop = asyncio.get_running_loop()
+        known = self._timers.get(key)
+        if known is not None:
+            if known.when() <= loop.time() + delay:
+                return
+            known.cancel()
+        self._timers[key] = loop.call_later(delay, self._fire, key)
+
+    def _fire(self, key: Key) -> None:
+        self._timers.pop(key, None)
+        self.add(key)
+
+    def finish(self) -> None:
+        """Begin no further key, for good: `run` returns once those that are worked on are done."""
+        self._ending = True
+        self._wake.set()
+
+    async def run(self) -> None:
+        """Work until cancelled, or finished. Cancelled, it can be run again, and continues with what waits."""
+        try:
+            async with asyncio.TaskGroup() as group:
+                for index in range(self._concurrency):
+                    group.create_task(self._worker(), name=f"{self.name} worker {index}")
+        finally:
+            for timer in self._timers.values():
+                timer.cancel()
+            self._timers.clear()
+
+    async def _worker(self) -> None:
+        while not self._ending:
+            key = await self._take()
+            if key is None:
+                return
+            self._queued.discard(key)
+            self._running[key] = time.monotonic()
+            namespace = _namespace(key)
+            self._at_work[namespace] += 1
+            try:
+                await self._once(key)
+            finally:
+                self._leave(key, namespace)
+            _heed_cancellation()
+
+    def _leave(self, key: Key, namespace: str) -> None:
+        """Note that the key is not processed any more."""
+        del self._running[key]
+        self._at_work[namespace] -= 1
+        if not self._at_work[namespace]:
+            del self._at_work[namespace]
+        if self._share is not None:
+            self._wake.set()  # another worker may have let this namespace wait
+        if key in self._again:
+            self._again.discard(key)
+            self.add(key)
+        if not len(self):
+            self._idle.set()
+
+    async def _take(self) -> Key | None:
+        """Wait for the key whose turn it is; None at the end."""
+        yields_until = math.inf
+        while not self._ending:
+            key = self._waiting.next(lambda namespace: self._may(namespace) and not self._yields(namespace))
+            if key is None and time.monotonic() > yields_until:
+                key = self._waiting.next(self._may)
+            if key is not None:
+                return key
+            yielding = self._after is not None and bool(self._waiting)
+            yields_until = min(yields_until, time.monotonic() + _YIELDING) if yielding else math.inf
+            self._wake.clear()
+            with suppress(TimeoutError):
+                async with asyncio.timeout(_TURN if yielding else None):
+                    await self._wake.wait()
+        return None
+
+    def _may(self, namespace: str) -> bool:
+        """Whether the namespace has not its share of the workers yet."""
+        return self._share is None or self._at_work[namespace] < self._share
+
+    def _yields(self, namespace: str) -> bool:
+        """Whether keys of the namespace wait in the queue before this one."""
+        return self._after is not None and namespace in self._after._waiting
+
+    async def _once(self, key: Key) -> None:
+        began, failed = time.monotonic(), True
+        try:
+            await self._work(key)
+        except NotGranted:
+            self._failures.pop(key, None)  # once the namespace is granted, all its keys are enqueued
+        except RequestError as error:
+            pause = self._pause(key, error.retry_after)
+            log.warning("%s %s: %s; again in %.1f s", self.name, _text(key), error, pause)
+            self._add_after(key, pause)
+        except Exception:  # a defect in one key's work must not stop the others; it is logged, and tried again
+            pause = self._pause(key, None)
+            log.exception("%s %s failed; again in %.1f s", self.name, _text(key), pause)
+            self._add_after(key, pause)
+        else:
+            failed = False
+            self._failures.pop(key, None)
+        if self._measure is not None:
+            self._measure(self.name, time.monotonic() - began, failed=failed)
+
+    def _pause(self, key: Key, at_least: float | None) -> float:
+        self._failures[key] += 1
+        return max(at_least or 0.0, pause_after(self._failures[key], FIRST_PAUSE, LONGEST_PAUSE))
+
+
+def _heed_cancellation() -> None:
+    """Be cancelled where a cancellation was lost: gather gives an error of one of its parts in place of it."""
+    task = asyncio.current_task()
+    if task is not None and task.cancelling():
+        raise asyncio.CancelledError
+
+
+def _namespace(key: object) -> str:
+    """The namespace of a name, or of a kind with a name; a key of another form has none."""
+    match key:
+        case (str(namespace), str()) | (_, (str(namespace), str())):
+            return namespace
+    return ""
+
+
+def _text(key: object) -> str:
+    return "/".join(map(str, key)) if isinstance(key, tuple) else str(key)

@@ -1,0 +1,1 @@
+"""What every process of ours needs: its start, command line, certificate, traces and retries."""

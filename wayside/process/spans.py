@@ -1,0 +1,166 @@
+"""The only module that imports OpenTelemetry: spans that are over, with ids of our choice, into the SDK's exporter."""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+from collections.abc import Sequence
+
+from opentelemetry import trace
+from opentelemetry.exporter.otlp.proto.http.trace_exporter import OTLPSpanExporter
+from opentelemetry.sdk.resources import Resource
+from opentelemetry.sdk.trace import ReadableSpan, SpanProcessor, TracerProvider
+from opentelemetry.sdk.trace.export import BatchSpanProcessor, SpanExporter, SpanExportResult
+from opentelemetry.sdk.trace.id_generator import IdGenerator, RandomIdGenerator
+from opentelemetry.sdk.trace.sampling import Decision
+
+from wayside.process.tracecontext import Span, TraceContext
+
+_QUEUE = 2048
+"""The SDK's default for OTEL_BSP_MAX_QUEUE_SIZE."""
+
+
+class _Ids(IdGenerator):
+    """Gives the ids that the present span of this thread is to have, else random ones."""
+
+    def __init__(self) -> None:
+        self._random = RandomIdGenerator()
+        self.wanted = threading.local()
+
+    def generate_trace_id(self) -> int:
+        wanted: TraceContext | None = getattr(self.wanted, "context", None)
+        return self._random.generate_trace_id() if wanted is None else wanted.trace_id
+
+    def generate_span_id(self) -> int:
+        wanted: TraceContext | None = getattr(self.wanted, "context", None)
+        return self._random.generate_span_id() if wanted is None else wanted.span_id
+
+    def is_trace_id_random(self) -> bool:
+        return False
+
+
+class _Exporter(SpanExporter):
+    """The OTLP exporter, and what becomes of spans there."""
+
+    def __init__(self) -> None:
+        self._inner = OTLPSpanExporter()
+        self.taken = 0
+        self.failed = 0
+
+    def export(self, spans: Sequence[ReadableSpan]) -> SpanExportResult:
+        self.taken += len(spans)
+        result = SpanExportResult.FAILURE
+        try:
+            result = self._inner.export(spans)
+        finally:
+            if result is not SpanExportResult.SUCCESS:
+                self.failed += len(spans)
+        return result
+
+    def shutdown(self) -> None:
+        self._inner.shutdown()  # type: ignore[no-untyped-call]
+
+
+class _Bounded(SpanProcessor):
+    """Before the SDK's queue: what finds it full is dropped and counted, instead of what waits the longest."""
+
+    def __init__(self, exporter: _Exporter) -> None:
+        self._exporter = exporter
+        self._queue = BatchSpanProcessor(exporter)
+        self._capacity = _capacity()
+        self._lock = threading.Lock()
+        self._queued = 0
+        self.dropped = 0
+
+    def on_end(self, span: ReadableSpan) -> None:
+        if span.context is None or not span.context.trace_flags.sampled:
+            return
+        with self._lock:
+            if self._queued - self._exporter.taken >= self._capacity:
+                self.dropped += 1
+                return
+            self._queued += 1
+        self._queue.on_end(span)
+
+    def shutdown(self) -> None:
+        self._queue.shutdown()  # type: ignore[no-untyped-call]
+
+
+class Exporting:
+    """The SDK, as the standard environment variables set it."""
+
+    def __init__(self, service: str, *, export: bool) -> None:
+        """`service` counts where OTEL_SERVICE_NAME or OTEL_RESOURCE_ATTRIBUTES name none."""
+        # Failures are counted and reported on request; the SDK would log each batch.
+        logging.getLogger("opentelemetry.exporter").setLevel(logging.CRITICAL)
+        own = {} if _names_service() else {"service.name": service}
+        self._ids = _Ids()
+        self._provider = TracerProvider(resource=Resource.create(own), shutdown_on_exit=False, id_generator=self._ids)
+        self._bounded: _Bounded | None = None
+        self._exporter: _Exporter | None = None
+        if export:
+            self._exporter = _Exporter()
+            self._bounded = _Bounded(self._exporter)
+            self._provider.add_span_processor(self._bounded)
+        self._tracer = self._provider.get_tracer("wayside")
+
+    @property
+    def dropped(self) -> int:
+        """Spans that found the queue full."""
+        return self._bounded.dropped if self._bounded is not None else 0
+
+    @property
+    def failed(self) -> int:
+        """Spans that the endpoint did not take."""
+        return self._exporter.failed if self._exporter is not None else 0
+
+    def samples(self, context: TraceContext, name: str) -> bool:
+        """Whether the sampler records a trace that begins with this span."""
+        decision = self._provider.sampler.should_sample(None, context.trace_id, name).decision
+        return decision is Decision.RECORD_AND_SAMPLE
+
+    def emit(self, span: Span) -> TraceContext:
+        """Queue a span; where it stands."""
+        parent = None if span.parent is None else trace.set_span_in_context(_remote(span.parent))
+        self._ids.wanted.context = span.context
+        try:
+            made = self._tracer.start_span(
+                span.name,
+                context=parent,
+                attributes=dict(span.attributes),
+                links=[trace.Link(_remote(each).get_span_context()) for each in span.links],
+                start_time=span.start,
+            )
+        finally:
+            self._ids.wanted.context = None
+        if span.error is not None:
+            made.set_status(trace.Status(trace.StatusCode.ERROR, span.error))
+        made.end(max(span.start, span.end))
+        at = made.get_span_context()
+        return TraceContext(at.trace_id, at.span_id, at.trace_flags.sampled)
+
+    def close(self) -> None:
+        """Hand over what waits. May take as long as the exporter does."""
+        self._provider.shutdown()
+
+
+def _remote(context: TraceContext) -> trace.NonRecordingSpan:
+    flags = trace.TraceFlags(trace.TraceFlags.SAMPLED if context.sampled else trace.TraceFlags.DEFAULT)
+    return trace.NonRecordingSpan(
+        trace.SpanContext(context.trace_id, context.span_id, is_remote=True, trace_flags=flags)
+    )
+
+
+def _names_service() -> bool:
+    attributes = os.environ.get("OTEL_RESOURCE_ATTRIBUTES", "").split(",")
+    return bool(os.environ.get("OTEL_SERVICE_NAME")) or any(
+        each.partition("=")[0].strip() == "service.name" for each in attributes
+    )
+
+
+def _capacity() -> int:
+    try:
+        return int(os.environ.get("OTEL_BSP_MAX_QUEUE_SIZE") or _QUEUE)
+    except ValueError:
+        return _QUEUE  # as in the SDK, which logs it
