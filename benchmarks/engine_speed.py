@@ -35,6 +35,7 @@ from benchmarks.workloads import esper, speeds
 from benchmarks.workloads.driving import replayed
 from detector.engine.episodes.events import Event
 from detector.engine.samples.sample import Arrival
+from detector.memory import tune_garbage_collection
 from wayside.api import EventRule
 
 PLAIN_UP_TO = 5
@@ -65,8 +66,7 @@ def main() -> int:
     )
     if options.esper:
         esper.build()
-    gc.collect()
-    gc.freeze()
+    tune_garbage_collection()
     same = True
     with tempfile.TemporaryDirectory() as folder:
         recording = Path(folder) / "recording.jsonl"

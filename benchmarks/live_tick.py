@@ -21,6 +21,7 @@ import msgspec
 from benchmarks.workloads import speeds
 from benchmarks.workloads.driving import Live, by_tick
 from detector.engine.samples.sample import Arrival
+from detector.memory import tune_garbage_collection
 from wayside.api import EventRule
 
 HZ = 100
@@ -78,8 +79,7 @@ def measure(rules: Sequence[EventRule], clients: int, ticks: int, fill: float) -
     live = Live(speeds.detector(), rules, speeds.START - 1)
     for tick, part in parts[:before]:
         live.advance(part, tick)
-    gc.collect()
-    gc.freeze()
+    tune_garbage_collection()
     spent = Spent([], [], sum(len(part) for _, part in parts[before:]))
     for tick, part in parts[before:]:
         begin = time.process_time_ns()
