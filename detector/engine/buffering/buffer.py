@@ -136,13 +136,14 @@ class Lane:
         samples, horizon = self.samples, now - self.duration
         if not samples or samples[0].received > horizon:
             return 0
-        pop = samples.popleft
-        freed = self._freed([pop() for _ in range(bisect_right(samples, horizon, 0, len(samples) - 1, key=_RECEIVED))])
+        freed = self._drop(bisect_right(samples, horizon, 0, len(samples) - 1, key=_RECEIVED))
         self.bytes -= freed
         return freed
 
-    def _freed(self, samples: Sequence[Sample]) -> int:
-        return bytes_of(samples)
+    def _drop(self, count: int) -> int:
+        """Forget that many of the oldest samples; returns the bytes that they took."""
+        pop = self.samples.popleft
+        return sum([len(pop().payload) for _ in range(count)]) + SAMPLE_OVERHEAD * count
 
     def step_back(self, to: int) -> None:
         """Time goes on from `to`, which is earlier: forget all samples, and that there were any."""
@@ -176,8 +177,9 @@ class ItemLane(Lane):
         """See Lane."""
         return (sample.share if isinstance(sample, Item) else len(sample.payload)) + SAMPLE_OVERHEAD
 
-    def _freed(self, samples: Sequence[Sample]) -> int:
-        return sum(map(self.size_of, samples))
+    def _drop(self, count: int) -> int:
+        """See Lane."""
+        return sum(self.size_of(self.samples.popleft()) for _ in range(count))
 
 
 class Buffer:
@@ -228,10 +230,9 @@ class Buffer:
         for lane in self:
             self.bytes -= lane.expire(now)
 
-    def latest(self) -> Iterator[tuple[str, int]]:
-        """Of each client, the greatest time of what came on any stream."""
-        for client, lanes in self._lanes.items():
-            yield client, max(lane.latest for lane in lanes.values())
+    def latest(self, client: str) -> int:
+        """The greatest time of what came from the client on any stream; NEVER where nothing did."""
+        return max([lane.latest for lane in self._lanes.get(client, {}).values()], default=NEVER)
 
     def forget(self, client: str, streams: Collection[str] | None = None) -> None:
         """Drop all lanes of a client, or those of some streams."""

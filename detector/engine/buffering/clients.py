@@ -15,10 +15,11 @@ from detector.engine.samples.liveliness import Tokens
 
 @dataclass(slots=True)
 class Presence:
-    """Since when a client is known, and when something was last received from it; nanoseconds."""
+    """Since when a client is known, and when something was last received from it or before; nanoseconds."""
 
     since: int
     last: int
+    """Or earlier: what came since then is in the buffer."""
     patience: int | None = None
     """How long it is known without a sample, in nanoseconds; None: for the Detector's `clientTimeout`."""
     restored: bool = False
@@ -28,10 +29,11 @@ class Presence:
 class Clients:
     """The known clients and their labels."""
 
-    def __init__(self, labels: Mapping[str, Mapping[str, str]], timeout: int) -> None:
-        """`labels` are those of clients known beforehand; `timeout` is in nanoseconds."""
-        self._labels = labels
-        self._timeout = timeout
+    def __init__(self, buffer: Buffer) -> None:
+        """`buffer` has what was received from them; `configure` follows."""
+        self._buffer = buffer
+        self._labels: Mapping[str, Mapping[str, str]] = {}
+        self._timeout = 0
         self._expected: frozenset[str] = frozenset()
         self._present: dict[str, Presence] = {}
         self._sorted: list[str] | None = None
@@ -49,6 +51,7 @@ class Clients:
 
         The timeout of one that no longer is counts from `now` at the earliest.
         """
+        self._look()  # streams may go from the buffer
         self._labels, self._timeout = labels, timeout
         self._loss = NEVER
         for client in self._expected.difference(expected):
@@ -92,8 +95,21 @@ class Clients:
             presence.last = time
 
     def may_lose(self, now: int) -> bool:
-        """Whether `lose` may have something to do: it costs a look at every client."""
+        """Whether `lose` has something to do, or a token came or went."""
+        if not self.tokens.changed and self._loss is not None and now > self._loss:
+            self._look()
         return self.tokens.changed or (self._loss is not None and now > self._loss)
+
+    def _look(self) -> None:
+        """See when something was last received from each client, and before when none is lost by that."""
+        for name, presence in self._present.items():
+            presence.last = max(presence.last, self._buffer.latest(name))
+        waited = (
+            presence.last + self._timeout_of(presence)
+            for name, presence in self._present.items()
+            if name not in self._expected and not self.tokens.hold(name)
+        )
+        self._loss = min(waited, default=None)
 
     def lose(self, now: int) -> list[str]:
         """Forget the clients that have timed out without a token, or dropped their last one; returns them.
@@ -101,6 +117,7 @@ class Clients:
         One that is expected is never lost.
         """
         tokens = self.tokens
+        self._look()
         lost = [
             name
             for name, presence in self._present.items()
@@ -111,12 +128,6 @@ class Clients:
         for name in lost:
             del self._present[name]
             self._sorted = None
-        waited = (
-            presence.last + self._timeout_of(presence)
-            for name, presence in self._present.items()
-            if name not in self._expected and not tokens.hold(name)
-        )
-        self._loss = min(waited, default=None)
         return lost
 
     def _timeout_of(self, presence: Presence) -> int:
@@ -131,11 +142,10 @@ class Clients:
 
     def missing(self, now: int) -> list[str]:
         """The expected clients that would be lost if they were not expected, by name; `now` in nanoseconds."""
-        present = self._present
         return [
             name
             for name in sorted(self._expected)
-            if now - present[name].last > self._timeout and not self.tokens.hold(name)
+            if now - self.last(name) > self._timeout and not self.tokens.hold(name)
         ]
 
     def knows(self, client: str, time: int) -> bool:
@@ -149,7 +159,7 @@ class Clients:
 
     def last(self, client: str) -> int:
         """When something was last received from the client, in nanoseconds since the epoch."""
-        return self._present[client].last
+        return max(self._present[client].last, self._buffer.latest(client))
 
     def labels(self, client: str) -> Mapping[str, str]:
         """The labels that the Detector gives the client."""

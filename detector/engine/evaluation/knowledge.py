@@ -56,7 +56,7 @@ class Knowledge:
             RuleError: an expression of one of the Detector's streams does not compile.
         """
         self.buffer = Buffer(detector.spec.buffer.bytes.bytes)
-        self.clients = Clients({}, detector.spec.client_timeout.ns)
+        self.clients = Clients(self.buffer)
         self.ingest = Ingest(self.buffer, self.clients, counters)
         self._counters = counters
         self._starts = starts
@@ -156,9 +156,7 @@ class Knowledge:
             if self.tables.behind:
                 self.settle()  # while the buffer still has what the ticks that wait look at
             self.buffer.expire(time)
-        for client, latest in self.buffer.latest():
-            self.clients.still_heard(client, latest)
-        lost = self.clients.lose(time)
+        lost = self.clients.lose(time) if self.clients.may_lose(time) else []
         if lost:
             self.ingest.lose(set(lost))
             self.signals.forget(lambda rule, client: client in self.clients)

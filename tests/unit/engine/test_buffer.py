@@ -188,5 +188,4 @@ def test_the_bytes_are_those_of_what_is_held_and_within_the_cap(
         assert buffer.bytes == held(buffer) <= cap
         assert all(lane.bytes == sum(len(s.payload) + SAMPLE_OVERHEAD for s in lane.samples) for lane in buffer)
         assert {sample.number for lane in buffer for sample in lane.samples} <= came
-        for client, latest in buffer.latest():
-            assert all(sample.time <= latest for lane in buffer if lane.client == client for sample in lane.samples)
+        assert all(sample.time <= buffer.latest(lane.client) for lane in buffer for sample in lane.samples)
