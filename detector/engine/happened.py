@@ -1,4 +1,4 @@
-"""What evaluation gives: events, each with its place in the order of all."""
+"""The results of evaluation: events, each with its position in the overall order."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from detector.engine.episodes.events import Event
 
 
 class Happened(NamedTuple):
-    """An event, and where it belongs in the order of all."""
+    """An event and its position in the overall order."""
 
     time: int
     order: int
-    """The rule's place among the rules."""
+    """The rule's position among the rules."""
     event: Event

@@ -1,4 +1,4 @@
-"""Short identifiers that follow from what they stand for: 16 lowercase letters and digits of its SHA-256."""
+"""Short identifiers derived from contents: 16 lowercase letters and digits of the SHA-256."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ def identifier(data: bytes) -> str:
 
 
 def episode_id(holder: str, rule: str, subject: str, start: int) -> str:
-    """The identifier of the episode that starts at a time, in nanoseconds since the epoch."""
+    """The identifier of the episode that starts at this time, in nanoseconds since the epoch."""
     return identifier(f"{holder}\0{rule}\0{subject}\0{start}".encode())
 
 
 def _base32(bits: int) -> str:
-    """Eight letters for 40 bits."""
+    """40 bits as eight characters."""
     return (
         _PAIRS[bits >> 30] + _PAIRS[bits >> 20 & _TEN_BITS] + _PAIRS[bits >> 10 & _TEN_BITS] + _PAIRS[bits & _TEN_BITS]
     )
