@@ -239,7 +239,7 @@ class Executor:
             for run in runs:
                 name = run.rule.name
                 happened[name] = self._lost(name, time) if regular else []
-                only, thinned = self._schedule.whom(run.rule, time, sampled)
+                only, thinned = self._schedule.selection(run.rule, time, sampled)
                 run.counters.skipped += thinned
                 if only.clients or only.subjects:
                     chosen[name] = only
@@ -283,7 +283,7 @@ class Executor:
         events = run.lose(time, self._clients) if regular else []
         if rule.on_sample is None:
             return events
-        only, thinned = self._schedule.whom(rule, time, sampled)
+        only, thinned = self._schedule.selection(rule, time, sampled)
         run.counters.skipped += thinned
         if only.clients or only.subjects:
             events += self._evaluated(run, time, only)
