@@ -1,1 +1,1 @@
-"""The Kubernetes API as the detector uses it: one connection, typed errors, and lists that are kept current."""
+"""The detector's access to the Kubernetes API: one connection, typed errors, and lists that are kept current."""

@@ -1,4 +1,4 @@
-"""Requests to the API server: JSON objects in and out, errors by what to do about them."""
+"""Requests to the API server: JSON objects in and out, errors classified by what the caller should do."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _TIMEOUT = aiohttp.ClientTimeout(total=10.0, sock_connect=5.0)
 
 
 class Resource(NamedTuple):
-    """Where the objects of a kind live."""
+    """The API path of a kind."""
 
     api_version: str
     plural: str
@@ -40,10 +40,10 @@ class Resource(NamedTuple):
 
 
 class Api:
-    """The verbs, for a namespace and resource each time.
+    """The verbs, each for a namespace and resource.
 
-    Every verb raises `UnavailableError` where the server does not answer or requests a retry, and another `ApiError`
-    where it refuses.
+    Every verb raises `UnavailableError` if the server does not respond or requests a retry, and another `ApiError` if
+    it refuses.
     """
 
     def __init__(self, client: ApiClient) -> None:
@@ -64,21 +64,22 @@ class Api:
         return await self._request("GET", resource.path(namespace, name))
 
     async def create(self, resource: Resource, namespace: str, body: JsonObject) -> JsonObject:
-        """Create the object; as stored."""
+        """Create the object; returns it as stored."""
         return await self._request("POST", resource.path(namespace), body, query={"fieldManager": FIELD_MANAGER})
 
     async def replace(self, resource: Resource, namespace: str, name: str, body: JsonObject) -> JsonObject:
-        """Put the object as it is; as stored."""
+        """Replace the object; returns it as stored."""
         query = {"fieldManager": FIELD_MANAGER}
         return await self._request("PUT", resource.path(namespace, name), body, query=query)
 
     async def patch(self, resource: Resource, namespace: str, name: str, patch: JsonPatch) -> JsonObject:
-        """Apply a JSON patch; as stored. A `test` of `/metadata/uid` makes sure that it is still the same object."""
+        """Apply a JSON patch; returns the object as stored. A `test` of `/metadata/uid` ensures that it is still the
+        same object."""
         query = {"fieldManager": FIELD_MANAGER}
         return await self._request("PATCH", resource.path(namespace, name), patch, JSON_PATCH, query=query)
 
     async def delete(self, resource: Resource, namespace: str, name: str, uid: str) -> None:
-        """Delete the object if it still is the one with this uid."""
+        """Delete the object if it still has this uid."""
         options = {"apiVersion": "v1", "kind": "DeleteOptions", "preconditions": {"uid": uid}}
         await self._request("DELETE", resource.path(namespace, name), options)
 
@@ -96,7 +97,7 @@ class Api:
             "resourceVersion": since,
             "timeoutSeconds": str(max(1, round(seconds))),
         }
-        # The server ends the watch by itself; a connection that died unnoticed ends by this timeout instead.
+        # The server ends the watch; this timeout ends a connection that died unnoticed.
         timeout = aiohttp.ClientTimeout(total=None, sock_connect=5.0, sock_read=seconds + 5.0)
         async with self._response("GET", resource.path(namespace), query=query, timeout=timeout) as response:
             rest = b""
@@ -136,12 +137,12 @@ class Api:
         content_type: str = JSON,
         *,
         query: Mapping[str, str] | None = None,
-        timeout: aiohttp.ClientTimeout = _TIMEOUT,  # noqa: ASYNC109  aiohttp's own; it also bounds the connecting
+        timeout: aiohttp.ClientTimeout = _TIMEOUT,  # noqa: ASYNC109  aiohttp's own; it also bounds connecting
     ) -> AsyncIterator[aiohttp.ClientResponse]:
         headers = {"Accept": JSON, "Content-Type": content_type}
         url = f"{self._client.configuration.host}{path}" + (f"?{urlencode(query)}" if query else "")
         try:
-            # Only the authorization: the generated machinery around it costs more than the request itself.
+            # Only the authorization: the generated code around it costs more than the request itself.
             await self._client.update_params_for_auth(headers, [], ["BearerToken"], path, method, body)
             answer = await self._client.rest_client.request(  # type: ignore[no-untyped-call]
                 method, url, headers, body, _request_timeout=timeout

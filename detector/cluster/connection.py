@@ -1,4 +1,4 @@
-"""Finds the API server and the own account: a kubeconfig, or the account of the pod."""
+"""Finds the API server and the detector's account: a kubeconfig, or the account of the pod."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _IN_CLUSTER = "KUBERNETES_SERVICE_HOST"
 _CONNECTIONS = 32
 
 _BROKEN = (ConfigException, OSError, YAMLError, ValueError, TypeError, KeyError, AttributeError)
-"""What the loader raises for files that are missing, not YAML or of another shape: it checks little itself."""
+"""What the loader raises for files that are missing, not YAML or malformed: it validates little itself."""
 
 
 @dataclass(frozen=True)
 class Cluster:
-    """A connection and the namespace that it is meant for."""
+    """A connection and its default namespace."""
 
     api: Api
     namespace: str
@@ -62,7 +62,7 @@ async def connect(
 
 
 async def _load(configuration: Configuration, kubeconfig: Path | None) -> str:
-    """Fill in the configuration; the default namespace."""
+    """Fill in the configuration; returns the default namespace."""
     if kubeconfig is None and "KUBECONFIG" not in os.environ and _IN_CLUSTER in os.environ:
         load_incluster_config(configuration)  # type: ignore[no-untyped-call]
         return _OWN_NAMESPACE.read_text().strip()  # noqa: ASYNC240  once, at the start

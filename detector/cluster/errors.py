@@ -1,4 +1,4 @@
-"""What the API server may answer, sorted by what the caller should do about it."""
+"""Errors of the API server, classified by what the caller should do."""
 
 from __future__ import annotations
 
@@ -8,32 +8,32 @@ from wayside.inputerror import InputError
 
 
 class ApiError(Exception):
-    """A request to the API server failed. The message is that of the server, or the reason why there is none."""
+    """A request to the API server failed. The message is the server's, or the reason why there was no response."""
 
     def __init__(self, code: int, reason: str, message: str) -> None:
         super().__init__(f"{code} {reason}: {message}" if code else f"{reason}: {message}")
         self.code = code
-        """The HTTP status; 0 where there was no answer."""
+        """The HTTP status; 0 without a response."""
         self.reason = reason
-        """In the words of the API, e.g. `Forbidden`."""
+        """The API's reason, e.g. `Forbidden`."""
         self.message = message
 
 
 class UnavailableError(ApiError):
-    """No answer, or one that requests a retry: the same request may succeed soon."""
+    """No response, or one that requests a retry: the same request may succeed soon."""
 
     def __init__(self, code: int, reason: str, message: str, retry_after: float = 0.0) -> None:
         super().__init__(code, reason, message)
         self.retry_after = retry_after
-        """Seconds to wait as the server requests; 0 if it gives none."""
+        """Seconds to wait as requested by the server; 0 if not given."""
 
 
 class RefusedError(ApiError):
-    """The server understood and refuses: retrying the same request is useless."""
+    """The server rejected the request: retrying it unchanged is useless."""
 
 
 class NotFoundError(RefusedError):
-    """There is no such object, namespace or kind."""
+    """The object, namespace or kind does not exist."""
 
 
 class AlreadyExistsError(RefusedError):
@@ -41,7 +41,7 @@ class AlreadyExistsError(RefusedError):
 
 
 class ConflictError(RefusedError):
-    """The object is not the one, or not in the state, that the request expected: read it again."""
+    """The object or its state is not what the request expected: read it again."""
 
 
 class GoneError(RefusedError):
@@ -49,14 +49,14 @@ class GoneError(RefusedError):
 
 
 _UNAVAILABLE_CODES = frozenset({401, 408, 429})
-"""Beside 5xx. 401 because a token that has just been rotated is read again with the next request."""
+"""In addition to 5xx. 401 because a token that has just been rotated is read again with the next request."""
 
 
 def error_of(code: int, body: bytes, retry_after: str | None = None) -> ApiError:
-    """The error that an answer stands for.
+    """The error for a response.
 
     Args:
-        code: the HTTP status, 400 or more (or that of a watch's ERROR event).
+        code: the HTTP status, 400 or more (or the code of a watch's ERROR event).
         body: the answer, usually a Status object.
         retry_after: the header, in seconds.
     """
@@ -65,7 +65,7 @@ def error_of(code: int, body: bytes, retry_after: str | None = None) -> ApiError
         status = json.loads(body)
         reason, message = str(status.get("reason", reason)), str(status.get("message", message))
     except (ValueError, AttributeError):
-        pass  # a proxy's page in place of a Status: its beginning is the message
+        pass  # a proxy's page instead of a Status: its beginning is the message
     if code in _UNAVAILABLE_CODES or code >= 500:
         wait = float(retry_after) if retry_after and retry_after.isdigit() else 0.0
         return UnavailableError(code, reason, message, wait)

@@ -1,1 +1,1 @@
-"""What the commands run."""
+"""The implementations of the commands."""

@@ -6,9 +6,10 @@ import asyncio
 
 
 class WorkQueue:
-    """A queue of names for one event loop; first come, first served.
+    """A queue of names for one event loop, first in, first out.
 
-    Its size is bounded by the number of different names. A name that is added while it is being worked on comes again
+    Its size is bounded by the number of distinct names. A name that is added while it is being processed is queued
+    again afterwards: it may have changed after the worker read it.
     afterwards: it may have changed after the worker looked.
     """
 

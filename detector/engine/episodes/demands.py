@@ -94,7 +94,8 @@ def to_task(demand: Demand, end_time: int | None = None) -> ApplicationTask:
     infinities, which JSON does not have. Of the event's values, those that exceed the bounds of free data are left out.
 
     Args:
-        demand: the demand. end_time: when the episode ended, in nanoseconds since the epoch; None while it is open.
+        demand: the demand.
+        end_time: when the episode ended, in nanoseconds since the epoch; None while it is open.
 
     Raises:
         ValueError: a part does not fit into an ApplicationTask, e.g. a subject that is too long.

@@ -69,7 +69,8 @@ class Event(msgspec.Struct, frozen=True):
         """The CloudEvent on one line; the same event always gives the same bytes.
 
         Raises:
-            ValueError: a time is outside the years 1 to 9999. TypeError: a value has no form in JSON.
+            ValueError: a time is outside the years 1 to 9999.
+            TypeError: a value has no form in JSON.
         """
         # The text is built by hand: an encoder takes several times as long.
         kind, what = (STARTED, "started") if self.reason is None else (ENDED, "ended")

@@ -21,7 +21,8 @@ def matched(stamps: Sequence[Sequence[int]], slop: int) -> list[tuple[int, ...]]
 
     Args:
         stamps: for each stream the stamps of its samples in ascending order; nanoseconds. The first stream is the
-        reference. slop: maximum distance between the stamps of a tuple, in nanoseconds.
+            reference.
+        slop: maximum distance between the stamps of a tuple, in nanoseconds.
     """
     reference, *others = stamps
     found = []
