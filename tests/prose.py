@@ -19,6 +19,7 @@ CLEAN = (
     "application_manager",
     "charts/wayside/files/crds",
     "crds",
+    "detector",
     "docs/actions.md",
     "docs/buffer.md",
     "docs/classification.md",
@@ -47,7 +48,7 @@ CLEAN = (
 
 RETIRED = {
     r"told": "reported, published, receives",
-    r"tells?": "reports, names, distinguishes, explains",
+    r"(?<!\.)tells?": "reports, names, distinguishes, explains",
     r"said": "reported, logged, published",
     r"says?": "reports, contains, defines, names; such as",
     r"asks|asked": "requests, queries, uses",
