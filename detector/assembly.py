@@ -69,8 +69,8 @@ class Refusal:
     """Whether its last good version stays in use."""
 
     def __str__(self) -> str:
-        what = "is refused; keeping its last good version" if self.kept else "is refused"
-        return f"EventRule {self.rule.name} {what}: {'; '.join(map(str, self.problems))}"
+        kept = "; keeping its last good version" if self.kept else ""
+        return f"EventRule {self.rule.name} is refused{kept}: {'; '.join(map(str, self.problems))}"
 
 
 def inlets(detector: Detector) -> Inlets:
