@@ -1,13 +1,13 @@
-# Both programs in one image: `detector` and `application-manager`. It has no entrypoint: a pod says which one it runs.
+# Both programs in one image: `detector` and `application-manager`. It has no entrypoint: a pod selects the program.
 #
 #   docker build -t wayside --build-arg VERSION=$(git describe --always) .
 #
-# With --build-arg REQUIREMENTS=requirements-full.txt it also has what ONNX models, Protobuf recordings and results of
-# replays need; docs/images.md says how both are built for two architectures, published and signed.
+# With --build-arg REQUIREMENTS=requirements-full.txt it also has the packages for ONNX models, Protobuf recordings and
+# results of replays; docs/images.md explains how both are built for two architectures, published and signed.
 #
-# The base is pinned by its digest (Python 3.13 on Debian 13), what is installed by docker/requirements.txt, with hashes.
-# Files bear no times of the build, so the same source gives the same layers (BuildKit: also give
-# --build-arg SOURCE_DATE_EPOCH=0 and --output type=image,rewrite-timestamp=true; buildah: --timestamp 0). Where the base
+# The base is pinned by its digest (Python 3.13 on Debian 13), the packages by docker/requirements.txt, with hashes.
+# Files contain no times of the build, so the same source gives the same layers (BuildKit: also give
+# --build-arg SOURCE_DATE_EPOCH=0 and --output type=image,rewrite-timestamp=true; buildah: --timestamp 0). If the base
 # comes from a registry of your own: --build-arg BASE=<a Debian with Python 3.11 to 3.13, venv and pip>.
 ARG BASE=docker.io/library/python:3.13-slim-trixie@sha256:9d2e5553305c7c7b0097999bb17187c69b921ccd6bc9d40e4bb5ebe652c00285
 
@@ -28,8 +28,8 @@ RUN /opt/wayside/bin/pip install --no-compile --no-deps --no-build-isolation /so
  && /opt/wayside/bin/pip uninstall --yes --quiet setuptools pip
 # Of pycrate's ASN.1 modules only those of ITS messages; all others, of mobile networks mostly, are 140 MB. The wheel of
 # cel-expr-python contains its build tree, 16 MB that nothing imports. The root of a
-# container cannot be written to, so all is compiled here, else each start would do so: bytecode that is not compared
-# with its source bears no times.
+# container is read-only, so everything is compiled here, otherwise each start would do so: bytecode that is not compared
+# with its source contains no times.
 RUN find /opt/wayside/lib -path '*/pycrate_asn1dir/*.py' ! -name '__init__.py' ! -name 'ITS*.py' -delete \
  && rm -rf /opt/wayside/lib/python3*/site-packages/bazel-project \
  && python3 -m compileall -q --invalidation-mode=unchecked-hash /opt/wayside/lib

@@ -1,7 +1,7 @@
 # Wayside: two commands do everything on a fresh machine, `make demo` and `make test`.
-# They need Python 3.11 to 3.13 and make; the tests of the cluster side also build a control plane (see docs/).
+# They need Python 3.11 to 3.13 and make; the cluster tests also build a control plane (see docs/).
 
-# The first of these that runs and is of a version that our dependencies have wheels for.
+# The first of these that runs and has a version for which our dependencies have wheels.
 FITS := -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))'
 PYTHON ?= $(shell for each in python3 python3.13 python3.12 python3.11; do $$each $(FITS) 2>/dev/null && echo $$each && break; done)
 VENV ?= .venv
@@ -15,10 +15,10 @@ WAITING := $(BIN)/python -m pytest -n 6 --dist loadgroup
 
 .PHONY: help demo demo-cluster tutorial examples test unit process cluster compat e2e lint bench load mutants soak requirements wheels image crds clean
 
-help: ## what can be made
+help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
 
-# The environment follows pyproject.toml. The stamp is written last, so an installation that was cut off starts again.
+# The environment follows pyproject.toml. The stamp is written last, so an interrupted installation starts again.
 $(BIN)/.installed: pyproject.toml
 	@$(or $(PYTHON),false) $(FITS) || \
 	  { echo "Wayside needs Python 3.11, 3.12 or 3.13, and finds none: make PYTHON=/path/to/python3.12"; exit 1; }
@@ -32,19 +32,19 @@ $(BIN)/.installed-dev: $(BIN)/.installed
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
 	@touch $@
 
-demo: $(BIN)/.installed ## the main job: vehicles, events, tasks and what would run, without a cluster
+demo: $(BIN)/.installed ## the main job: vehicles, events, tasks and the resulting objects, without a cluster
 	@$(BIN)/python examples/cooperative-recording/demo.py --output out
 
 demo-cluster: $(BIN)/.installed-dev ## the same against a real control plane; CONTEXT=current: that of the current kubeconfig
 	@$(BIN)/python examples/cooperative-recording/demo_cluster.py --output out $(if $(filter current,$(CONTEXT)),--current)
 
-tutorial: $(BIN)/.installed-dev ## the run that docs/tutorial.md tells of, step by step
+tutorial: $(BIN)/.installed-dev ## the run described in docs/tutorial.md, step by step
 	@$(BIN)/python examples/cooperative-recording/tutorial.py --pause
 
-examples: $(BIN)/.installed-dev ## all use cases: what must be detected and done, and what is; without a cluster
+examples: $(BIN)/.installed-dev ## all use cases: expected and actual events and actions, without a cluster
 	@$(BIN)/python -m examples.running --output out/examples
 
-# What is built once is built beside what needs none of it; then all that waits on other processes waits side by side.
+# Programs for the tests are built beside lint and unit tests, which need none; then the waiting tests run in parallel.
 test: $(BIN)/.installed-dev ## everything that CI runs
 	@mkdir -p out; $(BIN)/python -m tests.builds >out/builds.log 2>&1 & \
 	trap "kill $$! 2>/dev/null" EXIT; $(MAKE) --no-print-directory lint unit && \
@@ -53,7 +53,7 @@ test: $(BIN)/.installed-dev ## everything that CI runs
 lint: $(BIN)/.installed-dev ## style, words, types and the direction of the imports
 	@$(BIN)/ruff check . && $(BIN)/python -m tests.prose && $(BIN)/ruff format --check --quiet . && $(BIN)/mypy && $(BIN)/lint-imports
 
-unit: $(BIN)/.installed-dev ## the tests of what is pure, and of files
+unit: $(BIN)/.installed-dev ## the tests of pure code and of files
 	@$(BIN)/python -m pytest tests/unit -n 2 --dist worksteal
 
 process: $(BIN)/.installed-dev ## the tests with a detector's processes, Zenoh, MQTT, HTTP and a database's server
@@ -80,10 +80,10 @@ e2e: $(BIN)/.installed-dev ## the tests on a real node with containers, as root;
 	@$(BIN)/python -m tests.e2e.programs
 	@$(WAITING) tests/e2e
 
-bench: $(BIN)/.installed-dev ## the benchmarks: each prints a ratio to its baseline
+bench: $(BIN)/.installed-dev ## run the benchmarks: each prints a ratio to its baseline
 	@for each in $(basename $(notdir $(wildcard benchmarks/*.py))); do echo "== $$each"; $(BIN)/python -m benchmarks.$$each || exit 1; done
 
-mutants: $(BIN)/.installed-dev ## small wrong changes, one by one: for each, a test must fail
+mutants: $(BIN)/.installed-dev ## mutation tests: for each small wrong change, a test must fail
 	@$(BIN)/python -m tests.mutants
 
 load: $(BIN)/.installed-dev ## attacks on the manager from one namespace, while a task of another is measured
@@ -92,12 +92,12 @@ load: $(BIN)/.installed-dev ## attacks on the manager from one namespace, while 
 soak: $(BIN)/.installed-dev ## an hour of traffic, faster than it happens: nothing grows, every loss is counted
 	@$(BIN)/python -m benchmarks.soak
 
-crds: $(BIN)/.installed ## write crds/ anew from the models, and what of the chart and of docs/ follows from the code
+crds: $(BIN)/.installed ## regenerate crds/ from the models, and the generated parts of the chart and of docs/
 	@$(BIN)/python -m wayside.api crds
 	@$(BIN)/python -m wayside.expressions docs
 	@$(BIN)/python -m charts.generate
 
-requirements: $(BIN)/.installed-dev ## pin anew what the image is made of, by the newest that pyproject.toml allows
+requirements: $(BIN)/.installed-dev ## pin the image's packages to the newest versions that pyproject.toml allows
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
 	@echo 'setuptools>=77' | $(BIN)/uv pip compile pyproject.toml - --extra etsi --extra mqtt --extra otel --upgrade \
 	  --generate-hashes --universal --python-version 3.11 --no-header --no-annotate --quiet -o docker/requirements.txt
@@ -105,11 +105,11 @@ requirements: $(BIN)/.installed-dev ## pin anew what the image is made of, by th
 	  --extra mining --extra protobuf --extra results --constraint docker/requirements.txt --generate-hashes --universal \
 	  --python-version 3.11 --no-header --no-annotate --quiet -o docker/requirements-full.txt
 
-wheels: $(BIN)/.installed-dev ## whether the images' packages are there as wheels for both architectures, and how large they are
+wheels: $(BIN)/.installed-dev ## check that the images' packages exist as wheels for both architectures, and print their sizes
 	@$(BIN)/python docker/wheels.py
 
-image: $(BIN)/.installed-dev ## builds the Dockerfile with buildah, as root and without Docker, and prints the compressed size
+image: $(BIN)/.installed-dev ## build the Dockerfile with buildah, as root and without Docker, and print the compressed size
 	@$(BIN)/python docker/image.py
 
-clean: ## remove what was made here; the caches outside the tree stay
+clean: ## remove build results; the caches outside the tree stay
 	rm -rf $(VENV) out build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache benchmarks/peers/*/target

@@ -30,12 +30,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
+from detector.memory import tune_garbage_collection
 
 from benchmarks.workloads import esper, speeds
 from benchmarks.workloads.driving import replayed
 from detector.engine.episodes.events import Event
 from detector.engine.samples.sample import Arrival
-from detector.memory import tune_garbage_collection
 from wayside.api import EventRule
 
 PLAIN_UP_TO = 5

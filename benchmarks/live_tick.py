@@ -17,11 +17,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import msgspec
+from detector.memory import tune_garbage_collection
 
 from benchmarks.workloads import speeds
 from benchmarks.workloads.driving import Live, by_tick
 from detector.engine.samples.sample import Arrival
-from detector.memory import tune_garbage_collection
 from wayside.api import EventRule
 
 HZ = 100

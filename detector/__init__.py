@@ -1,1 +1,1 @@
-"""The detector: buffers the data of vehicles and stations, detects events in it and acts on them."""
+"""The detector: buffers the data of vehicles and stations, detects events in it, and runs actions."""

@@ -1,10 +1,10 @@
-"""A test of a rule in three lines: what would it have done in this drive?
+"""Test a rule in three lines: which events would it have produced in this drive?
 
     from detector.testing import run
     events = run("rules.yaml", "detector.yaml", "drive.mcap")
     assert [event.subject for event in events if event.started] == ["car1"]
 
-The engine is the one that runs live. Plugins run in the test's own process, so breakpoints and coverage see them.
+The engine is the same as in live operation. Plugins run in the test's process, so breakpoints and coverage see them.
 """
 
 from __future__ import annotations

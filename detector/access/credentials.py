@@ -1,7 +1,7 @@
-"""The certificates, key and password of the detector for a network, all read at one moment.
+"""The detector's certificates, key and password for a network, read as one consistent set.
 
-The files may change at any time, one after the other. So they are read, tried as a pair, and read again: what is given
-on belongs together, and stays what it is while a session uses it.
+The files may change at any time, one after the other. So they are read, tested as a pair, and read again: the result is
+consistent, and does not change while a session uses it.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from detector.access.mounted import AccessError, Login, TlsFiles, login, tls_fil
 from wayside.api.access import Access
 
 _ATTEMPTS = 5
-"""Number of attempts to read files that change in the meantime."""
+"""Number of attempts to read files that change during the read."""
 
 
 @dataclass(frozen=True, slots=True)
 class Material:
-    """PEM texts and a login, of one moment. None where there is none."""
+    """PEM texts and a login, read together. None if absent."""
 
     ca: bytes | None = field(default=None, repr=False)
     certificate: bytes | None = field(default=None, repr=False)
@@ -36,7 +36,7 @@ class Material:
 
 
 def read_material(access: Access, at: str) -> Material:
-    """What `access`, which stands at the field `at`, means now. Raises AccessError for what cannot be used."""
+    """The current material of `access`, which is in the field `at`. Raises AccessError if it cannot be used."""
     files, credentials = tls_files(access, at), login(access, at)
     if files is None:
         return Material(login=credentials)
@@ -53,8 +53,8 @@ def read_material(access: Access, at: str) -> Material:
 
 
 def expiry(pem: bytes) -> float:
-    """When the first of the certificates expires, in seconds since the epoch. Raises ValueError where there is none."""
-    from cryptography import x509  # noqa: PLC0415  most detectors prove nothing: they do without its memory
+    """When the first of the certificates expires, in seconds since the epoch. Raises ValueError if there is none."""
+    from cryptography import x509  # noqa: PLC0415  most detectors have no certificate and save its memory
 
     return min(each.not_valid_after_utc for each in x509.load_pem_x509_certificates(pem)).timestamp()
 
@@ -67,12 +67,12 @@ def _read(files: TlsFiles) -> tuple[bytes | None, bytes | None, bytes | None]:
 def _content(path: Path | None) -> bytes | None:
     try:
         return None if path is None else path.read_bytes()
-    except OSError:  # just being replaced: the next attempt decides
+    except OSError:  # being replaced: the next attempt decides
         return None
 
 
 def _problem(files: TlsFiles) -> str | None:
-    """What is wrong with the files, in words without any of their content."""
+    """The problem of the files, without any of their content."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     try:
         if files.ca is not None:

@@ -1,7 +1,7 @@
-"""Certificates and credentials as programs need them: files and texts. They are read when a connection is made.
+"""Certificates and credentials in the form that programs need: files and texts. They are read for each connection.
 
-A Secret is a folder named like it, in the folder that the environment variable `WAYSIDE_SECRETS` names (default:
-/etc/wayside/secrets), with a file for each of its keys: as Kubernetes mounts it.
+A Secret is a folder with its name, in the folder named by the environment variable `WAYSIDE_SECRETS` (default:
+/etc/wayside/secrets), with one file per key, as Kubernetes mounts it.
 """
 
 from __future__ import annotations
@@ -18,14 +18,12 @@ SECRETS_FOLDER = "/etc/wayside/secrets"
 
 
 class AccessError(ValueError):
-    """A certificate or password that is not where the resource places it; the message names the field, never a
-    secret.
-    """
+    """A certificate or password that is not at the configured place; the message names the field, never a secret."""
 
 
 @dataclass(frozen=True, slots=True)
 class TlsFiles:
-    """PEM files that are there."""
+    """Existing PEM files."""
 
     ca: Path | None
     certificate: Path | None
@@ -45,7 +43,7 @@ class Login:
 
 
 def tls_files(access: Access, field: str) -> TlsFiles | None:
-    """The files to use for TLS, None where none are given; `field` is where `access` stands. Raises AccessError."""
+    """The files for TLS, None if none are configured; `field` is the place of `access`. Raises AccessError."""
     if access.tls is not None:
         tls = access.tls
         return TlsFiles(
@@ -68,7 +66,7 @@ def tls_files(access: Access, field: str) -> TlsFiles | None:
 
 
 def login(access: Access, field: str) -> Login | None:
-    """The credentials to use, None where none are given; `field` is where `access` stands. Raises AccessError."""
+    """The credentials, None if none are configured; `field` is the place of `access`. Raises AccessError."""
     given = access.credentials
     if given is not None:
         if given.password_file is not None:
@@ -88,12 +86,12 @@ def login(access: Access, field: str) -> Login | None:
 
 
 def secret_text(name: str, key: str, field: str) -> str:
-    """What a Secret holds under a key; a newline at its end does not count. Raises AccessError."""
+    """The value of a Secret's key, without a trailing newline. Raises AccessError."""
     return _text(_secret(name, field) / key, field)
 
 
 def database_uri(database: DatabaseConnection, field: str) -> str:
-    """The connection string of a database; `field` is where `database` stands. Raises AccessError."""
+    """The connection string of a database; `field` is the place of `database`. Raises AccessError."""
     if database.uri_file is not None:
         return _text(Path(database.uri_file), f"{field}.uriFile")
     if database.uri_secret_name is not None:

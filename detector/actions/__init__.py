@@ -1,6 +1,6 @@
-"""What episodes lead to. Actions run beside the engine, never on its thread, and keep what they count.
+"""The actions of episodes. They run beside the engine, never on its thread, and have their own counters.
 
-For packages that bring actions of their own: `Action`, and what it is given.
+For packages that provide actions: `Action`, and the types that it receives.
 """
 
 from detector.actions.base import Action, ActionError, ActionParameters, Messenger, Setting, Surroundings

@@ -1,7 +1,7 @@
-"""What an action is: a class with typed parameters that receives the episodes of a rule, one after the other.
+"""Defines an action: a class with typed parameters that receives the episodes of a rule, one after the other.
 
-An action has a thread of its own: it may wait for disks and networks without delaying anything else. What it raises
-ends its work for that episode and no other.
+An action has a separate thread: it may wait for disks and networks without delaying anything else. An exception ends
+its work for that episode and no other.
 """
 
 from __future__ import annotations
@@ -26,31 +26,31 @@ P = TypeVar("P", bound=BaseModel)
 
 
 class ActionParameters(Model):
-    """Base of the parameters of an action from elsewhere: camelCase in YAML, and a misspelt field is an error."""
+    """Base of the parameters of an action from another package: camelCase in YAML; unknown fields are errors."""
 
 
 class ActionError(Exception):
-    """Raised by an action that cannot do its work for an episode, with a message for people."""
+    """Raised by an action that cannot do its work for an episode; the message is shown to users."""
 
 
 class Messenger(Protocol):
-    """The detector's Zenoh session, as far as actions use it. Thread-safe."""
+    """The part of the detector's Zenoh session that actions use. Thread-safe."""
 
     def publish(self, key: str, payload: bytes, encoding: str) -> None:
-        """Queue a message; never waits. With the queue full it is dropped and counted."""
+        """Queue a message; never waits. If the queue is full, the message is dropped and counted."""
 
     def query(
         self, selector: str, payload: bytes | None, timeout: float, attachment: bytes | None = None
     ) -> list[bytes]:
-        """Send a query to everyone who answers it, and wait at most `timeout` seconds for the answers.
+        """Send a query to all that can answer it, and wait at most `timeout` seconds for the answers.
 
-        Raises ActionError if there is no session, no answer, or an error as answer.
+        Raises ActionError if there is no session, no answer, or an error as the answer.
         """
 
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """The present configuration of the detector. It may differ after a change of the Detector."""
+    """The current configuration of the detector. It may differ after a change of the Detector."""
 
     detector: Detector
     decoders: Mapping[str, Decoder]
@@ -61,7 +61,7 @@ class Surroundings:
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """Where an action works. All of it is thread-safe."""
+    """The context of an action. All of it is thread-safe."""
 
     rule: EventRule
     action: str
@@ -72,23 +72,23 @@ class Setting:
     report: Callable[[Episode, Outcome], None]
     """Report the progress of an episode: it is published, counted and shown by `detector status`.
 
-    Every episode that was started must be reported DONE or FAILED at last, and may be RUNNING before, also repeatedly.
+    Every started episode must finally be reported DONE or FAILED, and may be reported RUNNING before, also repeatedly.
     """
     lose: Callable[[str, int, str], None]
     """Count losses: a short description, the number, and the reason. They are shown with the losses of the detector."""
     closing: threading.Event
-    """Set when the detector stops: anything that waits should give up soon."""
+    """Set when the detector stops: waiting code should give up soon."""
 
 
 class Action(ABC, Generic[P]):
     """An action of a rule.
 
-    There is one object for each action of each rule. All its methods are called on one thread that belongs to it, never
-    two at a time, and for each episode in this order: `started`, `samples` and `ended` as it happens, `completed` last.
+    There is one object for each action of each rule. All its methods are called on one separate thread, never two at a
+    time, and for each episode in this order: `started`, `samples` and `ended` as they happen, `completed` last.
     Episodes overlap.
 
-    What `started`, `samples`, `ended` or `completed` raises is reported as the failure of that episode, which then
-    receives nothing more.
+    An exception in `started`, `samples`, `ended` or `completed` is reported as the failure of that episode, which then
+    receives no further calls.
     """
 
     Parameters: ClassVar[type[BaseModel]]
@@ -107,21 +107,22 @@ class Action(ABC, Generic[P]):
         self.setting = setting
 
     def started(self, episode: Episode) -> None:
-        """An episode began, or was taken up again after a restart (`episode.resumed`)."""
+        """An episode began, or was restored after a restart (`episode.resumed`)."""
 
     def samples(self, episode: Episode, samples: Sequence[EpisodeSample]) -> None:
-        """The next samples of its window: of each client and stream in order of time, but for late ones."""
+        """The next samples of its window: in time order per client and stream, except for late ones."""
 
     def ended(self, episode: Episode) -> None:
         """Its event ended; samples of the window's `after` may follow."""
 
     def completed(self, episode: Episode, completion: Completion) -> None:
-        """Nothing more of it follows. It may still be open if the detector or the action ends."""
+        """No more samples or events follow. The episode may still be open if the detector or the action ends."""
 
     def wake(self) -> float | None:
-        """Called between the others: do what is due now, and return the maximum number of seconds until the next call.
+        """Called between the other methods: do what is due now, and return the maximum number of seconds until the next
+        call.
 
-        None: when there is something new. What it raises is counted, and it is called again after a second.
+        None: when there is new input. Exceptions are counted, and it is called again after a second.
         """
         return None
 

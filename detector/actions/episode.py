@@ -1,4 +1,4 @@
-"""What an action receives of an episode: its events, its rendered values, and its samples."""
+"""The episode in the form that an action receives: its events, its rendered values, and its samples."""
 
 from __future__ import annotations
 
@@ -20,23 +20,24 @@ class Episode:
     id: str
     rule: str
     subject: str
-    """As in events: `car1`, `car1+car2`, `~fleet`, followed by `~` and the element of `each` where there is one."""
+    """The text in events: `car1`, `car1+car2`, `~fleet`, followed by `~` and the element of `each` if there is one."""
     clients: tuple[str, ...]
-    """The clients that it is about."""
+    """The clients of the subject."""
     element: str | None
     onset_time: int
     start_time: int
     values: Mapping[str, JsonValue]
-    """The rule's variables at the start; what is unknown is left out."""
+    """The rule's variables at the start; unknown ones are left out."""
     classification: Mapping[str, JsonValue] | None
     rendered: Mapping[str, JsonValue]
-    """The action's templates, rendered at the start, or see `rendered_again`; what could not be rendered is missing."""
+    """The action's templates, rendered at the start, or see `rendered_again`; those that could not be rendered are
+    missing."""
     unrendered: Mapping[str, str]
-    """Of the action's templates, those that could not be rendered, and why."""
+    """The action's templates that could not be rendered, each with the reason."""
     started: Mapping[str, Any]
     """The CloudEvent of the start."""
     resumed: bool = False
-    """It was open before the detector started: what there was of it then, another run of the action has seen."""
+    """It was open before the detector started: its earlier part was handled by another run of the action."""
     end_time: int | None = None
     """None while it is open."""
     reason: str | None = None
@@ -49,16 +50,16 @@ class Episode:
 
 @dataclass(frozen=True, slots=True)
 class Completion:
-    """The last of an episode: its event has ended, and its window as well."""
+    """The end of an episode and of its window."""
 
     cut: str = ""
-    """Why the window ended before its time, e.g. since the detector stops; empty where it did not."""
+    """Why the window ended early, e.g. because the detector stops; empty if it did not."""
     missing: int = 0
-    """Samples of the window that the action was too slow to take."""
+    """Samples of the window that were dropped because the action was too slow."""
 
 
 class OutcomeState(StrEnum):
-    """How far an action has come with an episode."""
+    """The progress of an action with an episode."""
 
     RUNNING = "Running"
     DONE = "Done"
@@ -71,11 +72,11 @@ class Outcome:
 
     state: OutcomeState
     message: str = ""
-    """Why it failed, or what else there is to know."""
+    """Why it failed, or other information."""
     samples: int = 0
     bytes: int = 0
     missing: int = 0
-    """Samples, messages or the like that were lost on the way."""
+    """Number of samples, messages or the like that were lost."""
     files: tuple[str, ...] = ()
     details: Mapping[str, JsonValue] = field(default_factory=dict)
-    """More about it, in camelCase."""
+    """Further details, in camelCase."""

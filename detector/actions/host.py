@@ -25,7 +25,7 @@ from wayside.api.actions import action as api
 _log = logging.getLogger(__name__)
 
 _GRACE = 5.0
-"""Seconds that actions have at the end."""
+"""Seconds that actions have to finish at the end."""
 
 
 @dataclass(slots=True)
@@ -49,7 +49,7 @@ class ActionHost:
         maximum_bytes: int = MAXIMUM_BYTES,
         patient: bool = False,
     ) -> None:
-        """`maximum_bytes` of samples wait for each action; `now` gives nanoseconds since the epoch.
+        """`maximum_bytes` of samples are queued for each action; `now` returns nanoseconds since the epoch.
 
         `patient`: `dispatch` waits for an action that is too slow. Otherwise samples are dropped.
         """
@@ -66,7 +66,7 @@ class ActionHost:
         self.outcomes = Outcomes(holder, messenger.publish, now)
 
     def follow(self, rules: Iterable[EventRule], surroundings: Surroundings) -> None:
-        """The rules are these from now on. An action that is as before goes on; others finish what they have."""
+        """Use these rules from now on. Unchanged actions continue; others finish their running episodes."""
         self._surroundings = surroundings
         wanted = {
             Which(rule.name, action.name): (rule, action)
@@ -149,7 +149,7 @@ class ActionHost:
 
 
 def _same(assignment: _Assignment, rule: EventRule, action: api.Action) -> bool:
-    """Whether the action is to be as it is. The labels and texts of its rule go into recordings, so they count."""
+    """Whether the action is unchanged. The labels and texts of its rule go into recordings, so they count."""
     before = assignment.rule
     return (
         assignment.action == action

@@ -2,7 +2,7 @@
 
     wayside/actions/<holder>/<rule>/<episode>/<action>
 
-A follow-up is a CloudEvent, as events are: dev.wayside.action.running, .done or .failed.
+A follow-up is a CloudEvent, like an event: dev.wayside.action.running, .done or .failed.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ class Which(NamedTuple):
 
 @dataclass(slots=True)
 class ActionTally:
-    """What an action has done since the detector's start, or since it was last changed to be of another kind."""
+    """The counts of an action since the detector's start, or since its kind last changed."""
 
     kind: str
     running: int = 0
     done: int = 0
     failed: int = 0
     samples: int = 0
-    """Of runs that are done or failed, as are bytes, missing and files."""
+    """Of runs that are done or failed, like bytes, missing and files."""
     bytes: int = 0
     missing: int = 0
     files: int = 0
@@ -63,7 +63,7 @@ class Outcomes:
     """Keeps and publishes outcomes; thread-safe."""
 
     def __init__(self, holder: str, publish: Callable[[str, bytes, str], None], now: Callable[[], int]) -> None:
-        """`publish` takes key, payload and encoding and never waits; `now` gives nanoseconds since the epoch."""
+        """`publish` takes key, payload and encoding and never waits; `now` returns nanoseconds since the epoch."""
         self._holder = holder
         self._publish = publish
         self._now = now
@@ -77,13 +77,13 @@ class Outcomes:
         """Called with each new outcome and the id of the episode, on the thread that reports it."""
 
     def know(self, which: Which, kind: str) -> None:
-        """There is this action, whether or not it is ever needed."""
+        """Register the action, whether or not it ever runs."""
         with self._lock:
             if which not in self._tallies or self._tallies[which].kind != kind:
                 self._tallies[which] = ActionTally(kind)
 
     def begin(self, which: Which, episode: Episode) -> None:
-        """The action has the episode."""
+        """The action starts with the episode."""
         with self._lock:
             if (which, episode.id) not in self._reported:
                 self._reported[which, episode.id] = None
@@ -125,12 +125,12 @@ class Outcomes:
             self._reasons[which, what] = last
 
     def tallies(self) -> dict[Which, ActionTally]:
-        """A copy of what is kept of each action."""
+        """A copy of the counts of each action."""
         with self._lock:
             return {which: _copied(tally) for which, tally in sorted(self._tallies.items())}
 
     def lost(self) -> list[_Lost]:
-        """All that was lost."""
+        """All losses."""
         with self._lock:
             return [
                 _Lost(which, what, count, self._reasons[which, what])

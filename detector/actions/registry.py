@@ -1,7 +1,7 @@
-"""Which actions there are, and whether a rule gives them the parameters that they require.
+"""Finds the class of an action, and validates its parameters.
 
-Built-in actions are found as those of other packages are. Their parameters are fields of the rule, so they are known to
-be right once the rule is read.
+Built-in actions are found in the same way as those of other packages. Their parameters are fields of the rule, so they
+are valid once the rule is read.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ OFFERS = Offers[Action[Any]](
 )
 
 DEPLOY = "deploy"
-"""The action that is none of these: its tasks are reconciled (detector/actions/deploy)."""
+"""The one action without a class here: its tasks are reconciled (detector/actions/deploy)."""
 
 
 def prepare_action(action: api.Action, streams: Sequence[str] | None = None) -> tuple[type[Action[Any]], BaseModel]:
@@ -52,7 +52,7 @@ def prepare_action(action: api.Action, streams: Sequence[str] | None = None) -> 
 
 
 def action_problems(rule: EventRule, detector: Detector) -> Iterator[RuleProblem]:
-    """What is wrong with a rule's actions, as far as their classes can check here."""
+    """The problems of a rule's actions, as far as their classes can check here."""
     yield from secret_problems(rule, detector)
     streams = [stream.name for stream in detector.spec.streams]
     for index, action in enumerate(rule.spec.actions):

@@ -1,7 +1,7 @@
-"""Which Secrets a rule may use: not those with which the detector itself enters networks and databases.
+"""Which Secrets a rule may use: not those by which the detector itself accesses networks and databases.
 
-Who writes rules can have what a Secret holds sent anywhere. So a Secret that the Detector names for its own use is no
-rule's, unless the Detector gives it to rules as well, by `pod.secretNames`.
+An author of rules can have the value of a Secret sent anywhere. Therefore rules cannot use a Secret that the Detector
+names for its own use, unless `pod.secretNames` of the Detector lists it for rules as well.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ from wayside.api import Detector, EventRule
 from wayside.rules import RuleProblem
 
 _OWN = frozenset({"tlsSecretName", "credentialsSecretName", "uriSecretName"})
-"""Fields of a Detector, and of the parameters of its sources, that name a Secret."""
+"""Fields that name a Secret in a Detector and in the parameters of its sources."""
 
 _OF_RULES = _OWN | {"secretKeyRef", "urlSecretKeyRef"}
-"""Fields of an action that do, by name or as name and key."""
+"""Fields that name a Secret in an action, by name or as name and key."""
 
 Place = tuple[str | int, ...]
 
 
 def secret_problems(rule: EventRule, detector: Detector) -> Iterator[RuleProblem]:
-    """The places at which a rule names a Secret of the detector's own."""
+    """The places at which a rule names one of the detector's own Secrets."""
     pod = detector.spec.pod
     given = set() if pod is None else {*pod.secret_names}
     own = {name for _, name in _named(detector.spec.to_json(), _OWN, ())} - given

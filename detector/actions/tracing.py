@@ -1,7 +1,7 @@
-"""The spans of episodes and of their tasks, where traces are on (see `wayside.process.tracing`).
+"""The spans of episodes and of their tasks, if traces are on (see `wayside.process.tracing`).
 
-The span of an episode is exported when the episode ends. Its ids follow from the episode's id, so its event and its
-tasks carry them from the start, and a detector that takes the episode up again ends the same span.
+The span of an episode is exported when the episode ends. Its ids are derived from the episode's id, so its event and
+its tasks carry them from the start, and a detector that restores the episode ends the same span.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from wayside.process.tracing import Tracing, tracing
 
 
 class EpisodeTraces:
-    """Gives episodes and tasks their trace context, and exports their spans. Thread-safe; never waits."""
+    """Adds the trace context to episodes and tasks, and exports their spans. Thread-safe; never waits."""
 
     def __init__(self, tracing: Tracing) -> None:
         self.tracing = tracing
 
     def event(self, event: Event) -> Event:
-        """The event, with the trace context of its episode."""
+        """The event with the trace context of its episode."""
         return msgspec.structs.replace(event, traceparent=str(self._context(event.rule, event.episode)))
 
     def consequences(self, consequences: Sequence[Consequence]) -> list[Consequence]:
-        """Likewise, of the consequences for actions."""
+        """The same for the consequences of actions."""
         return [
             replace(each, event=self.event(each.event)) if isinstance(each, Begun | Over) else each
             for each in consequences
@@ -57,12 +57,13 @@ class EpisodeTraces:
         )
 
     def task(self, demand: Demand, task: ApplicationTask) -> ApplicationTask:
-        """The demand's task, with where it stands."""
+        """The demand's task with its trace context."""
         annotations = {**task.metadata.annotations, TRACEPARENT_ANNOTATION: str(self._of_demand(demand))}
         return task.model_copy(update={"metadata": task.metadata.model_copy(update={"annotations": annotations})})
 
     def created(self, demand: Demand, began: int) -> None:
-        """The demand's task was created, which began at a time in nanoseconds since the epoch: export its span."""
+        """The demand's task was created; `began` is when the request started, in nanoseconds since the epoch: export
+        its span."""
         self.tracing.emit(
             Span(
                 f"create task {demand.action}",
@@ -91,9 +92,9 @@ class EpisodeTraces:
 
 @contextmanager
 def episode_traces(*, export: bool = True) -> Iterator[EpisodeTraces | None]:
-    """Traces if the environment requests them, else None. On exit, waiting spans are sent, for two seconds at most.
+    """Traces if the environment requests them, else None. At exit, queued spans are sent, for two seconds at most.
 
-    A replay does not `export`: the spans are those of the drive, and were exported then.
+    A replay does not `export`: its spans were exported during the drive.
     """
     exporter = tracing("wayside-detector", export=export)
     if exporter is None:

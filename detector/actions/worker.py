@@ -1,7 +1,7 @@
-"""One action of one rule at work: its thread, and the bounded queue of its input.
+"""Runs one action of one rule: its thread, and the bounded queue of its input.
 
-Samples wait up to a number of bytes; beyond it they are dropped from that run, counted, and reported at its end.
-Messages about episodes are never dropped. What the action raises ends its work for that episode and no other.
+Samples are queued up to a number of bytes; beyond it they are dropped from that run, counted, and reported at its end.
+Messages about episodes are never dropped. An exception ends the action's work for that episode and no other.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from detector.engine.samples.sample import SAMPLE_OVERHEAD
 _log = logging.getLogger(__name__)
 
 MAXIMUM_BYTES = 256 * 2**20
-"""So many bytes of samples wait for an action at most, overhead included."""
+"""Maximum size of the samples that are queued for an action, overhead included."""
 
 SILENT = "the action ended without reporting an outcome"
 
 _AGAIN = 1.0
-"""Seconds after which `wake` is called again when it failed."""
+"""Seconds after which a failed `wake` is called again."""
 
 Make = Callable[[], Action[Any]]
-"""Makes the action; on its thread, since that may take time, and raises what it likes."""
+"""Creates the action, on its own thread: that may take time, and may raise any exception."""
 
 
 class Worker:
-    """Passes episodes to an action. One thread at a time calls `enqueue`, which never waits unless `patient`."""
+    """Passes episodes to an action. Only one thread at a time calls `enqueue`, which never waits unless `patient`."""
 
     def __init__(
         self,
@@ -54,7 +54,7 @@ class Worker:
         self._outcomes = outcomes
         self._maximum = maximum_bytes
         self._inbox: deque[tuple[Consequence, int]] = deque()
-        """With the bytes of the samples."""
+        """Each with the bytes of its samples."""
         self._waiting = 0
         self._missing: dict[Run, int] = {}
         self._changed = threading.Condition()
@@ -64,17 +64,17 @@ class Worker:
         self._completed: list[Episode] = []
         """Completed episodes about which the action has not reported anything yet."""
         self.open: set[Run] = set()
-        """The runs that are not completed, as the producer sees them."""
+        """The runs that are not completed, from the producer's point of view."""
         self._thread = threading.Thread(target=self._work, name=f"action {which.rule}/{which.action}", daemon=True)
         self._thread.start()
 
     @property
     def waiting_bytes(self) -> int:
-        """Of samples that wait for the action."""
+        """Size of the samples that are queued for the action."""
         return self._waiting
 
     def enqueue(self, consequence: Consequence) -> None:
-        """Pass on what happened."""
+        """Queue what happened."""
         match consequence:
             case Begun(run=run):
                 self.open.add(run)
@@ -96,7 +96,7 @@ class Worker:
             self._changed.notify()
 
     def request_close(self) -> None:
-        """Enqueue nothing more; returns at once."""
+        """Accept nothing more; returns at once."""
         with self._changed:
             self._closing = True
             self._changed.notify()
@@ -113,7 +113,7 @@ class Worker:
 
     def _work(self) -> None:
         action, problem = self._made()
-        due: float | None = 0.0  # at once: it may have something left of a run before
+        due: float | None = 0.0  # at once: it may have unfinished work from a previous run
         while True:
             with self._changed:
                 if not self._inbox and not self._closing:
@@ -133,7 +133,7 @@ class Worker:
         if action is not None:
             try:
                 action.close()
-            except Exception as error:  # noqa: BLE001  third-party code, at its very end
+            except Exception as error:  # noqa: BLE001  third-party code, in its last call
                 self._failed_in(action, "close", error)
             for episode in self._silent():
                 self._outcomes.report(self.which, episode, Outcome(OutcomeState.FAILED, SILENT))
@@ -141,7 +141,7 @@ class Worker:
     def _made(self) -> tuple[Action[Any] | None, str]:
         try:
             return self._make(), ""
-        except Exception as error:  # noqa: BLE001  third-party code: its episodes fail, and nothing else does
+        except Exception as error:  # noqa: BLE001  third-party code: only its episodes fail
             problem = f"cannot create the action: {_text(error)}"
             _log.error("action %s of EventRule %s: %s", self.which.action, self.which.rule, problem)
             return None, problem
@@ -158,7 +158,7 @@ class Worker:
             return
         try:
             self._call(action, consequence)
-        except Exception as error:  # noqa: BLE001  whatever it raises is the failure of this run alone
+        except Exception as error:  # noqa: BLE001  any exception is the failure of this run only
             if not isinstance(error, ActionError):
                 _log.debug("action %s of EventRule %s", self.which.action, self.which.rule, exc_info=error)
             self._fail(run, _text(error))
@@ -190,7 +190,7 @@ class Worker:
                 action.completed(episode, Completion(cut, missing))
 
     def _fail(self, run: Run, why: str) -> None:
-        """The action has failed with the run, and receives nothing more of it."""
+        """The action failed with the run, which receives no further calls."""
         episode = self._episodes.pop(run)
         if self._outcomes.is_open(self.which, episode.id):
             _log.error("action %s of EventRule %s failed for %s: %s", self.which.action, run.rule, episode.subject, why)

@@ -1,4 +1,4 @@
-"""From the resources to an engine: decoders, keys and compiled rules. Live operation and replay share it."""
+"""Builds an engine from the resources: decoders, keys and compiled rules. Shared by live operation and replay."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from wayside.rules import (
 
 
 class DetectorError(InputError, ValueError):
-    """A Detector that cannot run; `problems` gives the reasons."""
+    """A Detector that cannot run; `problems` lists the reasons."""
 
     def __init__(self, problems: Iterable[RuleProblem]) -> None:
         self.problems = tuple(problems)
@@ -49,36 +49,36 @@ class DetectorError(InputError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Inlets:
-    """What a Detector's streams need: how their payloads and keys are read, and which fields their messages have."""
+    """The inputs of a Detector's streams: how to read their payloads and keys, and the fields of their messages."""
 
     decoders: Mapping[str, Decoder]
     read_key: KeyReader
     fields: Mapping[str, Fields]
     types: RosTypes
     places: KnownPlaces
-    """Those that rules can name, the ones of map files among them."""
+    """The places that rules can name, including those of map files."""
 
 
 @dataclass(frozen=True, slots=True)
 class RefusedRule:
-    """A rule that is refused, with the reason."""
+    """A rejected rule, with the reason."""
 
     rule: EventRule
     problems: tuple[RuleProblem, ...]
     kept: bool
-    """Whether its last good version goes on."""
+    """Whether its last good version stays in use."""
 
     def __str__(self) -> str:
-        what = "is refused; keeping its last good version" if self.kept else "is refused"
-        return f"EventRule {self.rule.name} {what}: {'; '.join(map(str, self.problems))}"
+        kept = "; keeping its last good version" if self.kept else ""
+        return f"EventRule {self.rule.name} is refused{kept}: {'; '.join(map(str, self.problems))}"
 
 
 def inlets(detector: Detector) -> Inlets:
     """Decoders and key readers for the Detector's streams.
 
     Raises:
-        DetectorError: a key that is not in key-format notation, a message type that is unknown or badly defined, or a
-            bad expression.
+        DetectorError: a key that is not in key-format notation, an unknown or invalid message type, or an invalid
+            expression.
     """
     types, problems = message_types(detector.spec.messages)
     defined = {message.name for message in detector.spec.messages}
@@ -90,10 +90,10 @@ def inlets(detector: Detector) -> Inlets:
         try:
             decoder = decoders[stream.name] = codec_for(stream, types=types, asn1=asn1)
         except UnknownTypeError as error:
-            if stream.type not in defined:  # else it is known what is wrong with its definition
+            if stream.type not in defined:  # otherwise the problem of its definition is known
                 problems.append(RuleProblem(("spec", "streams", index, "type"), str(error)))
         except DefinitionError as error:
-            if asn1 is not None or not detector.spec.asn1:  # else what is wrong with the modules is reported already
+            if asn1 is not None or not detector.spec.asn1:  # otherwise the problem of the modules is reported already
                 field = "encoding" if stream.type is None else "type"
                 problems.append(RuleProblem(("spec", "streams", index, field), str(error)))
         else:
@@ -127,7 +127,7 @@ def inlets(detector: Detector) -> Inlets:
 
 
 def detector_problems(detector: Detector) -> tuple[RuleProblem, ...]:
-    """What keeps the Detector from running; reads the files that it names."""
+    """The problems that keep the Detector from running; reads the files that it names."""
     try:
         inlets(detector)
     except DetectorError as error:
@@ -136,7 +136,7 @@ def detector_problems(detector: Detector) -> tuple[RuleProblem, ...]:
 
 
 def lasting_problems(detector: Detector) -> tuple[RuleProblem, ...]:
-    """What is wrong with its streams whatever a recording brings along: types and their fields may come with one."""
+    """The problems of its streams that no recording can solve: recordings may contain types and their fields."""
     return tuple(
         problem
         for index, stream in enumerate(detector.spec.streams)
@@ -145,7 +145,7 @@ def lasting_problems(detector: Detector) -> tuple[RuleProblem, ...]:
 
 
 def message_types(messages: Sequence[MessageDefinition]) -> tuple[RosTypes, list[RuleProblem]]:
-    """The message types that a Detector knows; without its own where there are problems with them."""
+    """The message types that a Detector knows; without its own definitions if these have problems."""
     try:
         return types_with(tuple(Definition(message.name, message.definition) for message in messages)), []
     except DefinitionsError as error:
@@ -156,7 +156,7 @@ def message_types(messages: Sequence[MessageDefinition]) -> tuple[RosTypes, list
 
 
 def _asn1(detector: Detector, problems: list[RuleProblem]) -> OwnDefinitions | None:
-    """The ASN.1 modules that the Detector brings; what is wrong with them is added to the problems."""
+    """The ASN.1 modules of the Detector; their problems are appended to `problems`."""
     texts: list[str] = []
     for index, module in enumerate(detector.spec.asn1):
         try:
@@ -174,15 +174,15 @@ def _asn1(detector: Detector, problems: list[RuleProblem]) -> OwnDefinitions | N
 
 
 def offer_problems(rule: EventRule, detector: Detector) -> Iterator[RuleProblem]:
-    """What is wrong with the installed packages that a rule uses: its plugin signals and its actions."""
+    """The problems of the installed packages that a rule uses: its plugin signals and its actions."""
     yield from plugin_problems(rule, detector)
     yield from action_problems(rule, detector)
 
 
 class RuleIndex:
-    """Compiles rules repeatedly. A refused rule keeps its last good version, and never affects others.
+    """Compiles rules repeatedly. A rejected rule keeps its last good version, and never affects others.
 
-    So a typo in a rule that is being edited ends no episode.
+    A typo in a rule that is being edited therefore ends no episode.
     """
 
     def __init__(self) -> None:
@@ -190,7 +190,7 @@ class RuleIndex:
 
     @property
     def good(self) -> list[EventRule]:
-        """The rules as they are evaluated: of one that is refused, its last good version."""
+        """The rules to evaluate; for a rejected rule its last good version."""
         return list(self._good.values())
 
     def compile(
@@ -200,7 +200,7 @@ class RuleIndex:
         fields: Mapping[str, Fields],
         places: KnownPlaces | None = None,
     ) -> tuple[list[CompiledRule], list[RefusedRule]]:
-        """The rules to evaluate, and the refused ones."""
+        """The rules to evaluate, and the rejected ones."""
         compiled: list[CompiledRule] = []
         refused: list[RefusedRule] = []
         good: dict[str, EventRule] = {}
@@ -224,7 +224,7 @@ class RuleIndex:
 def _compiled(
     rule: EventRule, detector: Detector, fields: Mapping[str, Fields], places: KnownPlaces | None
 ) -> CompiledRule | None:
-    """The rule, or None where the Detector no longer allows it."""
+    """The rule, or None if the Detector no longer allows it."""
     try:
         return bind_models(compile_rule(rule, detector, fields, offer_problems(rule, detector), places))
     except RuleError:

@@ -1,4 +1,4 @@
-"""What `detector check` finds: every problem of Detectors and rules, with file, line and column."""
+"""The findings of `detector check`: every problem of Detectors and rules, with file, line and column."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _CHECKED = (Detector, EventRule)
 
 
 class CheckResult(NamedTuple):
-    """Errors, and warnings without those that the annotation of their object ignores."""
+    """Errors, and the warnings that their object's annotation does not ignore."""
 
     problems: list[Problem]
     warnings: list[Problem]
@@ -80,7 +80,7 @@ def findings(documents: Sequence[Document]) -> CheckResult:
 
 
 def _without_stamps(document: Document, detector: Detector, entries: Inlets) -> Iterator[Problem]:
-    """With clock Data, the streams that carry no stamps beside others that do."""
+    """With clock Data, the streams without stamps beside others that have them."""
     streams = [] if detector.spec.clock is Clock.WALL else list(enumerate(detector.spec.streams))
     without = [
         (index, stream)
@@ -103,7 +103,7 @@ def _unignored(document: Document, warnings: Iterable[Problem]) -> Iterator[Prob
 
 
 def _has_stamp(stream: Stream, fields: Fields | None) -> bool:
-    """Whether its messages can give the time of the sender."""
+    """Whether its messages can contain the time of the sender."""
     if stream.stamp is not None or stream.encoding is Encoding.UPER:
         return True
     if stream.encoding is not Encoding.CDR:
@@ -149,7 +149,7 @@ def _rule_problems(
 
 
 def checked_summary(documents: Sequence[Document]) -> str:
-    """How much was looked at, and what was not."""
+    """What was checked, and what was skipped."""
     counts = Counter(type(document.object).__name__ for document in documents)
     looked = ", ".join(_counted(counts.pop(kind.__name__, 0), kind.__name__) for kind in _CHECKED)
     if not counts:

@@ -1,8 +1,8 @@
 """Places from map files: GeoJSON, and lanelet2 maps (OSM files).
 
-On the Earth a map's coordinates are latitude and longitude. With an `origin` they become metres, as lanelet2's
-projections give them. Lanelets are lanes; ways of type stop_line and ways with a name are lines; lanelet2's polygons
-are areas. What has no name goes by its id.
+On the Earth a map's coordinates are latitude and longitude. With an `origin` they are projected to metres by lanelet2's
+projections. Lanelets become lanes; ways of type stop_line and ways with a name become lines; lanelet2's polygons become
+areas. Objects without a name get their id as name.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class MapError(ValueError):
 
 
 def known_places(detector: Detector) -> tuple[KnownPlaces, tuple[RuleProblem, ...]]:
-    """The places of the Detector and of its maps, and what is wrong with the maps. Reads the files."""
+    """The places of the Detector and of its maps, and the problems of the maps. Reads the files."""
     shapes = dict(places_of(detector))
     problems: list[RuleProblem] = []
     for index, each in enumerate(detector.spec.maps):
@@ -92,7 +92,7 @@ def _of_geojson(given: MapFile, content: bytes) -> Iterator[Shape]:
 
 
 def _of_feature(feature: Mapping[str, Any], frame: _Frame) -> Shape | None:
-    """The place that a feature is; None where it has no name, or is none."""
+    """The place of a feature; None if it has no name or is of another kind."""
     properties, geometry = feature.get("properties") or {}, feature.get("geometry") or {}
     name = properties.get("name", feature.get("id"))
     if name is None:
@@ -113,7 +113,7 @@ def _of_feature(feature: Mapping[str, Any], frame: _Frame) -> Shape | None:
 
 
 class _Frame:
-    """Turns longitude and latitude into the coordinates of places."""
+    """Converts longitude and latitude into the coordinates of places."""
 
     def __init__(self, given: MapFile) -> None:
         self.geographic = given.origin is None

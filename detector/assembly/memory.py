@@ -1,11 +1,11 @@
-"""Memory: reference cycles are looked for less often than Python would, and what is free goes back to the system.
+"""Memory: searches for reference cycles less often than Python would, and returns free memory to the system.
 
-A sample is a tuple, and by default every 700 new ones start a search for cycles, although they never form any. That
-cost as much as receiving and inserting them (`benchmarks/intake_rate.py`). But libraries do leave cycles behind
-(paho-mqtt, some with each message), and with rare searches they add up to ten megabytes unnoticed.
+A sample is a tuple, and by default every 700 new tuples trigger a search for cycles, although samples never form any.
+That cost as much as receiving and inserting them (`benchmarks/intake_rate.py`). But libraries do create cycles
+(paho-mqtt, some with each message), and with rare searches these grow to ten megabytes unnoticed.
 
-And the C library gives each thread a heap of its own that it shrinks from its end alone: one small piece at the end
-keeps megabytes, so that a detector seems to grow for hours although it uses no more (`benchmarks/soak.py`).
+Also, the C library gives each thread a separate heap that it shrinks only from its end: one small allocation at the end
+keeps megabytes, so a detector seems to grow for hours although it uses no more (`benchmarks/soak.py`).
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ import time
 from collections.abc import Callable
 
 _YOUNG = 100_000
-"""Number of new containers that starts a search among the young ones."""
+"""Number of new containers that triggers a search of the young generation."""
 
 _SWEEP, _TRIM = 5.0, 60.0
-"""Seconds after which the young ones are searched in any case, and free memory is given back: both milliseconds."""
+"""Periods in seconds of the search of the young generation and of trimming; each takes milliseconds."""
 
 
 def tune_garbage_collection() -> None:
-    """Let Python look for reference cycles less often."""
+    """Make Python search for reference cycles less often."""
     gc.collect()
     gc.freeze()
     gc.set_threshold(_YOUNG, 20, 50)
 
 
 class Sweeper:
-    """Searches the young containers and gives back what is free, from time to time."""
+    """Searches the young generation and trims the heap from time to time."""
 
     def __init__(self) -> None:
         now = time.monotonic()
@@ -38,7 +38,7 @@ class Sweeper:
         self._sweep_due, self._trim_due = now + _SWEEP, now + _TRIM
 
     def look(self) -> None:
-        """Do what it is time for."""
+        """Do what is due."""
         now = time.monotonic()
         if now >= self._sweep_due:
             gc.collect(0)
@@ -49,6 +49,6 @@ class Sweeper:
 
 
 def _trimming() -> Callable[[int], object]:
-    """glibc's `malloc_trim`; C libraries without it (musl, macOS) give memory back by themselves."""
+    """glibc's `malloc_trim`; C libraries without it (musl, macOS) return memory by themselves."""
     trim: Callable[[int], object] | None = getattr(ctypes.CDLL(None), "malloc_trim", None)
     return trim or (lambda _: None)

@@ -1,4 +1,4 @@
-"""What `detector check` prints: a line for each finding, with its name at the end."""
+"""The output of `detector check`: a line for each finding, with its name at the end."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def list_checks() -> None:
 
 
 def check_files(files: Sequence[Path], recordings: Sequence[Path], ignore: Sequence[str], *, strict: bool) -> None:
-    """Print what is wrong with the files, and exit with 1 where there is an error, or with `strict` a warning.
+    """Print the problems of the files, and exit with 1 if there is an error, or with `strict` a warning.
 
     Args:
         files: Detectors and EventRules.

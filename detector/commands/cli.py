@@ -1,6 +1,6 @@
 """The command `detector`: run, replay, check, and the commands that query a running one.
 
-Declared here, and in the modules of commands that are added below; what a command runs is imported when it runs.
+Commands are declared here and in the modules added below; a command imports its implementation when it runs.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ app = typer.Typer(
 )
 
 _EXPECTED = (InputError, OSError)
-"""Errors of the input: printed in one line, without a trace."""
+"""Errors of the input: printed on one line, without a traceback."""
 
 DetectorFile = Annotated[Path | None, typer.Option("--detector", help="A YAML file with one Detector.")]
 RuleFiles = Annotated[
@@ -130,7 +130,7 @@ def run(
         holder = _holder_in_pod(name) if as_pod else name
         source: Files | Named = Named(name, namespace, output, holder)
     else:
-        assert detector is not None  # noqa: S101  one of both is given
+        assert detector is not None  # noqa: S101  one of the two is given
         source = Files(detector, tuple(rules or ()), output or Path("out"))
     asyncio.run(run_service(RunOptions(source, record_intake, pages, _view(foxglove))))
     leave()
@@ -215,7 +215,7 @@ def replay(
         from detector.assembly.memory import tune_garbage_collection
         from detector.commands.replay import replay_files
 
-    tune_garbage_collection()  # otherwise a third of the time of reading is spent on searching among samples
+    tune_garbage_collection()  # otherwise a third of the reading time goes to the search for cycles among samples
     replay_files(
         recordings,
         output,
@@ -359,7 +359,7 @@ for command in (inquiry.status, inquiry.evaluate, inquiry.pause, inquiry.resume,
 
 
 def main() -> None:
-    """The console script."""
+    """The entry point of the console script."""
     sys.exit(commandline.run(app, "detector", _EXPECTED, sys.argv[1:]))
 
 

@@ -1,6 +1,6 @@
 """The commands that query a running detector: `detector status`, `evaluate`, `pause` and `resume`.
 
-A command imports what it runs when it runs, so that `--help` need not.
+A command imports its implementation when it runs, so that `--help` stays fast.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ Timeout = Annotated[float, typer.Option(help="Seconds to wait for responses.", m
 RuleName = Annotated[str, typer.Argument(help="The rule's name.", show_default=False)]
 
 _WIDTH = 160
-"""Columns of a table that goes into a pipe or a file."""
+"""Width in columns of a table that goes into a pipe or a file."""
 
 
 def status(
@@ -59,7 +59,7 @@ def status(
     ] = False,
     timeout: Timeout = 3.0,
 ) -> None:
-    """Show what running detectors receive, evaluate and lose; for a rule also its values, and what is unknown."""
+    """Show what running detectors receive, evaluate and lose; for a rule also its values, and which are unknown."""
     if everything:
         if name is not None or subject is not None:
             refuse(f"--all adds up every detector: leave out {'--name' if name is not None else '--subject'}")
@@ -86,7 +86,7 @@ def status(
 def _show_total(
     detector: Path | None, connect: list[str] | None, rule: str | None, timeout: float, as_json: bool
 ) -> None:
-    """Print the sum. Ends with exit code 1 where a detector of the file does not answer."""
+    """Print the sum. Ends with exit code 1 if a detector of the file does not respond."""
     with importing():
         from detector.status.model import read_status, to_json
         from detector.status.table import total_view
@@ -112,9 +112,10 @@ def _show_total(
 def _inquire_all(
     detector: Path | None, connect: list[str] | None, timeout: float
 ) -> tuple[list[bytes], dict[str, str]]:
-    """The statuses of all detectors of the file, else of every detector; and who of the file does not answer, and why.
+    """The statuses of all detectors of the file, else of every detector; and the detectors of the file that do not
+    respond, with the reasons.
 
-    Each network of the file's Detectors is queried by itself: regions may have networks of their own.
+    Each network of the file's Detectors is queried separately: regions may have separate networks.
 
     Raises:
         NoAnswerError: nobody answers.
@@ -218,7 +219,7 @@ def query_selected(
     config, holder = Zenoh(mode=ZenohMode.PEER), "*"
     if detector is not None:
         given_detector = load_rules(detector, ()).rule_set.detector
-        sidecars = given_detector.spec.mode is DetectorMode.SIDECAR  # each in a pod, which its holder names
+        sidecars = given_detector.spec.mode is DetectorMode.SIDECAR  # each in a pod, whose name is part of the holder
         holder = f"{given_detector.name}.$*" if sidecars else given_detector.name
         config = _reaching(given_detector.spec.zenoh)
     config = _through(config, connect)
@@ -228,7 +229,7 @@ def query_selected(
 
 
 def _through(zenoh: Zenoh, connect: list[str] | None) -> Zenoh:
-    """The way into the network by these endpoints, if any are given."""
+    """The network configuration with these endpoints, if any are given."""
     from wayside.api.zenoh import ZenohMode
 
     return (
@@ -237,7 +238,7 @@ def _through(zenoh: Zenoh, connect: list[str] | None) -> Zenoh:
 
 
 def _reaching(zenoh: Zenoh) -> Zenoh:
-    """The detector's own way into the network; one that others connect to is reached where it listens."""
+    """The detector's own network configuration; a detector that listens is reached at its listening endpoint."""
     if not zenoh.listen:
         return zenoh
     from wayside.api.zenoh import ZenohMode

@@ -1,4 +1,4 @@
-"""What `detector mine` runs: many recordings in, one dataset out."""
+"""The implementation of `detector mine`: many recordings in, one dataset out."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from detector.results.installed import check_package
 from wayside.process.commandline import refuse
 
 _WIDTH = 160
-"""Columns of a table that goes into a pipe or a file."""
+"""Width in columns of a table that goes into a pipe or a file."""
 _ERRORS = 20
-"""How many errors are printed."""
+"""Maximum number of errors that are printed."""
 _NAMES = 8
-"""How many rules are named."""
+"""Maximum number of rules that are named."""
 
 
 def mine_recordings(
@@ -45,7 +45,7 @@ def mine_recordings(
 ) -> None:
     """Mine recordings, write the dataset, and print a summary.
 
-    Exits with 1 where a recording or a rule has an error.
+    Exits with 1 if a recording or a rule has an error.
 
     Args:
         given: files, folders, patterns, URLs, and lists as @FILE.
@@ -102,7 +102,7 @@ def mine_recordings(
 
 
 def _finish(run: MiningRun, summary: Summary, output: Path, *, shared: bool) -> None:
-    """Print the errors and the last line. A share fails only where another attempt may help."""
+    """Print the errors and the last line. A share fails only if another attempt may help."""
     for cut in run.cut:
         whole = ", ".join(f"{rule} ({why})" for rule, why in sorted(cut.whole.items()))
         typer.echo(f"{cut.name}: cut into {cut.pieces} pieces" + (f", uncut for {whole}" if whole else ""), err=True)

@@ -1,4 +1,4 @@
-"""The command `detector mine`; what it runs is imported when it runs."""
+"""The command `detector mine`; its implementation is imported when it runs."""
 
 from __future__ import annotations
 

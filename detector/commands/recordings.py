@@ -1,4 +1,4 @@
-"""`detector recordings start`, `stop` and `status`: send by hand the requests that triggers send to detectors."""
+"""`detector recordings start`, `stop` and `status`: send manually the requests that triggers send to detectors."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Id = Annotated[str, typer.Argument(help="The id of the recording.", show_default
 Json = Annotated[bool, typer.Option("--json", help="Print JSON, a line for each recording.")]
 
 _WIDTH = 160
-"""Columns of a table that goes into a pipe or a file."""
+"""Width in columns of a table that goes into a pipe or a file."""
 
 
 @app.command()
@@ -78,7 +78,7 @@ def status(
     as_json: Json = False,
     timeout: Timeout = 3.0,
 ) -> None:
-    """Say what is recorded on request, and what was."""
+    """List the recordings on request, running and finished."""
     _print(_request_reports(_request(id=identity), detector, name, connect, timeout), as_json)
 
 
@@ -103,7 +103,7 @@ def _request_reports(
     connect: list[str] | None,
     timeout: float,
 ) -> list[tuple[str, RecordingReport]]:
-    """The reports, each with the name of the detector that gave it."""
+    """The reports, each with the name of the detector that sent it."""
     from detector.actions.trigger.requests import RECORDINGS, read_reports, write_request
 
     answers = query_selected(RECORDINGS, {}, detector, name, connect, timeout, write_request(request))
@@ -111,7 +111,7 @@ def _request_reports(
 
 
 def _print(reports: list[tuple[str, RecordingReport]], as_json: bool) -> None:
-    """Exits with 1 where a recording was refused or has failed."""
+    """Exits with 1 if a recording was refused or has failed."""
     from detector.actions.trigger.orders import Progress
 
     if as_json:

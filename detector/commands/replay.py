@@ -1,4 +1,5 @@
-"""What `detector replay` and `detector check --recording` run: recordings in, events, tasks and doubts out."""
+"""The implementations of `detector replay` and `detector check --recording`: recordings in, events, tasks and doubts
+out."""
 
 from __future__ import annotations
 
@@ -41,14 +42,14 @@ from wayside.findings import Finding, ignored_by
 from wayside.process.commandline import refuse
 
 CLIPS = "clips"
-"""The folder of what record actions write, in the output."""
+"""The folder for the output of record actions, below the output folder."""
 
 _WIDTH = 160
-"""Columns of a table that goes into a pipe or a file."""
+"""Width in columns of a table that goes into a pipe or a file."""
 
 
 class PlayOptions(NamedTuple):
-    """How recordings are played."""
+    """The options of a replay."""
 
     as_one: bool
     clips: Clips | None
@@ -70,7 +71,7 @@ def replay_files(
 ) -> None:
     """Replay, write the results into the folder, and print a summary.
 
-    Exits with 1 where a rule is refused, or one of several recordings cannot be replayed.
+    Exits with 1 if a rule is rejected, or one of several recordings cannot be replayed.
 
     Args:
         recordings: at least one file, folder or pattern.
@@ -87,7 +88,7 @@ def replay_files(
     Raises:
         VariantError: a variant cannot be made.
         MissingExtraError: a result needs a package that is not installed.
-        DocumentError, DetectorError, RecordingError, OSError: a file cannot be used; the text says why.
+        DocumentError, DetectorError, RecordingError, OSError: a file cannot be used; the text gives the reason.
     """
     check_installed(kinds)
     looking = Looking() if kinds else None
@@ -128,14 +129,14 @@ def replay_files(
 
 
 def _console() -> Console:
-    """For tables; in a pipe they are as wide as they are."""
+    """For tables; in a pipe they keep their full width."""
     console = Console(stderr=True)
     return console if console.is_terminal else Console(stderr=True, width=_WIDTH)
 
 
 def _lines(outcome: Outcome, where: str) -> Iterator[str]:
-    """What a person should know of a recording."""
-    yield from (f"warning: {cut}" for cut in outcome.cuts)  # which name their files
+    """Messages about a recording for the user."""
+    yield from (f"warning: {cut}" for cut in outcome.cuts)  # these name their files
     yield from (f"warning: {where}{doubt}" for doubt in outcome.doubts)
     yield from (f"{where}{note}" for note in outcome.notes)
     if outcome.cut:
@@ -160,7 +161,8 @@ def _number(count: int, noun: str) -> str:
 def doubts_of(
     documents: Sequence[Document], recordings: Sequence[Path]
 ) -> tuple[list[Finding | Problem], list[RecordingError]]:
-    """What the recordings show of the Detectors and their rules; and why some of several recordings cannot be read.
+    """Doubts that the recordings raise about the Detectors and their rules, and errors of recordings that cannot be
+    read.
 
     Warnings that an annotation of the Detector or the rule ignores are left out.
     """
@@ -193,7 +195,7 @@ def _unignored(found: Iterable[Finding], detector: Detector, rules: Iterable[Eve
 def _topic_doubts(
     documents: Sequence[Document], gathered: Sequence[Recording], errors: dict[str, RecordingError]
 ) -> Iterator[Problem]:
-    """What the messages show before anything is replayed; errors of recordings are noted."""
+    """Doubts from the messages alone, before the replay; errors of recordings are noted."""
     readable = []
     for recording in gathered:
         try:
@@ -206,7 +208,7 @@ def _topic_doubts(
 
 
 def _plugins(outages: Outages) -> AbstractContextManager[PluginHost]:
-    """Runs the plugins of one replay in processes of their own."""
+    """Runs the plugins of one replay in separate processes."""
     return closing(ProcessHost(outages, wait=True, patience=REPLAY_PATIENCE))
 
 
@@ -218,7 +220,7 @@ def _replayed(
     progress: ProgressLine,
     looking: Looking | None,
 ) -> tuple[Played, Sequence[Variant]]:
-    """What the recordings came to, and the variants of rules."""
+    """The outcome of the recordings, and the variants of rules."""
     intake = intake_file_of(recordings)
     if intake is not None:
         if options.sweeps or any("." in option.partition("=")[0] for option in options.sets):
@@ -275,7 +277,7 @@ def _intake_replayed(
 
 
 def _traced(outcome: Outcome) -> tuple[Iterable[Event], Iterable[ApplicationTask]]:
-    """The events and tasks; with where they stand in traces, as live, where the environment asks for traces."""
+    """The events and tasks, with their trace context if the environment requests traces."""
     with episode_traces(export=False) as traces:
         if traces is None:
             return outcome.events, outcome.tasks.values()

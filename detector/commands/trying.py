@@ -1,4 +1,4 @@
-"""What `detector try` runs: one expression over the messages of recordings, by client."""
+"""The implementation of `detector try`: one expression over the messages of recordings, by client."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from wayside.process.commandline import refuse
 from wayside.rules import RuleError, compile_rule
 
 _WIDE = 40
-"""Columns of a plot."""
+"""Width of a plot in columns."""
 _BARS = "▁▂▃▄▅▆▇█"
 
 
@@ -76,7 +76,7 @@ def _rule(expression: str, stream: str, every: str) -> EventRule:
 
 
 def _stream(expression: str, found: Sequence[Proposal], detector: Detector, wanted: str | None, every: str) -> str:
-    """The stream that the expression fits. Refuses one that fits none, or several."""
+    """The stream that the expression fits. Raises an error if none or several fit."""
     known = {**inlets(detector).fields, **fields_of(found)}
     names = [each.name for each in found]
     if wanted is not None and wanted not in names:
@@ -99,11 +99,11 @@ def _lines(trace: Trace) -> Iterator[str]:
     width = max((len(each.subject) for each in trace.subjects), default=0)
     for each in trace.subjects:
         series = each.signals.get("value")
-        said = "a list or a map: write what of it" if series is None else _said(series, trace)
-        yield f"  {each.subject:{width}}  {said}"
+        text = "a list or a map: name a member of it" if series is None else _summary(series, trace)
+        yield f"  {each.subject:{width}}  {text}"
 
 
-def _said(series: Series, trace: Trace) -> str:
+def _summary(series: Series, trace: Trace) -> str:
     known = ~np.isnan(series.values)
     if not known.any():
         return "unknown"

@@ -76,10 +76,10 @@ class Engine:
         self._starts.is_known = self.clients.__contains__
         self._plugins = PluginSignals(plugins or NoPlugins(), self.queries)
         self.consequences = Consequences(self.buffer)
-        """The messages for actions other than deploy."""
+        """The messages for all actions except deploy."""
         self._timeline = self._make_timeline(start)
         self.instruments = Instruments()
-        """These look on; they are set before the rules are."""
+        """Observers; set them before the rules."""
         self._executor = Executor(
             self._known,
             self._ticks,
@@ -92,13 +92,13 @@ class Engine:
         )
 
     def set_detector(self, detector: Detector, decoders: Mapping[str, Decoder], read_key: KeyReader) -> None:
-        """Go on with a changed Detector; call `set_rules` afterwards, with the rules compiled against it.
+        """Switch to a changed Detector; call `set_rules` afterwards, with the rules compiled against it.
 
-        Samples of streams that are read as before stay, and so do open episodes. A change of the clock begins a new
-        time axis: the buffer is emptied, what was pending is forgotten.
+        Samples of streams that are read as before are kept, and so are open episodes. A change of the clock begins a
+        new time axis: the buffer is emptied and pending episodes are discarded.
 
         Raises:
-            RuleError: an expression of one of the Detector's streams does not compile; nothing has changed then.
+            RuleError: an expression of one of the Detector's streams does not compile; the engine is then unchanged.
         """
         before = self.detector.spec
         self._known.follow(detector, decoders, read_key, self._timeline.now)
@@ -117,30 +117,30 @@ class Engine:
 
     @property
     def detector(self) -> Detector:
-        """As it is followed now."""
+        """The Detector in its current version."""
         return self._known.detector
 
     def advance(self, arrivals: Sequence[Arrival], until: int) -> list[Event]:
         """Take in what arrived, in order, and run the ticks up to `until`, or to the last arrival if that is later.
 
-        Arrivals of equal time come in one call: what comes in a later one is later than all of these and than `until`.
+        Arrivals of equal time come in one call: those of a later call are later than all of these and than `until`.
         """
         return self._executor.run(self._timeline.steps(arrivals, until))
 
     def finish(self) -> Iterator[list[Event]]:
-        """Nothing more comes: what still has to be evaluated, step by step. With clock Wall nothing has.
+        """No more samples follow: run the remaining evaluations, step by step. With clock Wall there are none.
 
-        The demands that are open between two steps can be read there.
+        Between two steps, the demands that are open at that time can be read.
         """
         for step in self._timeline.finish():
             yield self._executor.run((step,))
 
     def gap(self, time: int) -> list[Event]:
-        """The wall clock stood still or jumped: go on from `time`; windows reset, open episodes hold."""
+        """The wall clock stood still or jumped: continue at `time`; windows reset, open episodes are kept."""
         return self._executor.run(self._timeline.gap(time))
 
     def set_rules(self, rules: Sequence[CompiledRule]) -> list[Event]:
-        """Evaluate these rules from now on. Episodes of rules that are gone or mean something else end."""
+        """Evaluate these rules from now on. Episodes of removed rules, and of rules whose semantics changed, end."""
         now = self._timeline.now
         new = {rule.name: rule for rule in rules}
         events: list[Event] = []
@@ -174,9 +174,10 @@ class Engine:
         return events
 
     def restore(self, demands: Sequence[Demand], now: int, episodes: Sequence[OpenEpisode] = ()) -> list[Event]:
-        """Take up the episodes that were open before a restart; those whose rule changed meanwhile end.
+        """Restore the episodes that were open before a restart; those whose rule changed meanwhile end.
 
-        First those of the demands, then of `episodes` those that had none. Statistics are those of `episodes`.
+        The episodes of the demands come first, then those of `episodes` without demands. Statistics are taken from
+        `episodes`.
         """
         demanded: dict[tuple[str, str, str], list[Demand]] = {}
         for demand in demands:
@@ -215,13 +216,13 @@ class Engine:
 
     @property
     def measures(self) -> bool:
-        """Whether an open episode has statistics, which each evaluation may change."""
+        """Whether an open episode has statistics, which any evaluation may change."""
         return any(run.measured for run in self._runs.values())
 
     def set_paused(self, names: Collection[str]) -> None:
-        """Do not evaluate these rules until further notice, and all others again; names of no rule mean nothing.
+        """Pause these rules and resume all others; unknown names are ignored.
 
-        Open episodes of a paused rule hold, what was pending is forgotten.
+        Open episodes of a paused rule are kept, pending ones are discarded.
         """
         for name in self._runs.keys() & names:
             self._runs[name].forget_pending()
@@ -230,17 +231,17 @@ class Engine:
         self._executor.wake_all(self.now)
 
     def set_level(self, level: int) -> None:
-        """Thin evaluations by this level from now on (see load.py); 0: none."""
+        """Set the level of thinning (see load.py); 0: evaluate everything."""
         self.schedule.set_level(level)
         self._executor.plan()
 
     def evaluate_now(self, name: str) -> tuple[list[Event], list[OnDemandResult]]:
-        """Evaluate a rule with `onDemand` now: after the last tick, with what was taken in since up to `now`.
+        """Evaluate a rule with `onDemand` now: after the last tick, with the samples taken in since, up to `now`.
 
-        Returns what started and ended, and the result for each subject.
+        Returns the episodes that started and ended, and the result for each subject.
 
         Raises:
-            NoAnswerError: there is no such rule, or it is none that is evaluated on demand, disabled or paused.
+            NoAnswerError: the rule does not exist, has no `onDemand`, or is disabled or paused.
         """
         run = self._runs.get(name)
         if run is None:
@@ -260,7 +261,7 @@ class Engine:
 
     @property
     def demands_version(self) -> tuple[int, int]:
-        """Changes whenever the demands do: a caller reads them again only then."""
+        """Changes whenever the demands do, so that a caller reads them again only then."""
         return self._rules_version, sum(run.version for run in self._runs.values())
 
     def next_tick(self) -> int:
@@ -269,31 +270,31 @@ class Engine:
 
     @property
     def triggers(self) -> frozenset[str]:
-        """The streams whose samples make rules be evaluated."""
+        """The streams whose samples trigger evaluations."""
         return self._ticks.triggers
 
     @property
     def now(self) -> int:
-        """Up to here all ticks have run; nanoseconds on the engine's time axis."""
+        """All ticks up to this time have run; nanoseconds on the engine's time axis."""
         return self._timeline.now
 
     @property
     def on_wall_clock(self) -> bool:
-        """Whether the shell advances time; else the samples do."""
+        """Whether the caller advances time; otherwise the samples do."""
         return isinstance(self._timeline, WallTimeline)
 
     @property
     def timeline(self) -> Timeline:
-        """The time axis; with clock Data it counts what it dropped."""
+        """The time axis; with clock Data it counts dropped samples."""
         return self._timeline
 
     def latency(self, sample: Sample, stream: str) -> float | None:
-        """Seconds from the sample's stamp to its receipt; None where it carries no stamp. Counts nothing."""
+        """Seconds from the sample's stamp to its receipt; None if it has no stamp. Counts nothing."""
         return self._known.latency(sample, stream)
 
     @property
     def in_columns(self) -> frozenset[str]:
-        """The rules that are evaluated in columns, and so are seen by the observer."""
+        """The rules that are evaluated in columns and therefore reported to the observer."""
         return self._executor.in_columns
 
     @property
@@ -302,7 +303,7 @@ class Engine:
         return self._runs
 
     def queries(self) -> BufferQueries:
-        """What is in the buffer now."""
+        """Read access to the buffer in its current state."""
         return self._known.queries(self.now)
 
     def _make_timeline(self, start: int) -> Timeline:
@@ -326,7 +327,7 @@ class Engine:
 
 
 def _longest(detector: Detector) -> int:
-    """How long the stream that is kept longest is kept, in nanoseconds."""
+    """The longest retention of all streams, in nanoseconds."""
     return max(detector.spec.buffer_duration_ns(stream) for stream in detector.spec.streams)
 
 

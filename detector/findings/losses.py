@@ -1,6 +1,6 @@
-"""What is lost, or cannot be used: logged when it first happens, then at most once a minute, and in total at the end.
+"""Losses and unusable data: logged on first occurrence, then at most once a minute, and in total at the end.
 
-Every kind of loss has a counter where it happens, and the last one's reason. Here they are only read.
+Every kind of loss is counted where it occurs, with the reason of the last one. This module only reads the counters.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from wayside.rules import PairSubject
 _log = logging.getLogger(__name__)
 
 _APART = 1_000_000_000
-"""Nanoseconds: streams whose delays differ by more have diverging stamps."""
+"""Nanoseconds: streams whose delays differ by more than this have diverging stamps."""
 
 _EVERY = 60.0
-"""Seconds between two lines about the same kind of loss: bad input may come a thousand times a second."""
+"""Seconds between two log lines about the same kind of loss: bad input may arrive a thousand times a second."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,22 +44,22 @@ class Loss:
     what: str
     count: int
     last: str = ""
-    """The reason of the last one, where there is one."""
+    """The reason of the last one, if known."""
     _: KW_ONLY
     cause: str
-    """In one word, for metrics: letters and underscores."""
+    """One word, for metrics: letters and underscores."""
     stream: str = ""
     """The stream, or the source of streams."""
     rule: str = ""
 
 
 class Losses:
-    """Logs what is new in the counters of an engine and its intake."""
+    """Logs the increases of the counters of an engine and its intake."""
 
     def __init__(
         self, engine: Engine, intake: Intake | None = None, monotonic: Callable[[], float] = time.monotonic
     ) -> None:
-        """`intake`: None in a replay, which has none; `monotonic` gives seconds."""
+        """`intake`: None in a replay, which has none; `monotonic` returns seconds."""
         self._engine = engine
         self._intake = intake
         self._monotonic = monotonic
@@ -68,11 +68,11 @@ class Losses:
         self._logged: dict[str, tuple[int, float]] = {}
 
     def watch(self, tally: Tally) -> None:
-        """Also report what this tally counts."""
+        """Also report the counts of this tally."""
         self._tallies.append(tally)
 
     def watch_also(self, losses: Callable[[], Iterable[Loss]]) -> None:
-        """Also report these losses, whatever counts them."""
+        """Also report these losses."""
         self._others.append(losses)
 
     def log_new(self) -> None:
@@ -89,14 +89,14 @@ class Losses:
                 _log.warning("%s", finding)
 
     def sum_up(self) -> None:
-        """Log how many samples came, all losses since the start, and how the evaluations went."""
+        """Log the number of samples, all losses since the start, and a summary of the evaluations."""
         counters, buffer = self._engine.counters, self._engine.buffer
         _log.info("%d samples received, %d bytes buffered", sum(counters.samples.values()), buffer.bytes)
         for line in (*self.report(), *self.doubts()):
             _log.warning("in total, %s", line)
 
     def report(self) -> Iterator[str]:
-        """All losses since the start; and where values were unknown, since a misspelt field looks like that."""
+        """All losses since the start, and where values were unknown, since a misspelt field causes that."""
         for loss in self.all():
             if loss.count:
                 yield _line(loss, loss.count)
@@ -107,9 +107,7 @@ class Losses:
                 yield f"{of_rule}: {often}" if often else of_rule
 
     def doubts(self) -> Iterator[Finding]:
-        """Streams whose stamps do not match the clock; where counters watch ages, rules that use or lack old
-        samples.
-        """
+        """Streams whose stamps do not match the clock; with measured ages, also rules that use or lack old samples."""
         yield from (finding for _, finding in self._apart())
         spec = self._engine.detector.spec
         for name, rule in self._engine.counters.rules.items():
@@ -117,7 +115,7 @@ class Losses:
                 stream, period = spec.stream(stream_name), use.period
                 limit = None if stream is None else spec.stale_after_ns(stream)
                 if limit is None or period is None:
-                    continue  # it never goes stale: the last sample stays valid
+                    continue  # it never becomes stale: the last sample stays valid
                 every = f"every {period / 1e9:.2g} s"
                 if period > limit:
                     yield Finding(
@@ -138,12 +136,12 @@ class Losses:
                     )
 
     def _in_pairs(self, rule: str) -> bool:
-        """Whether the rule, as it is now, is about pairs, whose positions have a limit of their own."""
+        """Whether the current rule is about pairs, whose positions have a separate limit."""
         run = self._engine.rules.get(rule)
         return run is not None and isinstance(run.rule.subject, PairSubject)
 
     def _apart(self) -> Iterator[tuple[str, Finding]]:
-        """With clock Data, streams whose stamps diverge from those of the others: a key and a finding for each."""
+        """With clock Data, the streams whose stamps diverge from the others': a key and a finding for each."""
         counters = self._engine.counters
         all_unstamped = counters.delays.keys() <= counters.unstamped.keys()
         right = _right(counters.delays)
@@ -171,7 +169,7 @@ class Losses:
                 yield f"behind {name}", Finding(DIVERGING_STAMPS.name, f"{what} of stream {right[0]}: {late}, {remedy}")
 
     def all(self) -> Iterator[Loss]:
-        """Every kind of loss, also those that did not happen."""
+        """Every kind of loss, including those with count 0."""
         counters, timeline = self._engine.counters, self._engine.timeline
         for tally in self._tallies:
             for entry in tally.entries():
@@ -230,7 +228,7 @@ def _times(count: int) -> str:
 
 
 def _often(rule: RuleCounters, *, in_pairs: bool) -> Iterator[str]:
-    """Why values were unknown, the most frequent reasons."""
+    """The most frequent reasons for unknown values."""
     unexplained = rule.unknowns - rule.absences.total()
     if unexplained:
         limit = " (a position is old after its maxAge)" if in_pairs else ""
@@ -242,7 +240,7 @@ def _often(rule: RuleCounters, *, in_pairs: bool) -> Iterator[str]:
 def _right(delays: Mapping[str, int]) -> tuple[str, int]:
     """The stream with the reference stamps, and its delay in nanoseconds.
 
-    No stamp lies after its receipt, so the smallest delay is right; where all do, that nearest to the receipt.
+    No stamp can be later than its receipt, so the smallest delay is right; if all are later, the nearest one.
     """
     ahead = {name: -delay for name, delay in delays.items() if delay < -_APART}
     nearest = {name: delay for name, delay in delays.items() if name not in ahead} or ahead
@@ -251,6 +249,6 @@ def _right(delays: Mapping[str, int]) -> tuple[str, int]:
 
 
 def _samples(spec: DetectorSpec, stream: str) -> str:
-    """What the stream's samples are."""
+    """A description of the stream's samples."""
     found = spec.stream(stream)
     return "samples" if found is None or found.items is None else "items"

@@ -1,6 +1,6 @@
-"""What a running detector answers to requests: its status, and the result of a rule with onDemand.
+"""The responses of a running detector to requests: its status, and the result of a rule with onDemand.
 
-Some also change something: a rule is paused, or evaluated again; a recording begins, or ends.
+Some requests also change something: a rule is paused or resumed; a recording begins or ends.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ _RUNS = 20
 """Maximum number of episodes per action whose last message is shown."""
 
 _SILENT = 30.0
-"""Seconds without an evaluation after which it is considered dead; a slow one reports that itself."""
+"""Seconds without an evaluation after which it is considered dead; a slow evaluation reports itself."""
 
 
 class Answers:
-    """Answers requests, on any thread."""
+    """Responds to requests, on any thread."""
 
     def __init__(
         self,
@@ -46,7 +46,7 @@ class Answers:
         requested: Requested,
         pulse: Callable[[], float] = lambda: 0.0,
     ) -> None:
-        """`outlet` gives the outlet: the network that it has changes with the Detector, as do the `sources`.
+        """`outlet` returns the outlet: its network changes with the Detector, and so do the `sources`.
 
         `pulse` returns the seconds for which the event loop has not run.
         """
@@ -63,7 +63,7 @@ class Answers:
         }
 
     def answer(self, what: str, given: Mapping[str, str], payload: bytes) -> bytes:
-        """The answer as JSON. Raises ValueError if there is none; the message gives the reason."""
+        """The response as JSON. Raises ValueError if there is none; the message gives the reason."""
         if what == RECORDINGS:
             return self._requested.answer(payload)
         answer = self._answers.get(what)
@@ -73,7 +73,7 @@ class Answers:
         return answer(given)
 
     def status(self) -> Status:
-        """The newest status, with the parts that the engine does not know."""
+        """The latest status, with the parts that the engine does not have."""
         latest, outlet = self._evaluator.status.latest, self._outlet()
         dropped = [
             Drops("event_unpublished", "events not published", outlet.network.dropped_events),
@@ -111,9 +111,9 @@ class Answers:
         return silent < _SILENT and hung < _SILENT and dead is None, "".join(f"{line}\n" for line in lines).encode()
 
     def ready(self) -> tuple[bool, bytes]:
-        """Whether samples can come in and be evaluated, for /readyz.
+        """Whether samples can arrive and be evaluated, for /readyz.
 
-        A detector that listens is ready without connections: otherwise no Service would route to it.
+        A listening detector is ready without connections: otherwise no Service would route to it.
         """
         well, text = self.healthy()
         network = self._outlet().network
@@ -163,7 +163,7 @@ class Answers:
             raise ValueError(f"the evaluation did not answer within {_PATIENCE:g} s: it is overloaded") from None
 
     def _explanation(self, rule: str, subject: str | None, wait: str) -> RuleExplanation | None:
-        """What the rule's next evaluation sees; None if there is none within `wait` seconds."""
+        """The values that the rule's next evaluation reads; None if there is none within `wait` seconds."""
         if not re.fullmatch(r"[0-9]{1,2}(\.[0-9]{1,3})?", wait):
             raise ValueError(f"wait={wait}: give seconds below 100, e.g. wait=2.5")
         watching = None

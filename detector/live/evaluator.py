@@ -1,8 +1,7 @@
-"""The thread that drives the engine live: it reads the wall clock, empties the intake and runs the ticks that are due.
+"""The thread that drives the engine live: it reads the wall clock, drains the intake and runs due ticks.
 
-All that the engine consumes passes here in one order, so this is also where it is recorded: arrivals, and between them
-the controls (start, rules, restore, gap, level, paused, ask, end). The replay of such a recording makes the same calls
-again.
+All input of the engine passes through here in one order, so it is also recorded here: arrivals, and between them the
+controls (start, rules, restore, gap, level, paused, ask, end). The replay of such a recording makes the same calls.
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ _log = logging.getLogger(__name__)
 Result = TypeVar("Result")
 
 _DRAIN_EVERY = 0.05
-"""Seconds between two reads of the intake, so that its queue stays short even if ticks are rare."""
+"""Seconds between two drains of the intake, so that its queue stays short even if ticks are rare."""
 
 _LOG_EVERY = 1.0
 """Seconds between two checks for losses: there are counters for each rule and stream."""
@@ -51,11 +50,11 @@ _STALL = 1_000_000_000
 """Nanoseconds: a tick that is overdue by more is skipped, and a larger step back of the clock is accepted."""
 
 _SAVE_EVERY = 1_000_000_000
-"""Nanoseconds between two writes of open episodes with statistics: a kill costs no more of them."""
+"""Nanoseconds between two writes of open episodes with statistics: a kill loses at most this part of them."""
 
 
 class IntakeRecorder(Protocol):
-    """Keeps what the engine consumes, in that order."""
+    """Records the engine's input, in order."""
 
     def arrivals(self, arrivals: Sequence[Arrival]) -> None:
         """Samples that the engine takes in now."""
@@ -68,13 +67,13 @@ class IntakeRecorder(Protocol):
 
 
 class Outlet(Protocol):
-    """Where events and demands go. Never waits."""
+    """Receives events and demands. Never waits."""
 
     def events(self, events: Sequence[Event]) -> None:
-        """What started and ended, in order."""
+        """The starts and ends of episodes, in order."""
 
     def open_episodes(self, episodes: Callable[[], Sequence[OpenEpisode]]) -> None:
-        """Open episodes may have changed; `episodes` returns them, and must be called at once or not at all."""
+        """Open episodes may have changed; `episodes` returns them, and must be called immediately or not at all."""
 
     def follow(self, rules: Sequence[EventRule], surroundings: Surroundings) -> None:
         """These rules are evaluated from now on."""
@@ -87,17 +86,17 @@ class Outlet(Protocol):
 
 
 class LiveObserver(Observer, Protocol):
-    """Observes the evaluation, on its thread. It decides nothing, and never waits."""
+    """Observes the evaluation, on its thread. It influences no result, and never waits."""
 
     def attend(self, engine: Engine) -> None:
-        """The engine has other rules from now on."""
+        """The engine uses other rules from now on."""
 
     def looked(self, engine: Engine, events: Sequence[Event]) -> None:
-        """The engine has consumed the arrivals, and these events happened."""
+        """The engine has consumed the arrivals, and these events occurred."""
 
 
 class Evaluator:
-    """Runs an engine on a thread of its own until it is stopped."""
+    """Runs an engine on a separate thread until it is stopped."""
 
     def __init__(
         self,
@@ -111,9 +110,9 @@ class Evaluator:
         outages: Outages | None = None,
         onlooker: LiveObserver | None = None,
     ) -> None:
-        """`now` gives nanoseconds since the epoch; `on_failure` is called if the thread dies of an error.
+        """`now` returns nanoseconds since the epoch; `on_failure` is called if the thread dies of an error.
 
-        `outages` are those of the engine's plugins: they are recorded, so that a replay knows them.
+        `outages` are those of the engine's plugins: they are recorded for the replay.
         """
         self._engine = engine
         self._intake = intake
@@ -128,7 +127,7 @@ class Evaluator:
         self._wanted: RuleSet | None = None
         self._stopping = False
         self._urgent = False
-        """Whether samples for rules with onSample arrived since the last look began."""
+        """Whether samples for rules with onSample arrived since the current cycle began."""
         self._ended = False
         self._calls: list[tuple[Future[Any], Callable[[], Any]]] = []
         self._overload = Overload()
@@ -145,7 +144,7 @@ class Evaluator:
         self._thread = threading.Thread(target=self._run, name="evaluator", daemon=True)
 
     def start(self, rule_set: RuleSet, restored: Restored) -> None:
-        """Begin with these rules and the episodes that were open before; returns at once."""
+        """Begin with these rules and the restored episodes; returns at once."""
         start = self._engine.now
         self._record(
             start,
@@ -174,7 +173,8 @@ class Evaluator:
         self._thread.start()
 
     def call(self, work: Callable[[], Result]) -> Future[Result]:
-        """Run a function on the thread of the evaluation, between two looks; thread-safe. The future has its result."""
+        """Run a function on the thread of the evaluation, between two cycles; thread-safe. The future has its
+        result."""
         future: Future[Result] = Future()
         with self._wake:
             if self._ended:
@@ -185,18 +185,19 @@ class Evaluator:
         return future
 
     def ask(self, rule: str) -> Future[list[OnDemandResult]]:
-        """Evaluate a rule with onDemand now; thread-safe. Gives its result for each subject, or NoAnswerError."""
+        """Evaluate a rule with onDemand now; thread-safe. The future has its result for each subject, or
+        NoAnswerError."""
         return self.call(lambda: self._ask(rule))
 
     def pause_rule(self, rule: str, paused: bool) -> Future[None]:
-        """Do not evaluate the rule from now on, or (not `paused`) again; thread-safe.
+        """Pause the rule, or (not `paused`) resume it; thread-safe.
 
-        Gives NoAnswerError where there is no such rule. A restarted detector has no paused rules.
+        The future has NoAnswerError if the rule does not exist. A restarted detector has no paused rules.
         """
         return self.call(lambda: self._pause_rule(rule, paused))
 
     def configure(self, rule_set: RuleSet) -> None:
-        """Go on with other rules, or another Detector that can run, from the next look on; thread-safe."""
+        """Switch to other rules, or to another valid Detector, in the next cycle; thread-safe."""
         with self._wake:
             self._wanted = rule_set
             self._wake.notify()
@@ -238,8 +239,8 @@ class Evaluator:
                     future.cancel()
 
     def _hurry(self) -> None:
-        """Look at the intake now; thread-safe."""
-        if not self._urgent:  # else the next look, which has not drained the intake yet, finds the arrivals
+        """Drain the intake now; thread-safe."""
+        if not self._urgent:  # otherwise the next cycle, which has not drained the intake yet, finds the arrivals
             with self._wake:
                 self._urgent = True
                 self._wake.notify()
@@ -255,13 +256,13 @@ class Evaluator:
         self._record(end, {"kind": "end", "finished": True})
 
     def pause(self) -> float:
-        """Seconds until there is something to do. With clock Data only the samples determine when a tick is due."""
+        """Seconds until the next cycle. With clock Data only the samples determine when a tick is due."""
         if not self._engine.on_wall_clock:
             return _DRAIN_EVERY
         return min(_DRAIN_EVERY, max(0.0, (self._engine.next_tick() - self._now()) / 1e9))
 
     def _look(self, wanted: RuleSet | None) -> None:
-        """Consume the arrivals and run the due ticks."""
+        """One cycle: consume the arrivals and run the due ticks."""
         now = self._now()
         events: list[Event] = []
         if now + _STALL < self._intake.last:
@@ -291,7 +292,7 @@ class Evaluator:
         _log.info("EventRule %s is %s", rule, "paused; its open episodes are kept" if paused else "evaluated again")
 
     def _adapt(self, spent: int) -> None:
-        """Thin more evaluations after a slow look, and fewer once looks are fast again."""
+        """Raise the level of thinning after a slow cycle, and lower it once cycles are fast again."""
         if self._overload.observe(self._now(), spent, self._engine.schedule.highest):
             level, highest = self._overload.level, self._engine.schedule.highest
             text = "the evaluation is overloaded" if spent > LONG else "the evaluation keeps up with the load"
@@ -320,7 +321,7 @@ class Evaluator:
         return self._engine.gap(now)
 
     def _configure(self, wanted: RuleSet) -> list[Event]:
-        """Take over a changed Detector or rules."""
+        """Switch to a changed Detector or rules."""
         changed = wanted.detector.spec != self._engine.detector.spec
         if changed:
             entries = inlets(wanted.detector)

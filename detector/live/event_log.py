@@ -1,4 +1,4 @@
-"""Events as lines of `events.jsonl`, written by a thread of its own: a slow disk does not slow the evaluation."""
+"""Events as lines of `events.jsonl`, written by a separate thread: a slow disk does not slow the evaluation."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ _log = logging.getLogger(__name__)
 
 
 class EventLog:
-    """Appends one CloudEvent a line. At most `capacity` wait; further ones are dropped and counted."""
+    """Appends one CloudEvent per line. At most `capacity` events are queued; further ones are dropped and counted."""
 
     def __init__(self, path: Path, *, capacity: int = 65536) -> None:
-        """The file's folder is made; what the file holds stays.
+        """Creates the file's folder; existing contents of the file are kept.
 
         Raises:
             OSError: the file cannot be opened.
@@ -36,7 +36,7 @@ class EventLog:
             self.dropped += 1
 
     def close(self) -> None:
-        """Write what waits, and close the file."""
+        """Write the queued lines, and close the file."""
         self._lines.put(None)
         self._thread.join()
         self._file.close()
@@ -49,6 +49,6 @@ class EventLog:
                 self._file.write(line + "\n")
                 if self._lines.empty():
                     self._file.flush()
-            except (OSError, ValueError) as error:  # a disk that refuses, a text that has no UTF-8
+            except (OSError, ValueError) as error:  # a disk that refuses, a text that is not valid UTF-8
                 self.dropped += 1
                 _log.error("an event is missing in %s: %s", self._path, error)

@@ -1,6 +1,6 @@
-"""A detector in a cluster: its Detector, rules and tasks live in the API server, and a Lease shows that it is alive.
+"""A detector in a cluster: its Detector, rules and tasks are in the API server, and a Lease shows that it is alive.
 
-It begins once it knows its rules, holds its Lease and has the episodes of its live tasks back.
+It begins once it has its rules, its Lease, and the episodes of its live tasks.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ async def run_in_cluster(
     traces: EpisodeTraces | None,
     view: View | None = None,
 ) -> None:
-    """Run the Detector of that name, and emit its tasks as the holder, until it is to stop.
+    """Run the Detector of that name, and emit its tasks as the holder, until `stopping` is set.
 
     Raises:
         ConfigurationError, DetectorError, NetworkError, OSError: it cannot start; the message gives the reason.
@@ -90,7 +90,7 @@ async def _run_while_held(
 
 
 async def _unless(stopping: asyncio.Event, work: Awaitable[Result]) -> Result | None:
-    """The work's result, or None if it is to stop before."""
+    """The work's result, or None if `stopping` is set before."""
     working = asyncio.ensure_future(work)
     ending = asyncio.ensure_future(stopping.wait())
     done, pending = await asyncio.wait({working, ending}, return_when=asyncio.FIRST_COMPLETED)

@@ -1,4 +1,5 @@
-"""Where a running detector's events, demands and consequences go: Zenoh, a file, the reconciler of tasks, actions."""
+"""The destinations of a running detector's events, demands and consequences: Zenoh, a file, the task reconciler,
+actions."""
 
 from __future__ import annotations
 
@@ -23,7 +24,7 @@ _log = logging.getLogger(__name__)
 
 
 class LiveOutlet:
-    """Events go to Zenoh and into the log, demands to the reconciler; nothing here waits."""
+    """Sends events to Zenoh and to the log, demands to the reconciler; nothing here waits."""
 
     def __init__(
         self,
@@ -43,11 +44,11 @@ class LiveOutlet:
 
     @property
     def unwritten(self) -> int:
-        """Events that are missing in `events.jsonl`."""
+        """Number of events missing from `events.jsonl`."""
         return 0 if self._log is None else self._log.dropped
 
     def events(self, events: Sequence[Event]) -> None:
-        """Publish and log what started and ended."""
+        """Publish and log the starts and ends."""
         for event in events if self._traces is None else map(self._traces.event, events):
             line = event.to_json()
             self.network.publish(event.key, line.encode(), EVENT_ENCODING)
@@ -64,7 +65,7 @@ class LiveOutlet:
                 self._traces.over(event)
 
     def move(self, network: Network) -> None:
-        """The Detector changed: leave the network, and join the other. A failure is logged."""
+        """The Detector changed: leave its network, and join the other. A failure is logged."""
         dropped = self.network.dropped_events
         self.network.close()
         self.network = network
@@ -80,15 +81,15 @@ class LiveOutlet:
             self._state.save(episodes())
 
     def follow(self, rules: Sequence[EventRule], surroundings: Surroundings) -> None:
-        """Have the rules' actions at work."""
+        """Run the actions of these rules."""
         self.actions.follow(with_requested(rules, surroundings.detector), surroundings)
 
     def consequences(self, consequences: Sequence[Consequence]) -> None:
-        """Tell the actions."""
+        """Pass the consequences to the actions."""
         self.actions.dispatch(consequences if self._traces is None else self._traces.consequences(consequences))
 
     def publish(self, key: str, payload: bytes, encoding: str) -> None:
-        """See `Messenger`: for the actions, which are independent of changes of the network."""
+        """See `Messenger`: for the actions, which need not follow changes of the network."""
         self.network.publish(key, payload, encoding)
 
     def query(
@@ -101,5 +102,5 @@ class LiveOutlet:
             raise ActionError(str(error)) from error
 
     def demands(self, demands: Mapping[str, Demand], ended: Mapping[str, int]) -> None:
-        """Hand the demands over."""
+        """Pass the demands to the reconciler."""
         self._reconciler.update(demands, ended)

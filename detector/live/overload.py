@@ -1,30 +1,30 @@
-"""Detects when the evaluation falls behind or has caught up: the level of thinning, from the duration of looks. Pure.
+"""Detects when the evaluation falls behind or has caught up: the level of thinning, from the duration of cycles. Pure.
 
-A look that took long means that ticks are overdue: the level rises by one at once. It falls by one after each ten
-seconds without such a look. `detector/engine/timing/load.py` defines the levels.
+A slow cycle means that ticks are overdue: the level rises by one at once. It falls by one after each ten seconds
+without a slow cycle. `detector/engine/timing/load.py` defines the levels.
 """
 
 from __future__ import annotations
 
 LONG = 250_000_000
-"""Maximum nanoseconds for the evaluation of one look; from 1 s on, ticks are lost."""
+"""Maximum nanoseconds for the evaluation of one cycle; from 1 s on, ticks are lost."""
 
 CALM = 10 * 10**9
-"""Nanoseconds without a long look after which one level is taken back."""
+"""Nanoseconds without a slow cycle after which the level falls by one."""
 
 
 class Overload:
-    """Tracks the duration of the looks at the intake."""
+    """Tracks the duration of the evaluator's cycles."""
 
     def __init__(self) -> None:
         self.level = 0
         self._since = 0
-        """When the last long look, or the last step down, was."""
+        """When the last slow cycle, or the last step down, was."""
 
     def observe(self, now: int, spent: int, highest: int) -> bool:
-        """A look ended `now` that took `spent` nanoseconds; returns whether the level changed.
+        """A cycle ended `now` that took `spent` nanoseconds; returns whether the level changed.
 
-        `highest`: the level beyond which nothing more can be left out.
+        `highest`: the level at which thinning reaches its maximum.
         """
         before = self.level = min(self.level, highest)
         if spent > LONG:

@@ -1,4 +1,5 @@
-"""What was open when the detector stopped: first the episodes of its own live tasks, then those of its state volume."""
+"""The episodes that were open when the detector stopped: first those of its own live tasks, then those of its state
+volume."""
 
 from __future__ import annotations
 
@@ -14,12 +15,12 @@ from detector.live.state import StateFile
 
 @dataclass(frozen=True, slots=True)
 class Restored:
-    """What the engine takes up again."""
+    """The input of the engine's restore."""
 
     demands: Sequence[Demand] = ()
     """Of live tasks, oldest first."""
     episodes: Sequence[OpenEpisode] = ()
-    """Of the state volume, without those whose task has ended: the detector ended it and was killed before it wrote."""
+    """Of the state volume, except those whose task has ended: the detector ended it and was killed before it wrote."""
 
 
 async def what_was_open(store: TaskStore, state: StateFile | None) -> Restored:

@@ -1,4 +1,4 @@
-"""A detector at work: intake, evaluation, network, event log and recording, wired, started and stopped in order."""
+"""A running detector: intake, evaluation, network, event log and recording, connected, started and stopped in order."""
 
 from __future__ import annotations
 
@@ -46,17 +46,17 @@ _log = logging.getLogger(__name__)
 
 
 class View(LiveObserver, Protocol):
-    """Shows people what is evaluated."""
+    """Displays the evaluation to users."""
 
     @property
     def port(self) -> int:
-        """Where it is served."""
+        """The port on which it is served."""
 
     def losses(self) -> Iterable[Loss]:
-        """What was not shown."""
+        """Number of items that were not shown."""
 
     def close(self) -> None:
-        """End it."""
+        """Stop it."""
 
 
 class Running:
@@ -75,7 +75,7 @@ class Running:
         traces: EpisodeTraces | None = None,
         view: View | None = None,
     ) -> None:
-        """Start nothing yet.
+        """Starts nothing yet.
 
         Raises:
             DetectorError: the Detector cannot run.
@@ -197,7 +197,7 @@ class Running:
         )
 
     def _putter(self, stream: str) -> Callable[[Sequence[tuple[str, bytes]]], None]:
-        """The inputs for the messages of a stream; changes of tokens are dropped last."""
+        """The inputs for the messages of a stream; changes of tokens wait for room before they are dropped."""
         return self._intake.patient_putter(stream) if stream == LIVELINESS else self._intake.putter(stream)
 
     def _good(self, wanted: Detector) -> Detector:
@@ -240,7 +240,7 @@ def _server(address: PagesAddress, answers: Answers) -> StatusServer:
 
 
 def _of_state(state: StateFile) -> Iterator[Loss]:
-    """What could not be written to or read from the state volume."""
+    """Failures to write to or read from the state volume."""
     unwritten = "times the state volume could not be written"
     yield Loss(unwritten, state.failures, state.last_failure, cause="state_unwritten")
     yield Loss("unreadable files of the state volume set aside", state.set_aside, cause="state_unreadable")
@@ -255,7 +255,7 @@ def _of_traces(traces: EpisodeTraces) -> Iterator[Loss]:
 
 
 def _of_actions(outcomes: Outcomes) -> Iterator[Loss]:
-    """What actions reported as lost."""
+    """Losses that actions reported."""
     for lost in outcomes.lost():
         cause = "action_" + re.sub(r"[^a-z]+", "_", lost.what.lower()).strip("_")
         what = f"{lost.what} (action {lost.which.action} of EventRule {lost.which.rule})"
@@ -263,7 +263,7 @@ def _of_actions(outcomes: Outcomes) -> Iterator[Loss]:
 
 
 def _unused(path: Path) -> Path:
-    """The path, or where there is a file already, one beside it: a restart must not destroy what was recorded."""
+    """The path, or an unused one beside it if the file exists: a restart must not overwrite a recording."""
     candidates = chain([path], (path.with_name(f"{path.stem}.{number}{path.suffix}") for number in count(2)))
     free = next(candidate for candidate in candidates if not candidate.exists())
     if free != path:
@@ -272,7 +272,7 @@ def _unused(path: Path) -> Path:
 
 
 def _checked(detector: Detector) -> Inlets:
-    """What its streams need. Raises DetectorError, also where a plugin is missing or refuses its parameters."""
+    """The inputs of its streams. Raises DetectorError, also if a plugin is missing or rejects its parameters."""
     entries = inlets(detector)
     problems = list(source_plugin_problems(detector))
     if problems:
@@ -281,7 +281,7 @@ def _checked(detector: Detector) -> Inlets:
 
 
 def _subscribed(streams: Iterable[Stream]) -> list[tuple[object, ...]]:
-    """What the network has to know of the streams."""
+    """The streams in the form that the network needs."""
     return [
         (stream.name, stream.key, stream.layout, stream.domain, stream.type, stream.history, stream.recover)
         for stream in streams

@@ -1,4 +1,4 @@
-"""`detector run`: wires streams, evaluation, actions and rules together, and stops cleanly on SIGTERM.
+"""`detector run`: connects streams, evaluation, actions and rules, and stops cleanly on SIGTERM.
 
 Zenoh ─▶ intake ─▶ evaluator (thread, owns the engine) ─▶ events: Zenoh, file
                       ▲                                └▶ demands: reconciler ─▶ tasks (API server, or files)
@@ -50,12 +50,12 @@ class Named:
 
 @dataclass(frozen=True, slots=True)
 class RunOptions:
-    """What to run."""
+    """The options of a run."""
 
     source: Files | Named
     record_intake: Path | None = None
     pages: PagesAddress | None = None
-    """Where /metrics, /healthz and /readyz are served; None: nowhere."""
+    """The address of /metrics, /healthz and /readyz; None: not served."""
     view: View | None = None
 
 
@@ -80,7 +80,7 @@ async def _run(options: RunOptions, stopping: asyncio.Event, traces: EpisodeTrac
         case Files() as files:
             await _run_from_files(files, options, stopping, traces)
         case Named() as named:
-            # Not at the top: the Kubernetes client takes half a second to import, which is only needed with a cluster.
+            # Not at the top: the Kubernetes client takes half a second to import, and only a cluster needs it.
             from detector.live.in_cluster import run_in_cluster  # noqa: PLC0415
 
             record, pages = options.record_intake, options.pages

@@ -1,9 +1,8 @@
-"""The state volume: open episodes as one file, so that those without tasks survive a restart, even a kill -9.
+"""The state volume: open episodes in one file, so that those without tasks survive a restart, even a kill -9.
 
-The file is replaced in one step by a thread of its own, so the evaluation never waits for the disk and no reader ever
-reads half a file. Only the newest set of episodes waits to be written: a slow disk writes less often, and what a kill
-costs is what happened since the last write. An episode that ended then is open again after the restart, and ends again,
-with the same id.
+A separate thread replaces the file atomically, so the evaluation never waits for the disk and no reader sees half a
+file. Only the latest set of episodes is queued: a slow disk writes less often, and a kill loses what happened since the
+last write. An episode that ended in that time is open again after the restart, and ends again with the same id.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ _RETRY = 5.0
 
 
 def state_file(detector: Detector, holder: str) -> StateFile | None:
-    """The Detector's state volume, where it has one. Raises OSError where that cannot be written."""
+    """The Detector's state volume, if it has one. Raises OSError if it cannot be written."""
     state = detector.spec.state
     if state is None:
         return None
@@ -42,10 +41,10 @@ def state_file(detector: Detector, holder: str) -> StateFile | None:
 
 
 class StateFile:
-    """The open episodes of one holder, in a folder. `save` from one thread at a time."""
+    """The open episodes of one holder, in a folder. `save` is for one thread at a time."""
 
     def __init__(self, folder: Path, namespace: str, holder: str) -> None:
-        """Make the folder where it is missing, and prepare. Raises OSError where the folder cannot be written."""
+        """Create the folder if it is missing. Raises OSError if it cannot be written."""
         folder.mkdir(parents=True, exist_ok=True)
         self._whose = {"namespace": namespace, "holder": holder}
         self.path = folder / f"{encode(namespace)}_{encode(holder)}.json"
@@ -62,9 +61,9 @@ class StateFile:
         """Files that could not be read."""
 
     def load(self) -> list[OpenEpisode]:
-        """The episodes that were open when the file was last written; none where there is no file.
+        """The episodes that were open when the file was last written; none if there is no file.
 
-        An unreadable file is logged and set aside under a free name: nothing is restored then.
+        An unreadable file is logged and renamed to an unused name; nothing is restored then.
         """
         try:
             text = self.path.read_bytes()
@@ -103,7 +102,7 @@ class StateFile:
             _log.error("cannot read the state; set it aside as %s and restored nothing from it: %s", aside, error)
 
     def save(self, episodes: Sequence[OpenEpisode]) -> None:
-        """These are open now. Never waits; only the newest counts."""
+        """Save the open episodes. Never waits; only the latest set counts."""
         with self._changed:
             self._wanted = episodes
             if self._thread is None:
@@ -112,7 +111,7 @@ class StateFile:
             self._changed.notify()
 
     def close(self) -> None:
-        """Write what waits; returns when that has succeeded or failed."""
+        """Write the queued set; returns when that has succeeded or failed."""
         with self._changed:
             self._closing = True
             self._changed.notify()
@@ -152,7 +151,7 @@ class StateFile:
             "of": self._whose,
             "episodes": [episode.to_document() for episode in episodes],
         }
-        # Not json.dump: each call leaves some thirty objects in cycles, which are collected rarely here.
+        # Not json.dump: each call leaves some thirty objects in cycles, which are rarely collected here.
         text = json.dumps(document, separators=(",", ":"), allow_nan=False)
         with self._draft.open("w", encoding="utf-8") as file:
             file.write(text)
@@ -161,6 +160,6 @@ class StateFile:
         self._draft.replace(self.path)
         folder = os.open(self.path.parent, os.O_RDONLY)
         try:
-            os.fsync(folder)  # else the old name might come back after a loss of power
+            os.fsync(folder)  # otherwise the old name might come back after a loss of power
         finally:
             os.close(folder)

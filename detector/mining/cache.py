@@ -1,7 +1,7 @@
-"""What was mined before: a file for each recording and run, in the dataset's folder.
+"""The cached results of mining: a file for each recording and run, in the dataset's folder.
 
-Files have no state but their content, and come under their names when they are whole. So processes of several machines
-may write into one folder, and one that is killed leaves nothing that is half.
+Files are renamed to their final names when they are complete. Several machines may therefore write into one folder, and
+a killed process leaves no partial file.
 """
 
 from __future__ import annotations
@@ -18,30 +18,30 @@ from detector.mining.work import Mined, decode_mined
 
 
 class CacheEntry(msgspec.Struct):
-    """What a job came to."""
+    """The result of a job."""
 
     keys: dict[str, str]
     """By rule, its key (see `keys`)."""
     mined: bytes
-    """As `work.mine_recording` gave it."""
+    """The output of `work.mine_recording`."""
     clips: str | None = None
     """The name of its folder of clips."""
     failed: bool = False
-    """Whether the next run tries again."""
+    """Whether the next run retries it."""
 
 
 class Cache:
     """The entries of one dataset."""
 
     def __init__(self, folder: Path) -> None:
-        """Raises OSError where the folder cannot be made."""
+        """Raises OSError if the folder cannot be created."""
         self._folder = folder
         self._entries = folder / "mined"
         self._entries.mkdir(parents=True, exist_ok=True)
         self._seen: dict[str, tuple[str, RecordingPreview]] = self._read_seen()
 
     def put(self, content: str, entry: CacheEntry) -> None:
-        """Keep what a job came to. Raises OSError."""
+        """Store the result of a job. Raises OSError."""
         name = f"{content}-{job_digest(entry.keys)}"
         if entry.failed:
             name += ".failed"
@@ -50,7 +50,7 @@ class Cache:
         _write(self._entries / name, msgspec.msgpack.encode(entry))
 
     def entries(self) -> dict[str, list[Path]]:
-        """The files of entries by the content of their recordings."""
+        """The files of entries, by the content of their recordings."""
         found: dict[str, list[Path]] = {}
         for path in sorted(self._entries.iterdir()):
             if not path.name.startswith("."):
@@ -60,12 +60,12 @@ class Cache:
     # What recordings are known by
 
     def seen(self, source: InputRecording, stamp: str | None) -> RecordingPreview | None:
-        """What an earlier look at the recording showed, where its files are as they were."""
+        """The result of an earlier look at the recording, if its files are unchanged."""
         before = self._seen.get("\0".join(source.files))
         return before[1] if before is not None and before[0] == stamp else None
 
     def note_seen(self, looks: Iterable[tuple[InputRecording, str | None, RecordingPreview]]) -> None:
-        """Keep what looks showed. Raises OSError."""
+        """Store the results of looks. Raises OSError."""
         new = {"\0".join(source.files): (stamp, seen) for source, stamp, seen in looks if stamp is not None}
         if new:
             self._seen = {**self._read_seen(), **new}
@@ -80,12 +80,12 @@ class Cache:
 
 
 def job_digest(keys: Mapping[str, str]) -> str:
-    """Stands for the rules of a job."""
+    """Identifies the rules of a job."""
     return hashlib.blake2b("".join(sorted(keys.values())).encode(), digest_size=8).hexdigest()
 
 
 def read_entry(path: Path) -> CacheEntry | None:
-    """The entry; None where another version wrote it. Raises OSError."""
+    """The entry; None if another version wrote it. Raises OSError."""
     try:
         return msgspec.msgpack.decode(path.read_bytes(), type=CacheEntry)
     except msgspec.DecodeError:
@@ -93,12 +93,12 @@ def read_entry(path: Path) -> CacheEntry | None:
 
 
 def mined_in(entry: CacheEntry) -> Mined:
-    """What the entry holds."""
+    """The contents of the entry."""
     return decode_mined(entry.mined)
 
 
 def _write(path: Path, data: bytes) -> None:
-    """Under its name when it is whole."""
+    """Write atomically."""
     partial = path.with_name(f".{path.name}.{os.getpid()}")
     partial.write_bytes(data)
     partial.replace(path)

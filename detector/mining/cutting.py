@@ -1,8 +1,8 @@
-"""Which recordings are cut into pieces, where, and for which rules that is exact.
+"""Which recordings are cut into pieces, where, and for which rules this is exact.
 
 A piece computes the observations of its ticks from its own samples and those shortly before: windows, clients and
-staleness reach no further back. What does reach further (episodes, `for`, `cooldown`) is computed afterwards, from the
-observations of all pieces in order: see `joining`.
+staleness reach no further back. State that reaches further (episodes, `for`, `cooldown`) is computed afterwards, from
+the observations of all pieces in order: see `joining`.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from wayside.api.eventrule import Aggregate
 from wayside.rules import ClientSubject, CompiledRule, FleetSubject
 
 _LEAST = 10
-"""A piece is at least as many times as long as what it reads before its beginning."""
+"""Minimum length of a piece, as a multiple of the part that it reads before its beginning."""
 START, END = 0, 2**63 - 1
-"""In place of the ends of a recording; nanoseconds."""
+"""Stand for the ends of a recording; nanoseconds."""
 
 
 class PieceTimes(NamedTuple):
     """The times of one piece; nanoseconds."""
 
     reads: int
-    """From here on it reads samples."""
+    """It reads samples from here on."""
     after: int
-    """Its ticks and samples come after this time,"""
+    """Its ticks and samples are later than this time,"""
     until: int
     """and up to this one."""
 
@@ -45,13 +45,13 @@ class Cutting(NamedTuple):
 
     spans: list[PieceTimes]
     rules: frozenset[str]
-    """Those for which it is exact."""
+    """The rules for which it is exact."""
     whole: dict[str, str]
-    """Why it is not for the others."""
+    """The other rules, with the reasons."""
 
 
 def cutting_of(recording: Recording, detector: Detector, rules: Sequence[EventRule], pieces: int) -> Cutting | None:
-    """How to cut a recording into that many pieces; None where that cannot be.
+    """How to cut a recording into that many pieces; None if this is impossible.
 
     Raises:
         DetectorError: the Detector cannot run.
@@ -110,12 +110,12 @@ def warmup_of(detector: Detector, rules: Sequence[CompiledRule]) -> int:
     kept = [spec.buffer_duration_ns(stream) for stream in spec.streams]
     stale = [spec.stale_after_ns(stream) or 0 for stream in spec.streams]
     every = max(rule.every_ns or 0 for rule in rules)
-    # The oldest sample of a window may be compared with the one before it, which is not stale then.
+    # The oldest sample of a window may be compared with the previous one, which is not stale then.
     return max(kept) + max(stale) + spec.client_timeout.ns + 2 * (every + HOUSEKEEPING)
 
 
 def _spans(chunks: Sequence[tuple[int, int]], pieces: int, warmup: int) -> list[PieceTimes]:
-    """Pieces of about equal size that begin where chunks do; fewer where they would be too short."""
+    """Pieces of about equal size that begin with chunks; fewer if they would be too short."""
     total, size = sum(size for _, size in chunks), 0
     cuts = [START]
     for start, length in chunks:

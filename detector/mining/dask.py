@@ -1,4 +1,4 @@
-"""Worker processes of a Dask cluster: a laptop's, Slurm's, or one on Kubernetes."""
+"""Worker processes of a Dask cluster: on a laptop, on Slurm, or on Kubernetes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class ClusterError(InputError, RuntimeError):
 
 
 class DaskWorkers:
-    """The workers of a cluster. They read the recordings by the same paths, and write clips to them."""
+    """The workers of a cluster. They access the recordings and the folder of clips by the same paths."""
 
     def __init__(self, address: str) -> None:
         """`address` is the scheduler's, e.g. tcp://127.0.0.1:8786. Raises ClusterError."""
@@ -41,7 +41,7 @@ class DaskWorkers:
         return sum(self._client.nthreads().values())  # type: ignore[no-untyped-call]
 
     def run(self, calls: Iterable[RemoteCall]) -> Iterator[tuple[RemoteCall, Any]]:
-        """See `Workers`. The scheduler gives what a dead worker was at to another one, up to its `allowed-failures`."""
+        """See `Workers`. The scheduler reassigns a dead worker's calls, up to its `allowed-failures`."""
         running = {self._client.submit(*call, pure=False, retries=ATTEMPTS): call for call in calls}
         for future in as_completed([*running]):  # type: ignore[no-untyped-call]
             call = running.pop(future)

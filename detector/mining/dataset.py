@@ -1,4 +1,4 @@
-"""The dataset: Parquet files that DuckDB, polars and pandas read without being told anything.
+"""The dataset: Parquet files that DuckDB, polars and pandas read without configuration.
 
     episodes/rule=NAME/part-0.parquet   a row for each episode, by recording and start; all rules have the same columns
     recordings.parquet                  a row for each recording
@@ -6,7 +6,7 @@
     streams.parquet                     for each recording and stream: the quality of the data
     errors.parquet                      what is wrong with recordings, and with rules over them
 
-The rows are in an order of their own, so the same results give the same bytes, however they were computed.
+The rows have a defined order, so the same results give the same bytes, however they were computed.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ _ROWS = 50_000
 
 
 class MinedRecording(NamedTuple):
-    """What a recording came to."""
+    """The result of one recording."""
 
     name: str
     content: str
-    """What it is known by; empty where it cannot be read."""
+    """Identifies the content; empty if it cannot be read."""
     parts: Callable[[], Sequence[Mined]]
-    """Reads what is kept of it, each part about other rules; it is asked more than once."""
+    """Reads the cached parts, each about other rules; called more than once."""
 
 
 def write_dataset(
     folder: Path, recordings: Sequence[MinedRecording], rules: Sequence[str], *, with_clips: bool
 ) -> None:
-    """Write all files, in order of the recordings given. Those of rules that are no longer there are removed.
+    """Write all files, in order of the given recordings. Files of removed rules are deleted.
 
     `with_clips`: episodes have a column with the folders of their clips, relative to the dataset.
 
@@ -83,7 +83,7 @@ def _write_episodes(
                         episode.recording = recording.name
                         waiting[episode.rule].append((episode, part.clips.get(episode.episode, ())))
             for rule, rows in waiting.items():
-                while len(rows) >= _ROWS:  # always that many, so that groups do not depend on the recordings
+                while len(rows) >= _ROWS:  # always this number, so that groups do not depend on the recordings
                     writers[rule].write_table(_table(rows[:_ROWS], kinds, with_clips))
                     del rows[:_ROWS]
         for rule, rows in waiting.items():
@@ -158,7 +158,8 @@ def _recording_row(recording: MinedRecording, parts: Sequence[Mined]) -> tuple[o
 
 
 def _stream_rows(parts: Sequence[Mined]) -> Iterator[tuple[object, ...]]:
-    """What each part saw is the same, but for messages that could not be read: only rules that look find these."""
+    """The stream statistics of all parts agree, except for unreadable messages: only rules that read these find
+    them."""
     by_stream = [[part.streams[at] for part in parts if part.streams] for at in range(_streams(parts))]
     for of_one in by_stream:
         worst = max(of_one, key=lambda each: (each.unreadable, each.last_unreadable))

@@ -1,4 +1,4 @@
-"""The pieces of a recording made one again: episodes are stepped over the observations of all of them, in order."""
+"""Joins the pieces of a recording: episodes are computed over the observations of all pieces, in order."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def flaw_of(pieces: Sequence[Observed]) -> str | None:
 
 
 def joined(job: MiningJob, recording: Recording, pieces: Sequence[Observed]) -> Mined:
-    """What a recording came to; the pieces, in order, have no flaw. The job's rules are those that they looked at."""
+    """The result of a recording; the pieces, in order, have no flaw. The job's rules are those that they evaluated."""
     detector = with_recorded_types(job.detector, recording)
     entries = inlets(detector)
     compiled, _ = RuleIndex().compile(job.rules, detector, entries.fields, entries.places)
@@ -124,7 +124,7 @@ class _Texts:
         self.texts: list[str] = []
 
     def common(self, values: Values, texts: Sequence[str]) -> Values:
-        """The values, texts by their places here."""
+        """The values, with texts as their indices here."""
         found = values.tags == Tag.TEXT
         if not found.any():
             return values
@@ -140,7 +140,7 @@ class _Texts:
 
 
 def _whole(parts: Sequence[Values]) -> Values:
-    """The parts as one; what is as before is no change."""
+    """The parts as one; repeated values are no changes."""
     times = np.concatenate([part.times for part in parts])
     values = np.concatenate([part.values for part in parts])
     tags = np.concatenate([part.tags for part in parts])
@@ -152,21 +152,21 @@ def _whole(parts: Sequence[Values]) -> Values:
 
 
 def _series(values: Values, texts: Sequence[str]) -> Series:
-    """As of the whole recording: what is a text anywhere has no statistics."""
+    """As for the whole recording: a value that is ever a text has no statistics."""
     series = series_of(values.times, values.values, values.tags, texts)
     kinds = {Tag.BOOLEAN: SeriesKind.BOOLEAN, Tag.TEXT: SeriesKind.TEXT}
     return replace(series, kind=next((kinds[tag] for tag in kinds if tag in values.kinds), SeriesKind.NUMBER))
 
 
 class _At:
-    """What a rule sees of a subject at a time."""
+    """The values that a rule reads for a subject at a time."""
 
     def __init__(self, values: Mapping[str, Values], texts: Sequence[str]) -> None:
         self._values = values
         self._texts = texts
 
     def at(self, time: int) -> dict[str, object]:
-        """The signals that are known."""
+        """The known signals."""
         found: dict[str, object] = {}
         for name, each in self._values.items():
             place = int(np.searchsorted(each.times, time, "right")) - 1

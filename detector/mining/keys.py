@@ -1,4 +1,4 @@
-"""What a result is known by: the content of the recording, and a digest of all that decides what a rule makes of it."""
+"""The keys of results: the content of the recording, and a digest of everything that affects a rule's result."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from detector.replay.clips import RECORD
 from wayside.api import Detector, EventRule
 
 _LAYOUT = 1
-"""Counts the layouts of what is kept: what an earlier version kept is not read."""
+"""The version of the cached layout: results of earlier versions are not read."""
 
 
 def rule_keys(detector: Detector, rules: Sequence[EventRule]) -> dict[str, str]:
-    """By rule, a digest of it, of the rules that it looks at, its models, the Detector with its maps, and this version.
+    """By rule, a digest of it, of the rules that it reads, its models, the Detector with its maps, and this version.
 
     The rules have the actions that run (see `mined_rule`).
     """
@@ -32,7 +32,7 @@ def rule_keys(detector: Detector, rules: Sequence[EventRule]) -> dict[str, str]:
 
 
 def mined_rule(rule: EventRule, *, record: bool) -> EventRule:
-    """The rule without actions, except record actions where they run: no other decides anything."""
+    """The rule without actions, except record actions if they run: no other affects the result."""
     actions = [action for action in rule.spec.actions if record and action.field == RECORD]
     return rule.model_copy(update={"spec": rule.spec.model_copy(update={"actions": actions})})
 
@@ -43,7 +43,7 @@ def records(rule: EventRule) -> bool:
 
 
 def with_dependencies(names: Iterable[str], rules: Mapping[str, EventRule]) -> set[str]:
-    """The rules, and those that their signals look at, directly or not. What is not there is left out."""
+    """The rules, and those that their signals read, directly or indirectly. Missing ones are left out."""
     found: set[str] = set()
     left = [*names]
     while left:
@@ -55,7 +55,7 @@ def with_dependencies(names: Iterable[str], rules: Mapping[str, EventRule]) -> s
 
 
 def _document(rule: EventRule) -> object:
-    """All of the rule that decides something, with the content of its models."""
+    """Everything in the rule that affects the result, with the content of its models."""
     files = [signal.model.file for signal in rule.spec.signals if signal.model is not None]
     return [rule.name, rule.spec.model_dump(mode="json"), [_digest(Path(file)) for file in files]]
 
@@ -64,4 +64,4 @@ def _digest(path: Path) -> str:
     try:
         return hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()
     except OSError as error:
-        return str(error)  # the rule is refused
+        return str(error)  # the rule is rejected

@@ -1,7 +1,7 @@
-"""A whole run: the workers mine the recordings that have no result yet, then the dataset is written from all results.
+"""A run of mining: the workers mine the recordings without a result, then the dataset is written from all results.
 
-A result is identified by content, rules and version. So a run may be killed and restarted, and several runs may share
-the work in one folder: each writes its own results, and the run that finds all of them writes the dataset.
+A result is identified by content, rules and version. A run may therefore be killed and restarted, and several runs may
+share the work in one folder: each writes its own results, and the run that finds all of them writes the dataset.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from wayside.api import Detector, EventRule
 CLIPS = "clips"
 CACHE = ".cache"
 _READERS = 8
-"""Threads that look at recordings."""
+"""Number of threads that identify recordings."""
 
 
 class WorkShare(NamedTuple):
-    """A part of the work: what others do is left to them."""
+    """A part of the work; the rest is left to others."""
 
     number: int
     """From 0."""
@@ -47,10 +47,10 @@ class WorkShare(NamedTuple):
 
 
 class MiningProgress(Protocol):
-    """Sees how far a run is."""
+    """Observes the progress of a run."""
 
     def expect(self, recordings: int, amount: int) -> None:
-        """What is left to do: recordings, and their bytes."""
+        """The remaining work: recordings, and their bytes."""
 
     def done(self, amount: int) -> None:
         """One is done."""
@@ -58,18 +58,18 @@ class MiningProgress(Protocol):
 
 @dataclass
 class MiningRun:
-    """What a run did."""
+    """The result of a run."""
 
     recordings: int
     mined: int = 0
-    """Those for which something was left to do."""
+    """Number of recordings that had remaining work."""
     rules_run: set[str] = field(default_factory=set)
     complete: bool = True
-    """Whether the dataset was written, or is as it would be written; else others have not done their share yet."""
+    """Whether the dataset was written, or is up to date; otherwise other shares are not done yet."""
     cut: list[CutRecording] = field(default_factory=list)
     """The recordings that were cut into pieces."""
     changed: bool = False
-    """Whether it was written."""
+    """Whether the dataset was written."""
 
 
 def run_mining(
@@ -87,11 +87,11 @@ def run_mining(
 
     Args:
         sources: the recordings, in the order in which the dataset has them.
-        output: its folder, made where it is missing.
-        detector: with its rules.
-        rules: those that it selects.
-        workers: where the work is done.
-        watch: sees how far it is.
+        output: its folder, created if it is missing.
+        detector: the Detector of the rules.
+        rules: the rules that it selects.
+        workers: the workers that run the jobs.
+        watch: observes the progress.
         record: whether record actions run.
         share: the part that is done here; None: all.
 
@@ -122,13 +122,13 @@ def run_mining(
     run.complete = not any(entries.left(content, failed_too=True) for content in jobs)
     if run.complete:
         with (output / CACHE / "lock").open("a") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)  # two shares may be the last at once
+            fcntl.flock(lock, fcntl.LOCK_EX)  # two shares may finish at the same time
             run.changed = _write(output, sources, seen, entries, work)
     return run
 
 
 class _Work(NamedTuple):
-    """What is done to each recording."""
+    """The work for each recording."""
 
     output: Path
     detector: Detector
@@ -144,7 +144,7 @@ class _Work(NamedTuple):
         return MiningJob(source, content, self.detector, evaluated, wanted, clips)
 
     def entry(self, done: Done) -> CacheEntry:
-        """What is kept of a result."""
+        """The cache entry of a result."""
         result = done.result
         if isinstance(result, Lost):
             result = msgspec.msgpack.encode(Mined(flaws=[Flaw("failed", result.reason)]))
@@ -159,7 +159,7 @@ class _Work(NamedTuple):
 
 
 class _Entries:
-    """What is kept of each recording, and which rules of which entry count."""
+    """The cached results of each recording, and which rules of which entry count."""
 
     def __init__(self, cache: Cache, keys: Mapping[str, str]) -> None:
         self._keys = keys
@@ -167,7 +167,7 @@ class _Entries:
         self._failed: set[Path] = set()
         for content, paths in cache.entries().items():
             covered: set[str] = set()
-            for path in paths:  # those that failed come after those of the same rules that did not, by their names
+            for path in paths:  # failed entries sort after successful ones of the same rules, by their names
                 entry = read_entry(path)
                 if entry is None:
                     continue
@@ -180,14 +180,14 @@ class _Entries:
                         covered |= own
 
     def left(self, content: str, *, failed_too: bool = False) -> frozenset[str]:
-        """The rules that have not been run over it; `failed_too`: those that failed count as run."""
+        """The rules that have not been run over it; `failed_too`: failed ones count as run."""
         done = self._by_content.get(content, {})
         return frozenset(self._keys).difference(
             *(names for path, names in done.items() if failed_too or path not in self._failed)
         )
 
     def used(self, content: str) -> dict[Path, frozenset[str]]:
-        """The entries that count, each with its rules: of each rule, one; a failure only where nothing else is."""
+        """The entries that count, each with its rules: one per rule; a failure only if there is nothing else."""
         done = self._by_content.get(content, {})
         good = {path: names for path, names in done.items() if path not in self._failed}
         covered = frozenset[str]().union(*good.values())
@@ -196,7 +196,7 @@ class _Entries:
 
 
 def _look_at(sources: Sequence[InputRecording], cache: Cache) -> dict[InputRecording, RecordingPreview | Flaw]:
-    """What each recording is known by, or why it cannot be read."""
+    """The identity of each recording, or why it cannot be read."""
 
     def seen(source: InputRecording) -> tuple[str | None, RecordingPreview | Flaw, bool]:
         try:
@@ -225,7 +225,7 @@ def _write(
     entries: _Entries,
     work: _Work,
 ) -> bool:
-    """Write the dataset unless it is there; returns whether it was written."""
+    """Write the dataset unless it is up to date; returns whether it was written."""
     used = {
         source: entries.used(found.content) if isinstance(found, RecordingPreview) else {}
         for source, found in seen.items()
@@ -251,7 +251,7 @@ def _write(
 
 
 def _forget_clips(folder: Path, used: Iterable[Path]) -> None:
-    """Remove the clips that no episode of the dataset has any more."""
+    """Remove the clips that belong to no episode of the dataset any more."""
     kept = {entry.clips for path in used if (entry := read_entry(path)) is not None}
     for path in folder.iterdir() if folder.is_dir() else ():
         if path.name not in kept:

@@ -1,4 +1,4 @@
-"""What a worker does with a piece of a recording: which observations and signals change when, within it."""
+"""A worker's processing of a piece of a recording: the changes of observations and signals within it."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ from wayside.expressions.columns.values import Tag
 from wayside.inputerror import InputError
 
 LOST = 255
-"""In place of an observation: the client is lost. No observation is like it."""
+"""Stands in for an observation: the client is lost. No observation has this value."""
 
 
 class PieceJob(NamedTuple):
-    """A piece, and the rules to look at, for all of which cutting is exact."""
+    """A piece, and the rules to evaluate, for all of which cutting is exact."""
 
     span: PieceTimes
     files: tuple[str, ...]
@@ -51,29 +51,29 @@ class PieceJob(NamedTuple):
 
 
 class Values(NamedTuple):
-    """The changes of one signal of one client: equal lengths."""
+    """The changes of one signal of one client; arrays of equal length."""
 
     times: Integers
     values: Doubles
-    """Of texts, their places in `texts` of the piece."""
+    """Texts are indices into `texts` of the piece."""
     tags: Bytes
     kinds: frozenset[int]
-    """All tags that there are, also of the changes that are left out."""
+    """All tags that occur, including those of left-out changes."""
 
 
 class _Seen(NamedTuple):
-    """What a rule saw of one client, for one element."""
+    """The observations and signals of a rule for one client and element."""
 
     times: Integers
     codes: Bytes
-    """Observations, or LOST, each from its time on."""
+    """Observations, or LOST, each valid from its time."""
     signals: dict[str, Values]
-    """Right wherever an episode may be open; elsewhere with gaps."""
+    """Complete wherever an episode may be open; elsewhere with gaps."""
 
 
 @dataclass
 class Observed:
-    """What came of a piece."""
+    """The result of a piece."""
 
     flaw: str | None = None
     """Why the recording cannot be cut after all."""
@@ -91,7 +91,7 @@ class Observed:
 
 
 def observe(job: PieceJob) -> Observed:
-    """What happens in a piece. Whatever cutting cannot be exact for is a flaw."""
+    """Process a piece. Everything for which cutting cannot be exact is a flaw."""
     tuned()
     try:
         return _observed(job)
@@ -142,28 +142,28 @@ def _observed(job: PieceJob) -> Observed:
 
 
 def _split(parts: Iterable[Sequence[Arrival]], after: int) -> Iterator[Sequence[Arrival]]:
-    """The parts; one that goes beyond the time is split there."""
+    """The parts; one that extends beyond the time is split there."""
     for part in parts:
         cut = bisect_right(part, after, key=attrgetter("received"))
         yield from (each for each in (part[:cut], part[cut:]) if each)
 
 
 def _begun(replay: Replay, span: PieceTimes) -> _Counted:
-    """Run the ticks before the piece; returns what was counted up to there."""
+    """Run the ticks before the piece; returns the counts up to there."""
     if span.after > replay.engine.now:
         replay.take((), span.after)
     return _counted(replay.engine)
 
 
 class _Counted(NamedTuple):
-    """What an engine counted."""
+    """The counts of an engine."""
 
     rules: dict[str, NDArray[np.int64]]
     """Evaluations, unknown, errors."""
     unnamed: dict[str, int]
     unreadable: int
     lost: int
-    """Samples that were dropped for lack of room: which ones depends on all that came before."""
+    """Samples dropped because of caps: which ones depends on everything before."""
 
 
 def _counted(engine: Engine) -> _Counted:
@@ -178,30 +178,30 @@ def _counted(engine: Engine) -> _Counted:
 
 @dataclass
 class _Group:
-    """The rules of a group, and what of them has been noted."""
+    """The rules of a group, and their noted changes."""
 
     tracks: Sequence[Track]
     every: int
     codes: list[Changes]
     signals: dict[int, tuple[Changes, Track, str]]
-    """By its place in the block: its changes, and a track that has it under a name."""
+    """By index in the block: its changes, and a track that uses it under a name."""
     present: set[int] = field(default_factory=set)
-    """The clients of the block before."""
+    """The clients of the previous block."""
     last: int = 0
     """The last tick."""
 
 
 class _Recorder:
-    """Looks on at the engine of a piece."""
+    """Observes the engine of a piece."""
 
     def __init__(self, after: int) -> None:
-        """It notes what comes after this time; before, only who is there."""
+        """It records what is later than this time; before it, only the known clients."""
         self._after = after
         self._groups: dict[int, _Group] = {}
         self._numbers: dict[str, int] = {}
         self.texts: dict[str, int] = {}
         self.odd = False
-        """Whether there are values that are neither numbers, booleans nor texts."""
+        """Whether there are values other than numbers, booleans and texts."""
 
     def attend(self, engine: Engine) -> None:
         """See `ReplayObserver`."""
@@ -215,7 +215,7 @@ class _Recorder:
         raise AssertionError("rules about pairs are not cut")
 
     def clients(self, tracks: Sequence[Track], block: Block, codes: Codes, looked: Truths | None) -> None:
-        """Note what changes in a block."""
+        """Record the changes in a block."""
         group = self._groups.get(id(tracks))
         if group is None:
             group = self._groups[id(tracks)] = _group(tracks)
@@ -239,7 +239,7 @@ class _Recorder:
             self._nobody_until(group, until + 1)
 
     def seen(self) -> dict[tuple[str, str | None, str], _Seen]:
-        """What was noted."""
+        """The recorded changes."""
         found: dict[tuple[str, str | None, str], _Seen] = {}
         names = [*self._numbers]
         for group in self._groups.values():
@@ -270,7 +270,7 @@ class _Recorder:
             found.values[place] = self.texts.setdefault(text, len(self.texts))
 
     def _nobody_until(self, group: _Group, tick: int) -> None:
-        """Blocks without any client are not seen: who was there at the last one is lost at the next tick."""
+        """Blocks without any client are not reported: the clients of the last block are lost at the next tick."""
         following = group.last + group.every
         if group.last and following < tick:
             self._lose(group, group.present, following)
@@ -298,9 +298,9 @@ def _group(tracks: Sequence[Track]) -> _Group:
 
 
 class _Relevant:
-    """Where an episode of a subject may be open: values elsewhere decide nothing, and are most of all.
+    """The times at which an episode of a subject may be open: other values affect nothing, and are the majority.
 
-    At the beginning of a piece nobody knows. An observation that ends any episode closes it, one by which an episode
+    At the beginning of a piece this is unknown. An observation that ends any episode closes it; one by which an episode
     may start opens it.
     """
 
@@ -311,13 +311,13 @@ class _Relevant:
         starts = ~lost & (codes & 3 == TRUE)
         decided = np.maximum.accumulate(np.where(ends | starts, np.arange(len(codes)), -1))
         self._behind = np.where(decided < 0, True, starts[np.maximum(decided, 0)])
-        """Whether one may be open after each change."""
+        """Whether an episode may be open after each change."""
         self._before = np.concatenate(([True], self._behind[:-1]))
         opening = np.flatnonzero(self._behind & ~self._before)
         self._opens = np.concatenate((times[:1], times[opening]))
 
     def of(self, values: Values) -> Values:
-        """The changes that matter, and what holds where it begins to."""
+        """The relevant changes, and the values valid at their beginning."""
         at = np.searchsorted(self._times, values.times, "right") - 1
         known = np.maximum(at, 0)
         kept = (at < 0) | self._behind[known] | (self._before[known] & (self._times[known] == values.times))

@@ -1,4 +1,4 @@
-"""report.html: a dataset in one page that needs nothing else, with links to its clips."""
+"""report.html: a dataset as one self-contained page, with links to its clips."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from detector.results.report import html_page
 
 REPORT = "report.html"
 _EPISODES = 200
-"""How many episodes of each rule are listed."""
+"""Maximum number of listed episodes per rule."""
 _ROWS = 500
-"""How many rows other tables have."""
+"""Maximum number of rows in other tables."""
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; margin: 0 auto; max-width: 75rem; padding: 1rem; }
@@ -42,7 +42,7 @@ filter.addEventListener("input", () => {{
 
 
 def write_mining_report(folder: Path, summary: Summary) -> None:
-    """Write the page beside the dataset that it is about. Raises OSError."""
+    """Write the page beside its dataset. Raises OSError."""
     brief = (
         f"{summary.recordings_read} recordings, {summary.seconds / 3600:.1f} hours, {summary.samples} samples, "
         f"{sum(rule.episodes for rule in summary.rules)} episodes, {len(summary.errors)} errors"
@@ -105,13 +105,14 @@ def _episodes(folder: Path, rule: str, count: int) -> str:
 
 
 class _Links(list[str]):
-    """Folders of clips."""
+    """Links to folders of clips."""
 
 
 def _section(
     title: str, hint: str, head: Sequence[str], rows: Sequence[Sequence[Any]], count: int | None = None
 ) -> str:
-    """A table; columns whose name begins with # have numbers. `count`: of all rows, if there may be more."""
+    """A table; columns whose name begins with # contain numbers. `count`: the total number of rows, if there may be
+    more."""
     if count is not None and count > len(rows):
         hint = f"{hint} {len(rows)} of {count} rows."
     parts = [f"<h2>{escape(title)}</h2>", f'<p class="hint">{escape(hint.strip())}</p>', '<div class="scroll"><table>']

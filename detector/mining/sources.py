@@ -1,6 +1,6 @@
-"""The recordings that are given: on disk or behind URLs, what they are known by, and how a worker gets their files.
+"""The given recordings, on disk or at URLs: how they are identified, and how a worker gets their files.
 
-Recordings on disk are gathered as for a replay. Behind a URL, a recording is one file, or a rosbag2 folder.
+Recordings on disk are gathered as for a replay. At a URL, a recording is one file, or a rosbag2 folder.
 """
 
 from __future__ import annotations
@@ -21,28 +21,28 @@ from detector.results.installed import check_package
 _BLOCK = 1 << 20
 _BAG = "metadata.yaml"
 _CHECKSUMS = ("ETag", "Content-MD5", "Digest", "Last-Modified", "mtime", "LastModified")
-"""By what stores say that a file is another one, the best first."""
+"""The properties by which stores distinguish versions of a file, the best first."""
 
 
 class InputRecording(NamedTuple):
     """One recording."""
 
     name: str
-    """As people know it, and as the dataset has it."""
+    """Its name for users and in the dataset."""
     files: tuple[str, ...]
     """Paths, or URLs."""
 
     @property
     def is_remote(self) -> bool:
-        """Whether its files have to be fetched."""
+        """Whether its files must be fetched."""
         return "://" in self.files[0]
 
 
 class RecordingPreview(NamedTuple):
-    """What a look at a recording shows before it is read."""
+    """What is known of a recording before it is read."""
 
     content: str
-    """What it is known by: the same content gives the same text."""
+    """Identifies the content: the same content gives the same text."""
     bytes: int
 
 
@@ -50,10 +50,10 @@ def sources_of(given: Iterable[str]) -> list[InputRecording]:
     """The recordings, in order of their names; each once.
 
     Args:
-        given: files, folders and patterns, on disk or as URLs; @FILE for a file with one of these on each line.
+        given: files, folders and patterns, on disk or as URLs; @FILE for a file with one of these per line.
 
     Raises:
-        RecordingError: one is missing; a folder, pattern or list holds no recording.
+        RecordingError: one is missing; a folder, pattern or list contains no recording.
         MissingExtraError: a URL needs a package that is not installed.
         OSError: a list or a folder cannot be read.
     """
@@ -67,7 +67,7 @@ def sources_of(given: Iterable[str]) -> list[InputRecording]:
 
 
 def look(source: InputRecording) -> RecordingPreview:
-    """What the recording is known by. Of one on disk that is read; of a URL, its store says it.
+    """The identity of the recording: on disk its content, at a URL the store's properties.
 
     Raises:
         OSError: a file cannot be read.
@@ -82,7 +82,7 @@ def look(source: InputRecording) -> RecordingPreview:
 
 
 def stamp_of(source: InputRecording) -> str | None:
-    """Changes if the files on disk do: size and time of change of each; None for URLs, whose look costs little."""
+    """Changes if the files on disk do: size and modification time of each; None for URLs, which are checked quickly."""
     if source.is_remote:
         return None
     stats = [path.stat() for file in source.files for path in _files(Path(file))]
@@ -91,7 +91,7 @@ def stamp_of(source: InputRecording) -> str | None:
 
 @contextmanager
 def fetched(source: InputRecording) -> Iterator[Recording]:
-    """The recording's files on disk; those of URLs are there for as long as the context lasts.
+    """The recording's files on disk; those from URLs exist during the context.
 
     Raises:
         OSError: a file cannot be fetched.
@@ -122,7 +122,7 @@ def _files(path: Path) -> Iterator[Path]:
 
 
 def _read(path: Path) -> tuple[bytes, int]:
-    """A digest of the content, and its size in bytes. The name's ending decides how it is read, so it counts."""
+    """A digest of the content, and its size in bytes. The suffix is included, because it determines the reader."""
     digest, size = hashlib.blake2b(path.suffix.encode(), digest_size=16), 0
     for each in _files(path):
         digest.update(each.name.encode() if path.is_dir() else b"")
@@ -133,11 +133,11 @@ def _read(path: Path) -> tuple[bytes, int]:
     return digest.digest(), size
 
 
-# Behind URLs
+# URLs
 
 
 def _store(url: str) -> tuple[Any, str]:
-    """The file system behind a URL, and the path in it."""
+    """The file system of a URL, and the path in it."""
     check_package("fsspec", url, "mining")
     scheme = urlsplit(url).scheme
     if scheme == "s3":  # pyarrow's own: the packages of s3fs exclude those of the Kubernetes client
@@ -156,7 +156,7 @@ def _store(url: str) -> tuple[Any, str]:
 
 
 def _s3_options() -> dict[str, str]:
-    """Where S3 is, as the command line tools of AWS read it; credentials are found by the library."""
+    """The location of S3, from the variables of the AWS command line tools; the library finds credentials."""
     options = {}
     if endpoint := os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL"):
         options["endpoint_override"] = endpoint
@@ -166,7 +166,7 @@ def _s3_options() -> dict[str, str]:
 
 
 def _behind(url: str) -> Iterator[InputRecording]:
-    """The recordings that a URL stands for."""
+    """The recordings at a URL."""
     store, path = _store(url)
     is_file = PurePosixPath(path).suffix in (*BINARY, *TEXT)
     try:
@@ -191,7 +191,7 @@ def _members(store: Any, path: str) -> list[str]:
 
 
 def _stored(url: str) -> tuple[bytes, int]:
-    """A digest of what the store says of the content, and its size; where it says too little, of the content."""
+    """A digest of the store's properties of the content, and its size; if these are insufficient, of the content."""
     store, path = _store(url)
     digest, size = hashlib.blake2b(url.encode(), digest_size=16), 0
     for each in _members(store, path):
@@ -209,7 +209,7 @@ def _stored(url: str) -> tuple[bytes, int]:
 
 
 def _fetch(url: str, folder: Path) -> Path:
-    """The file or folder that was fetched."""
+    """Fetch a file or folder; returns its path."""
     store, path = _store(url)
     members = _members(store, path)
     folder = folder / PurePosixPath(path).name if members != [path] else folder
@@ -220,6 +220,6 @@ def _fetch(url: str, folder: Path) -> Path:
 
 
 def sampled(sources: Sequence[InputRecording], number: int) -> list[InputRecording]:
-    """Some of the recordings, in their order: by a digest of their names, so the same ones each time."""
+    """A sample of the recordings, in their order: selected by a digest of their names, so always the same."""
     by_chance = sorted(sources, key=lambda source: hashlib.blake2b(source.name.encode(), digest_size=8).digest())
     return sorted(by_chance[:number])

@@ -1,4 +1,4 @@
-"""What a dataset holds, in brief: episodes by rule and by recording, and the rarest."""
+"""A summary of a dataset: episodes by rule and by recording, and the rarest ones."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from rich.table import Table
 from detector.mining.dataset import EPISODES
 
 _RECORDINGS = 10
-"""How many recordings are listed."""
+"""Maximum number of listed recordings."""
 _RARE = 5
-"""How many of the rarest episodes are."""
+"""Maximum number of listed rare episodes."""
 
 
 class RuleSummary(NamedTuple):
@@ -24,17 +24,17 @@ class RuleSummary(NamedTuple):
     rule: str
     episodes: int
     recordings: int
-    """In how many there is an episode."""
+    """Number of recordings with an episode."""
     total: float
     longest: float
-    """Seconds, of the episodes that ended."""
+    """Seconds, of ended episodes."""
     evaluations: int
     unknown: int
     errors: int
 
 
 class RareEpisode(NamedTuple):
-    """An episode of a rule that has few."""
+    """An episode of a rule with few episodes."""
 
     rule: str
     recording: str
@@ -44,23 +44,23 @@ class RareEpisode(NamedTuple):
 
 @dataclass(frozen=True)
 class Summary:
-    """All of it."""
+    """The whole summary."""
 
     rules: list[RuleSummary]
     """The rarest first."""
     recordings: list[tuple[str, dict[str, int]]]
-    """Their episodes by rule; the recordings with most episodes first. Those without any are left out."""
+    """Their episodes by rule; the recordings with most episodes first. Recordings without episodes are left out."""
     rarest: list[RareEpisode]
     errors: list[dict[str, Any]]
     """The rows of errors.parquet."""
     recordings_read: int
     samples: int
     seconds: float
-    """Of data, of all recordings together."""
+    """Duration of all recordings together."""
 
 
 def summary_of(folder: Path) -> Summary:
-    """Read a dataset. Raises OSError where it is not whole."""
+    """Read a dataset. Raises OSError if it is incomplete."""
     import pyarrow.parquet as pq  # noqa: PLC0415  an extra
 
     by_recording: dict[str, dict[str, int]] = {}
@@ -93,7 +93,7 @@ def summary_of(folder: Path) -> Summary:
 
 
 def _rarest(folder: Path, rules: list[RuleSummary]) -> list[RareEpisode]:
-    """The first episodes of the rules that have fewest, but have some."""
+    """The first episodes of the rules that have the fewest."""
     import pyarrow.parquet as pq  # noqa: PLC0415
 
     found: list[RareEpisode] = []

@@ -1,6 +1,6 @@
-"""What workers get for a job: the whole of it, or pieces of its recording and the rules that need the whole.
+"""The tasks of workers for a job: the whole of it, or pieces of its recording and the rules that need the whole.
 
-A recording is cut only where it would hold the others up: pieces cost a little more than the whole.
+A recording is cut only if it would delay the end: pieces cost slightly more than the whole.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from detector.mining.workers import Lost, RemoteCall, Workers
 from detector.replay.errors import RecordingError
 
 _PER_WORKER = 2
-"""A recording is cut into pieces so small that each worker has at least this number of calls."""
+"""Minimum number of calls per worker when a recording is cut."""
 
 
 class Done(NamedTuple):
-    """What a job came to, or a part of its rules."""
+    """The result of a job, or of some of its rules."""
 
     job: MiningJob
     rules: frozenset[str]
@@ -39,15 +39,16 @@ class CutRecording(NamedTuple):
     name: str
     pieces: int
     whole: Mapping[str, str]
-    """The rules that ran over the whole, and why."""
+    """The rules that ran over the whole recording, with the reasons."""
 
 
 def run_jobs(jobs: Iterable[tuple[MiningJob, int]], workers: Workers, cut: list[CutRecording]) -> Iterator[Done]:
-    """Run the jobs, each with the size of its recording in bytes; results as they are ready, by parts of the rules.
+    """Run the jobs, each with the size of its recording in bytes; yields results as they are ready, by parts of the
+    rules.
 
-    Adds to `cut` which recordings were cut.
+    Appends the recordings that were cut to `cut`.
     """
-    # The largest first: the last one decides when all are done.
+    # The largest first, to shorten the tail.
     ordered = sorted(jobs, key=lambda each: (-each[1], each[0].content))
     total = sum(size for _, size in ordered)
     calls: list[RemoteCall] = []
@@ -82,7 +83,7 @@ def run_jobs(jobs: Iterable[tuple[MiningJob, int]], workers: Workers, cut: list[
 
 
 def _cutting(job: MiningJob, count: int) -> Cutting | None:
-    """How to cut the recording of a job; what is wrong with it comes to light when it is mined."""
+    """How to cut the recording of a job; its errors are reported when it is mined."""
     if count < 2 or job.source.is_remote:
         return None
     try:
@@ -93,13 +94,13 @@ def _cutting(job: MiningJob, count: int) -> Cutting | None:
 
 
 def _with(job: MiningJob, wanted: frozenset[str]) -> MiningJob:
-    """The job for some of its rules alone."""
+    """The job for only some of its rules."""
     needed = with_dependencies(wanted, {rule.name: rule for rule in job.rules})
     return job._replace(wanted=wanted, rules=[rule for rule in job.rules if rule.name in needed])
 
 
 class _Pieces:
-    """The pieces of a recording, and what came of them so far."""
+    """The pieces of a recording, and their results so far."""
 
     def __init__(self, job: MiningJob, cutting: Cutting) -> None:
         self.job = job._replace(clips=None)
@@ -108,13 +109,13 @@ class _Pieces:
         self._observed: dict[int, Observed] = {}
 
     def take(self, call: RemoteCall, result: Observed | Lost) -> bool:
-        """What came of a piece; whether it was the last one."""
+        """Store the result of a piece; returns whether it was the last one."""
         found = Observed(flaw=result.reason) if isinstance(result, Lost) else result
         self._observed[[id(each) for each in self.calls].index(id(call))] = found
         return len(self._observed) == len(self.calls)
 
     def result(self) -> bytes | None:
-        """What they came to; None: the recording has to be mined whole."""
+        """The joined result; None: the recording must be mined as a whole."""
         pieces: Sequence[Observed] = [self._observed[at] for at in range(len(self.calls))]
         if flaw_of(pieces) is not None:
             return None

@@ -1,4 +1,4 @@
-"""What a worker process does: one recording, some rules; what comes of it is plain data that any process can keep."""
+"""A worker's job: one recording, some rules; the result is plain data."""
 
 from __future__ import annotations
 
@@ -30,21 +30,22 @@ from wayside.api import Detector, EventRule
 from wayside.inputerror import InputError
 
 _DIGITS = 12
-"""Of the content's digest, in the name of the holder: ids of episodes differ even if recordings begin alike."""
+"""Number of digits of the content's digest in the name of the holder: ids of episodes differ even for recordings with
+the same beginning."""
 
 
 class Flaw(msgspec.Struct, frozen=True, order=True):
-    """What is wrong with a recording, or with a rule over it."""
+    """A problem of a recording, or of a rule over it."""
 
     kind: str
-    """`unreadable`: nothing was mined; `cut`: its end is missing; `refused`: a rule does not fit; `failed`: mining it
-    failed for a reason that may pass, so that the next run tries again."""
+    """`unreadable`: nothing was mined; `cut`: the recording is truncated; `refused`: a rule does not fit; `failed`:
+    mining failed for a possibly temporary reason, so the next run retries it."""
     message: str
     rule: str | None = None
 
 
 class RuleCount(msgspec.Struct, frozen=True):
-    """How the evaluations of a rule went."""
+    """The counts of a rule's evaluations."""
 
     rule: str
     evaluations: int
@@ -53,23 +54,23 @@ class RuleCount(msgspec.Struct, frozen=True):
 
 
 class Mined(msgspec.Struct):
-    """What a recording came to, for some rules."""
+    """The result of a recording, for some rules."""
 
     episodes: list[EpisodeRow] = []
-    """In order of the rules, then of their starts; they name no recording."""
+    """In order of the rules, then of their starts; without the recording's name."""
     counts: list[RuleCount] = []
     streams: list[StreamQuality] = []
     flaws: list[Flaw] = []
     clips: dict[str, list[str]] = {}
-    """By episode, the folders of its clips, in that of the job."""
+    """By episode, the folders of its clips, in the folder of the job."""
     samples: int = 0
     begin: int = 0
     end: int = 0
-    """When the first and the last sample were received, nanoseconds since the epoch; 0: there is none."""
+    """When the first and the last sample were received, nanoseconds since the epoch; 0: there were none."""
 
     @property
     def is_failed(self) -> bool:
-        """Whether another attempt may come to something else."""
+        """Whether another attempt may succeed."""
         return any(flaw.kind == "failed" for flaw in self.flaws)
 
 
@@ -80,15 +81,15 @@ class MiningJob(NamedTuple):
     content: str
     detector: Detector
     rules: Sequence[EventRule]
-    """All that are evaluated."""
+    """All rules to evaluate."""
     wanted: frozenset[str]
-    """Those whose episodes are kept: the others are there because these look at their episodes."""
+    """The rules whose episodes are kept: the others are evaluated because these read their episodes."""
     clips: str | None
-    """The folder for clips of this job alone; None: no clips."""
+    """The folder for clips of this job only; None: no clips."""
 
 
 def mine_recording(job: MiningJob) -> bytes:
-    """Mine one recording; returns a `Mined` as msgpack. What is wrong with the recording is part of it."""
+    """Mine one recording; returns a `Mined` as msgpack, including the recording's problems."""
     tuned()
     return msgspec.msgpack.encode(_mined(job))
 
@@ -100,7 +101,7 @@ def tuned() -> None:
 
 
 def decode_mined(data: bytes) -> Mined:
-    """The inverse. Raises msgspec.DecodeError where another version wrote it."""
+    """The inverse of `mine`'s encoding. Raises msgspec.DecodeError if another version wrote it."""
     return msgspec.msgpack.decode(data, type=Mined)
 
 
@@ -119,7 +120,7 @@ def _mined(job: MiningJob) -> Mined:
 
 
 def _plain(text: str, recording: Recording) -> str:
-    """The text with the names of files alone: it is the same wherever they lie."""
+    """The text with only the names of files, so that it does not depend on their folder."""
     for path in recording:
         text = text.replace(str(path), path.name)
     return text
@@ -140,7 +141,7 @@ def _replayed(job: MiningJob, recording: Recording) -> Mined:
     )
     (outcome,) = played.outcomes.values()
     result = result_of(job.source.name, outcome, tracer, arrivals)
-    # The last tick of one rule must not decide about the statistics of another: which rules run together may differ.
+    # The last tick of one rule must not affect the statistics of another: which rules run together may differ.
     mined = mined_of(replace(result, trace=replace(result.trace, end=outcome.end)), job.wanted)
     mined.begin, mined.end = arrivals.span
     mined.flaws = sorted(_flaws(outcome, job, recording))
@@ -149,12 +150,12 @@ def _replayed(job: MiningJob, recording: Recording) -> Mined:
 
 
 def job_holder(job: MiningJob) -> str:
-    """Under whose name the job's episodes are."""
+    """The holder of the job's episodes."""
     return f"{job.detector.name}.{job.content[:_DIGITS]}"
 
 
 def mined_of(result: Result, wanted: frozenset[str]) -> Mined:
-    """What is kept of a replay; flaws and clips come later."""
+    """The cached part of a replay's result; flaws and clips are added later."""
     episodes = [each for each in result.episodes if each.rule in wanted]
     for each in episodes:
         each.recording = ""
@@ -167,7 +168,7 @@ def mined_of(result: Result, wanted: frozenset[str]) -> Mined:
 
 
 def in_their_order(episodes: Iterable[EpisodeRow]) -> list[EpisodeRow]:
-    """As a `Mined` has them."""
+    """In the order of a `Mined`."""
     return sorted(episodes, key=lambda each: (each.rule, each.start_time, each.subject))
 
 
@@ -183,7 +184,7 @@ def _flaws(outcome: Outcome, job: MiningJob, recording: Recording) -> list[Flaw]
 
 def _clips(folder: Path) -> Clips:
     """Raises OSError."""
-    shutil.rmtree(folder, ignore_errors=True)  # of an attempt that was killed
+    shutil.rmtree(folder, ignore_errors=True)  # from an attempt that was killed
     return Clips(folder)
 
 

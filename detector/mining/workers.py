@@ -1,4 +1,4 @@
-"""Worker processes: calls go in, results come out. A process that dies takes no other call with it."""
+"""Worker processes: calls go in, results come out. A process that dies fails no other call."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from multiprocessing import get_context
 from typing import Any, NamedTuple, Protocol
 
 ATTEMPTS = 2
-"""In the company of others. A process that dies may have been killed for what another one does."""
+"""Attempts beside other calls. A process that dies may have been killed because of another one."""
 
 
 class RemoteCall(NamedTuple):
-    """A function of a module, and what it is called with; both travel to another process."""
+    """A function of a module, and its arguments; both are sent to another process."""
 
     function: Callable[[Any], Any]
     argument: Any
@@ -23,33 +23,33 @@ class RemoteCall(NamedTuple):
 
 @dataclass(frozen=True)
 class Lost:
-    """In place of a result: the process died each time."""
+    """Stands in for a result: the process died each time."""
 
     reason: str
 
 
 class Workers(Protocol):
-    """Where calls run."""
+    """Runs calls."""
 
     @property
     def count(self) -> int:
-        """How many calls run side by side."""
+        """How many calls run in parallel."""
 
     def run(self, calls: Iterable[RemoteCall]) -> Iterator[tuple[RemoteCall, Any]]:
-        """Each call with its result, or `Lost`, in the order in which they are ready.
+        """Each call with its result, or `Lost`, as they become ready.
 
-        An error that a call raises is raised here.
+        An exception of a call is raised here.
         """
 
     def close(self) -> None:
-        """Nothing more is called."""
+        """No more calls follow."""
 
 
 class LocalWorkers:
-    """Processes of this machine."""
+    """Processes on this machine."""
 
     def __init__(self, processes: int) -> None:
-        """`processes` is how many there are at most, at least one; they start when they are needed."""
+        """`processes` is the maximum number, at least one; they start on demand."""
         self._processes = processes
         self._executor: ProcessPoolExecutor | None = None
 
@@ -59,9 +59,9 @@ class LocalWorkers:
         return self._processes
 
     def run(self, calls: Iterable[RemoteCall]) -> Iterator[tuple[RemoteCall, Any]]:
-        """See `Workers`. A process that dies breaks its pool: what was under way begins again in another one.
+        """See `Workers`. A process that dies breaks its pool: the running calls start again in a new pool.
 
-        A call that was under way that often runs alone, so that it is known which one it is that kills its process.
+        A call that was running in that many broken pools runs alone, to find out whether it kills its process.
         """
         left = deque((call, 0) for call in calls)
         alone: list[RemoteCall] = []
@@ -82,7 +82,7 @@ class LocalWorkers:
             self._executor = None
 
     def _run(self, left: deque[tuple[RemoteCall, int]], alone: list[RemoteCall]) -> Iterator[tuple[RemoteCall, Any]]:
-        """Until a process dies, or nothing is left."""
+        """Run until a process dies, or nothing is left."""
         self._executor = executor = self._executor or _pool(self._processes)
         running: dict[Future[Any], tuple[RemoteCall, int]] = {}
         try:
@@ -107,5 +107,5 @@ class LocalWorkers:
 
 
 def _pool(processes: int) -> ProcessPoolExecutor:
-    # A fork would copy the locks of threads as they are; a spawned process has nothing of ours.
+    # A fork would copy held locks of other threads; a spawned process starts clean.
     return ProcessPoolExecutor(processes, mp_context=get_context("spawn"))

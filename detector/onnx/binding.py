@@ -1,6 +1,4 @@
-"""Binds the models of a compiled rule to their files, and reports what does not match: file, inputs, shapes,
-outputs.
-"""
+"""Binds the models of a compiled rule to their files, and reports mismatches: file, inputs, shapes, outputs."""
 
 from __future__ import annotations
 
@@ -19,11 +17,11 @@ from wayside.api.model import Channels, ImageLayout, ModelImage, ModelInput, Mod
 from wayside.rules import CompiledModel, CompiledRule, RuleError, RuleProblem
 
 MAXIMUM_OUTPUT = 4096
-"""So many numbers a model may give for one client: expressions stop after some ten thousand steps."""
+"""Maximum number of values in a model's output for one client: expressions stop after about ten thousand steps."""
 
 
 def bind_models(rule: CompiledRule) -> CompiledRule:
-    """The rule with its models ready to run; another file makes it another rule.
+    """The rule with its models ready to run; another file changes the rule's identity.
 
     Raises:
         RuleError: with every problem of the models.
@@ -61,12 +59,12 @@ class Runner:
         self._kinds = {each.name: each.dtype for each in file.inputs if each.name in self._given}
 
     def tensor(self, name: str, payload: bytes) -> NDArray[Any]:
-        """What a camera's or lidar's message is as that input. Raises DecodeError."""
+        """The message of a camera or lidar as that input. Raises DecodeError."""
         given = self._given[name]
         return _image(given.image, payload) if given.image is not None else _points(_known(given.points), payload)
 
     def run(self, rows: Sequence[Mapping[str, Any]]) -> list[Any]:
-        """For each row of inputs the signal's value: a double, a list of doubles, or a map of these by output.
+        """The signal's value for each row of inputs: a double, a list of doubles, or a map of these by output.
 
         Raises:
             ValueError: the model fails.
@@ -118,7 +116,7 @@ def _problems(model: CompiledModel, file: ModelFile) -> Iterator[tuple[FieldPath
 
 
 def _trial(inputs: Sequence[ModelInput], file: ModelFile, wanted: Sequence[Tensor]) -> Iterator[tuple[FieldPath, str]]:
-    """Runs the model once, for as many clients as it takes at a time up to two, on zeros."""
+    """Runs the model once on zeros, for two clients, or for as many as it takes at a time."""
     dtypes = {each.name: each.dtype for each in file.inputs}
     row = {given.name: np.zeros(given.shape, dtypes[given.name]) for given in inputs}
     try:
@@ -136,7 +134,7 @@ def _trial(inputs: Sequence[ModelInput], file: ModelFile, wanted: Sequence[Tenso
 
 
 def _misfit(given: ModelInput, declared: Tensor) -> str:
-    """Why what is given does not fit the model's input; empty where it does."""
+    """Why the input does not fit the model's; empty if it does."""
     if declared.dtype is None:
         return f"input {declared.name} is {declared.kind}: only tensors of numbers are supported"
     if len(declared.shape) < 2:
@@ -188,7 +186,7 @@ def _known(wanted: ModelPoints | None) -> ModelPoints:
 
 
 def _plain(value: NDArray[np.float64]) -> Any:
-    """A double where there is one number, else lists of them."""
+    """A double for a single number, otherwise lists of them."""
     return float(value.reshape(())) if value.size == 1 else value.tolist()
 
 

@@ -1,6 +1,6 @@
-"""A model file: read, known by its sha256, and run the same way each time.
+"""A model file: read, identified by its sha256, and run the same way each time.
 
-One thread and no choice between kernels at run time: the same inputs give the same outputs, live and in a replay.
+It uses one thread and does not choose kernels at run time: the same inputs give the same outputs, live and in a replay.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ _NUMBERS: Mapping[str, str] = {
     "tensor(bool)": "bool",
     **{f"tensor({sign}int{bits})": f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)},
 }
-"""numpy's names for ONNX's types of numbers."""
+"""numpy's names of ONNX's numeric types."""
 
 _loaded: WeakValueDictionary[str, ModelFile] = WeakValueDictionary()
-"""By sha256, the models that some rule uses: a change of another rule does not load them again."""
+"""By sha256, the models in use: a change of another rule does not reload them."""
 
 _MAXIMUM_BYTES = 2**31
-"""ONNX keeps models in one protobuf message, which cannot be larger."""
+"""ONNX stores models in one protobuf message, which cannot be larger."""
 
 
 class ModelError(ValueError):
@@ -37,25 +37,25 @@ class ModelError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Tensor:
-    """An input or output as the file declares it."""
+    """An input or output as declared in the file."""
 
     name: str
     kind: str
     """ONNX's type, e.g. tensor(float)."""
     shape: tuple[int | None, ...]
-    """With the first axis, the clients'; None: of any length."""
+    """Including the first axis, which is the clients; None: any length."""
 
     @property
     def dtype(self) -> np.dtype[Any] | None:
-        """numpy's type; None where the tensor holds no numbers."""
+        """numpy's type; None if the tensor contains no numbers."""
         return np.dtype(_NUMBERS[self.kind]) if self.kind in _NUMBERS else None
 
 
 class ModelFile:
-    """A model that is ready to run."""
+    """A model ready to run."""
 
     def __init__(self, content: bytes, sha256: str) -> None:
-        """Raises ModelError: onnxruntime is not there, or cannot read the content."""
+        """Raises ModelError: onnxruntime is not installed, or cannot read the content."""
         try:
             import onnxruntime  # noqa: PLC0415  an extra, and half a second to import
         except ImportError:
@@ -68,7 +68,7 @@ class ModelFile:
         options.log_severity_level = 4
         try:
             self._session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
-        except Exception as error:  # onnxruntime's errors have no base of their own
+        except Exception as error:  # onnxruntime's errors have no common base
             raise ModelError(f"is not a valid ONNX model: {_line(error)}") from error
         self.sha256 = sha256
         self.inputs = tuple(map(_tensor, self._session.get_inputs()))
@@ -76,11 +76,11 @@ class ModelFile:
 
     @property
     def one_by_one(self) -> bool:
-        """Whether the first axis is of length 1: the model takes one client at a time."""
+        """Whether the first axis has length 1: the model takes one client at a time."""
         return any(each.shape[:1] == (1,) for each in self.inputs)
 
     def run(self, inputs: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-        """The outputs by name. Raises ModelError where the model fails on these inputs."""
+        """The outputs by name. Raises ModelError if the model fails on these inputs."""
         names = [each.name for each in self.outputs]
         try:
             return dict(zip(names, self._session.run(names, dict(inputs)), strict=True))
@@ -96,10 +96,10 @@ class ModelFile:
 
 
 def load_model(path: str) -> ModelFile:
-    """The model of a file. One that has not changed since is not read into a new session.
+    """The model of a file. An unchanged file is not loaded again.
 
     Raises:
-        ModelError: no file, or no model.
+        ModelError: the file does not exist, or is not a model.
     """
     try:
         size = Path(path).stat().st_size

@@ -1,6 +1,6 @@
 """Plugins: Python classes that compute a signal from the buffer. See docs/plugins.md.
 
-What a plugin needs is here; everything else in this package is how the detector finds and runs it.
+This module has the interface for plugins; the rest of the package finds and runs them.
 """
 
 from detector.engine.queries.geometry import Pose

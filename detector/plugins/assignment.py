@@ -1,4 +1,4 @@
-"""Which of two sets of points belong together: as many pairs within a gate as there can be, the nearest of these."""
+"""Matches two sets of points: as many pairs within a gate as possible, the nearest of these."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ Point = tuple[float, float]
 
 
 def warm_up() -> None:
-    """Load what `assigned` needs: it takes a second or two."""
-    import scipy.optimize  # noqa: F401, PLC0415  not at the top: checking a rule needs none of it
+    """Load the dependencies of `assigned`, which takes a second or two."""
+    import scipy.optimize  # noqa: F401, PLC0415  not at the top: checking a rule does not need it
 
 
 def assigned(first: Sequence[Point], second: Sequence[Point], gate: float) -> dict[int, int]:
-    """From indices of the one to indices of the other, each used at most once, at most `gate` metres apart.
+    """From indices of the first to indices of the second, each used at most once, at most `gate` metres apart.
 
     Of all assignments with the greatest number of pairs, one with the smallest sum of distances.
     """
@@ -27,7 +27,7 @@ def assigned(first: Sequence[Point], second: Sequence[Point], gate: float) -> di
 
     distances = np.array([[math.dist(a, b) for b in second] for a in first])
     within = distances <= gate
-    # Dearer than all pairs within the gate together: so it is taken only where there is no pair left.
+    # More expensive than all pairs within the gate together, so it is only used if no pair is left.
     beyond = (gate + 1.0) * (min(len(first), len(second)) + 1)
     rows, columns = linear_sum_assignment(np.where(within, distances, beyond))
     return {int(row): int(column) for row, column in zip(rows, columns, strict=True) if within[row, column]}

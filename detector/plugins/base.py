@@ -1,4 +1,4 @@
-"""What a plugin is: a class with typed parameters and one method, of which every subject has an object of its own."""
+"""Defines a plugin: a class with typed parameters and one method, with one object per subject."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ P = TypeVar("P", bound="PluginParameters")
 
 
 class PluginParameters(Model):
-    """Base of a plugin's parameters: camelCase in YAML, immutable, and a misspelt field is an error."""
+    """Base of a plugin's parameters: camelCase in YAML, immutable; unknown fields are errors."""
 
 
 def _known_stream(name: str, info: ValidationInfo) -> str:
@@ -30,31 +30,31 @@ def _known_stream(name: str, info: ValidationInfo) -> str:
 
 
 StreamName = Annotated[str, Field(min_length=1, max_length=63), AfterValidator(_known_stream)]
-"""A parameter that names a stream: `detector check` refuses one that the Detector does not have."""
+"""A parameter that names a stream: `detector check` rejects one that the Detector does not have."""
 
 Seconds = Annotated[float, Field(ge=0, le=86_400)]
-"""A parameter that is a length of time in seconds."""
+"""A parameter that is a duration in seconds."""
 
 
 class Subject(NamedTuple):
-    """Whom a plugin's object computes its signal for."""
+    """The subject for which a plugin's object computes its signal."""
 
     text: str
-    """As in events: `car1`, `car1+car2`, `~fleet`, followed by `~` and the element of `each` where there is one."""
+    """The text in events: `car1`, `car1+car2`, `~fleet`, followed by `~` and the element of `each` if there is one."""
     element: str | None
     """The name of the element of `each`."""
 
 
 class Plugin(ABC, Generic[P]):
-    """Computes a signal. Each subject of the rule has an object of its own, whose attributes are its state.
+    """Computes a signal. Each subject of the rule has a separate object, whose attributes are its state.
 
-    The object is made when the subject is first evaluated, and dropped when the rule is no longer evaluated for it,
-    when the rule changes, and when time jumps. What it computes must follow from its parameters, its state and the
-    queries alone (no clock, no random numbers): then a replay gives what the drive gave.
+    The object is created when the subject is first evaluated, and dropped when the rule is no longer evaluated for it,
+    when the rule changes, and when time jumps. Its results must depend only on its parameters, its state and the
+    queries (no clock, no random numbers): then a replay gives the same results as the drive.
     """
 
     Parameters: ClassVar[type[PluginParameters]]
-    """The model of `signals[].plugin.parameters`; what it refuses, `detector check` reports with its place."""
+    """The model of `signals[].plugin.parameters`; `detector check` reports invalid ones with their place."""
 
     def __init__(self, parameters: P, subject: Subject) -> None:
         self.parameters = parameters
@@ -62,18 +62,18 @@ class Plugin(ABC, Generic[P]):
 
     @classmethod
     def warm_up(cls) -> None:
-        """Called once where the plugin runs, before any other call: slow loading belongs here.
+        """Called once before any other call, in the process of the plugin: put slow loading here.
 
-        A value must be there within half a second, and that includes what is imported for it.
+        A value must be returned within half a second, including its imports.
         """
 
     @abstractmethod
     def value(self, queries: Queries, clients: tuple[str, ...]) -> Value:
-        """The signal at this evaluation: a boolean, number, text, list or map of these; None where it is unknown.
+        """The signal at this evaluation: a boolean, number, text, list or map of these; None if it is unknown.
 
         Args:
-            queries: the buffer as it is at the tick. Messages are shared: look, do not change.
+            queries: the buffer at the tick. Messages are shared: do not modify them.
             clients: the client; the two of a pair; the fleet's members at this tick.
 
-        Whatever it raises makes the signal unknown for this evaluation; it is counted and reported.
+        Any exception makes the signal unknown for this evaluation; it is counted and reported.
         """

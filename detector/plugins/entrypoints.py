@@ -1,8 +1,7 @@
-"""What installed packages offer: classes of one kind, each with a model of its parameters.
+"""The classes of one kind that installed packages provide, each with a model of its parameters.
 
-A package declares what it provides by an entry point; a resource names it and gives it parameters. Whatever is
-wrong with that (nothing of that name, a module that does not load, parameters that it refuses) is reported with its
-field.
+A package declares what it provides by an entry point; a resource names it and gives it parameters. Every problem is
+reported with its field: an unknown name, a module that does not load, invalid parameters.
 """
 
 from __future__ import annotations
@@ -20,14 +19,14 @@ from pydantic import BaseModel, ValidationError
 from wayside.api.wording import FieldPath, messages
 
 T = TypeVar("T")
-"""The base class of what is offered."""
+"""The base class of the provided classes."""
 
 _OWN = "wayside"
-"""The distribution whose offers come before those of others with the same name."""
+"""The distribution whose classes take precedence over those of others with the same name."""
 
 
 class PluginError(ValueError):
-    """A plugin that is not there, cannot be loaded, or refuses its parameters; `problems` gives places and reasons.
+    """A plugin that does not exist, cannot be loaded, or rejects its parameters; `problems` has places and reasons.
 
     The paths begin at the part of the resource that names the plugin.
     """
@@ -39,30 +38,31 @@ class PluginError(ValueError):
 
 @dataclass(frozen=True)
 class Offers(Generic[T]):
-    """One kind of what packages offer. Loading runs their code: only what is named is loaded, and only once."""
+    """The classes of one kind that packages provide. Loading runs their code: only named ones are loaded, and only
+    once."""
 
     group: str
-    """Of the entry points, e.g. wayside.signals."""
+    """The group of the entry points, e.g. wayside.signals."""
     noun: str
-    """What people call one of them, e.g. plugin."""
+    """The word for one of them in messages, e.g. plugin."""
     base: type
-    """T: what the classes derive from; they have an attribute `Parameters`."""
+    """T: the base class; derived classes have an attribute `Parameters`."""
     model: type[BaseModel]
-    """What `Parameters` derives from."""
+    """The base class of `Parameters`."""
     guide: str
     """The guide for writing one, e.g. docs/plugins.md."""
     shipped: tuple[EntryPoint, ...] = ()
     """Those that need no installed package."""
 
     def installed(self) -> dict[str, EntryPoint]:
-        """By name; of two with the same name, the detector's own, or the one found first."""
+        """By name; of two with the same name, the detector's own, or the first one found."""
         found: dict[str, EntryPoint] = {}
         for entry in (*self.shipped, *sorted(entry_points(group=self.group), key=_foreign)):
             found.setdefault(entry.name, entry)
         return dict(sorted(found.items()))
 
     def load(self, name: str, at: FieldPath) -> type[T]:
-        """The class of that name, which stands in the field `at`. Raises PluginError; then nothing is remembered."""
+        """The class named in the field `at`. Raises PluginError; nothing is cached then."""
         try:
             found: type[T] = _load(self, name)
         except LookupError as error:
@@ -72,7 +72,7 @@ class Offers(Generic[T]):
     def parameters(
         self, offered: type[T], given: Mapping[str, Any], at: FieldPath, context: Mapping[str, Any] | None = None
     ) -> Any:
-        """An instance of the class's Parameters, from what stands in the field `at`. Raises PluginError."""
+        """An instance of the class's Parameters, from the value of the field `at`. Raises PluginError."""
         written = dict(given)
         try:
             return offered.Parameters.model_validate(written, context=context)  # type: ignore[attr-defined]
@@ -86,7 +86,7 @@ def _foreign(entry: EntryPoint) -> bool:
 
 @cache
 def _load(offers: Offers[T], name: str) -> type[T]:
-    """Raises LookupError, with a text for the one who named it."""
+    """Raises LookupError, with a text for the user."""
     entries = offers.installed()
     entry = entries.get(name)
     what = f"{offers.noun} {name}"
@@ -110,7 +110,7 @@ def _load(offers: Offers[T], name: str) -> type[T]:
 
 
 def _remedy(entry: EntryPoint, error: Exception) -> str:
-    """What to install where an offer of the detector's own lacks a library."""
+    """What to install if one of the detector's own classes lacks a library."""
     if not isinstance(error, ImportError) or entry.dist is None or _foreign(entry):
         return ""
     extras = entry.dist.metadata.get_all("Provides-Extra") or []

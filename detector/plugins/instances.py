@@ -1,4 +1,4 @@
-"""The objects of one plugin signal, one for each subject; and a host that calls them in the detector's own process."""
+"""The objects of one plugin signal, one per subject; and a host that calls them in the detector's process."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ class Instances:
     """The objects of one signal."""
 
     def __init__(self, plugin: str, parameters: Mapping[str, Any]) -> None:
-        """Raises PluginError, and whatever the plugin's `warm_up` raises."""
+        """Raises PluginError, and the exceptions of the plugin's `warm_up`."""
         self._plugin, self._parameters = prepare_plugin(plugin, parameters)
         self._plugin.warm_up()
         self._objects: dict[str, Plugin[Any]] = {}
 
     def value(self, subject: Subject, clients: tuple[str, ...], queries: Queries) -> Value:
-        """The signal's value. Raises whatever the plugin raises, and TypeError where its value is no plain data."""
+        """The signal's value. Raises the plugin's exceptions, and TypeError if its value is not plain data."""
         found = self._objects.get(subject.text)
         if found is None:
             found = self._objects[subject.text] = self._plugin(self._parameters, subject)
@@ -44,7 +44,7 @@ class Instances:
 
 
 def failure_text(error: BaseException) -> str:
-    """What a plugin raised, in one line, with the place in the plugin's own code where it did."""
+    """A plugin's exception in one line, with its place in the plugin's code."""
     place, trace = "", error.__traceback__
     while trace is not None:
         name = trace.tb_frame.f_code.co_filename
@@ -55,7 +55,7 @@ def failure_text(error: BaseException) -> str:
 
 
 class LocalHost:
-    """Runs plugins in the detector's own process: for tests and debuggers. One that hangs is not stopped."""
+    """Runs plugins in the detector's process: for tests and debuggers. A hanging plugin is not stopped."""
 
     def __init__(self) -> None:
         self._signals: dict[tuple[str, str], Instances] = {}
@@ -75,7 +75,7 @@ class LocalHost:
             return self._signals[call.rule, call.signal].value(
                 Subject(call.subject, call.element), call.clients, queries
             )
-        except Exception as error:  # a plugin may raise whatever it likes
+        except Exception as error:  # a plugin may raise any exception
             raise PluginFailedError(Reason.ERROR, failure_text(error)) from error
 
     def keep(self, rule: str, subjects: Collection[str]) -> None:

@@ -1,6 +1,7 @@
 """Which calls of plugins found none running: noted live, recorded with the intake, and replayed from it.
 
-Calls of a signal are counted from the engine's start; that count is the same live and in a replay, whatever the clock.
+Calls of a signal are counted from the engine's start; this count is the same live and in a replay, independent of the
+clock.
 """
 
 from __future__ import annotations
@@ -11,14 +12,14 @@ from typing import Any
 from detector.engine.scoping.plugins import PluginCall
 
 KIND = "plugin"
-"""Of the controls in an intake file."""
+"""The kind of these controls in an intake file."""
 
 
 class Outages:
-    """Notes when a plugin stops and runs again; in a replay, reads it from the recording."""
+    """Notes when a plugin stops and runs again; in a replay, reads this from the recording."""
 
     def __init__(self, recorded: Callable[[], Iterable[Mapping[str, Any]]] | None = None) -> None:
-        """`recorded` gives the controls of an intake file; it is called when the first plugin is."""
+        """`recorded` returns the controls of an intake file; it is called with the first call of a plugin."""
         self._recorded = recorded
         self._expected: dict[tuple[str, str], list[tuple[int, bool]]] | None = None
         self._calls: dict[tuple[str, str], int] = {}
@@ -26,7 +27,7 @@ class Outages:
         self._changes: list[dict[str, Any]] = []
 
     def expects(self, call: PluginCall) -> bool:
-        """Whether the plugin ran at this call, as far as a recording shows; call it once for each call."""
+        """Whether the plugin ran at this call, according to the recording; call it once per call."""
         place = call.rule, call.signal
         number = self._calls[place] = self._calls.get(place, 0) + 1
         if self._expected is None:
@@ -38,7 +39,7 @@ class Outages:
         return next((running for since, running in reversed(changes) if since <= number), True)
 
     def note(self, call: PluginCall, *, running: bool) -> None:
-        """Whether the plugin ran at this call."""
+        """Note whether the plugin ran at this call."""
         place = call.rule, call.signal
         if running is (place in self._away):
             (self._away.discard if running else self._away.add)(place)
@@ -53,6 +54,6 @@ class Outages:
             )
 
     def take_changes(self) -> list[dict[str, Any]]:
-        """What changed since the last call, as controls for the intake file."""
+        """The changes since the last call, as controls for the intake file."""
         taken, self._changes = self._changes, []
         return taken

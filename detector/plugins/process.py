@@ -1,7 +1,7 @@
-"""The process of one plugin signal, as the detector sees it: started, called, stopped, and restarted.
+"""The process of one plugin signal, from the detector's side: started, called, stopped, and restarted.
 
-One that does not give its value within the patience is killed, and its state with it; it is started again after growing
-pauses, three times, and then stays stopped until the rule changes.
+A process that does not return its value in time is killed, and its state is lost. It is restarted after growing pauses,
+three times, and then stays stopped until the rule changes.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from wayside.rules import CompiledPlugin
 _log = logging.getLogger(__name__)
 
 PATIENCE = 0.5
-"""Seconds in which a live plugin must give its value: less than the stall after which ticks are skipped."""
+"""Seconds in which a live plugin must return its value: less than the stall after which ticks are skipped."""
 
 START_PATIENCE = 60.0
-"""Seconds in which a plugin must have started, where one waits for it."""
+"""Seconds in which a plugin must have started, if the caller waits for it."""
 
 _PAUSES = (1.0, 10.0, 60.0)
-"""Seconds before a stopped plugin is started again; after the last time it is not."""
+"""Seconds before a stopped plugin is restarted; after the last one it stays stopped."""
 
 _GLANCE = 0.0005
-"""Seconds for a look at whether it has started."""
+"""Seconds to check whether it has started."""
 
 _QUERIES = frozenset({"clients", "streams", "newest", "last", "between", "nearest", "pose", "tuples", "transform"})
 
@@ -57,7 +57,7 @@ class SignalProcess:
         self.why = "its process is starting"
 
     def start(self) -> None:
-        """Start the process, unless it was started before; returns at once."""
+        """Start the process, unless it has been started; returns at once."""
         if not self._starts:
             self._launch()
 
@@ -69,7 +69,7 @@ class SignalProcess:
             self._process = subprocess.Popen(  # noqa: S603  our own module
                 [sys.executable, "-m", "detector.plugins.worker", str(theirs.fileno())],
                 stdin=subprocess.DEVNULL,
-                stdout=2,  # what a plugin prints belongs to the log
+                stdout=2,  # a plugin's output belongs to the log
                 pass_fds=(theirs.fileno(),),
                 env={**os.environ, "PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))},
             )
@@ -77,7 +77,7 @@ class SignalProcess:
         self._wire.send("start", self._plugin.plugin, self._plugin.parameters)
 
     def is_ready(self, within: float, *, again: bool) -> bool:
-        """Whether it is ready, after waiting `within` seconds for its start; `again`: a stopped one may start."""
+        """Whether it is ready, after waiting `within` seconds for its start; `again`: restart a stopped one."""
         if self._process is None and again and self._starts <= len(_PAUSES) and self._monotonic() >= self._again_at:
             self._launch()
         if self._ready or self._wire is None:
@@ -97,9 +97,7 @@ class SignalProcess:
         return self._ready
 
     def request_value(self, call: PluginCall, queries: Queries, patience: float) -> Value:
-        """The signal's value. Raises PluginFailedError where the plugin failed, StoppedError if its process has
-        stopped.
-        """
+        """The signal's value. Raises PluginFailedError if the plugin failed, StoppedError if its process stopped."""
         wire = self._wire
         assert wire is not None  # noqa: S101  it is ready
         self._subjects.add(call.subject)
@@ -108,7 +106,7 @@ class SignalProcess:
             while True:
                 requested = self._monotonic()
                 answer, *content = wire.receive(max(patience, 0.0))
-                patience -= self._monotonic() - requested  # the time that we take for the queries is not the plugin's
+                patience -= self._monotonic() - requested  # our time for the queries does not count as the plugin's
                 match answer:
                     case "query":
                         _reply(wire, queries, *content)
@@ -175,5 +173,5 @@ def _reply(wire: Wire, queries: Queries, method: str, arguments: list[Any], opti
         wire.send(*answer, within=PATIENCE)
     except (ClosedError, TimeoutError):
         raise
-    except Exception as error:  # noqa: BLE001  the queries of a plugin must not stop the engine
+    except Exception as error:  # noqa: BLE001  a plugin's queries must not stop the engine
         wire.send("raised", type(error).__name__, str(error))

@@ -1,8 +1,9 @@
-"""Runs each plugin signal in a process of its own, so that one that hangs or crashes is stopped while the rules go on.
+"""Runs each plugin signal in a separate process, so that a plugin that hangs or crashes is stopped and the rules
+continue.
 
-The value is computed at the tick: the engine's thread waits for it, and answers the plugin's queries meanwhile. Which
-calls found no running plugin is the only thing here that depends on how fast the machine is; `outages` notes it and
-takes it, so that the replay of an intake file gives the same events.
+The value is computed at the tick: the engine's thread waits for it, and answers the plugin's queries in the meantime.
+Only the set of calls that find no running plugin depends on the speed of the machine. `outages` records it and replays
+it, so that the replay of an intake file gives the same events.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from wayside.expressions import Reason, Value
 from wayside.rules import CompiledRule
 
 REPLAY_PATIENCE = 10.0
-"""Seconds in a replay, where nothing waits."""
+"""Seconds in a replay, which can wait."""
 
 
 class ProcessHost:
@@ -32,9 +33,9 @@ class ProcessHost:
         patience: float = PATIENCE,
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
-        """`wait`: for a process that is starting, as a replay does; live, the signal is unknown until it has started.
+        """`wait`: for a process that is starting, as in a replay; live, the signal is unknown until it has started.
 
-        `patience` and what `monotonic` gives are seconds.
+        `patience` and the result of `monotonic` are in seconds.
         """
         self.outages = outages or Outages()
         self._wait = wait

@@ -1,4 +1,4 @@
-"""Which plugins there are, and whether a rule gives them the parameters that they require."""
+"""Finds the class of a plugin, and validates its parameters."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def prepare_plugin(
 
 
 def plugin_problems(rule: EventRule, detector: Detector) -> Iterator[RuleProblem]:
-    """What is wrong with the plugins of a rule's signals."""
+    """The problems of the plugins in a rule's signals."""
     streams = [stream.name for stream in detector.spec.streams]
     for index, signal in enumerate(rule.spec.signals):
         if signal.plugin is not None:

@@ -1,4 +1,4 @@
-"""Follows points from one moment to the next, to measure how long each has been there."""
+"""Tracks points over time, to measure how long each has been present."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from detector.plugins.assignment import Point, assigned
 
 @dataclass(slots=True)
 class TrackedPoint:
-    """A point that is followed. Times are nanoseconds."""
+    """A tracked point. Times are nanoseconds."""
 
     place: Point
     since: int
@@ -18,12 +18,13 @@ class TrackedPoint:
 
 
 class Tracks:
-    """The points that are there, and were there before."""
+    """The points that are present, or were present recently."""
 
     def __init__(self, within: float, speed: float, gap: int) -> None:
-        """A point is the same as one before at most `within` metres, and `speed` m/s times the time between, away.
+        """A point matches an earlier one at a distance of at most `within` metres plus `speed` m/s times the time
+        between.
 
-        One that is missing for `gap` nanoseconds starts over; with 0, one that is missing once.
+        A point that is missing for `gap` nanoseconds starts over; with 0, if it is missing once.
         """
         self._within = within
         self._speed = speed
@@ -31,7 +32,7 @@ class Tracks:
         self._tracks: list[TrackedPoint] = []
 
     def follow(self, points: Sequence[Point], time: int) -> None:
-        """These are the points at that time (ns), which is later than the one before."""
+        """The points at that time (ns), which is later than the previous one."""
         tracks = self._tracks
         elapsed = max((time - track.last for track in tracks), default=0) / 1e9
         same = assigned([track.place for track in tracks], points, self._within + self._speed * elapsed)
@@ -42,7 +43,7 @@ class Tracks:
         self._tracks += [TrackedPoint(points[index], time, time) for index in sorted(new)]
 
     def lasting(self, time: int, least: int) -> list[TrackedPoint]:
-        """Those that are there at that time and have been for at least this many nanoseconds, oldest first."""
+        """The points present at that time for at least this many nanoseconds, oldest first."""
         return sorted(
             (track for track in self._tracks if track.last == time and time - track.since >= least),
             key=lambda track: (track.since, track.place),

@@ -1,9 +1,10 @@
-"""Objects of one list without a counterpart in another: what one of two perceptions sees and the other does not.
+"""Objects of one list without a counterpart in another: one of two perception systems detects them and the other does
+not.
 
-The two lists are those of one client, or one of each client of a pair. Samples of about the same stamp are compared:
-the objects are brought into one frame, matched by position (as many pairs within the gate as there can be, and of these
-the nearest), and what is left over is followed over time. The signal is the list of those that have been left over for
-long enough; a rule uses e.g. `when: size(unmatched) > 0`.
+The two lists belong to one client, or to the two clients of a pair. Samples with about the same stamp are compared: the
+objects are transformed into one frame, matched by position (as many pairs within the gate as possible, and the nearest
+of these), and the remaining ones are tracked over time. The signal is the list of objects that have remained unmatched
+for long enough; a rule uses e.g. `when: size(unmatched) > 0`.
 """
 
 from __future__ import annotations
@@ -24,19 +25,19 @@ from detector.plugins.tracking import Tracks
 from wayside.expressions import Value
 
 _SAMPLES = 100
-"""So many samples of each list are looked at, from the newest on."""
+"""Number of samples of each list that are compared, from the newest."""
 
 _LATE = 1_000_000_000
-"""Nanoseconds for which what was compared last stands, while the transforms of newer samples are not known."""
+"""Nanoseconds for which the last comparison stays valid, while the transforms of newer samples are unknown."""
 
 _OBJECTS = 500
-"""The longest list; matching takes the cube of it."""
+"""Maximum length of a list; matching takes cubic time."""
 
 Metres = Annotated[float, Field(gt=0, le=10_000)]
 
 
 class PoseStream(PluginParameters):
-    """Where the client is, in the common frame."""
+    """The stream with the client's pose in the common frame."""
 
     stream: StreamName
     at: str = ""
@@ -44,7 +45,7 @@ class PoseStream(PluginParameters):
 
 
 class ObjectList(PluginParameters):
-    """Where a list of objects is, and in which frame its positions are."""
+    """The stream with a list of objects, and the frame of its positions."""
 
     stream: StreamName
     list: str = "objects"
@@ -53,9 +54,9 @@ class ObjectList(PluginParameters):
     y: str = "y"
     """The paths to the position in an object, in metres."""
     frame: str | None = None
-    """The common frame: tf takes positions from the message's header.frame_id into it, at the message's stamp."""
+    """The common frame: tf transforms positions from the message's header.frame_id into it, at the message's stamp."""
     pose: PoseStream | None = None
-    """Instead of tf: positions are relative to the client, which is there."""
+    """Instead of tf: positions are relative to the client's pose."""
 
     @model_validator(mode="after")
     def _one_way(self) -> ObjectList:
@@ -67,23 +68,23 @@ class ObjectList(PluginParameters):
 
 
 class UnmatchedParameters(PluginParameters):
-    """What is compared with what, and how."""
+    """The lists to compare, and how."""
 
     objects: ObjectList
     counterparts: ObjectList | None = None
-    """Default: as objects, which makes sense for a pair."""
+    """Default: the same as objects, which is useful for a pair."""
     of: Literal["a", "b"] = "a"
-    """In a pairs scope: whose objects are looked for among the other's."""
+    """In a pairs scope: whose objects are searched for among the other's."""
     within: Metres = 2.0
-    """The gate: how far an object and its counterpart may be apart, in metres."""
+    """The gate: maximum distance between an object and its counterpart, in metres."""
     slop: Seconds = 0.1
-    """How far apart the stamps of samples that are compared may be."""
+    """Maximum difference between the stamps of compared samples."""
     persist: Seconds = 1.0
     """How long an object must be without a counterpart."""
     gap: Seconds = 0.0
-    """How long it may be out of sight, or matched, in between."""
+    """How long it may be invisible, or matched, in between."""
     speed: Annotated[float, Field(ge=0, le=1000)] = 15.0
-    """How fast objects move at most, in m/s: what is further away is another one."""
+    """Maximum speed of objects in m/s: an object farther away is a different one."""
 
 
 class UnmatchedObjects(Plugin[UnmatchedParameters]):
@@ -95,7 +96,7 @@ class UnmatchedObjects(Plugin[UnmatchedParameters]):
         super().__init__(parameters, subject)
         self._tracks = Tracks(parameters.within, parameters.speed, round(parameters.gap * 1e9))
         self._last: int | None = None
-        """The stamp of the objects that were compared last."""
+        """The stamp of the objects that were last compared."""
 
     @classmethod
     def warm_up(cls) -> None:
@@ -103,7 +104,7 @@ class UnmatchedObjects(Plugin[UnmatchedParameters]):
         assignment.warm_up()
 
     def value(self, queries: Queries, clients: tuple[str, ...]) -> Value:
-        """None until two samples could be compared, and where one of the streams is stale."""
+        """None until two samples could be compared, and if one of the streams is stale."""
         if len(clients) > 2:
             raise ValueError(f"it compares one or two clients, not {len(clients)}: use it in a client or pairs scope")
         parameters = self.parameters
@@ -135,7 +136,7 @@ class UnmatchedObjects(Plugin[UnmatchedParameters]):
     def _compare(
         self, queries: Queries, mine: ObjectList, objects: DecodedSample, theirs: ObjectList, others: DecodedSample
     ) -> None:
-        """Follow what the one sample has and the other has not. Raises TransformError."""
+        """Track the objects of one sample without a counterpart in the other. Raises TransformError."""
         points = _points(mine, objects, _frame(queries, mine, objects))
         counterparts = _points(theirs, others, _frame(queries, theirs, others))
         found = assigned(points, counterparts, self.parameters.within)
@@ -148,7 +149,7 @@ def _by_stamp(samples: list[DecodedSample]) -> list[DecodedSample]:
 
 
 def _frame(queries: Queries, of: ObjectList, sample: DecodedSample) -> Pose:
-    """What takes the list's positions into the common frame, at the sample's stamp. Raises TransformError."""
+    """The transform of the list's positions into the common frame, at the sample's stamp. Raises TransformError."""
     if of.pose is not None:
         pose = queries.pose(sample.client, of.pose.stream, sample.stamp, at=of.pose.at)
         if pose is None:
@@ -163,7 +164,7 @@ def _frame(queries: Queries, of: ObjectList, sample: DecodedSample) -> Pose:
 
 
 def _points(of: ObjectList, sample: DecodedSample, frame: Pose) -> list[Point]:
-    """Where the objects are in the common frame; those without a position are left out."""
+    """The positions of the objects in the common frame; objects without a position are left out."""
     objects = _at(sample.message, of.list)
     if not isinstance(objects, list):
         raise ValueError(f"a message of stream {of.stream} has no list at {of.list!r}")

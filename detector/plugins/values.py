@@ -1,4 +1,4 @@
-"""What plugins give, made what expressions take: numbers are doubles, and there is nothing but plain data."""
+"""Converts plugins' values to those of expressions: numbers become doubles, and only plain data is accepted."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ _EXACT = 2**53
 
 
 def plain_value(value: Any, depth: int = _DEEPEST) -> Value:
-    """The value with integers as doubles and tuples as lists; NaN is None, at the top as inside.
+    """The value with integers as doubles and tuples as lists; NaN becomes None, at any depth.
 
-    Raises TypeError for what is no plain data, or nested too deep.
+    Raises TypeError for other data, and for data nested too deeply.
     """
     match value:
         case None | bool() | str():

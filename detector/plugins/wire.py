@@ -1,4 +1,4 @@
-"""How the detector and the process of a plugin talk: lists of plain data, each with its length before it.
+"""The protocol between the detector and a plugin's process: lists of plain data, each preceded by its length.
 
     detector → plugin   start(plugin, parameters)                       → ready() | refused(text)
                         value(subject, element, clients, now)           → queries, then result(value) | failed(text)
@@ -23,13 +23,14 @@ _decode = msgspec.msgpack.Decoder().decode
 
 
 class ClosedError(Exception):
-    """The other side is gone."""
+    """The other side has closed the connection."""
 
 
 class Wire:
     """One end of the connection.
 
-    A message may come in pieces, between which the time of a `receive` ends: what has come is kept for the next one.
+    A message may arrive in pieces, and the time of a `receive` may end in between: the pieces are kept for the next
+    call.
     """
 
     def __init__(self, connection: socket.socket) -> None:
@@ -38,7 +39,7 @@ class Wire:
         self._size: int | None = None
 
     def send(self, *message: Any, within: float | None = None) -> None:
-        """Raises ClosedError, TimeoutError (after `within` seconds), and TypeError or OverflowError for strange
+        """Raises ClosedError, TimeoutError (after `within` seconds), and TypeError or OverflowError for unsupported
         data.
         """
         data = _encode(message)
@@ -60,7 +61,7 @@ class Wire:
         return message
 
     def close(self) -> None:
-        """Hang up."""
+        """Close the connection."""
         self._socket.close()
 
     def _exactly(self, size: int, until: float | None) -> bytes:

@@ -1,6 +1,6 @@
-"""The process in which the plugin of one signal runs: `python -m detector.plugins.worker FD`.
+"""The process of one plugin signal: `python -m detector.plugins.worker FD`.
 
-It only answers; its queries go back to the detector, which answers them from its buffer while it waits for the value.
+It only responds; the detector answers its queries from the buffer while it waits for the value.
 """
 
 from __future__ import annotations
@@ -102,14 +102,14 @@ class RemoteQueries:
 
 
 def _serve(wire: Wire) -> None:
-    """Answer until the detector hangs up."""
+    """Respond until the detector closes the connection."""
     _, plugin, parameters = wire.receive()
     try:
         instances = Instances(plugin, parameters)
     except PluginError as error:
         wire.send("refused", str(error))
         return
-    except Exception as error:  # noqa: BLE001  a plugin's warm_up may raise whatever it likes
+    except Exception as error:  # noqa: BLE001  a plugin's warm_up may raise any exception
         wire.send("refused", failure_text(error))
         return
     wire.send("ready")
@@ -131,12 +131,12 @@ def _value(
         return "result", instances.value(Subject(subject, element), tuple(clients), RemoteQueries(wire, now))
     except ClosedError:
         raise
-    except Exception as error:  # noqa: BLE001  a plugin may raise whatever it likes
+    except Exception as error:  # noqa: BLE001  a plugin may raise any exception
         return "failed", failure_text(error)
 
 
 def _leave_with_the_detector() -> None:
-    """However the detector ended, and whatever the plugin is doing: no process is left behind."""
+    """Exit when the detector ends, whatever the plugin is doing: no process is left behind."""
     parent = os.getppid()
     while os.getppid() == parent:
         time.sleep(1)
@@ -144,7 +144,7 @@ def _leave_with_the_detector() -> None:
 
 
 def main() -> None:
-    """Run until the detector hangs up; it stops this process, not the terminal's Ctrl-C."""
+    """Run until the detector closes the connection; the detector stops this process, not the terminal's Ctrl-C."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_leave_with_the_detector, daemon=True).start()
     with contextlib.suppress(ClosedError):

@@ -1,4 +1,4 @@
-"""The plugin `bag`: plays recordings into the running detector, at their own speed or another."""
+"""The plugin `bag`: plays recordings into the running detector, at their original or another speed."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from wayside.api.base import Model
 _log = logging.getLogger(__name__)
 
 _LONGEST_WAIT = 0.5
-"""Seconds at most between two looks whether to stop."""
+"""Maximum seconds between two checks of whether to stop."""
 
 
 class BagParameters(Model):
-    """Which recordings to play, and how."""
+    """The recordings to play, and how."""
 
     paths: list[Annotated[str, Field(min_length=1, max_length=1024)]] = Field(
         min_length=1,
@@ -32,21 +32,22 @@ class BagParameters(Model):
         "these. They are played as one.",
     )
     rate: float = Field(default=1.0, gt=0, le=1000, description="How many times as fast as recorded.")
-    loop: bool = Field(default=False, description="Whether to begin anew at the end.")
+    loop: bool = Field(default=False, description="Whether to restart at the end.")
 
 
 class BagSource(Source[BagParameters]):
-    """Recordings, played as if they happened now: with clock Wall, messages are received when they are played."""
+    """Plays recordings as if they happened now: with clock Wall, the receive time of a message is the time at which it
+    is played."""
 
     Parameters: ClassVar[type[BaseModel]] = BagParameters
 
     def run(self, feed: Feed) -> None:
-        """Play to the end. Raises RecordingError where a recording is missing, damaged, or does not fit a stream."""
+        """Play to the end. Raises RecordingError if a recording is missing, damaged, or does not fit a stream."""
         while not feed.stopping:
             self._play(feed)
             if not self.parameters.loop:
                 return
-            feed.wait(0.01)  # a recording of no length must not keep the processor busy
+            feed.wait(0.01)  # looping over an empty recording must not keep the processor busy
 
     def _play(self, feed: Feed) -> None:
         paths = recording_paths(Path(path) for path in self.parameters.paths)

@@ -1,6 +1,6 @@
-"""Recorded messages in batches: what is the same for many messages is looked at once.
+"""Recorded messages in batches, so that work common to many messages is done once.
 
-Every reader yields batches. Readers of formats that come message by message are wrapped by `batched`.
+Every reader yields batches. `batched` wraps readers of formats that return single messages.
 """
 
 from __future__ import annotations
@@ -13,17 +13,18 @@ from detector.replay.message import Message
 
 MAXIMUM_MESSAGES = 4096
 MAXIMUM_BYTES = 8 << 20
-"""Bytes of payload in a batch, to within one message."""
+"""Maximum bytes of payload in a batch, exceeded by at most one message."""
 _ONE_BY_ONE = 256
-"""Messages that are read one by one make short batches: who plays them live waits while a batch is read."""
+"""Maximum number of messages in a batch of a reader that returns single messages: live playback waits while a batch is
+read."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Channel:
-    """What messages of one key have in common; two channels are equal only if they are the same object."""
+    """The common properties of the messages of one key; two channels are equal only if they are the same object."""
 
     key: str
-    """As in `Message`, and so are the others."""
+    """As in `Message`, like the other fields."""
     encoding: str
     type: str | None
     decode: Callable[[bytes], object] | None = None
@@ -31,9 +32,9 @@ class Channel:
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """Messages in the order of their times, which never go back inside a batch; lists of equal length, not empty.
+    """Messages in time order; lists of equal length, not empty.
 
-    A time that does go back, in a recording that is out of order, begins a new batch.
+    A time that goes back, in a recording that is out of order, begins a new batch.
     """
 
     times: list[int]
@@ -42,11 +43,11 @@ class Batch:
     payloads: list[bytes]
 
     def part(self, begin: int, end: int) -> Batch:
-        """The messages from position `begin` to before `end`."""
+        """The messages from index `begin` to before `end`."""
         return Batch(self.times[begin:end], self.channels[begin:end], self.payloads[begin:end])
 
     def picked(self, positions: Sequence[int]) -> Batch:
-        """The messages at these positions."""
+        """The messages at these indices."""
         return Batch(
             [self.times[at] for at in positions],
             [self.channels[at] for at in positions],
@@ -62,7 +63,7 @@ def messages_of(batches: Iterable[Batch]) -> Iterator[Message]:
 
 
 def batched(messages: Iterable[Message]) -> Iterator[Batch]:
-    """The messages in batches. Where `messages` raises an error, what came before it is yielded first."""
+    """The messages in batches. If `messages` raises an error, the messages before it are yielded first."""
     channels: dict[tuple[object, ...], Channel] = {}
     batch, size = Batch([], [], []), 0
     try:
@@ -90,14 +91,15 @@ def batched(messages: Iterable[Message]) -> Iterator[Batch]:
 def merged_batches(recordings: Sequence[Iterator[Batch]]) -> Iterator[Batch]:
     """The messages of all recordings by time; of equal times, those of the recording given first.
 
-    Where the times of a recording go back, its messages wait for earlier ones of the others, as in `heapq.merge`.
+    If the times of a recording go back, its messages wait for earlier ones of the others, as in `heapq.merge`.
     """
     if len(recordings) == 1:
         yield from recordings[0]
         return
     heads = [(batch, rest) for rest in recordings if (batch := next(rest, None)) is not None]
     while heads:
-        # All up to the earliest end of a batch is known: only this batch's recording may go on with an equal time.
+        # All messages up to the earliest end of a batch are known: only this batch's recording may continue at the same
+        # time.
         ending = min(range(len(heads)), key=lambda at: heads[at][0].times[-1])
         limit = heads[ending][0].times[-1]
         cuts = [

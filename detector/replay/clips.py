@@ -1,6 +1,6 @@
-"""Clips: what the record actions of rules cut from a recording, as they would have done live.
+"""Clips: the recordings that the record actions of rules make from a replay, as they would have live.
 
-Only `record` runs. Other actions reach databases, systems and people, which a replay must leave alone.
+Only `record` actions run. Other actions reach databases, systems and people, which a replay must not affect.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ class Clips:
     """The folder of all clips of one replay. Its limits are those of the Detector's `recordings`."""
 
     def __init__(self, folder: Path) -> None:
-        """Raises OSError where clips of an earlier replay cannot be removed."""
+        """Raises OSError if clips of an earlier replay cannot be removed."""
         self.folder = folder
         for each in [*finished_recordings(folder)]:
             shutil.rmtree(each.path)
 
     def placed(self, detector: Detector) -> Detector:
-        """The Detector with its recordings in this folder; it need not have any."""
+        """The Detector with this folder for its recordings; it may have none."""
         path = str(self.folder)
         limits = detector.spec.recordings
         recordings = (limits or Recordings(path=path)).model_copy(update={"path": path, "age": None})
@@ -43,26 +43,26 @@ class Clips:
 
     @property
     def count(self) -> int:
-        """How many there are."""
+        """Number of clips."""
         return sum(1 for _ in finished_recordings(self.folder))
 
 
 class Recorders:
-    """The record actions of the rules of one replay. They are never too slow: the replay waits for them."""
+    """The record actions of the rules of one replay. The replay waits for them, so they are never too slow."""
 
     def __init__(self, holder: str) -> None:
         self._host = ActionHost(holder, _Nobody(), patient=True)
 
     def follow(self, rules: Sequence[EventRule], surroundings: Surroundings) -> None:
-        """The rules are these from now on."""
+        """Use these rules from now on."""
         self._host.follow([_recording(rule) for rule in rules], surroundings)
 
-    def tell(self, consequences: Sequence[Consequence]) -> None:
+    def dispatch(self, consequences: Sequence[Consequence]) -> None:
         """Pass on what happened, in order."""
         self._host.dispatch(consequences)
 
     def close(self) -> Iterator[str]:
-        """Complete all clips. Gives a line for each action that failed or lost something."""
+        """Complete all clips. Returns a line for each action that failed or lost something."""
         self._host.close(_GRACE)
         for which, tally in self._host.outcomes.tallies().items():
             if tally.failed:
@@ -74,7 +74,7 @@ class Recorders:
 
 
 class _Nobody:
-    """Follow-ups of a replay are for nobody."""
+    """Discards the follow-ups of a replay."""
 
     def publish(self, key: str, payload: bytes, encoding: str) -> None:
         """See `Messenger`."""
@@ -87,6 +87,6 @@ class _Nobody:
 
 
 def _recording(rule: EventRule) -> EventRule:
-    """The rule with its record actions alone."""
+    """The rule with only its record actions."""
     actions = [action for action in rule.spec.actions if action.field == RECORD]
     return rule.model_copy(update={"spec": rule.spec.model_copy(update={"actions": actions})})

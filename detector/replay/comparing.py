@@ -1,8 +1,9 @@
-"""Two rules compared over the same recording: which episodes both have, which only one, and how far apart they are.
+"""Compares two rules over the same recording: their common episodes, the episodes of only one, and the differences in
+time.
 
-For each subject, two episodes are the same where they overlap in time. Each is matched with at most one: in order of
-their starts, an episode of the first rule takes the one of the second that it shares most time with. An episode that is
-still open ends with the recording.
+For each subject, two episodes match if they overlap in time. Each is matched with at most one: in order of their
+starts, an episode of the first rule is matched with the episode of the second rule that it shares most time with. An
+episode that is still open ends with the recording.
 """
 
 from __future__ import annotations
@@ -23,16 +24,16 @@ class EpisodeTimes:
     end: int
     subject: str
     open: bool = False
-    """It had not ended when the recording did."""
+    """It was still open at the end of the recording."""
     recording: str | None = None
-    """The recording that it is from, where there are several."""
+    """The recording of the episode, if there are several."""
 
     def shared(self, other: EpisodeTimes) -> int:
-        """How long both last, in nanoseconds; negative where they are apart."""
+        """How long both last, in nanoseconds; negative if they are apart."""
         return min(self.end, other.end) - max(self.start, other.start)
 
     def to_json(self) -> dict[str, Any]:
-        """Subject, start and end as text, and the recording where there are several."""
+        """Subject, start and end as text, and the recording if there are several."""
         times = {"startTime": format_time(self.start), "endTime": None if self.open else format_time(self.end)}
         return {"subject": self.subject, **times, **self.origin}
 
@@ -44,7 +45,7 @@ class EpisodeTimes:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """What two rules found."""
+    """The result of the comparison of two rules."""
 
     first: str
     second: str
@@ -54,17 +55,18 @@ class Comparison:
 
     @property
     def start_differences(self) -> list[float]:
-        """Second minus first, in seconds: positive where the second rule was later."""
+        """Second minus first, in seconds: positive if the second rule was later."""
         return [(second.start - first.start) / 1e9 for first, second in self.both]
 
     @property
     def end_differences(self) -> list[float]:
-        """The same of the ends, of those that both ended."""
+        """The same for the ends, if both episodes ended."""
         return [(second.end - first.end) / 1e9 for first, second in self.both if not (first.open or second.open)]
 
     @property
     def agreement(self) -> float | None:
-        """The time in which both had an episode of a subject, over that in which either had; None without any."""
+        """The time in which both had an episode of a subject, divided by the time in which either had; None if there
+        are no episodes."""
         shared = sum(first.shared(second) for first, second in self.both)
         spans = [*self.only_first, *self.only_second, *(span for pair in self.both for span in pair)]
         either = sum(span.end - span.start for span in spans) - shared
@@ -111,7 +113,7 @@ def compare(events: Iterable[Event], first: str, second: str, end: int) -> Compa
 
 
 def combined(comparisons: Sequence[Comparison]) -> Comparison:
-    """Those of several recordings as one; there is at least one."""
+    """The comparisons of several recordings, merged; there is at least one."""
     return Comparison(
         comparisons[0].first,
         comparisons[0].second,

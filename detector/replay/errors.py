@@ -1,4 +1,4 @@
-"""What can be wrong with a recording."""
+"""Errors of recordings."""
 
 import struct
 
@@ -20,5 +20,5 @@ DAMAGE = (
     ValueError,
     struct.error,
 )
-"""What parsers of binary files raise, beside errors of their own, where the bytes are not what they expect. Caught only
-around their reading of a file, each byte of which may be damaged."""
+"""Exceptions of parsers of binary files for unexpected bytes, beside their own. Caught only around the reading of a
+file, in which any byte may be damaged."""

@@ -1,8 +1,8 @@
-"""Which files are meant by what a command is given, and which of them are one recording.
+"""The files of a command's arguments, and which of them form one recording.
 
-Folders stand for the recordings in them, patterns such as `drives/*.mcap` for what they match. Files are one recording
-where the metadata.yaml of their rosbag2 folder names them, and where a recorder split it: their names differ by a
-number that counts on, and each begins where the one before ends. The order in which they are given does not matter.
+Folders stand for the recordings in them, patterns such as `drives/*.mcap` for the matching files. Files form one
+recording if the metadata.yaml of their rosbag2 folder names them, or if a recorder split it: then their names differ by
+a consecutive number, and each begins where the previous one ends. The order of the arguments does not matter.
 """
 
 from __future__ import annotations
@@ -23,26 +23,26 @@ from detector.replay.intake_file import is_intake_file
 from detector.replay.recordings import check_exists, span_of
 
 Recording = tuple[Path, ...]
-"""The files that are one recording; or one rosbag2 folder."""
+"""The files of one recording; or one rosbag2 folder."""
 
 _SPLIT = 10 * 10**9
-"""Nanoseconds: a recorder opens its next file sooner."""
+"""Nanoseconds: a recorder opens its next file within this time."""
 
 _OVERLAP = 10**9
-"""Nanoseconds: messages that were under way when a file was closed may stand in the next."""
+"""Nanoseconds: messages in transit when a file was closed may be in the next one."""
 
 _DATE = re.compile(r"\d{4}(?:[-_]\d\d){5}|\d{14}")
 _NUMBERED = re.compile(r"(.*?)(\d+)([_.-]*)")
 TEXT = (".jsonl", ".ndjson")
 BINARY = (".mcap", ".bag", ".db3", ".pcap", ".pcapng")
-"""By what the names of recordings end."""
+"""The suffixes of the names of recordings."""
 
 
 def recordings_of(given: Sequence[Path], *, as_one: bool = False) -> list[Recording]:
-    """The recordings that are given, in that order; as_one: all of them as a single one.
+    """The given recordings, in that order; as_one: all of them as one.
 
-    What is damaged or of no known kind is a recording of its own: an error when it is played. Raises RecordingError
-    for what is missing, and for folders and patterns without any recording.
+    A file that is damaged or of unknown kind counts as a separate recording, and raises an error when it is played.
+    Raises RecordingError for missing files, and for folders and patterns without any recording.
     """
     paths = recording_paths(given)
     for path in paths:
@@ -51,7 +51,7 @@ def recordings_of(given: Sequence[Path], *, as_one: bool = False) -> list[Record
 
 
 def intake_file_of(given: Sequence[Path]) -> Path | None:
-    """The intake file, if one is given. Raises RecordingError where other recordings are given with it."""
+    """The intake file, if one is given. Raises RecordingError if other recordings are given as well."""
     paths = recording_paths(given)
     found = next(filter(_is_intake_file, paths), None)
     if found is not None and len(paths) > 1:
@@ -60,13 +60,13 @@ def intake_file_of(given: Sequence[Path]) -> Path | None:
 
 
 def recording_name(recording: Recording) -> str:
-    """For people, and for the events of several recordings."""
+    """The name for users, and for the events of several recordings."""
     first = os.fsencode(recording[0]).decode(errors="replace")
     return first if len(recording) == 1 else f"{first} and {len(recording) - 1} more"
 
 
 def recording_paths(given: Iterable[Path]) -> list[Path]:
-    """Files, and rosbag2 folders: folders and patterns are replaced by what they hold. Each path once."""
+    """Files and rosbag2 folders: folders and patterns are replaced by their contents. Each path once."""
     found = [path for each in given for path in _expanded(each)]
     return list({path.resolve(): path for path in found}.values())
 
@@ -89,7 +89,7 @@ def _expanded(path: Path) -> Iterator[Path]:
 
 
 def _inside(folder: Path) -> Iterator[Path]:
-    """The recordings in a folder and its folders, by name; what is hidden or no recording is passed over."""
+    """The recordings in a folder and its subfolders, by name; hidden files and other files are skipped."""
     for path in sorted(folder.iterdir(), key=_natural):
         if path.name.startswith("."):
             continue
@@ -103,7 +103,7 @@ def _is_intake_file(path: Path) -> bool:
     try:
         return path.exists() and is_intake_file(path)
     except OSError:
-        return False  # whoever reads it says why it cannot be read
+        return False  # the reader reports the reason
 
 
 def _is_bag(folder: Path) -> bool:
@@ -111,12 +111,12 @@ def _is_bag(folder: Path) -> bool:
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
-    """By name, numbers by their value."""
+    """The name with numbers compared by value."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", str(path))]
 
 
 def _joined(paths: Sequence[Path]) -> Iterator[Recording]:
-    """The recordings, in the order of their first files."""
+    """The recordings, in order of their first files."""
     left = list(paths)
     while left:
         recording = _of_one_bag(left) or _split(left)
@@ -125,7 +125,7 @@ def _joined(paths: Sequence[Path]) -> Iterator[Recording]:
 
 
 def _of_one_bag(paths: Sequence[Path]) -> Recording | None:
-    """The files of the rosbag2 folder that the first of the paths belongs to; the folder where they are all there."""
+    """The files of the rosbag2 folder that the first path belongs to; the folder itself if all its files are given."""
     first = paths[0]
     named = [] if first.is_dir() else _named_files(first.parent)
     if first.name not in named:
@@ -136,14 +136,14 @@ def _of_one_bag(paths: Sequence[Path]) -> Recording | None:
 def _named_files(folder: Path) -> list[str]:
     """The files that a folder's metadata.yaml names."""
     try:
-        told = yaml.safe_load((folder / "metadata.yaml").read_text(encoding="utf-8"))
-        return [Path(each).name for each in told["rosbag2_bagfile_information"]["relative_file_paths"]]
+        metadata = yaml.safe_load((folder / "metadata.yaml").read_text(encoding="utf-8"))
+        return [Path(each).name for each in metadata["rosbag2_bagfile_information"]["relative_file_paths"]]
     except (OSError, ValueError, TypeError, LookupError, yaml.YAMLError):
         return []
 
 
 def _split(paths: Sequence[Path]) -> Recording:
-    """The first of the paths, and the files of its recorder before and after it, in the order of their numbers."""
+    """The first path, with the adjacent files of its recorder, in order of their numbers."""
     numbered: dict[_Place, list[Path]] = {}
     for path in paths:
         if (place := _place(path)) is not None:
@@ -168,23 +168,23 @@ def _split(paths: Sequence[Path]) -> Recording:
 
 
 class _Place(NamedTuple):
-    """A file's place in a series of files."""
+    """A file's position in a series of files."""
 
     folder: Path
     before: str
-    """What stands before the number in the name."""
+    """The part of the name before the number."""
     behind: str
     number: int
 
 
 def _place(path: Path) -> _Place | None:
-    """The series that a file's name belongs to, and its number there; None without a number. Dates do not count."""
+    """The series of a file by its name, and its number there; None without a number. Dates do not count."""
     found = None if path.is_dir() else _NUMBERED.fullmatch(_DATE.sub("", path.stem))
     return None if found is None else _Place(path.parent, found[1], found[3] + path.suffix, int(found[2]))
 
 
 def _goes_on(one: Path, other: Path) -> bool:
-    """Whether the second begins where the first ends. What cannot be read is a recording of its own."""
+    """Whether the second file begins where the first one ends. An unreadable file is a separate recording."""
     try:
         first, second = span_of(one), span_of(other)
     except RecordingError:

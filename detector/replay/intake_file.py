@@ -1,8 +1,8 @@
-"""Intake files: what a detector consumed, in the order in which it did, so that its replay gives the same events.
+"""Intake files: the input of a detector's engine in its original order, so that the replay gives the same events.
 
-An intake file is an MCAP file, so any MCAP tool opens it. A channel holds the messages of one stream and key as they
-came; its metadata names the stream. One more channel holds the controls: what else the engine was told, in between.
-What counts is the order in the file, not the order of the times.
+An intake file is an MCAP file, so any MCAP tool opens it. A channel contains the messages of one stream and key as
+received; its metadata names the stream. One more channel contains the controls: all other inputs of the engine. The
+order in the file counts, not the order of the times.
 """
 
 from __future__ import annotations
@@ -22,33 +22,34 @@ from detector.plugins.outages import KIND as OUTAGE
 from detector.replay.errors import DAMAGE, RecordingError
 
 LIBRARY = "wayside intake 1"
-"""By this text in the header, an intake file is known; the number is the version of what follows."""
+"""The text in the header that identifies an intake file; the number is the version of the contents."""
 STREAM = "stream"
 """Metadata of a channel of messages: the stream's name."""
 CONTROL_TOPIC = "wayside/intake"
 _MAX_RECORD = 1 << 30
 
 _DAMAGE = (*DAMAGE, McapError, zstandard.ZstdError)
-"""All that the reader raises where a file is cut or damaged."""
+"""All exceptions of the reader for a truncated or damaged file."""
 
 
 class Control(NamedTuple):
-    """Something else that the engine was told between arrivals."""
+    """Another input of the engine between arrivals."""
 
     time: int
     """Nanoseconds since the epoch."""
     document: dict[str, Any]
-    """Its `kind`, and what belongs to that. Of the writer: `lost` (`arrivals`: how many are missing here, because the
-    disk was too slow); of the reader: `cut` (`reason`: the file ends here without having been closed)."""
+    """Its `kind`, and the fields of that kind. Written by the writer: `lost` (`arrivals`: how many are missing here
+    because the disk was too slow); added by the reader: `cut` (`reason`: the file ends here without having been
+    closed)."""
 
     @property
     def kind(self) -> str:
-        """What it is about."""
+        """The kind of control."""
         return str(self.document.get("kind", ""))
 
 
 def is_intake_file(path: Path) -> bool:
-    """Whether the file is an intake file, whole or cut. Raises OSError."""
+    """Whether the file is an intake file, complete or truncated. Raises OSError."""
     if path.is_dir():
         return False
     with path.open("rb") as file:
@@ -60,9 +61,9 @@ def is_intake_file(path: Path) -> bool:
 
 
 def read_intake(path: Path) -> Iterator[Arrival | Control]:
-    """Arrivals and controls in the order in which they were consumed.
+    """Arrivals and controls in their original order.
 
-    A file that was not closed (kill -9) gives what can be read, then a control `cut`. Raises RecordingError if it is
+    A file that was not closed (kill -9) yields its readable part, then a control `cut`. Raises RecordingError if it is
     no intake file.
     """
     if not is_intake_file(path):
@@ -88,7 +89,7 @@ def read_intake(path: Path) -> Iterator[Arrival | Control]:
 
 
 def recorded_outages(path: Path) -> Iterator[dict[str, Any]]:
-    """When the plugins of rules did not run, as the file says. Raises RecordingError."""
+    """The outages of plugins in the file. Raises RecordingError."""
     return (each.document for each in read_intake(path) if isinstance(each, Control) and each.kind == OUTAGE)
 
 

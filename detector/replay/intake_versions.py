@@ -1,7 +1,7 @@
-"""Versions of intake files: a file replays with the defaults and the order of time that its detector had.
+"""Versions of intake files: a file replays with the defaults and the time order of its detector's version.
 
-Version 1: a stream goes stale after `clientTimeout`, and a position is known while its stream is not stale.
-Version 2: `staleAfter` is 5 s and `maxAge` of a position 1 s by default; for the order, see `engine.timing.timeline`.
+Version 1: a stream becomes stale after `clientTimeout`, and a position is known while its stream is not stale. Version
+2: `staleAfter` is 5 s and `maxAge` of a position 1 s by default; for the order, see `engine.timing.timeline`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ _CLIENT_TIMEOUT = "30s"
 
 
 def detector_as_of(document: dict[str, Any], version: int) -> dict[str, Any]:
-    """A recorded Detector, with the defaults of its time written out."""
+    """A recorded Detector, with the defaults of its version written out."""
     if version > 1:
         return document
     spec = document["spec"]
@@ -28,7 +28,7 @@ def detector_as_of(document: dict[str, Any], version: int) -> dict[str, Any]:
 
 
 def rule_as_of(rule: CompiledRule, version: int) -> CompiledRule:
-    """A recorded rule, evaluated as at its time."""
+    """A recorded rule, evaluated as in its version."""
     if version > 1 or not isinstance(rule.subject, PairSubject):
         return rule
     position = replace(rule.subject.position, max_age_ns=None)

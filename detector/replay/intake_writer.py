@@ -1,7 +1,7 @@
 """Writes an intake file beside a running engine, which never waits for the disk.
 
-What is to be written waits in a bounded queue for a thread of its own. If the disk is too slow and the queue is full,
-arrivals are left out; that is counted, logged, and marked in the file, whose replay then cannot be faithful.
+A bounded queue passes the data to a separate thread. If the disk is too slow and the queue is full, arrivals are
+dropped; that is counted, logged, and marked in the file, whose replay is then inexact.
 """
 
 from __future__ import annotations
@@ -24,29 +24,29 @@ from wayside.api.stream import Stream
 log = logging.getLogger(__name__)
 
 _FLUSH_SECONDS = 0.8
-"""What is written is on its way to the disk after this long: about what a kill -9 may cost."""
+"""Maximum seconds until data is passed to the kernel: about the loss caused by a kill -9."""
 _OVERHEAD = 100
 """Bytes that an arrival takes in the queue beside its payload."""
 _MAX_CHANNELS = 60_000
-"""MCAP numbers channels with 16 bits; messages on more keys than this are left out."""
+"""MCAP numbers channels with 16 bits; messages on further keys are left out."""
 
 
 class _Streams(NamedTuple):
-    """From here on, these are the Detector's streams."""
+    """The Detector's streams from here on."""
 
     streams: tuple[Stream, ...]
     types: RosTypes
 
 
 class _Arrivals(NamedTuple):
-    """Samples, and the bytes that they take in the queue."""
+    """Samples, and their bytes in the queue."""
 
     arrivals: Sequence[Arrival]
     size: int
 
 
 class IntakeWriter:
-    """Takes what the engine consumes, from one thread at a time, and writes it on another."""
+    """Receives the engine's input, from one thread at a time, and writes it on another."""
 
     def __init__(
         self,
@@ -56,7 +56,7 @@ class IntakeWriter:
         *,
         maximum_bytes: int = 256 * 2**20,
     ) -> None:
-        """`streams` and `types` tell how messages read, for other tools to open the file. Raises OSError."""
+        """`streams` and `types` give the format of the messages, for other tools to open the file. Raises OSError."""
         self._path = path
         self._mcap = _Mcap(path)
         self._queue: list[_Arrivals | Control | _Streams] = [_Streams(tuple(streams), types or standard())]
@@ -67,18 +67,18 @@ class IntakeWriter:
         self._unmarked = 0
         self._unmarked_since = 0
         self.lost = 0
-        """Arrivals that the file does not hold, and so its replay does not see."""
+        """Number of arrivals missing from the file, and therefore from its replay."""
         self.error: Exception | None = None
         """Why writing ended early, if it did."""
         self._thread = threading.Thread(target=self._run, name="intake-writer", daemon=True)
         self._thread.start()
 
     def follow(self, streams: Iterable[Stream], types: RosTypes) -> None:
-        """The Detector changed: what comes from now on belongs to these streams."""
+        """The Detector changed: the following messages belong to these streams."""
         self._append(_Streams(tuple(streams), types))
 
     def arrivals(self, arrivals: Sequence[Arrival]) -> None:
-        """Samples that the engine takes in now. Never waits; with the queue full they are left out and counted."""
+        """Samples that the engine takes in now. Never waits; if the queue is full, they are dropped and counted."""
         size = sum(len(arrival.payload) for arrival in arrivals) + _OVERHEAD * len(arrivals)
         with self._changed:
             if self.error is not None or self._bytes + size > self._maximum_bytes:
@@ -90,11 +90,12 @@ class IntakeWriter:
             self._changed.notify()
 
     def control(self, time: int, document: Mapping[str, Any]) -> None:
-        """Something else that the engine is told, at a time in nanoseconds. They are few: none is left out."""
+        """Another input of the engine, at a time in nanoseconds. These are few: none is dropped."""
         self._append(Control(time, dict(document)))
 
     def close(self) -> None:
-        """Writes what waits and completes the file; without it, the file can be read up to about the last second."""
+        """Writes the queued data and completes the file; without this call, the file can be read up to about the last
+        second."""
         with self._changed:
             self._mark_lost()
             self._closing = True
@@ -124,7 +125,7 @@ class IntakeWriter:
     def _run(self) -> None:
         try:
             self._write()
-        except Exception as error:  # noqa: BLE001  this thread's edge: whatever it is ends the recording, and is said
+        except Exception as error:  # noqa: BLE001  any error ends the recording, and is logged
             log.error("%s: writing failed; the recording ends here: %s", self._path, error)
             with self._changed:
                 self.error = error
@@ -159,12 +160,12 @@ class IntakeWriter:
 
 
 class _Mcap:
-    """The file itself: a channel per stream and key, made when its first message comes."""
+    """The file itself: a channel per stream and key, created with its first message."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("wb")
         self._writer = Writer(self._file)
-        self._writer.start("ros2", LIBRARY)  # the profile that tools for ROS bags ask for
+        self._writer.start("ros2", LIBRARY)  # the profile that ROS bag tools expect
         self._control = self._writer.register_channel(CONTROL_TOPIC, "json", 0)
         self._channels: dict[tuple[str, str], int] = {}
         self._schemas: dict[tuple[str, str], int] = {}
@@ -180,11 +181,12 @@ class _Mcap:
                 self._writer.finish()  # type: ignore[no-untyped-call]
 
     def flush(self) -> None:
-        """From here on, everything so far can be read, whatever happens to the process."""
+        """Everything written so far can be read after this call, whatever happens to the process."""
         self._writer.flush()  # type: ignore[no-untyped-call]
 
     def follow(self, streams: Iterable[Stream], types: RosTypes) -> None:
-        """Messages from now on are of these streams: where a stream reads otherwise than before, in new channels."""
+        """The following messages belong to these streams: those of a stream whose format changed go into new
+        channels."""
         old, self._readings = self._readings, {stream.name: _reading(stream, types) for stream in streams}
         same = {name for name, reading in self._readings.items() if old.get(name) == reading}
         self._channels = {place: channel for place, channel in self._channels.items() if place[0] in same}
@@ -220,12 +222,12 @@ class _Mcap:
 
 
 class _Reading(NamedTuple):
-    """How the messages of a stream read."""
+    """The format of a stream's messages."""
 
     encoding: str
     type: str | None
     definition: str | None
-    """Of a ROS message type, with all that it refers to."""
+    """The definition of a ROS message type, with all types that it refers to."""
 
 
 def _reading(stream: Stream, types: RosTypes) -> _Reading:

@@ -1,4 +1,4 @@
-"""JSON lines: one message a line, `{"t": <ns>, "key": "vehicles/car7/pose", "value": {…}}`, in the order of `t`."""
+"""JSON lines: one message per line, `{"t": <ns>, "key": "vehicles/car7/pose", "value": {…}}`, in the order of `t`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from detector.replay.message import Cut, OnCut, Wanted, topic_key
 EXAMPLE = '{"t": 1700000000000000000, "key": "vehicles/car7/pose", "value": {"x": 1.5}}'
 
 _BLOCK = 1 << 17
-"""About how many bytes of lines make a batch."""
+"""Approximate number of bytes of lines in a batch."""
 _TAIL = 1 << 16
 """Number of bytes at the end of a file in which the last line is searched."""
 
@@ -31,20 +31,20 @@ _UNREADABLE = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)
 
 
 class _Block(NamedTuple):
-    """The lines that can be read, up to the first that cannot."""
+    """The readable lines, up to the first unreadable one."""
 
     lines: list[_Line]
     numbers: Sequence[int]
-    """Of each line."""
+    """The number of each line."""
     unreadable: tuple[int, bytes, Exception] | None = None
-    """Number, text and error of that first one."""
+    """Number, text and error of the first unreadable line."""
 
 
 def read_json_lines(path: Path, wanted: Wanted, on_cut: OnCut) -> Iterator[Batch]:
-    """The lines' messages; their values stay the text that they are. Empty lines are passed over.
+    """The messages in the lines; their values stay text. Empty lines are skipped.
 
-    A last line that was not written to its end is a cut. Raises RecordingError, with file and line, for what is no
-    such line and where `t` goes back.
+    An incomplete last line is a cut. Raises RecordingError, with file and line, for an invalid line and if `t` goes
+    back.
     """
     channels: dict[str, Channel | None] = {}
     last = messages = 0
@@ -72,7 +72,7 @@ def read_json_lines(path: Path, wanted: Wanted, on_cut: OnCut) -> Iterator[Batch
 
 
 def json_lines_span(path: Path) -> tuple[int, int] | None:
-    """The times of the first line and of the last that has an end; None where one cannot be read."""
+    """The times of the first line and of the last complete one; None if one cannot be read."""
     with path.open("rb") as file:
         first = file.readline()
         file.seek(max(0, file.seek(0, 2) - _TAIL))
@@ -84,11 +84,11 @@ def json_lines_span(path: Path) -> tuple[int, int] | None:
 
 
 def _decoded(texts: Sequence[bytes], number: int) -> _Block:
-    """`number` is that of the first line."""
+    """`number` is the number of the first line."""
     try:
         return _Block(list(map(_read, texts)), range(number, number + len(texts)))
     except _UNREADABLE:
-        pass  # or empty: look at each line
+        pass  # or empty: check each line
     block = _Block([], numbers := [])
     for where, text in enumerate(texts, start=number):
         if text.isspace():
@@ -107,7 +107,7 @@ class _Wrong(NamedTuple):
 
 
 def _first_wrong(lines: Sequence[_Line], last: int) -> _Wrong | None:
-    """The first line whose time goes back from that before, which is `last` at first, or that has no key."""
+    """The first line whose time goes back from the previous one, which is `last` at first, or that has no key."""
     times = [last, *[line.t for line in lines]]
     if sorted(times) == times and all(map(topic_key, {line.key for line in lines})):
         return None
@@ -121,7 +121,7 @@ def _first_wrong(lines: Sequence[_Line], last: int) -> _Wrong | None:
 
 
 def _batch(lines: Sequence[_Line], wanted: Wanted, channels: dict[str, Channel | None]) -> Batch:
-    """The wanted messages, if any; `channels` holds those of the keys that are known, None for unwanted ones."""
+    """The wanted messages, if any; `channels` has the channels of known keys, None for unwanted ones."""
     keys = [line.key for line in lines]
     there = set(keys)
     for key in there - channels.keys():

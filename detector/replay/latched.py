@@ -1,7 +1,7 @@
-"""What latched streams say is known from the beginning of a recording, wherever in it it was recorded.
+"""Makes the samples of latched streams available from the beginning of a recording, wherever they were recorded.
 
-A recording that began after a map or a static transform was published holds it late, or not where its readers start. So
-the first sample about each thing on a latched stream is taken first, and not again at its own place.
+A recording that began after a map or a static transform was published contains it late, or at an unexpected place. So
+the first sample of each topic on a latched stream comes first, and is not repeated at its original place.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from wayside.api import Detector
 def recorded_arrivals(
     recordings: Sequence[Path], router: Router, detector: Detector, on_cut: OnCut = ignore
 ) -> Iterator[list[Arrival]]:
-    """What the recordings hold for the Detector's streams, in lists; that of latched streams first.
+    """The recordings' messages for the Detector's streams, in lists; those of latched streams first.
 
     Raises:
         DetectorError: the Detector cannot run.
@@ -35,7 +35,7 @@ def recorded_arrivals(
     topics = latched_topics(detector, inlets(detector).decoders)
     if not topics:
         return arrivals
-    # Read once for these alone (a recording with an index skips the rest): the whole of it need not fit into memory.
+    # Read once for these only (a recording with an index skips the rest): it need not fit into memory as a whole.
     latched = Router([stream for stream in detector.spec.streams if stream.latched])
     latched_arrivals = chain.from_iterable(latched.arrivals(open_recordings(recordings, latched.wanted)))
     return latched_first(arrivals, latched_arrivals, topics)
@@ -44,12 +44,12 @@ def recorded_arrivals(
 def latched_first(
     recorded: Iterable[list[Arrival]], latched: Iterable[Arrival], topics: dict[str, Topic]
 ) -> Iterator[list[Arrival]]:
-    """The arrivals of a recording. What was latched comes first, at the time of the recording's first sample.
+    """The arrivals of a recording. Latched ones come first, at the time of the recording's first sample.
 
     Args:
         recorded: all arrivals in order, in lists that are not empty.
-        latched: the same, or those of latched streams alone, in order.
-        topics: for each latched stream, what a sample speaks of.
+        latched: the same, or only those of latched streams, in order.
+        topics: for each latched stream, the function that returns the topic of a sample.
     """
     first: dict[tuple[str, Hashable], Arrival] = {}
     for arrival in latched:
@@ -58,7 +58,7 @@ def latched_first(
     taken: set[tuple[str, Hashable]] = set()
 
     def is_taken(arrival: Arrival) -> bool:
-        """Whether the arrival, of a latched stream, came first already."""
+        """Whether the arrival, of a latched stream, was moved to the beginning."""
         about = _about(arrival, topics)
         if about in taken:
             return False

@@ -1,7 +1,7 @@
 """The chunks of an MCAP file that has an index, read in bulk and merged by time.
 
-The message indexes behind a chunk say where its messages begin. They are checked against the chunk, byte by byte: where
-they do not fit it (or are missing), the chunk is gone through record by record.
+The message indexes after a chunk contain the offsets of its messages. They are checked against the chunk, byte by byte:
+if they do not match (or are missing), the chunk is read record by record.
 """
 
 from __future__ import annotations
@@ -27,23 +27,23 @@ from detector.replay.errors import DAMAGE
 from detector.replay.message import Wanted, topic_key
 
 Left = Callable[[McapChannel], Callable[[int], bool] | None]
-"""For a channel, whether the message with a sequence number is left out; None where none of its messages is.
+"""For a channel, the function that returns whether the message with a sequence number is left out; None if none is.
 
-The function is called once for each message of the channel, in the order of their times.
+The function is called once for each message of the channel, in time order.
 """
 
 _RECORD = struct.Struct("<BQ")
 _INDEX = struct.Struct("<BQHI")
-"""The head of a message index: opcode, length of the record, channel, length of the entries."""
+"""The header of a message index: opcode, length of the record, channel, length of the entries."""
 _ENTRY = 16
 """Bytes: a time and an offset."""
 
 _BODY = 22
-"""Bytes of a message's record before the payload."""
+"""The bytes of a message's record before its payload."""
 _HEAD = np.dtype(
     [("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("time", "<u8"), ("publish", "<u8")]
 )
-"""All of a message's record before the payload."""
+"""The fields of a message's record before its payload."""
 _CHANNELS = 1 << 16
 _DEFINITIONS = {Opcode.SCHEMA.value: Schema.read, Opcode.CHANNEL.value: McapChannel.read}
 
@@ -51,19 +51,19 @@ _DEFINITIONS = {Opcode.SCHEMA.value: Schema.read, Opcode.CHANNEL.value: McapChan
 _ROW = np.dtype(
     [("time", "u8"), ("channel", "u2"), ("sequence", "u4"), ("chunk", "i4"), ("begin", "i8"), ("end", "i8")]
 )
-"""A message: the payload lies from `begin` to `end` in the data of `chunk`."""
+"""A message: its payload is at `begin` to `end` in the data of `chunk`."""
 _Rows = NDArray[np.void]
-"""Of `_ROW`, in the order of their times; of equal times as they lie in the file."""
+"""Rows of `_ROW`, in time order; equal times in the order of the file."""
 
 
 class _Waiting(NamedTuple):
-    """What is left of a chunk."""
+    """The remaining messages of a chunk."""
 
     offset: int
-    """Where in the file the chunk lies."""
+    """The chunk's offset in the file."""
     rows: _Rows
     data: bytes
-    """The chunk, unpacked."""
+    """The chunk, decompressed."""
 
 
 class Chunks:
@@ -78,7 +78,7 @@ class Chunks:
         left: Left,
         between: tuple[int, int] | None = None,
     ) -> None:
-        """`described` says of a channel what batches tell; it is called once the first message of the channel comes.
+        """`described` returns the batch's properties of a channel; it is called at the first message of the channel.
 
         `between`: only messages from the first to the second time, both included.
         """
@@ -100,10 +100,10 @@ class Chunks:
         self._has_come = np.zeros(_CHANNELS, np.bool_)
 
     def batches(self) -> Iterator[Batch]:
-        """The wanted messages by time; of equal times as they lie in the file.
+        """The wanted messages in time order; equal times in the order of the file.
 
-        A chunk is read when its first time is reached: no more of them are in memory than overlap. Raises McapError,
-        ValueError, LookupError and others where the file is damaged.
+        A chunk is read when its first time is reached: only overlapping chunks are in memory. Raises McapError,
+        ValueError, LookupError and others if the file is damaged.
         """
         indexes = sorted(
             filter(self._is_wanted, self._summary.chunk_indexes),
@@ -119,7 +119,7 @@ class Chunks:
         yield from self._cut_out(waiting)
 
     def _is_wanted(self, index: ChunkIndex) -> bool:
-        """Whether the chunk may hold wanted messages; without message indexes nobody knows."""
+        """Whether the chunk may contain wanted messages; without message indexes this is unknown."""
         if self._between is not None:
             first, last = self._between
             if index.message_end_time < first or index.message_start_time > last:
@@ -150,16 +150,17 @@ class Chunks:
         if self._between is not None:
             begin, end = index.message_start_time, index.message_end_time
             if len(rows) and not begin <= rows["time"][0] <= rows["time"][-1] <= end:
-                raise ValueError("a chunk has other times than its index")  # what else is in it would be missed
+                raise ValueError("a chunk has other times than its index")  # its other messages would be missed
             first, last = self._between
             rows = rows[(rows["time"] >= first) & (rows["time"] <= last)]
         return _Waiting(index.chunk_start_offset, rows, data)
 
     def _begins(self, index: ChunkIndex, size: int) -> NDArray[np.uint64] | None:
-        """Where the messages of a chunk of `size` bytes begin, in order, as the indexes behind it say; None without."""
+        """The offsets of the messages in a chunk of `size` bytes, in order, from its message indexes; None without
+        indexes."""
         length = index.message_index_length
         begin = index.chunk_start_offset + index.chunk_length
-        most = size + _INDEX.size * _CHANNELS  # no message is shorter than its entry
+        most = size + _INDEX.size * _CHANNELS  # each message is longer than its entry
         if not 0 < length <= most or begin + length > self._size:
             return None
         self._file.seek(begin)
@@ -175,7 +176,7 @@ class Chunks:
         return np.sort(np.frombuffer(b"".join(entries), "<u8")[1::2])
 
     def _cut_out(self, waiting: Sequence[_Waiting]) -> Iterator[Batch]:
-        """Batches of what waits."""
+        """Batches from the waiting messages."""
         if not waiting:
             return
         rows, data = _together(waiting)
@@ -214,7 +215,7 @@ class Chunks:
 
 
 def _split(waiting: Sequence[_Waiting], index: ChunkIndex) -> tuple[list[_Waiting], list[_Waiting]]:
-    """What comes before a chunk begins, and what does not. Of equal times, the place in the file decides."""
+    """The messages before a chunk begins, and the others. For equal times, the position in the file decides."""
     before, rest = [], []
     start = np.array([index.message_start_time], np.uint64)
     for each in waiting:
@@ -228,7 +229,7 @@ def _split(waiting: Sequence[_Waiting], index: ChunkIndex) -> tuple[list[_Waitin
 
 
 def _together(waiting: Sequence[_Waiting]) -> tuple[_Rows, list[bytes]]:
-    """The rows of chunks by time, then by place in the file; and the chunks' data."""
+    """The rows of chunks by time, then by position in the file; and the chunks' data."""
     if len(waiting) == 1:
         return waiting[0].rows, [waiting[0].data]
     parts = sorted(waiting, key=lambda each: each.offset)
@@ -238,17 +239,17 @@ def _together(waiting: Sequence[_Waiting]) -> tuple[_Rows, list[bytes]]:
 
 
 def _located(data: bytes, begins: NDArray[np.uint64]) -> _Rows | None:
-    """The messages that begin at these places; None unless these are all messages of the chunk, and whole.
+    """The messages at these offsets; None unless these are all messages of the chunk, and complete.
 
     Args:
-        data: the chunk, unpacked.
-        begins: in ascending order, but not to be trusted.
+        data: the chunk, decompressed.
+        begins: ascending, but untrusted.
     """
     last = len(data) - _HEAD.itemsize
     if not len(begins) or int(begins[-1]) > last:
         return None
     starts = begins.astype(np.int64)
-    # A view of the head that would begin at each byte: taking from it copies the heads and nothing else.
+    # A view of the header at every byte: indexing it copies only the headers.
     heads = np.ndarray((last + 1,), _HEAD, data, strides=(1,))[starts]
     lengths = heads["length"]
     if (heads["opcode"] != Opcode.MESSAGE).any() or (lengths < _BODY).any() or (lengths > len(data)).any():
@@ -265,7 +266,7 @@ def _located(data: bytes, begins: NDArray[np.uint64]) -> _Rows | None:
 
 
 def _fills(data: bytes, starts: NDArray[np.int64], ends: NDArray[np.int64]) -> bool:
-    """Whether what lies between messages are whole records of other kinds."""
+    """Whether the bytes between messages are complete records of other kinds."""
     gap_begins = np.concatenate(([0], ends))
     gap_ends = np.concatenate((starts, [len(data)]))
     gaps = np.flatnonzero(gap_begins != gap_ends)
@@ -273,7 +274,7 @@ def _fills(data: bytes, starts: NDArray[np.int64], ends: NDArray[np.int64]) -> b
 
 
 def _are_others(data: bytes, begin: int, end: int) -> bool:
-    """Whether these bytes are whole records, none of them a message."""
+    """Whether these bytes are complete records, none of them a message."""
     at = begin
     while at + _RECORD.size <= end:
         opcode, length = _RECORD.unpack_from(data, at)
@@ -285,7 +286,7 @@ def _are_others(data: bytes, begin: int, end: int) -> bool:
 
 
 def _is_definition(data: bytes, at: int, opcode: int, length: int) -> bool:
-    """Whether a schema or channel can be read here and is as long as it says."""
+    """Whether a schema or channel can be read here and matches its declared length."""
     file = io.BytesIO(data)
     file.seek(at)
     stream = ReadDataStream(file)

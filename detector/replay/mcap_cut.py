@@ -1,7 +1,7 @@
-"""MCAP files without an index: their recorder was killed, or wrote none. They are gone through record by record.
+"""MCAP files without an index: their recorder was killed, or wrote none. They are read record by record.
 
-What lies before the cut is read, also the messages at the beginning of a chunk that was not written to its end, as far
-as its compression allows.
+Everything before the cut is read, including the first messages of an incomplete chunk, as far as its compression
+allows.
 """
 
 from __future__ import annotations
@@ -23,34 +23,34 @@ MAGIC = b"\x89MCAP0\r\n"
 
 _RECORD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQII")
-"""The first and the last time, size and checksum of what is inside, and how long the name of its compression is."""
+"""The first and the last time, size and checksum of the contents, and the length of the compression's name."""
 _MESSAGE = struct.Struct("<HIQ")
 
 
 class ChunkLocation(NamedTuple):
-    """Where a chunk lies, or a message outside of chunks."""
+    """The position of a chunk, or of a message outside of chunks."""
 
     start: int
     """Its first log time; nanoseconds."""
     offset: int
     length: int
-    """How many bytes of it there are."""
+    """Number of bytes present."""
     is_chunk: bool
 
 
 @dataclass
 class UnindexedMcap:
-    """What a file without an index holds."""
+    """The contents of a file without an index."""
 
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     places: list[ChunkLocation] = field(default_factory=list)
     cut: str | None = None
-    """Where the file ends, if not where it should."""
+    """Where the file ends, if it is truncated."""
 
 
 def scan_mcap(file: BinaryIO) -> UnindexedMcap:
-    """Goes through the file. Raises struct.error, ValueError, McapError where its records are damaged."""
+    """Scans the file. Raises struct.error, ValueError, McapError if its records are damaged."""
     found = UnindexedMcap()
     size = os.fstat(file.fileno()).st_size
     at = len(MAGIC)
@@ -81,9 +81,9 @@ def scan_mcap(file: BinaryIO) -> UnindexedMcap:
 
 
 def messages_at(file: BinaryIO, place: ChunkLocation, contents: UnindexedMcap) -> Iterator[Message]:
-    """The messages of a chunk, or the one that lies there; schemas and channels on the way are added to the contents.
+    """The messages of a chunk, or the single message; schemas and channels in it are added to the contents.
 
-    Raises ValueError, McapError where the chunk is damaged.
+    Raises ValueError, McapError if the chunk is damaged.
     """
     file.seek(place.offset)
     data = file.read(place.length)
@@ -118,7 +118,7 @@ def _define(opcode: int, data: bytes, contents: UnindexedMcap) -> None:
 
 
 def _unpacked(compression: str, data: bytes) -> bytes:
-    """As much as there is, of data that may end too early."""
+    """Decompresses as much as possible of data that may be truncated."""
     unpack: dict[str, Callable[[bytes], bytes]] = {
         "": bytes,
         "lz4": lambda packed: bytes(lz4.frame.LZ4FrameDecompressor().decompress(packed)),

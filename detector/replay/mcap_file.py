@@ -29,7 +29,7 @@ _DAMAGE = (*DAMAGE, McapError, zstandard.ZstdError)
 
 
 class _Index(NamedTuple):
-    """The reader of a file that has an index, and that."""
+    """The reader of a file with an index, and the index."""
 
     reader: SeekingReader
     summary: Summary
@@ -42,11 +42,11 @@ def read_mcap(
     left: Left = lambda channel: None,
     between: tuple[int, int] | None = None,
 ) -> Iterator[Batch]:
-    """The file's messages, in the order of their log times. One that is cut is read up to there.
+    """The file's messages, in the order of their log times. A truncated file is read up to its end.
 
     `between`: only those from the first to the second time, both included; for files that `mcap_chunks` knows.
 
-    Raises RecordingError if it is damaged, or holds Protobuf messages that cannot be read.
+    Raises RecordingError if it is damaged, or contains Protobuf messages that cannot be read.
     """
     protobuf = Decoders(path)
 
@@ -124,7 +124,7 @@ def _without_index(
                     yield _message(described(contents.schemas.get(channel.schema_id), channel), message)
         except _DAMAGE:
             if contents.cut is None or place is not contents.places[-1]:
-                raise  # else it is what the recorder wrote last
+                raise  # otherwise it is what the recorder wrote last
 
     if contents.places != sorted(contents.places):
         _define_all(file, contents)  # a channel's first chunk in the file is not the first in time
@@ -152,7 +152,7 @@ def mcap_types(path: Path) -> list[RecordedType]:
 
 
 def mcap_span(path: Path) -> tuple[int, int] | None:
-    """The first and the last log time in the file's index; None where it has none. Raises RecordingError if damaged."""
+    """The first and the last log time in the file's index; None if it has none. Raises RecordingError if damaged."""
     with path.open("rb") as file:
         try:
             index = _index(file)
@@ -165,7 +165,7 @@ def mcap_span(path: Path) -> tuple[int, int] | None:
 
 
 def mcap_chunks(path: Path) -> list[tuple[int, int]] | None:
-    """By chunk, its first time and its size in bytes, by time; None where the file has no index of chunks."""
+    """By chunk, its first time and its size in bytes, by time; None if the file has no index of chunks."""
     try:
         with path.open("rb") as file:
             index = _index(file)
@@ -177,13 +177,13 @@ def mcap_chunks(path: Path) -> list[tuple[int, int]] | None:
 
 
 def is_cut(path: Path) -> bool:
-    """Whether the file's end is missing."""
+    """Whether the file is truncated."""
     with path.open("rb") as file:
         return not _is_whole(file)
 
 
 def _is_whole(file: BinaryIO) -> bool:
-    """Whether the file ends as MCAP files do."""
+    """Whether the file has the end of an MCAP file."""
     file.seek(0, 2)
     size = file.tell()
     file.seek(max(0, size - len(MAGIC)))
@@ -191,7 +191,7 @@ def _is_whole(file: BinaryIO) -> bool:
 
 
 def _define_all(file: BinaryIO, contents: UnindexedMcap) -> dict[int, Schema]:
-    """Takes in the schemas and channels that stand in chunks as well; returns the schemas."""
+    """Reads the schemas and channels in chunks as well; returns the schemas."""
     for place in contents.places:
         try:
             for _ in messages_at(file, place, contents):
@@ -203,7 +203,7 @@ def _define_all(file: BinaryIO, contents: UnindexedMcap) -> dict[int, Schema]:
 
 
 def _index(file: BinaryIO) -> _Index | None:
-    """The file's index; None where it has none, having been cut or written without one."""
+    """The file's index; None if it has none, because it was truncated or written without one."""
     if not _is_whole(file):
         return None
     file.seek(0)

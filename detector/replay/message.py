@@ -1,4 +1,4 @@
-"""A recorded message, and what else recordings tell."""
+"""A recorded message, and other contents of recordings."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 Wanted = Callable[[str], bool]
-"""Whether messages on that key are asked for: what is not is passed over without being read, where the format can."""
+"""Whether messages on that key are wanted: others are skipped without being read, if the format allows."""
 
 
 class Message(NamedTuple):
@@ -17,33 +17,33 @@ class Message(NamedTuple):
     time: int
     """When it was recorded, in nanoseconds since the epoch."""
     key: str
-    """Its Zenoh key: of a ROS topic, the name without its leading slash."""
+    """Its Zenoh key; for a ROS topic, the name without its leading slash."""
     payload: bytes
     """The message as it was recorded."""
     encoding: str
-    """As MCAP names it: cdr, json, ros1 and others."""
+    """MCAP's name of the encoding: cdr, json, ros1 and others."""
     type: str | None
-    """The message type, e.g. geometry_msgs/msg/PoseStamped, where the recording tells it."""
+    """The message type, e.g. geometry_msgs/msg/PoseStamped, if the recording contains it."""
     decode: Callable[[bytes], object] | None = None
-    """Makes plain values of the payload, where the recording alone says how: Protobuf."""
+    """Decodes the payload to plain values, if this needs the recording's definitions: Protobuf."""
 
 
 class RecordedType(NamedTuple):
-    """What a recording says of a message type."""
+    """A recording's definition of a message type."""
 
     name: str
     text: str
-    """Its definition with all that it refers to; empty where the recording has none."""
+    """The definition with all types that it refers to; empty if the recording has none."""
     idl: bool
-    """Whether the text is IDL; else it is as in a .msg file."""
+    """Whether the text is IDL; otherwise it is in the form of a .msg file."""
 
 
 class Cut(NamedTuple):
-    """A recording whose end is missing, since its recorder was killed or the file was not copied whole."""
+    """A truncated recording: its recorder was killed, or the file was not copied completely."""
 
     path: Path
     messages: int
-    """How many of the wanted messages were read up to there."""
+    """Number of wanted messages that were read up to there."""
     reason: str
 
     def __str__(self) -> str:
@@ -51,25 +51,24 @@ class Cut(NamedTuple):
 
 
 OnCut = Callable[[Cut], None]
-"""Told when the reading of a recording ends at a cut."""
+"""Called when the reading of a recording ends at a cut."""
 
 
 def ignore(cut: Cut) -> None:
-    """For those who read a recording a second time."""
+    """For a second pass over a recording."""
 
 
 class Piece(NamedTuple):
-    """Messages that lie together in a file, none of them earlier than `start` (nanoseconds)."""
+    """Messages that are stored together in a file, none earlier than `start` (nanoseconds)."""
 
     start: int
     read: Callable[[], Iterable[Message]]
 
 
 def messages_in_order(pieces: Iterable[Piece]) -> Iterator[Message]:
-    """The messages of all pieces in the order of their times, those of equal times as they lie in the file.
+    """The messages of all pieces in time order; equal times in the order of the file.
 
-    The pieces are given in that order. Each is read when its start is reached, so no more of them are in memory than
-    overlap.
+    The pieces are given in that order. Each is read when its start is reached, so only overlapping ones are in memory.
     """
     waiting: list[tuple[int, int, int, Message]] = []
     for place, piece in sorted(enumerate(pieces), key=lambda each: (each[1].start, each[0])):

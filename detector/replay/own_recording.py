@@ -1,7 +1,7 @@
-"""What the record action wrote: a rosbag2 that may hold JSON and other streams beside its ROS topics.
+"""Recordings of the record action: a rosbag2 that may contain JSON and other streams beside its ROS topics.
 
-Other readers pass those over, so its MCAP files are read here. In a split recording each file begins with what was last
-said on latched streams; such a message has the number that it had the first time, and is taken once.
+Other readers skip those, so its MCAP files are read here. In a split recording each file begins with the last samples
+of latched streams; such a message has its original number, and is used only once.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from detector.replay.message import OnCut, RecordedType, Wanted
 
 
 def is_own_recording(path: Path) -> bool:
-    """Whether the folder is a recording of the record action."""
+    """Whether the folder was written by the record action."""
     try:
-        told = json.loads((path / DESCRIPTION).read_bytes())
+        metadata = json.loads((path / DESCRIPTION).read_bytes())
     except (OSError, ValueError):
         return False
-    return isinstance(told, dict) and told.get("format") == FORMAT
+    return isinstance(metadata, dict) and metadata.get("format") == FORMAT
 
 
 def read_own_recording(path: Path, wanted: Wanted, on_cut: OnCut) -> Iterator[Batch]:
-    """The messages, file by file, in the order of their times. Raises RecordingError where a file is not as it was."""
+    """The messages, file by file, in time order. Raises RecordingError if a file has been altered."""
     taken: set[tuple[str, str, int]] = set()
 
     def repeated(channel: Channel) -> Callable[[int], bool] | None:

@@ -1,4 +1,4 @@
-"""Cuts a recording into what the engine takes at one go: large parts, since each call has a cost of its own."""
+"""Cuts a recording into parts for the engine: large ones, because each call has a fixed cost."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from operator import attrgetter
 from detector.engine.samples.sample import Arrival
 
 PAUSE = 3600 * 1_000_000_000
-"""Nanoseconds: a longer pause in a recording is a gap; evaluating nothing for years helps nobody."""
+"""Nanoseconds: a longer pause in a recording is a gap; evaluating empty years is useless."""
 
 _ARRIVALS = 1 << 16
 _BYTES = 64 << 20
 _STEP = 4096
-"""A part is cut to within as many arrivals."""
+"""A part is cut to within this number of arrivals."""
 
 _received = attrgetter("received")
 
 
 def parts_of(batches: Iterable[Sequence[Arrival]]) -> Iterator[Sequence[Arrival]]:
-    """The arrivals in parts that are not empty, none longer than about 65,536 arrivals or 64 MiB of payload.
+    """The arrivals in non-empty parts of at most about 65,536 arrivals or 64 MiB of payload.
 
-    Arrivals of one time are always in one part, however many they are. A pause longer than `PAUSE` ends a part.
+    All arrivals of one time are in one part, regardless of their number. A pause longer than `PAUSE` ends a part.
     """
     part: list[Arrival] = []
     size = 0
@@ -34,7 +34,7 @@ def parts_of(batches: Iterable[Sequence[Arrival]]) -> Iterator[Sequence[Arrival]
         part += piece
         size += sum([len(arrival.payload) for arrival in piece])
         if len(part) >= _ARRIVALS or size >= _BYTES:
-            # What has the last time waits: more of that time may follow.
+            # Arrivals of the last time wait: more of that time may follow.
             cut = bisect_left(part, part[-1].received, key=_received)
             if cut:
                 yield part[:cut]
@@ -54,7 +54,7 @@ def _pieces(batches: Iterable[Sequence[Arrival]]) -> Iterator[Sequence[Arrival]]
 
 
 def _pauses(arrivals: Sequence[Arrival], first: int, last: int) -> Iterator[int]:
-    """The positions up to `last` before which there is a pause. Only halves that hold one are searched."""
+    """The indices up to `last` before which there is a pause. Only halves that contain one are searched."""
     if arrivals[last].received - arrivals[first].received <= PAUSE:
         return
     if last - first == 1:

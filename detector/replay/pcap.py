@@ -1,8 +1,8 @@
 """Captured packets of ITS stations: pcap and pcapng files with GeoNetworking frames.
 
-A frame becomes a message on the key `etsi/cam`, `etsi/denm` and so on, by what it carries, and on `etsi/other` where
-that cannot be told (beacons, encrypted packets). Frames of other protocols are passed over. What a file format or link
-type means is told by the pcap and pcapng drafts of the IETF (opsawg) and tcpdump's list of link types.
+A frame becomes a message on the key `etsi/cam`, `etsi/denm` and so on, by its contents, or on `etsi/other` if these are
+unknown (beacons, encrypted packets). Frames of other protocols are skipped. The file formats and link types follow the
+pcap and pcapng drafts of the IETF (opsawg) and tcpdump's list of link types.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from detector.streams.codecs.etsi.messages import BY_NUMBER, PREFIX
 from detector.streams.codecs.etsi.packets import ETHERTYPE, message_in
 
 MAGICS = (b"\xa1\xb2\xc3\xd4", b"\xd4\xc3\xb2\xa1", b"\xa1\xb2\x3c\x4d", b"\x4d\x3c\xb2\xa1", b"\x0a\x0d\x0d\x0a")
-"""How such files begin: pcap with micro- or nanoseconds in either byte order, and pcapng."""
+"""The beginnings of such files: pcap with micro- or nanoseconds in either byte order, and pcapng."""
 
 OTHER = PREFIX + "other"
-"""The key of packets whose message cannot be told."""
+"""The key of packets whose message is unknown."""
 
 _PCAPNG = MAGICS[-1]
 _SECTION, _INTERFACE, _SIMPLE, _PACKET = 0x0A0D0D0A, 1, 3, 6
 _RESOLUTION, _OFFSET = 9, 14
 _LARGEST = 1 << 24
-"""Bytes: no block of a sound file is larger."""
+"""Bytes: no block of a valid file is larger."""
 
 _VLAN = (0x8100, 0x88A8)
 _SNAP = b"\xaa\xaa\x03\x00\x00\x00"
@@ -59,7 +59,7 @@ def read_pcap(path: Path, wanted: Wanted, on_cut: OnCut) -> Iterator[Batch]:
                     messages.append(Message(time, key, packet, "uper", None))
     except _CutError as error:
         on_cut(Cut(path, len(messages), str(error)))
-    # Captures of several interfaces go back in time by a little; they are small enough to be put in order as a whole.
+    # Captures of several interfaces go back in time by a little; they are small enough to be sorted as a whole.
     yield from batched(sorted(messages, key=attrgetter("time")))
 
 
@@ -72,7 +72,7 @@ def _key(packet: bytes) -> str:
 
 
 def _geonetworking(link: int, data: bytes) -> bytes | None:
-    """What the frame carries for GeoNetworking; None where it carries nothing for it."""
+    """The GeoNetworking packet in the frame; None if there is none."""
     match link:
         case 1:  # Ethernet
             start = 12
@@ -82,7 +82,7 @@ def _geonetworking(link: int, data: bytes) -> bytes | None:
             start = 14
         case 276:  # Linux cooked capture, second version
             return data[20:] if data[:2] == ETHERTYPE.to_bytes(2, "big") else None
-        case 105 | 127:  # IEEE 802.11, also with a radiotap header, as ITS-G5 captures are
+        case 105 | 127:  # IEEE 802.11, also with a radiotap header, as in ITS-G5 captures
             frame = data if link == 105 else data[int.from_bytes(data[2:4], "little") :]
             start = _behind_wifi(frame)
             data = frame
@@ -94,7 +94,7 @@ def _geonetworking(link: int, data: bytes) -> bytes | None:
 
 
 def _behind_wifi(frame: bytes) -> int:
-    """Where the protocol stands in an IEEE 802.11 data frame with an LLC/SNAP header; at its end where it is none."""
+    """The offset of the protocol in an IEEE 802.11 data frame with an LLC/SNAP header; its end for other frames."""
     if len(frame) < 24 or frame[0] & 0x0C != 0x08:
         return len(frame)
     start = 24 + (6 if frame[1] & 3 == 3 else 0) + (2 if frame[0] & 0x80 else 0)
@@ -107,7 +107,7 @@ def _frames(path: Path) -> Iterator[_Frame]:
         yield from _pcapng(data) if data.startswith(_PCAPNG) else _pcap(data)
     except _CutError:
         raise
-    except struct.error as error:  # something is read beyond the end
+    except struct.error as error:  # a read beyond the end
         raise _CutError("the file ends inside a header") from error
     except ValueError as error:
         raise RecordingError(
@@ -160,7 +160,7 @@ def _pcapng(data: bytes) -> Iterator[_Frame]:
 
 
 def _interface(body: bytes, order: str) -> tuple[int, int, int]:
-    """Link type, units of time in a second, and the seconds to add to times."""
+    """Link type, time units per second, and the seconds to add to times."""
     (link,) = struct.unpack_from(order + "H", body, 0)
     units, offset, position = 10**6, 0, 8
     while position + 4 <= len(body):

@@ -1,4 +1,4 @@
-"""Recordings played one after another, each through an engine of its own: nothing goes from one into the next."""
+"""Plays recordings one after another, each through a separate engine: no state passes from one to the next."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ Plugins = Callable[[], AbstractContextManager[PluginHost | None]]
 
 
 class ReplayWatch(Protocol):
-    """Sees what is replayed on its way."""
+    """Observes the arrivals of a replay."""
 
     def __call__(self, batches: Iterable[Sequence[Arrival]], /) -> Iterable[Sequence[Arrival]]:
         """The same arrivals."""
 
 
 class Played(NamedTuple):
-    """What several recordings came to."""
+    """The result of playing several recordings."""
 
     outcomes: dict[str, Outcome]
     """By the recording's name, in the order given; at least one."""
@@ -50,11 +50,11 @@ def play(
     clips: Clips | None = None,
     holder: str | None = None,
 ) -> Played:
-    """What each recording came to. Without `plugins` they run in this process. `holder` is by default the Detector.
+    """The outcome of each recording. Without `plugins` they run in this process. `holder` is by default the Detector.
 
-    Of several recordings, the events of each name it, and from the second on its number is part of the holder: ids and
-    task names differ even if all begin at the same time. `onlooker` gives who looks on at the recording of that name.
-    With `clips`, the rules' record actions run.
+    For several recordings, the events of each name it, and from the second on its number is part of the holder: ids and
+    task names differ even if all begin at the same time. `onlooker` returns the onlooker for the recording of that
+    name. With `clips`, the rules' record actions run.
 
     Raises:
         DetectorError: the Detector cannot run.
@@ -91,7 +91,7 @@ def _played(
     onlooker: ReplayObserver | None,
     clips: Clips | None,
 ) -> tuple[Outcome, list[str]]:
-    """What a recording came to, and its keys that belong to no stream."""
+    """The outcome of a recording, and its keys that belong to no stream."""
     cuts: list[Cut] = []
     completed = with_recorded_types(detector, recording)
     router = Router(completed.spec.streams, recording_name(recording))
@@ -109,17 +109,17 @@ def _played(
 def _without_samples(
     outcomes: dict[str, Outcome], unrouted: dict[str, list[str]], detector: Detector
 ) -> Iterator[RecordingError]:
-    """Why there is nothing to evaluate in any of the recordings."""
+    """Why none of the recordings has anything to evaluate."""
     for name, outcome in outcomes.items():
         if not unrouted[name]:
             cut = "".join(f": it is cut ({each.reason})" for each in outcome.cuts[:1])
             yield RecordingError(f"{name} holds no message{cut}")
     if keys := sorted({key for found in unrouted.values() for key in found}):
         cut = "".join(f"{each}; " for name, outcome in outcomes.items() if unrouted[name] for each in outcome.cuts)
-        asked = _listed([stream.key for stream in detector.spec.streams])
+        expected = _listed([stream.key for stream in detector.spec.streams])
         yield RecordingError(
             f"{cut}no message belongs to a stream of the Detector: the recordings hold the keys "
-            f"{_listed(keys)}, the streams ask for {asked}: correct the streams' key"
+            f"{_listed(keys)}, the streams ask for {expected}: correct the streams' key"
         )
 
 

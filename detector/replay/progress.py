@@ -1,4 +1,4 @@
-"""How far a replay is: on a terminal only, since it may take minutes."""
+"""The progress of a replay, only on a terminal, because it may take minutes."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ _EVERY = 10_000
 
 
 class ProgressLine:
-    """Shows a line that is taken away at the end; nothing where the console is no terminal."""
+    """Shows a line that is removed at the end; nothing if the console is not a terminal."""
 
     def __init__(self, console: Console, monotonic: Callable[[], float] = time.monotonic) -> None:
-        """`monotonic` gives seconds."""
+        """`monotonic` returns seconds."""
         self._console = console
         self._stack = ExitStack()
         self._monotonic = monotonic
@@ -41,22 +41,22 @@ class ProgressLine:
 
     @property
     def shown(self) -> bool:
-        """Whether anybody sees it."""
+        """Whether the line is visible."""
         return self._console.is_terminal
 
     def expect(self, spans: Sequence[Span | None]) -> None:
-        """The recordings that follow, in this order; None: how long one is cannot be seen beforehand."""
+        """The recordings that follow, in this order; None: the duration is not known in advance."""
         self._spans = [*spans]
 
     def watch(self, records: Iterable[Record]) -> Iterator[Record]:
-        """The records, counted on their way."""
+        """The records, counted while they pass."""
         for number, record in enumerate(records, start=1):
             if number % _EVERY == 0:
                 self._status.update(f"{number:,} messages replayed")
             yield record
 
     def watch_batches(self, batches: Iterable[Sequence[Arrival]]) -> Iterator[Sequence[Arrival]]:
-        """The batches of the next recording, their messages counted on their way."""
+        """The batches of the next recording, their messages counted while they pass."""
         number, recording = 0, self._watched
         self._watched += 1
         for batch in batches:
@@ -65,11 +65,11 @@ class ProgressLine:
             yield batch
 
     def note(self, what: str) -> None:
-        """Show what is done now."""
+        """Show the current step."""
         self._status.update(what)
 
     def _estimate(self, recording: int, now: int) -> str:
-        """How much of all recordings is done, and how long the rest takes."""
+        """The completed share of all recordings, and the remaining time."""
         spans = [span for span in self._spans if span is not None]
         if not spans or len(spans) < len(self._spans):
             return ""

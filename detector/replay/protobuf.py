@@ -1,7 +1,7 @@
-"""Protobuf messages of MCAP files, by the definitions that the files bring: plain values, as JSON and CBOR have them.
+"""Protobuf messages of MCAP files, by the definitions in the files: plain values, as in JSON and CBOR.
 
-Fields have the names of the .proto file. Numbers are numbers, also those of 64 bits; enums are the names of their
-values; a field that can tell whether it was set is absent where it was not, any other has its default.
+Fields have their names in the .proto file. Numbers are numbers, including those of 64 bits; enums are the names of
+their values; a field with presence is absent if it was not set, any other has its default.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ if TYPE_CHECKING:
     from google.protobuf.message import Message
 
 ENCODING = "protobuf"
-"""As MCAP calls it, of messages and of schemas."""
+"""MCAP's name, of messages and of schemas."""
 
 Decode = Callable[[bytes], object]
-"""Raises ValueError for what is no message of its type."""
+"""Raises ValueError if the bytes are not a message of its type."""
 
 
 class Decoders:
-    """The decoders of one file, made when they are first asked for."""
+    """The decoders of one file, created on first use."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._by_schema: dict[int, Decode] = {}
 
     def decoder(self, schema: Schema | None, topic: str) -> Decode:
-        """What reads the messages of a topic with this schema.
+        """The decoder of the messages of a topic with this schema.
 
-        Raises RecordingError where the file does not define them, or the package that reads Protobuf is not installed.
+        Raises RecordingError if the file does not define them, or the package for Protobuf is not installed.
         """
         if schema is None or schema.encoding != ENCODING:
             given = "no schema" if schema is None else f"a schema in {schema.encoding or 'no encoding'}"
@@ -49,7 +49,7 @@ class Decoders:
 
     def _made(self, schema: Schema, topic: str) -> Decode:
         try:
-            # Not at the top: an extra, which who replays no Protobuf need not have.
+            # Not at the top: an extra, which is only needed for Protobuf.
             from google.protobuf.message import DecodeError  # noqa: PLC0415
             from mcap_protobuf.decoder import DecoderFactory  # noqa: PLC0415
         except ImportError as error:

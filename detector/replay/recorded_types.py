@@ -1,4 +1,4 @@
-"""Message types as recordings define them: a replay reads messages by the definitions that they were recorded with."""
+"""Message types defined by recordings: a replay reads messages by the definitions that they were recorded with."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ _log = logging.getLogger(__name__)
 
 
 def with_recorded_types(detector: Detector, recordings: Sequence[Path]) -> Detector:
-    """The Detector, its `messages` completed by those that the recordings define otherwise, or alone.
+    """The Detector, with its `messages` extended by the recordings' new or different definitions.
 
-    Raises RecordingError where a recording is missing or damaged, where the definition of a type that is known from
-    nowhere else cannot be read, and where two recordings define a type differently.
+    Raises RecordingError if a recording is missing or damaged, if the only definition of a type cannot be read, and if
+    two recordings define a type differently.
     """
     wanted = {stream.type for stream in detector.spec.streams if stream.encoding is Encoding.CDR}
     types, problems = message_types(detector.spec.messages)
     if problems:
-        return detector  # which cannot run; whoever runs it says so
+        return detector  # it cannot run; the caller reports that
     new: dict[str, tuple[Path, Definition]] = {}
     for path in recordings:
         for recorded in types_of(path):
@@ -53,7 +53,7 @@ def with_recorded_types(detector: Detector, recordings: Sequence[Path]) -> Detec
 
 
 def _definition(path: Path, recorded: RecordedType, types: RosTypes) -> Definition | None:
-    """What the recording says of the type; None where that says nothing new."""
+    """The recording's definition of the type; None if it is not new."""
     if not recorded.text.strip():
         return None
     try:
@@ -87,7 +87,7 @@ def _as_msg(name: str, inside: Typesdict) -> str:
 
 
 def _like(one: Sequence[tuple[str, FieldDesc]], other: Sequence[tuple[str, FieldDesc]]) -> bool:
-    """Whether fields are the same; that of an empty message has no meaning."""
+    """Whether fields are the same; the placeholder field of an empty message is ignored."""
     return list(_meant(one)) == list(_meant(other))
 
 

@@ -1,4 +1,4 @@
-"""Recordings of any kind as one series of messages in the order of their times."""
+"""Recordings of any kind as one series of messages in time order."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ _KINDS = "rosbag2 folders, ROS 1 bags, .mcap, .db3, .pcap, .pcapng and JSON line
 def open_recordings(
     paths: Sequence[Path], wanted: Wanted = lambda key: True, on_cut: OnCut = ignore
 ) -> Iterator[Batch]:
-    """The messages of all recordings on the wanted keys, merged by time; of equal times, the recording given first.
+    """The wanted messages of all recordings, merged by time; of equal times, those of the recording given first.
 
-    The kinds are told by what the files hold. One that is cut is read up to there; `on_cut` is told. Raises
-    RecordingError at once for one that is missing or of no known kind, later where one turns out to be damaged.
+    The kinds are detected by the contents of the files. A truncated one is read up to its end, and `on_cut` is called.
+    Raises RecordingError at once for one that is missing or of unknown kind, later if one turns out to be damaged.
     """
     readers = [(_reader(path), path) for path in paths]
     return merged_batches([read(path, wanted, on_cut) for read, path in readers])
 
 
 def check_exists(path: Path) -> None:
-    """Raises RecordingError where the recording is missing."""
+    """Raises RecordingError if the recording is missing."""
     if not path.exists():
         raise RecordingError(f"{path}: no such file or folder")
 
 
 def span_of(path: Path) -> tuple[int, int] | None:
-    """The times of the first and the last message; None without messages. Raises RecordingError."""
+    """The times of the first and the last message; None if there are no messages. Raises RecordingError."""
     by_index: dict[_Read, Callable[[Path], tuple[int, int] | None]] = {
         read_mcap: mcap_span,
         read_rosbag1: rosbag1_span,
@@ -58,7 +58,8 @@ def span_of(path: Path) -> tuple[int, int] | None:
 
 
 def quick_span_of(paths: Sequence[Path]) -> tuple[int, int] | None:
-    """About the times of the first and the last message of one recording; None where only reading all of it tells."""
+    """The approximate times of the first and the last message of one recording; None if this requires reading all of
+    it."""
     quick: dict[_Read, Callable[[Path], tuple[int, int] | None]] = {
         read_mcap: mcap_span,
         read_rosbag1: rosbag1_span,

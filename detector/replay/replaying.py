@@ -1,7 +1,7 @@
-"""The replay of recordings through the very engine that runs live.
+"""Replays recordings through the same engine that runs live.
 
-An intake file holds what a live engine consumed, controls included: its replay makes the same calls and gives the same
-events, byte by byte. Any other recording is a series of messages; its replay gives the same events each time.
+An intake file contains the input of a live engine, including controls: its replay makes the same calls and gives the
+same events, byte by byte. Any other recording is a series of messages; its replay gives the same events each time.
 """
 
 from __future__ import annotations
@@ -37,38 +37,38 @@ _BATCH = 4096
 
 
 class ReplayObserver(Observer, Protocol):
-    """Sees what a replay evaluates. It decides nothing."""
+    """Observes the evaluation of a replay. It influences no result."""
 
     def attend(self, engine: Engine) -> None:
-        """The engine has other rules from now on."""
+        """The engine uses other rules from now on."""
 
 
 @dataclass(slots=True)
 class Outcome:
-    """What a replay came to."""
+    """The outcome of a replay."""
 
     events: list[Event] = field(default_factory=list)
     tasks: dict[str, ApplicationTask] = field(default_factory=dict)
     refusals: list[RefusedRule] = field(default_factory=list)
     samples: int = 0
     notes: list[str] = field(default_factory=list)
-    """What a person should know: pauses, losses, and what was unknown or failed."""
+    """Notes for the user: pauses, losses, unknown values and failures."""
     cuts: list[Cut] = field(default_factory=list)
-    """Files of the recording whose end is missing."""
+    """Truncated files of the recording."""
     doubts: list[Finding] = field(default_factory=list)
-    """Stamps that do not fit the clock, many old samples, streams that go stale between their samples."""
+    """Stamps that do not fit the clock, many old samples, streams that become stale between their samples."""
     cut: bool = False
-    """The intake file ends in the middle: its writer was killed."""
+    """The intake file is incomplete: its writer was killed."""
     end: int = 0
-    """Up to here all ticks have run; nanoseconds since the epoch."""
+    """All ticks up to this time have run; nanoseconds since the epoch."""
     rules: dict[str, EventRule] = field(default_factory=dict)
-    """All rules that were given at some time, as they were last, by name."""
+    """All rules of the replay in their last version, by name."""
     lost: int = 0
-    """Arrivals that the intake file does not hold: the disk was too slow for them."""
+    """Arrivals missing from the intake file: the disk was too slow for them."""
 
 
 class Replay:
-    """An engine, and the bookkeeping of what it says."""
+    """An engine, and the records of its results."""
 
     def __init__(
         self,
@@ -86,8 +86,8 @@ class Replay:
     ) -> None:
         """`start` is when the detector started, in nanoseconds since the epoch; `plugins` runs them.
 
-        `version` is that of the intake file that the rules stand in; `order`: see `timeline.ORDER`. With `clips`, the
-        rules' record actions run.
+        `version` is that of the intake file with the rules; `order`: see `timeline.ORDER`. With `clips`, the rules'
+        record actions run.
 
         Raises:
             DetectorError: the Detector cannot run.
@@ -111,48 +111,48 @@ class Replay:
         self.set_rules(rules)
 
     def take(self, arrivals: Sequence[Arrival], until: int) -> None:
-        """Samples, and how far time has come."""
+        """Take in samples, and advance the time."""
         self.outcome.samples += len(arrivals)
         self._note(self._engine.advance(arrivals, until))
 
     @property
     def version(self) -> int:
-        """That of the intake file."""
+        """The version of the intake file."""
         return self._version
 
     @property
     def engine(self) -> Engine:
-        """The engine that is driven."""
+        """The driven engine."""
         return self._engine
 
     def ask(self, rule: str) -> None:
-        """Somebody asked a rule; with other rules than were recorded, it may not be there to answer."""
+        """A rule was evaluated on demand; if other rules were recorded, it may not exist here."""
         with contextlib.suppress(NoAnswerError):
             self._note(self._engine.evaluate_now(rule)[0])
 
     def finish(self) -> None:
-        """Nothing more comes: what still has to be evaluated."""
+        """No more samples follow: run the remaining evaluations."""
         for events in self._engine.finish():
             self._note(events)
 
     def close(self) -> None:
-        """The recording is over: clips are completed."""
+        """The recording is over: complete the clips."""
         if self._recorders is not None:
-            self._recorders.tell(self._engine.consequences.cut(self._engine.now, "the recording ended"))
+            self._recorders.dispatch(self._engine.consequences.cut(self._engine.now, "the recording ended"))
             self.outcome.notes += self._recorders.close()
 
     def gap(self, time: int) -> None:
-        """Time went on without ticks."""
+        """Time moved on without ticks."""
         self._note(self._engine.gap(time))
 
     def set_detector(self, detector: Detector) -> None:
-        """Go on with a changed Detector; `set_rules` follows."""
+        """Switch to a changed Detector; `set_rules` follows."""
         self._detector = detector = detector if self._clips is None else self._clips.placed(detector)
         self._entries = inlets(detector)
         self._engine.set_detector(detector, self._entries.decoders, self._entries.read_key)
 
     def set_rules(self, rules: Sequence[EventRule]) -> None:
-        """Go on with these rules."""
+        """Switch to these rules."""
         compiled, refused = self._rule_index.compile(rules, self._detector, self._entries.fields, self._entries.places)
         self.outcome.refusals += refused
         self.outcome.rules |= {rule.name: rule for rule in rules}
@@ -164,14 +164,14 @@ class Replay:
             self._onlooker.attend(self._engine)
 
     def restore(self, demands: Sequence[Demand], time: int, episodes: Sequence[OpenEpisode] = ()) -> None:
-        """Take up the episodes that were open before the recording."""
+        """Restore the episodes that were open before the recording."""
         for demand in demands:
             self._demands[demand.name] = demand
             self.outcome.tasks[demand.name] = to_task(demand)
         self._note(self._engine.restore(demands, time, episodes))
 
     def report(self) -> Iterator[str]:
-        """What was lost, and how the evaluations went, a line each."""
+        """The losses and a summary of the evaluations, one line each."""
         losses = Losses(self._engine)
         self.outcome.doubts += losses.doubts()
         return losses.report()
@@ -181,7 +181,7 @@ class Replay:
         self.outcome.end = max(self.outcome.end, self._engine.now)
         self._note_changes()
         if self._recorders is not None:
-            self._recorders.tell(self._engine.consequences.take(self._engine.now))
+            self._recorders.dispatch(self._engine.consequences.take(self._engine.now))
         if self._engine.demands_version == self._demands_version:
             return
         self._demands_version = self._engine.demands_version
@@ -196,7 +196,7 @@ class Replay:
         self._demands = demands
 
     def _note_changes(self) -> None:
-        """What became of demands since the last time: one that began and ended in between is a task as well."""
+        """Note changes of demands since the last call: one that began and ended in between is a task as well."""
         journal = self._engine.instruments.journal or []
         changed = {change.demand.name: change for change in journal}
         for name, (_, demand, end) in changed.items():
@@ -216,7 +216,7 @@ def replay_intake(
     onlooker: ReplayObserver | None = None,
     clips: Clips | None = None,
 ) -> Outcome:
-    """Replay an intake file: with what it holds, or with another Detector or other rules where given.
+    """Replay an intake file with its own Detector and rules, or with others if given.
 
     `plugins` runs them; without it they run in this process. With `clips`, record actions run.
 
@@ -249,7 +249,7 @@ def replay_intake(
 
 
 def _until(control: Control, batch: Sequence[Arrival]) -> int:
-    """How far the ticks had run when the engine was told."""
+    """The engine's time at which it received the control."""
     if control.kind in ("cut", "lost"):
         return batch[-1].received if batch else 0
     return int(control.document.get("until", control.time))
@@ -309,7 +309,7 @@ def _control(
         case "lost":
             outcome.lost += int(document["arrivals"])
         case "end":
-            if document.get("finished"):  # files of detectors that did not evaluate the last `lateness` say nothing
+            if document.get("finished"):  # older files lack it: the last `lateness` was not evaluated
                 replay.finish()
         case _:
             pass  # plugin: their host knows it already
@@ -328,11 +328,11 @@ def replay_arrivals(
     onlooker: ReplayObserver | None = None,
     clips: Clips | None = None,
 ) -> Outcome:
-    """Replay what any other recording holds, as the live intake would have queued it; `plugins` as for an intake file.
+    """Replay any other recording in the way the live intake would have queued it; `plugins` as for an intake file.
 
     Args:
-        batches: the arrivals, whose times never go back; where a batch ends has no meaning.
-        holder: as which detector; by default under the Detector's name.
+        batches: the arrivals, whose times never go back; the boundaries of batches have no meaning.
+        holder: the holder to run as; by default the Detector's name.
         clips: where record actions write; None: they do not run.
 
     Raises:
@@ -359,7 +359,7 @@ def replay_arrivals(
             replay.gap(first - 1)
             outcome.notes.append(
                 f"the recording pauses after {format_time(last)} for {(first - last) / 1e9:.0f} s: "
-                "nothing is evaluated in between, windows begin anew, open episodes hold"
+                "nothing is evaluated in between, windows reset, open episodes are kept"
             )
         last = part[-1].received
         replay.take(part, last)

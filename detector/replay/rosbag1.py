@@ -1,7 +1,7 @@
-"""ROS 1 bags, read through rosbags: each message is turned into CDR, as the ROS 2 type of the same name reads it.
+"""ROS 1 bags, read through rosbags: each message is converted to CDR, to be read as the ROS 2 type of the same name.
 
-A bag brings the definitions of its types. A header's `seq`, which ROS 2 has no more, is left out; beyond that a type
-must hold the same fields in the same order as its ROS 2 namesake, or have none.
+A bag contains the definitions of its types. A header's `seq`, which ROS 2 no longer has, is left out; apart from that,
+a type must have the same fields in the same order as the ROS 2 type of the same name, if there is one.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ _BUILTIN = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration", _H
 
 
 def read_rosbag1(path: Path, wanted: Wanted, on_cut: OnCut) -> Iterator[Batch]:
-    """The bag's messages as CDR, in the order of their times. One that was not closed is read as far as it goes.
+    """The bag's messages as CDR, in time order. A bag that was not closed is read as far as possible.
 
-    Raises RecordingError if it is damaged, or holds a type that ROS 2 defines otherwise.
+    Raises RecordingError if it is damaged, or contains a type that ROS 2 defines differently.
     """
     return batched(_messages(path, wanted, on_cut))
 
@@ -44,7 +44,7 @@ def _messages(path: Path, wanted: Wanted, on_cut: OnCut) -> Iterator[Message]:
             return
         with Reader(path) as reader:
             connections = [connection for connection in reader.connections if wanted(topic_key(connection.topic))]
-            if not connections:  # rosbags would read none as all
+            if not connections:  # rosbags would treat an empty list as all
                 return
             convert = _converter(path, connections)
             _order(reader, connections)
@@ -75,7 +75,7 @@ def _read_cut(path: Path, contents: UnindexedBag, wanted: Wanted, on_cut: OnCut)
 
 
 def _contents(path: Path) -> UnindexedBag | None:
-    """What a bag that has no index holds; None where it has one."""
+    """The contents of a bag without an index; None if it has one."""
     try:
         with Reader(path):
             return None
@@ -84,7 +84,7 @@ def _contents(path: Path) -> UnindexedBag | None:
 
 
 def _converter(path: Path, connections: Sequence[Connection]) -> Callable[[Connection, int, bytes], Message]:
-    """Turns the messages of these connections into CDR. Raises RecordingError, TypesysError."""
+    """The conversion of these connections' messages to CDR. Raises RecordingError, TypesysError."""
     types = _types(connections)
     _compare(path, types, connections)
 
@@ -103,7 +103,7 @@ def _converter(path: Path, connections: Sequence[Connection]) -> Callable[[Conne
 
 
 def rosbag1_span(path: Path) -> tuple[int, int] | None:
-    """The times of the first and the last message, as the bag's index tells; None where it has none."""
+    """The times of the first and the last message in the bag's index; None if it has none."""
     try:
         with Reader(path) as reader:
             return (reader.start_time, reader.end_time) if reader.message_count else None
@@ -112,7 +112,7 @@ def rosbag1_span(path: Path) -> tuple[int, int] | None:
 
 
 def rosbag1_types(path: Path) -> list[RecordedType]:
-    """The message types that the bag defines, as ROS 2 would. Raises RecordingError if it is damaged."""
+    """The message types that the bag defines, in ROS 2's form. Raises RecordingError if it is damaged."""
     try:
         cut = _contents(path)
         if cut is not None:
@@ -129,7 +129,8 @@ def _recorded_types(connections: Iterable[Connection]) -> list[RecordedType]:
 
 
 def _as_ros2(connection: Connection) -> str:
-    """The definition of the connection's type for ROS 2; as it is where it cannot be read: nobody may ask for it."""
+    """The definition of the connection's type for ROS 2; unchanged if it cannot be read, because it may not be
+    needed."""
     try:
         return _types([connection]).generate_msgdef(connection.msgtype, ros_version=2)[0]
     except TypesysError:
@@ -137,7 +138,7 @@ def _as_ros2(connection: Connection) -> str:
 
 
 def _order(reader: Reader, connections: Sequence[Connection]) -> None:
-    """Of equal times, let the place in the bag decide: rosbags would give one connection after the other."""
+    """For equal times, use the position in the bag: rosbags would yield one connection after the other."""
     entries = sorted((entry for each in connections for entry in reader.indexes[each.id]), key=tuple)
     reader.indexes.update((each.id, []) for each in connections)
     reader.indexes[connections[0].id] = entries
@@ -164,7 +165,7 @@ def _types(connections: Sequence[Connection]) -> Typestore:
 
 
 def _compare(path: Path, types: Typestore, connections: Sequence[Connection]) -> None:
-    """Raises RecordingError where ROS 2 has a type of that name that reads otherwise."""
+    """Raises RecordingError if ROS 2 has a type of that name with another layout."""
     known = get_typestore(Stores.ROS2_JAZZY)
     for connection in connections:
         name = connection.msgtype
@@ -176,7 +177,7 @@ def _compare(path: Path, types: Typestore, connections: Sequence[Connection]) ->
 
 
 def _layout(types: Typestore, name: str) -> list[object]:
-    """What follows what in the bytes of a message; names of fields do not matter."""
+    """The sequence of values in the bytes of a message; names of fields do not matter."""
     return [_piece(types, description) for _, description in types.fielddefs[name][1]]
 
 

@@ -1,7 +1,7 @@
-"""ROS 1 bags that were not closed: they have no index, so they are gone through record by record.
+"""ROS 1 bags that were not closed: they have no index, so they are read record by record.
 
-A bag (format 2.0) is a row of records, each a header of named fields and data. Chunks are records whose data are
-records again, perhaps compressed: connections and messages.
+A bag (format 2.0) is a sequence of records, each with a header of named fields and data. The data of a chunk are again
+records, possibly compressed: connections and messages.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _UNPACK: dict[str, Callable[[bytes], bytes]] = {
     "bz2": lambda data: bz2.BZ2Decompressor().decompress(data),
     "lz4": lambda data: bytes(lz4.frame.LZ4FrameDecompressor().decompress(data)),
 }
-"""As much as there is, of data that may end too early."""
+"""Decompresses as much as possible of data that may be truncated."""
 
 
 class Recorded(NamedTuple):
@@ -40,7 +40,7 @@ class Recorded(NamedTuple):
 
 
 class Chunk(NamedTuple):
-    """Where a chunk's data lie, how they are compressed, and the time of the first of its messages (nanoseconds)."""
+    """The position of a chunk's data, their compression, and the time of its first message (nanoseconds)."""
 
     start: int
     offset: int
@@ -50,16 +50,16 @@ class Chunk(NamedTuple):
 
 @dataclass
 class UnindexedBag:
-    """What a bag without an index holds."""
+    """The contents of a bag without an index."""
 
     connections: dict[int, Connection] = field(default_factory=dict)
     chunks: list[Chunk] = field(default_factory=list)
     cut: str | None = None
-    """Where the bag ends, if not where it should."""
+    """Where the bag ends, if it is truncated."""
 
 
 def scan_bag(path: Path, magic: bytes) -> UnindexedBag:
-    """Goes through the bag. Raises OSError, ValueError, LookupError, struct.error where its records are damaged."""
+    """Scans the bag. Raises OSError, ValueError, LookupError, struct.error if its records are damaged."""
     found = UnindexedBag()
     with path.open("rb") as file:
         size = os.fstat(file.fileno()).st_size
@@ -88,7 +88,7 @@ def scan_bag(path: Path, magic: bytes) -> UnindexedBag:
 
 
 def chunk_messages(path: Path, chunk: Chunk, contents: UnindexedBag) -> Iterator[Recorded]:
-    """The messages of a chunk, as they lie there."""
+    """The messages of a chunk, in the order of the file."""
     with path.open("rb") as file:
         file.seek(chunk.offset)
         return _messages(file.read(chunk.length), chunk.compression, contents)
@@ -126,7 +126,7 @@ def _connection(header: dict[str, bytes], body: bytes) -> Connection:
 
 
 def _record(data: bytes, at: int) -> tuple[dict[str, bytes], bytes, int] | None:
-    """Header and data of a record, and where it ends; None where not all of it is there."""
+    """Header and data of a record, and its end; None if it is incomplete."""
     parts = []
     for _ in range(2):
         if at + _LENGTH.size > len(data):

@@ -21,9 +21,9 @@ _DAMAGE = (*DAMAGE, ReaderError, apsw.Error, ZstdError)
 
 
 def read_rosbag2(path: Path, wanted: Wanted, on_cut: OnCut) -> Iterator[Batch]:
-    """The bag's messages in the order of their times. Raises RecordingError if it is damaged or of an unknown kind.
+    """The bag's messages in time order. Raises RecordingError if it is damaged or of an unknown kind.
 
-    Of a bag with MCAP files whose recorder was killed, each file is read up to where it is cut.
+    If the recorder of a bag with MCAP files was killed, each file is read up to its cut.
     """
     files = sorted(path.glob("*.mcap")) if path.is_dir() else []
     if any(is_cut(file) for file in files):
@@ -35,7 +35,7 @@ def _messages(path: Path, wanted: Wanted) -> Iterator[Message]:
     try:
         with Reader(path) as reader:
             connections = [connection for connection in reader.connections if wanted(topic_key(connection.topic))]
-            if not connections:  # rosbags would read none as all
+            if not connections:  # rosbags would treat an empty list as all
                 return
             for connection, time, payload in reader.messages(connections):
                 extra = connection.ext

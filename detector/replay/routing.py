@@ -1,4 +1,4 @@
-"""Which streams a recorded message belongs to, as the subscriptions decide it live."""
+"""The streams of a recorded message, by the same rules as live subscriptions."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ _WRITERS: Mapping[Encoding, Callable[[object], bytes]] = {
     Encoding.JSON: msgspec.json.encode,  # bytes become base64, NaN and infinities null
     Encoding.CBOR: cbor2.dumps,
 }
-"""How a message that the recording alone can decode is handed to a stream."""
+"""Encodes a message that only the recording can decode, for a stream."""
 
 
 class _Target(NamedTuple):
-    """A stream that the messages of a channel belong to."""
+    """A stream for the messages of a channel."""
 
     stream: str
     key: str
     write: Callable[[bytes], bytes] | None
-    """Makes the payload as the stream's encoding has it; None where it is handed over as it was recorded."""
+    """Converts the payload to the stream's encoding; None if it is passed on unchanged."""
 
 
 def _writer(channel: Channel, stream: Stream) -> Callable[[bytes], bytes] | None:
-    """Writes a payload in the stream's encoding; one that cannot be read stays as it is, for the stream to count it."""
+    """Converts a payload to the stream's encoding; an unreadable one stays unchanged, and the stream counts it."""
     write, decode = _WRITERS.get(stream.encoding), channel.decode
     if write is None or decode is None:
         return None
@@ -50,10 +50,10 @@ def _writer(channel: Channel, stream: Stream) -> Callable[[bytes], bytes] | None
 
 
 class Router:
-    """Sends recorded messages into the Detector's streams."""
+    """Routes recorded messages to the Detector's streams."""
 
     def __init__(self, streams: Sequence[Stream], recording: str = "") -> None:
-        """`recording` is its name for errors. Raises DetectorError where a stream's key or an expression is wrong."""
+        """`recording` is its name for errors. Raises DetectorError if a stream's key or an expression is invalid."""
         self._where = f"{recording}: " if recording else ""
         problems = [problem for index, stream in enumerate(streams) for problem in stream_problems(stream, index)]
         if problems:
@@ -72,13 +72,13 @@ class Router:
 
     @property
     def unrouted(self) -> list[str]:
-        """Keys that were looked at and belong to no stream, at most twenty, sorted."""
+        """Keys that belong to no stream, at most twenty, sorted."""
         return sorted(key for key, streams in self._routes.items() if not streams)[:_SHOWN]
 
     def routed(self, batches: Iterable[Batch]) -> Iterator[Batch]:
         """The messages that belong to any stream.
 
-        Raises RecordingError where a message is recorded in another encoding or type than its stream's.
+        Raises RecordingError if a message has another encoding or type than its stream.
         """
         for batch in batches:
             there = set(batch.channels)
@@ -96,11 +96,11 @@ class Router:
                 yield batch.picked(positions)
 
     def arrivals(self, batches: Iterable[Batch]) -> Iterator[list[Arrival]]:
-        """The messages as the live intake would have queued them, each once for every stream of its key.
+        """The messages in the form of the live intake, each once for every stream of its key.
 
         The receive time is the recorded one: equal times stay equal, in the order of the messages and then of the
-        streams. A time that goes back becomes the last one before it. Lists are not empty. Raises RecordingError like
-        `routed`.
+        streams. A time that goes back is replaced by the latest one before it. Lists are not empty. Raises
+        RecordingError like `routed`.
         """
         last = 0
         targets = self._targets
@@ -114,7 +114,7 @@ class Router:
             ]
 
     def _targets_of(self, channel: Channel) -> tuple[_Target, ...]:
-        """The channel's streams in the Detector's order. Raises RecordingError where one cannot read it."""
+        """The channel's streams in the Detector's order. Raises RecordingError if one cannot read it."""
         streams = self._route(channel.key)
         for stream in streams:
             self._check(channel, stream)

@@ -1,4 +1,4 @@
-"""Variants of rules: the same rule with other fields, played in the same pass as the rule as written."""
+"""Variants of rules: a rule with changed fields, played in the same pass as the rule as written."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _RANGE = re.compile(r"(-?[0-9.eE+-]+):(-?[0-9.eE+-]+):([0-9.eE+-]+)")
 
 
 class VariantError(InputError, ValueError):
-    """A change that cannot be made; the text names the option, the field and the remedy."""
+    """A change that cannot be applied; the text names the option, the field and the remedy."""
 
 
 class Change(NamedTuple):
@@ -30,36 +30,36 @@ class Change(NamedTuple):
 
     rule: str
     path: tuple[str, ...]
-    """Below spec; items of lists by their names or numbers."""
+    """The path below spec; items of lists by their names or numbers."""
     value: Any
 
     @property
     def label(self) -> str:
-        """For people."""
+        """The label for users."""
         text = self.value if isinstance(self.value, str) else json.dumps(self.value)
         return f"{'.'.join(self.path)}={text}"
 
 
 class Variant(NamedTuple):
-    """A rule with other fields. It has no actions, and a name of its own."""
+    """A rule with changed fields. It has no actions, and a distinct name."""
 
     of: str
     """The rule as written."""
     label: str
     rule: EventRule
     parameters: frozenset[str]
-    """Those of the rule that the variant sets for all clients."""
+    """The parameters of the rule that the variant sets for all clients."""
     is_written: bool = False
     """It is another rule as written, with its own name and actions, that is only compared."""
 
 
 def variants_of(rules: Sequence[EventRule], sets: Sequence[str], sweeps: Sequence[str]) -> list[Variant]:
-    """The variants that the options name: of each rule one with all that is set, and one for each value of each sweep.
+    """The variants named by the options: for each rule one with all `sets`, and one for each value of each sweep.
 
     `RULE=OTHER` names another rule in place of a variant.
 
     Raises:
-        VariantError: an option cannot be read, names no rule or no field of it, or makes a rule that is wrong.
+        VariantError: an option cannot be parsed, names no rule or no field of it, or makes an invalid rule.
     """
     known = {rule.name: rule for rule in rules}
     fixed: dict[str, list[Change]] = {}
@@ -81,7 +81,7 @@ def variants_of(rules: Sequence[EventRule], sets: Sequence[str], sweeps: Sequenc
 
 
 def with_variants(detector: Detector, variants: Sequence[Variant]) -> Detector:
-    """The Detector, with the parameters that it sets for clients also set for variants, but those that they change."""
+    """The Detector, with its clients' parameters applied to variants as well, except those that they change."""
     if not any(client.parameters for client in detector.spec.clients):
         return detector
     clients = []
@@ -112,7 +112,7 @@ def _parts(option: str, text: str, rules: Mapping[str, EventRule]) -> tuple[str,
 
 
 def _known(option: str, text: str, rule: str, rules: Mapping[str, EventRule]) -> str:
-    """The name, where there is such a rule."""
+    """The name, if that rule exists."""
     if rule not in rules:
         close = difflib.get_close_matches(rule, rules, n=1)
         hint = f"did you mean {close[0]}?" if close else f"there is {', '.join(sorted(rules)) or 'none'}"
@@ -121,7 +121,7 @@ def _known(option: str, text: str, rule: str, rules: Mapping[str, EventRule]) ->
 
 
 def _value(text: str) -> Any:
-    """As YAML has it: a number, a boolean, a list; all else is text."""
+    """A YAML value: a number, a boolean, a list; otherwise text."""
     try:
         return yaml.safe_load(text)
     except yaml.YAMLError:
@@ -129,7 +129,7 @@ def _value(text: str) -> Any:
 
 
 def _values(option: str, text: str) -> Iterator[Any]:
-    """`80:200:20`, both ends included, or values with commas between."""
+    """`80:200:20`, both ends included, or values separated by commas."""
     span = _RANGE.fullmatch(text)
     if span is None:
         yield from (_value(each.strip()) for each in text.split(","))
@@ -187,7 +187,7 @@ def _below(here: Any, step: str, change: Change) -> Any:
 
 
 def _index(items: Sequence[Any], step: str, change: Change) -> int:
-    """The item of that name or number."""
+    """The index of the item with that name or number."""
     for at, item in enumerate(items):
         if isinstance(item, Mapping) and item.get("name") == step:
             return at

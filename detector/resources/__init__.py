@@ -1,1 +1,1 @@
-"""Where the Detector and its EventRules come from: files, or the API server, whose changes are followed."""
+"""The sources of the Detector and its EventRules: files, or the API server, which is watched for changes."""

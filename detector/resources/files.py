@@ -21,7 +21,7 @@ class FileRules:
     rules: dict[str, Document]
     """The selected rules by name, for the places of errors."""
     warnings: tuple[str, ...]
-    """Rules that are given but not evaluated, and why."""
+    """Rules that were given but are not evaluated, and why."""
 
 
 Check = Callable[[Detector], Iterable[RuleProblem]]
@@ -31,13 +31,13 @@ def load_rules(detector: str | Path, rules: Iterable[str | Path], check: Check =
     """Read exactly one Detector, and the rules that it selects.
 
     Args:
-        detector: a file or folder. It may hold other kinds too; they are ignored.
+        detector: a file or folder. Other kinds in it are ignored.
         rules: files or folders, likewise. EventRules beside the detector count only if they are given here.
-        check: finds what keeps the Detector from running.
+        check: returns the problems that keep the Detector from running.
 
     Raises:
-        DocumentError: with every problem of every file; also where there is no Detector, or more than one, or two
-            rules of one name.
+        DocumentError: with every problem of every file; also if there is no Detector, or more than one, or two
+            rules of the same name.
     """
     problems: list[Problem] = []
     beside_detector = _load([detector], problems)

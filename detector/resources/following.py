@@ -1,4 +1,5 @@
-"""The Detector and its rules from files, read again on SIGHUP: a detector without a cluster changes while it runs."""
+"""The Detector and its rules from files, read again on SIGHUP: a detector without a cluster can be reconfigured while
+it runs."""
 
 from __future__ import annotations
 
@@ -16,7 +17,8 @@ _log = logging.getLogger(__name__)
 
 
 def hangups() -> asyncio.Event:
-    """An event that every SIGHUP sets from now on. Call it before the files are first read, so that none is lost."""
+    """An event that every SIGHUP sets from now on. Call it before the files are first read, so that no signal is
+    lost."""
     changed = asyncio.Event()
     asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, changed.set)
     return changed
@@ -25,7 +27,7 @@ def hangups() -> asyncio.Event:
 async def follow_files(
     detector: Path, rules: Sequence[Path], check: Check, changed: asyncio.Event
 ) -> AsyncIterator[RuleSet]:
-    """The content of the files each time `changed` is set. Wrong files are logged and change nothing."""
+    """The content of the files each time `changed` is set. Invalid files are logged and change nothing."""
     try:
         while True:
             await changed.wait()

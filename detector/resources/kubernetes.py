@@ -1,4 +1,4 @@
-"""A Detector and its EventRules from the API server, followed as they change."""
+"""A Detector and its EventRules from the API server, watched for changes."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ Parsed = TypeVar("Parsed", bound=Kind)
 
 
 class ClusterRules:
-    """The Detector of a name and the rules that it selects, kept current.
+    """The Detector of this name and the rules that it selects, kept current.
 
-    While the API server is away, and while the Detector is missing or cannot be read, the last known set holds. A rule
-    that cannot be read (e.g. one of a newer version) is reported and left out; the others are not affected.
+    While the API server is unavailable, or the Detector is missing or unreadable, the last known set stays in use. An
+    unreadable rule (e.g. of a newer version) is reported and left out; the others are not affected.
     """
 
     def __init__(self, client: Client, namespace: str, detector_name: str, resync: float = 30.0) -> None:
@@ -49,7 +49,7 @@ class ClusterRules:
 
     @property
     def problems(self) -> dict[str, str]:
-        """What cannot be read, and why, by kind and name."""
+        """The unreadable objects, and the reasons, by kind and name."""
         return {
             f"{kind.__name__} {name}": why
             for kind, known in ((Detector, self._detectors), (EventRule, self._rules))
@@ -57,7 +57,7 @@ class ClusterRules:
         }
 
     async def follow(self) -> AsyncGenerator[RuleSet, None]:
-        """The set as soon as it is known, then each time that it has changed. Never ends and raises nothing."""
+        """The set as soon as it is known, then after each change. Never ends and raises nothing."""
         last: RuleSet | None = None
         tasks = [
             asyncio.create_task(self._take(self._detector_source, self._detectors)),
@@ -70,7 +70,7 @@ class ClusterRules:
                 self._changed.clear()
                 for task in tasks:
                     if task.done():
-                        task.result()  # it never ends but by an error, which must not be swallowed
+                        task.result()  # it only ends by an error, which must not be swallowed
                 current = self._current()
                 if current is not None and not current.same_as(last):
                     last = current
@@ -129,9 +129,9 @@ class _Known(Generic[Parsed]):
 
     def _put(self, obj: Object) -> None:
         name = obj["metadata"]["name"]
-        # The status is the manager's business, and a newer manager's may have fields that we do not know.
+        # The manager owns the status, and a newer manager's may have unknown fields.
         read = {key: value for key, value in obj.items() if key != "status"}
-        shape = {"apiVersion": API_VERSION, "kind": self._kind.__name__}  # items of a list come without
+        shape = {"apiVersion": API_VERSION, "kind": self._kind.__name__}  # list items have neither
         try:
             parsed = parse_object(shape | read)
         except ValueError as error:
@@ -140,7 +140,7 @@ class _Known(Generic[Parsed]):
                 _log.warning("cannot read the %s %s; %s: %s", self._kind.__name__, name, what, error)
             self.unreadable[name] = str(error)
             return
-        assert isinstance(parsed, self._kind)  # noqa: S101  the shape guarantees it
+        assert isinstance(parsed, self._kind)  # noqa: S101  guaranteed by the shape
         self.unreadable.pop(name, None)
         self.objects[name] = parsed
 

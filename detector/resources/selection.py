@@ -10,14 +10,14 @@ from wayside.api import Detector, EventRule
 
 @dataclass(frozen=True)
 class RuleSet:
-    """What the engine is to run."""
+    """The input of the engine."""
 
     detector: Detector
     rules: tuple[EventRule, ...]
     """Those that the detector selects, by name."""
 
     def same_as(self, other: RuleSet | None) -> bool:
-        """Whether both are equal to the engine; status and similar fields do not count."""
+        """Whether both are equal to the engine; status and similar fields are ignored."""
         return other is not None and _essence(self) == _essence(other)
 
 

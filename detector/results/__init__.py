@@ -1,1 +1,1 @@
-"""Results to look at: what a replay saw between its events, as a report, as MCAP and as tables."""
+"""Results for inspection: the values of a replay between its events, as a report, as MCAP and as tables."""

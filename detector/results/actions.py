@@ -1,4 +1,4 @@
-"""What each action would have done: the applications that are demanded over time, and the data that is handed on."""
+"""The actions that would have run: the applications demanded over time, and the data passed on."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from wayside.times import parse_time
 
 
 class Deed(NamedTuple):
-    """One thing that an action does for one episode. Times are nanoseconds since the epoch."""
+    """One action for one episode. Times are nanoseconds since the epoch."""
 
     rule: str
     action: str
@@ -20,14 +20,14 @@ class Deed(NamedTuple):
     what: str
     """`deploy`, `record`, `database` and so on."""
     about: str
-    """The template with its parameters, or which streams."""
+    """The template with its parameters, or the streams."""
     begin: int
     end: int | None
-    """None: not over when the recording ended."""
+    """None: still running at the end of the recording."""
 
 
 def deeds_of(result: Result) -> list[Deed]:
-    """What would have been done, in order of time."""
+    """The actions that would have run, in time order."""
     found = [*_tasks(result), *_windows(result)]
     return sorted(found, key=lambda deed: (deed.begin, deed.rule, deed.subject, deed.action))
 

@@ -1,4 +1,4 @@
-"""What changes in blocks of columns: the points at which a value differs from the one before."""
+"""Changes in blocks of columns: the points at which a value differs from the previous one."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from numpy.typing import NDArray
 from detector.results.series import Bytes, Doubles, Integers
 
 _NEVER_SEEN = 255
-"""In place of a tag: no tag is like it, so the first point always counts."""
+"""Stands in for a tag: no tag has this value, so the first point always counts."""
 
 
 class ChangePoints(NamedTuple):
-    """Points at which something changed, in order of the clients, then of the times."""
+    """Changes, in order of the clients, then of the times."""
 
     rows: NDArray[np.intp]
-    """Of the block: which of its clients."""
+    """Indices of the block's clients."""
     ticks: NDArray[np.intp]
-    """Of the block: which of its ticks."""
+    """Indices of the block's ticks."""
     values: Doubles
-    """What they are from there on, as it is kept: texts may be written over."""
+    """The new values in stored form: texts may be recoded."""
 
 
 class Changes:
-    """The changes of one value of many clients, block after block."""
+    """The changes of one value for many clients, block after block."""
 
     def __init__(self) -> None:
         self._last_values: Integers = np.zeros(0, np.int64)
@@ -36,14 +36,14 @@ class Changes:
     def add(
         self, clients: Integers, times: Integers, values: Doubles, tags: Bytes, present: NDArray[np.bool_] | None
     ) -> ChangePoints:
-        """Note what changed, and return where.
+        """Record the changes; returns their positions.
 
         Args:
             clients: numbers of the block's clients, the same in every block.
             times: the ticks, nanoseconds since the epoch, later than all before.
             values: shape (clients, ticks).
             tags: the same shape; values of different tags differ.
-            present: the same shape: which points there are; None: all.
+            present: the same shape: which points exist; None: all.
         """
         bits = np.ascontiguousarray(values).view(np.int64)
         self._make_room(int(clients.max()) + 1 if len(clients) else 0)
@@ -67,7 +67,7 @@ class Changes:
         return ChangePoints(rows, ticks, new)
 
     def by_client(self, chosen: Container[int] | None) -> Iterator[tuple[int, Integers, Doubles, Bytes]]:
-        """Of each chosen client (None: of all), its number, and times, values and tags of its changes."""
+        """For each chosen client (None: all), its number, and the times, values and tags of its changes."""
         if not self._parts:
             return
         clients, times, values, tags = (np.concatenate(part) for part in zip(*self._parts, strict=True))

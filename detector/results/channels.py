@@ -1,6 +1,6 @@
-"""The channels in which Foxglove and Lichtblick show what was evaluated, in a file or live.
+"""The channels in which Foxglove and Lichtblick display the evaluation, from a file or live.
 
-Each rule and subject has a channel of JSON with a schema; besides there are the episodes, a log and the scene.
+Each rule and subject has a JSON channel with a schema; further channels contain the episodes, a log and the scene.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def topic_of(rule: str, subject: str) -> str:
 
 @lru_cache(maxsize=4096)
 def message_path(name: str) -> tuple[str, ...]:
-    """Where a signal or term stands in a message: `a.speed` in `a`, `fastest - speed` under `fastest_minus_speed`."""
+    """The path of a signal or term in a message: `a.speed` in `a`, `fastest - speed` under `fastest_minus_speed`."""
     if re.fullmatch(r"[\w.]+", name):
         return tuple(name.split("."))
     spelt = "".join(f" {_SIGNS[char]} " if char in _SIGNS else char for char in name)
@@ -50,7 +50,7 @@ def message_path(name: str) -> tuple[str, ...]:
 def subject_channel(
     result: Result, subject: SubjectTrace, buckets: int
 ) -> tuple[dict[str, Any], Iterator[tuple[int, bytes]]]:
-    """The schema of a subject's channel, and its messages: all that is known at each time at which a value changes."""
+    """The schema of a subject's channel, and its messages: all known values at each time at which one changes."""
     trace, terms, exact = result.trace, result.terms.get((subject.rule, subject.subject)), subject.changes
     named = {**subject.signals, **(terms.computed if terms is not None else {})}
     short = {name: thinned(series, trace.begin, trace.end, buckets, exact) for name, series in named.items()}
@@ -59,23 +59,23 @@ def subject_channel(
     limits: dict[str, Any] = {}
     for each in terms.thresholds if terms is not None else ():
         _put(limits, (each.field, *message_path(each.term)), each.value)
-    said = {name: steps.at(times).tolist() for name, steps in subject.conditions.items()}
+    conditions = {name: steps.at(times).tolist() for name, steps in subject.conditions.items()}
     reasons = {name: _reasons(steps.reasons, steps.times, times) for name, steps in subject.conditions.items()}
     schema: dict[str, Any] = {"type": "object", "title": f"wayside.{subject.rule}", "properties": {}}
     for field in fields:
         _declare(schema, field.path, {"type": _TYPES[field.kind]})
-    for name in said:
+    for name in conditions:
         _declare(schema, (name,), {"type": "string", "enum": [*WORDS]})
         _declare(schema, (f"{name}_reason",), {"type": "string"})
     if limits:
         schema["properties"]["threshold"] = _shape(limits)
-    return schema, _messages(times, fields, said, reasons, limits)
+    return schema, _messages(times, fields, conditions, reasons, limits)
 
 
 def _messages(
     times: Integers,
     fields: list[_Field],
-    said: Mapping[str, list[int]],
+    conditions: Mapping[str, list[int]],
     reasons: Mapping[str, list[str | None]],
     limits: Mapping[str, Any],
 ) -> Iterator[tuple[int, bytes]]:
@@ -86,7 +86,7 @@ def _messages(
             value = values[row]
             if value is not None:
                 _put(message, path, value)
-        for name, codes in said.items():
+        for name, codes in conditions.items():
             message[name] = WORDS[codes[row]]
             reason = reasons[name][row]
             if reason is not None:
@@ -97,7 +97,7 @@ def _messages(
 
 
 def _plain(series: Series, times: Integers) -> list[float | bool | str | None]:
-    """The values at these times as JSON has them; None: unknown or infinite, which JSON cannot express."""
+    """The values at these times in JSON's form; None: unknown or infinite, which JSON cannot express."""
     values = series.at(times).tolist()
     if series.kind is SeriesKind.NUMBER:
         return [value if math.isfinite(value) else None for value in values]

@@ -1,4 +1,4 @@
-"""Episodes as a table: a row each, with its times, its values and the statistics of its signals."""
+"""Episodes as a table: one row each, with its times, its values and the statistics of its signals."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FIXED = (
 )  # fmt: skip
 TIMES = ("onset_time", "start_time", "end_time")
 _KINDS: Mapping[type, str] = {bool: "boolean", float: "number", type(None): "null"}
-"""Of columns, by the type of a value; all others are text."""
+"""Kinds of columns, by the type of a value; all others are text."""
 
 
 @dataclass(slots=True)
@@ -39,11 +39,11 @@ class EpisodeRow:
     onset_time: int
     start_time: int
     end_time: int | None
-    """None: it was open when the recording ended. Nanoseconds since the epoch, as all times."""
+    """None: it was open at the end of the recording. Nanoseconds since the epoch, like all times."""
     reason: str | None
     dry_run: bool
     values: dict[str, Plain] = field(default_factory=dict)
-    """By `<signal>.start`, `.end`, `.min`, `.max` and `.mean`: those that are known."""
+    """By `<signal>.start`, `.end`, `.min`, `.max` and `.mean`: the known ones."""
 
     @property
     def duration(self) -> float | None:
@@ -54,8 +54,8 @@ class EpisodeRow:
 def episodes_of(recording: str, events: Iterable[Event], trace: Trace) -> list[EpisodeRow]:
     """The episodes of a recording, in order of their starts.
 
-    Minimum and maximum are those of all ticks of the episode; the mean is weighted by time. An episode that is open
-    has those up to the end of the recording.
+    Minimum and maximum cover all ticks of the episode; the mean is weighted by time. For an open episode they cover the
+    time up to the end of the recording.
     """
     traces = {(each.rule, each.subject): each for each in trace.subjects}
     found: dict[str, EpisodeRow] = {}
@@ -83,7 +83,7 @@ def _episode(recording: str, event: Event) -> EpisodeRow:
 
 
 def flat(values: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Plain]]:
-    """The values of an event by the names that expressions use; lists as JSON."""
+    """The values of an event by their names in expressions; lists as JSON."""
     for name, value in values.items():
         if name == "client" and above:
             continue
@@ -117,7 +117,7 @@ def _statistics(trace: SubjectTrace, episode: EpisodeRow, last: int) -> dict[str
 
 
 def within(series: Series, begin: int, end: int) -> tuple[Any, Any]:
-    """Times and values of a series between two times, both included; the first is what holds at the beginning."""
+    """Times and values of a series between two times, both included; the first is the value at the beginning."""
     low, high = np.searchsorted(series.times, [begin, end], "right")
     times = np.concatenate(([begin], series.times[low:high]))
     values = np.concatenate((series.at(np.array([begin])), series.values[low:high]))
@@ -125,12 +125,12 @@ def within(series: Series, begin: int, end: int) -> tuple[Any, Any]:
 
 
 def columns_of(episodes: Iterable[EpisodeRow]) -> list[str]:
-    """The names of the values, in their order."""
+    """The names of the values, in order."""
     return sorted({name for each in episodes for name in each.values})
 
 
 def write_csv(path: Path, episodes: Sequence[EpisodeRow]) -> None:
-    """Write the table as CSV: times as RFC 3339, what is unknown as nothing."""
+    """Write the table as CSV: times as RFC 3339, unknown values empty."""
     names = columns_of(episodes)
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
@@ -149,12 +149,12 @@ def _times(each: EpisodeRow) -> tuple[int | None, ...]:
 
 
 def _text(value: Plain) -> Plain:
-    """Booleans as every reader of CSV knows them; numbers as they are, with all digits."""
+    """Booleans in the form that CSV readers expect; numbers unchanged, with all digits."""
     return str(value).lower() if isinstance(value, bool) else value
 
 
 def write_parquet(path: Path, episodes: Sequence[EpisodeRow]) -> None:
-    """Write the table as Parquet: times as timestamps in UTC to the nanosecond, subjects as a list."""
+    """Write the table as Parquet: times as timestamps in UTC with nanoseconds, subjects as a list."""
     import pyarrow.parquet as pq  # noqa: PLC0415  an extra
 
     pq.write_table(table_of(episodes, value_kinds(episodes)), path, compression="zstd")
@@ -170,14 +170,14 @@ def value_kinds(episodes: Iterable[EpisodeRow]) -> dict[str, str]:
 
 
 def merged_kind(one: str, other: str) -> str:
-    """That of a column with values of both kinds."""
+    """The kind of a column with values of both kinds."""
     if "null" in (one, other):
         return one if other == "null" else other
     return one if one == other else "text"
 
 
 def table_of(episodes: Sequence[EpisodeRow], kinds: Mapping[str, str]) -> Any:
-    """The episodes as a pyarrow.Table, with a column for each value that has a kind."""
+    """The episodes as a pyarrow.Table, with a column for each value with a kind."""
     import pyarrow as pa  # noqa: PLC0415
 
     text, time = pa.string(), pa.timestamp("ns", tz="UTC")

@@ -1,4 +1,4 @@
-"""results.mcap: what was evaluated, to open beside the recording in Foxglove or Lichtblick."""
+"""results.mcap: the evaluation, to open beside the recording in Foxglove or Lichtblick."""
 
 from __future__ import annotations
 
@@ -24,11 +24,12 @@ from detector.results.result import Result
 from detector.results.scene import Scene
 
 MOST = 200_000
-"""Approximate limit of messages about values: longer series keep minimum and maximum of equal parts of the time."""
+"""Approximate maximum number of messages with values: longer series are reduced to minimum and maximum of equal
+periods."""
 
 
 def write_mcap(path: Path, result: Result) -> None:
-    """Write the file; one that is there is replaced."""
+    """Write the file; an existing one is replaced."""
     context = foxglove.Context()
     with foxglove.open_mcap(path, context=context, allow_overwrite=True):
         messages: list[tuple[int, int, Any]] = []

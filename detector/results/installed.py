@@ -12,6 +12,6 @@ class MissingExtraError(InputError, RuntimeError):
 
 
 def check_package(package: str, option: str, extra: str = "results") -> None:
-    """Raises MissingExtraError where the package is missing that the option needs."""
+    """Raises MissingExtraError if the package that the option needs is missing."""
     if find_spec(package) is None:
         raise MissingExtraError(f"{option} needs {package}: pip install 'wayside[{extra}]'")

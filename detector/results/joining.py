@@ -1,4 +1,4 @@
-"""Small blocks that follow each other, seen as one: numpy costs as much for a few points as for thousands."""
+"""Joins consecutive small blocks: numpy costs as much for a few points as for thousands."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from wayside.expressions.columns.values import Bools, Column, Tag
 
 
 class Waiting(NamedTuple):
-    """A block as it was evaluated, and the numbers of its clients."""
+    """An evaluated block, and the numbers of its clients."""
 
     block: Block
     codes: Codes
@@ -24,7 +24,7 @@ class Waiting(NamedTuple):
 
 
 class Seen:
-    """Some blocks of the same clients, one after another, as one block."""
+    """Consecutive blocks of the same clients as one block."""
 
     def __init__(self, blocks: Sequence[Block]) -> None:
         """At least one."""
@@ -41,7 +41,7 @@ class Seen:
         }
 
     def at(self, point: int) -> tuple[Block, int]:
-        """The block that has a point, and which of its points it is."""
+        """The block that contains a point, and the point's index in it."""
         client, tick = divmod(point, len(self.ticks))
         place = bisect_right(self._starts, tick) - 1
         block = self._blocks[place]
@@ -61,12 +61,12 @@ class Seen:
         return Column(values, self._along(tags).astype(np.uint8))
 
     def _along(self, parts: Sequence[np.ndarray]) -> np.ndarray:
-        """Flat arrays over the points of the blocks, as one over all points."""
+        """Concatenates flat arrays over the points of the blocks."""
         clients = self.shape[0]
         return np.concatenate([part.reshape(clients, -1) for part in parts], axis=1).ravel()
 
     def _joined(self, parts: Sequence[Bools]) -> Bools:
-        """The same for arrays with a row for each track."""
+        """The same for arrays with a row per track."""
         if len(parts) == 1:
             return parts[0]
         rows, clients = len(parts[0]), self.shape[0]
@@ -91,7 +91,7 @@ class Joined(NamedTuple):
 
 
 def joined_blocks(waiting: Sequence[Waiting]) -> Iterator[Joined]:
-    """The blocks, those of the same clients joined."""
+    """The blocks, with those of the same clients joined."""
     for _, group in itertools.groupby(waiting, key=lambda each: each.numbers.tobytes()):
         parts = [*group]
         codes = parts[0].codes if len(parts) == 1 else np.concatenate([part.codes for part in parts], axis=2)

@@ -1,4 +1,4 @@
-"""Which results there are."""
+"""The kinds of results."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from enum import StrEnum
 
 
 class ResultKind(StrEnum):
-    """What `detector replay --results` writes."""
+    """The options of `detector replay --results`."""
 
     REPORT = "report"
     """report.html."""
@@ -18,6 +18,6 @@ class ResultKind(StrEnum):
 
 
 def chosen(kinds: list[ResultKind] | None) -> frozenset[ResultKind]:
-    """All kinds that are meant, without ALL."""
+    """The selected kinds, with ALL expanded."""
     each = frozenset(ResultKind) - {ResultKind.ALL}
     return each if kinds and ResultKind.ALL in kinds else frozenset(kinds or ())

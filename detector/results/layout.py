@@ -72,5 +72,5 @@ def _series(result: Result, subject: SubjectTrace) -> list[layouts.PlotSeries]:
 
 
 def _quoted(subject: SubjectTrace) -> str:
-    """The topic in a message path; in quotes, since it has signs that the path's syntax has as well."""
+    """The topic in a message path; quoted, because it contains characters of the path's syntax."""
     return f'"{topic_of(subject.rule, subject.subject)}"'

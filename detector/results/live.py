@@ -1,9 +1,9 @@
-"""The live view: what a detector evaluates now, over Foxglove's WebSocket protocol.
+"""The live view: what a detector currently evaluates, over Foxglove's WebSocket protocol.
 
     evaluation ─▶ a tracer for each second ─▶ queue ─▶ thread: messages ─▶ server ─▶ clients
 
-The evaluation only hands tracers over. Rules are looked at where somebody has subscribed to a channel of theirs; from
-time to time all are, since a subject has a channel once it was seen.
+The evaluation only passes on tracers. Rules are observed if somebody has subscribed to one of their channels; from time
+to time all are, to open channels for new subjects.
 """
 
 from __future__ import annotations
@@ -49,19 +49,19 @@ from wayside.rules import CompiledRule
 _log = logging.getLogger(__name__)
 
 _SLICE = 1_000_000_000
-"""Nanoseconds of evaluation that are handed over at a time."""
+"""Nanoseconds of evaluation that are passed on at a time."""
 _SURVEY = 5_000_000_000
-"""Nanoseconds between two looks for new subjects."""
+"""Nanoseconds between two scans for new subjects."""
 _WAITING = 8
-"""Maximum number of slices that wait for the view's thread."""
+"""Maximum number of slices that are queued for the view's thread."""
 _NEW = 200
 """Maximum number of channels that are opened with one slice."""
 _MOST = 1000
 """Maximum number of channels of subjects."""
 _BACKLOG = 16384
-"""Maximum number of messages that wait for a client; then the oldest is dropped."""
+"""Maximum number of messages that are queued for a client; beyond it, the oldest is dropped."""
 _ALL = 1 << 20
-"""Nothing is thinned."""
+"""Disables thinning."""
 
 
 class ViewError(InputError, OSError):
@@ -69,7 +69,7 @@ class ViewError(InputError, OSError):
 
 
 class _Slice(NamedTuple):
-    """What was evaluated in a second."""
+    """The evaluation of one second."""
 
     tracer: Tracer
     rules: Mapping[str, CompiledRule]
@@ -86,10 +86,10 @@ class _Open(NamedTuple):
 
 
 class LiveView:
-    """Serves the channels. `attend`, `looked` and the observer's methods belong to the evaluation's thread."""
+    """Serves the channels. `attend`, `looked` and the observer's methods run on the evaluation's thread."""
 
     def __init__(self, host: str, port: int) -> None:
-        """Raises ViewError where the address is not free."""
+        """Raises ViewError if the address is in use."""
         self._context = foxglove.Context()
         self._subscriptions = _Subscriptions()
         try:
@@ -107,7 +107,7 @@ class LiveView:
         self._since = 0
         """When the tracer began."""
         self._surveyed = 0
-        """When new subjects were last looked for."""
+        """When new subjects were last scanned for."""
         self._events: list[Event] = []
         self._dropped = 0
         self._slices: queue.Queue[_Slice | None] = queue.Queue(_WAITING)
@@ -123,11 +123,11 @@ class LiveView:
 
     @property
     def port(self) -> int:
-        """Where it is served."""
+        """The port on which it is served."""
         return self._server.port
 
     def close(self) -> None:
-        """End; clients are disconnected."""
+        """Stop; clients are disconnected."""
         self._slices.put(None)
         self._thread.join()
         self._server.stop()
@@ -140,13 +140,13 @@ class LiveView:
     # The evaluation
 
     def attend(self, engine: Engine) -> None:
-        """The engine has other rules from now on."""
+        """The engine uses other rules from now on."""
         for name, run in engine.rules.items():
             if name not in engine.in_columns:
                 run.witness = self._witness(run.rule)
 
     def looked(self, engine: Engine, events: Sequence[Event]) -> None:
-        """The engine has taken in what came, and these events happened."""
+        """The engine has taken in the arrivals, and these events occurred."""
         self._events += events
         if self._tracer is None:
             self._tracer = self._next(engine.now)
@@ -155,7 +155,7 @@ class LiveView:
             self._tracer = self._next(engine.now)
 
     def _next(self, now: int) -> Tracer | None:
-        """What looks on from now on; None where nobody has subscribed, and no new subject is looked for."""
+        """The next tracer; None if nobody has subscribed, and no scan for new subjects is due."""
         topics = self._subscriptions.topics
         self._since = now
         if now - self._surveyed >= _SURVEY:
@@ -207,7 +207,7 @@ class LiveView:
         while (each := self._slices.get()) is not None:
             try:
                 self._show(each)
-            except Exception:  # noqa: BLE001  an error here must cost the view alone
+            except Exception:  # noqa: BLE001  an error here must only affect the view
                 _log.exception("a second is left out of the live view")
                 self._dropped += 1
 
@@ -235,7 +235,7 @@ class LiveView:
             self._scene.skip(result)
 
     def _result(self, shown: _Slice, topics: frozenset[str]) -> Result:
-        """The slice, with the subjects that somebody has subscribed to, and some that have no channel yet."""
+        """The slice, with the subjects that somebody has subscribed to, and some without a channel."""
         new: set[str] = set()
 
         def wanted(rule: str, subject: str) -> bool:
@@ -256,7 +256,7 @@ class LiveView:
         return Result("live", trace, shown.events, (), rules, {}, terms, (), {}, (), 0)
 
     def _channel(self, topic: str, rule: CompiledRule, schema: dict[str, Any]) -> foxglove.Channel:
-        """The subject's channel; it is opened again where there is more to declare."""
+        """The subject's channel; it is reopened if its schema has grown."""
         known = self._channels.get(topic)
         if known is not None:
             if schema == known.schema:
@@ -270,7 +270,7 @@ class LiveView:
         return channel
 
     def _forget(self, rules: Mapping[str, CompiledRule]) -> None:
-        """Close the channels of rules that are gone or changed."""
+        """Close the channels of removed or changed rules."""
         digests = {name: rule.digest for name, rule in rules.items()}
         if digests == self._digests:
             return
@@ -282,7 +282,7 @@ class LiveView:
 
 
 class _Subscriptions(ServerListener):
-    """Knows the topics that clients have subscribed to. Called on the server's threads."""
+    """Tracks the topics that clients have subscribed to. Called on the server's threads."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -304,7 +304,7 @@ class _Subscriptions(ServerListener):
 
 
 def _merged(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, Any]:
-    """The properties of two schemas of one channel: a value that was unknown is declared as a number."""
+    """The merged properties of two schemas of one channel: a value that was unknown is declared as a number."""
     found = dict(new)
     for name, kind in old.items():
         other = found.get(name)

@@ -1,4 +1,4 @@
-"""What nearly happened: of rules with a margin, the moments at which they came nearest to an episode without one."""
+"""Near misses: for rules with a margin, the moments at which they came nearest to an episode without one."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from wayside.rules import CompiledRule
 from wayside.times import format_time
 
 MOST = 10
-"""Of each rule, how many are listed."""
+"""Maximum number listed per rule."""
 
 _PROMINENCE = 1.0
-"""Two moments count apart where the margin falls by this between them: by one unit of the scale."""
+"""Two moments count separately if the margin falls by this between them: by one unit of the scale."""
 
 
 class NearMoment(NamedTuple):
-    """One moment."""
+    """One near miss."""
 
     recording: str
     rule: str
@@ -28,7 +28,7 @@ class NearMoment(NamedTuple):
     time: int
     """Nanoseconds since the epoch."""
     margin: float
-    """At most 0 where the condition did not hold; more where it did not hold for long enough."""
+    """At most 0 if the condition did not hold; more if it held for too short a time."""
 
 
 def nearest_moments(
@@ -50,14 +50,14 @@ def nearest_moments(
 
 
 def listed(moments: Iterable[NearMoment]) -> list[NearMoment]:
-    """The nearest of these, in order."""
+    """The nearest of these moments, in order."""
     return sorted(moments, key=lambda each: (-each.margin, each.time, each.subject))[:MOST]
 
 
 def _peaks(
     times: Sequence[int], values: Sequence[float], spans: Sequence[tuple[int, int | None]]
 ) -> Iterator[tuple[int, float]]:
-    """Where the margin is largest between episodes, unknowns and falls; not on the way into an episode or out of it."""
+    """The maxima of the margin between episodes, unknowns and falls; not adjacent to an episode."""
     stretch: list[tuple[int, float]] = []
     after = False
     for time, value in zip(times, values, strict=True):
@@ -71,7 +71,7 @@ def _peaks(
 
 
 def _of_stretch(stretch: Sequence[tuple[int, float]], after: bool, before: bool) -> Iterator[tuple[int, float]]:
-    """The peaks of values without a break; `after` and `before`: an episode comes before it, or after it."""
+    """The peaks of values without a gap; `after` and `before`: an episode precedes or follows it."""
     if not stretch:
         return
     best = low = stretch[0]

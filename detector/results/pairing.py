@@ -1,4 +1,4 @@
-"""What rules about pairs see, tick by tick, and where clients are on the way."""
+"""The values of rules about pairs, tick by tick, and the clients' places."""
 
 from __future__ import annotations
 
@@ -36,33 +36,33 @@ _ROLES = ("a", "b")
 
 
 class PairLog:
-    """What one rule saw of its pairs."""
+    """The values of one rule for its pairs."""
 
     def __init__(self, track: Track) -> None:
         self._track = track
         self._ticks: list[int] = []
         self._keys: list[Integers] = []
-        self._said: dict[str, list[Bytes]] = {"when": []}
+        self._codes: dict[str, list[Bytes]] = {"when": []}
         if track.rule.until is not None:
-            self._said["until"] = []
+            self._codes["until"] = []
         self._values: dict[str, list[Doubles]] = {"distance": []}
         self._kinds: dict[str, SeriesKind] = {}
         self._odd: set[str] = set()
         self._unsure: dict[str, Integers] = {}
-        self._reasons: dict[str, dict[tuple[int, int], str]] = {field: {} for field in self._said}
+        self._reasons: dict[str, dict[tuple[int, int], str]] = {field: {} for field in self._codes}
 
     def add(self, time: int, these: PairBlock, numbers: Integers) -> None:
-        """Note a tick; `numbers` are those of the clients of the these's block."""
+        """Record a tick; `numbers` are those of the clients in the block."""
         self._ticks.append(time)
         keys = numbers[these.first] << _SHIFT | numbers[these.second]
         self._keys.append(keys)
         outside = these.codes & OUTSIDE == OUTSIDE
-        for field, parts in self._said.items():
+        for field, parts in self._codes.items():
             verdict = these.verdicts[field]
-            said = np.where(verdict.true, np.uint8(TRUE), np.where(verdict.false, np.uint8(FALSE), np.uint8(UNKNOWN)))
-            said[outside] = AWAY
-            parts.append(said)
-            self._note_unsure(field, time, these, keys, said)
+            codes = np.where(verdict.true, np.uint8(TRUE), np.where(verdict.false, np.uint8(FALSE), np.uint8(UNKNOWN)))
+            codes[outside] = AWAY
+            parts.append(codes)
+            self._note_unsure(field, time, these, keys, codes)
         self._values["distance"].append(np.where(these.placed, these.distance, np.nan))
         if these.closing is not None and these.closing_known is not None:
             speeds = np.where(these.closing_known, these.closing, np.nan)
@@ -81,7 +81,7 @@ class PairLog:
                 values.append(self._numbers(f"{role}.{name}", own))
 
     def _numbers(self, name: str, column: Column) -> Doubles:
-        """The values of a signal, NaN where it is unknown; notes what else than numbers it holds."""
+        """The values of a signal, NaN if unknown; notes other types than numbers."""
         tags = column.tags
         if tags is None:
             return column.values
@@ -92,7 +92,7 @@ class PairLog:
         return np.where((tags == Tag.NUMBER) | (tags == Tag.BOOLEAN), column.values, np.nan)
 
     def subjects(self, rule: str, names: Sequence[str], wanted: Wanted) -> Iterator[SubjectTrace]:
-        """Each pair that was looked at and is wanted; `names` are the clients', by their numbers."""
+        """Each evaluated and wanted pair; `names` are the clients', by their numbers."""
         sizes = [len(keys) for keys in self._keys]
         if not sum(sizes):
             return
@@ -100,7 +100,7 @@ class PairLog:
         order = np.argsort(keys, kind="stable")
         keys, ordinals = keys[order], ordinals[order]
         ticks = np.array(self._ticks, np.int64)
-        said = {field: np.concatenate(parts)[order] for field, parts in self._said.items()}
+        by_field = {field: np.concatenate(parts)[order] for field, parts in self._codes.items()}
         values = {name: np.concatenate(parts)[order] for name, parts in self._values.items() if name not in self._odd}
         bounds = [0, *(np.flatnonzero(np.diff(keys)) + 1).tolist(), len(keys)]
         for begin, end in itertools.pairwise(bounds):
@@ -114,7 +114,7 @@ class PairLog:
             for name, column in values.items():
                 kind = self._kinds.get(name, SeriesKind.NUMBER)
                 subject.signals[name] = Series(*_changes(ticks, ordinals[own], column[own], left, np.nan), kind)
-            for field, codes_of in said.items():
+            for field, codes_of in by_field.items():
                 times, codes = _changes(ticks, ordinals[own], codes_of[own].astype(float), left, AWAY)
                 reasons = self._reasons[field]
                 found = {at: reasons.get((key, int(times[at]))) for at in np.flatnonzero(codes == UNKNOWN).tolist()}
@@ -122,9 +122,9 @@ class PairLog:
                 subject.conditions[field] = Steps(times, codes.astype(np.uint8), why)
             yield subject
 
-    def _note_unsure(self, field: str, time: int, these: PairBlock, keys: Integers, said: Bytes) -> None:
-        """Note of pairs whose condition is unknown from now on why it is."""
-        at = np.flatnonzero(said == UNKNOWN)
+    def _note_unsure(self, field: str, time: int, these: PairBlock, keys: Integers, codes: Bytes) -> None:
+        """For pairs whose condition becomes unknown here, note the reason."""
+        at = np.flatnonzero(codes == UNKNOWN)
         before = self._unsure.get(field)
         if not len(at) and before is None:
             return
@@ -154,7 +154,7 @@ class PairLog:
 
 
 class WayLog:
-    """Where clients are, as one of the rules about pairs sees it: the first of them."""
+    """The places of clients, as seen by one of the rules about pairs: the first one."""
 
     def __init__(self) -> None:
         self.geographic = False
@@ -164,7 +164,7 @@ class WayLog:
         self._axes: list[Doubles] = []
 
     def add(self, rule: str, geographic: bool, time: int, these: PairBlock, numbers: Integers) -> None:
-        """Note a tick."""
+        """Record a tick."""
         if self._rule is None:
             self._rule, self.geographic = rule, geographic
         if rule != self._rule:
@@ -175,7 +175,7 @@ class WayLog:
         self._axes.append(these.places.axes[:2, known])
 
     def ways(self, names: Sequence[str]) -> dict[str, Way]:
-        """By client, its places; without those at which it stands still."""
+        """By client, its places; without repeated ones."""
         if not self._times:
             return {}
         clients = np.concatenate(self._clients)
@@ -194,7 +194,7 @@ class WayLog:
 
 
 def _left(ordinals: NDArray[np.intp], count: int) -> NDArray[np.intp]:
-    """The places after which the pair was not looked at."""
+    """The indices after which the pair was not evaluated."""
     after = np.flatnonzero(np.diff(ordinals) > 1)
     return np.append(after, len(ordinals) - 1) if ordinals[-1] < count - 1 else after
 
@@ -202,7 +202,7 @@ def _left(ordinals: NDArray[np.intp], count: int) -> NDArray[np.intp]:
 def _changes(
     ticks: Integers, ordinals: NDArray[np.intp], values: Doubles, left: NDArray[np.intp], away: float
 ) -> tuple[Integers, Doubles]:
-    """Times and values where they change; `away` where the pair is left."""
+    """Times and values at changes; `away` where the evaluation of the pair ends."""
     kept = np.ones(len(values), bool)
     same = (values[1:] == values[:-1]) | ((values[1:] != values[1:]) & (values[:-1] != values[:-1]))
     kept[1:] = ~same | (np.diff(ordinals) > 1)

@@ -1,4 +1,4 @@
-"""The places that rules name: those of the Detector, and polygons among their parameters."""
+"""The places that rules name: the Detector's, and polygons among the rules' parameters."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ class Polygon(NamedTuple):
 
     rule: str
     name: str
-    """The place's, the parameter's, or the element's and the field's."""
+    """The name of the place or parameter, or of the element and the field."""
     corners: tuple[tuple[float, float], ...]
     """x and y in metres, or latitude and longitude in degrees."""
     geographic: bool
     closed: bool = True
-    """Whether it is an area, else a line."""
+    """Whether it is an area; otherwise it is a line."""
 
 
 def polygons_of(rules: Iterable[CompiledRule]) -> Iterator[Polygon]:

@@ -1,4 +1,4 @@
-"""How good the data of a recording is, by stream: how much came, from whom, how regularly, and what was lost."""
+"""The data quality of a recording, by stream: the number of samples, their clients, regularity, and losses."""
 
 from __future__ import annotations
 
@@ -24,41 +24,41 @@ class _Key:
 
 @dataclass(frozen=True, slots=True)
 class StreamQuality:
-    """What came on one stream."""
+    """The quality of one stream."""
 
     stream: str
     key: str
-    """The pattern."""
+    """The key pattern."""
     encoding: str
     samples: int
     keys: int
-    """Of how many keys: mostly one a client."""
+    """Number of keys, mostly one per client."""
     rate: float | None
-    """Samples a second of one key, the median over the keys; None with less than two samples of each."""
+    """Samples per second of one key, the median over the keys; None if each has fewer than two samples."""
     gap: float | None
     """The longest time between two samples of one key, seconds."""
     gap_key: str | None
     gap_time: int | None
-    """Where it is, and when it begins; nanoseconds since the epoch."""
+    """The key and the beginning of this gap; nanoseconds since the epoch."""
     unreadable: int
     last_unreadable: str
     unnamed: int
 
 
 class Arrivals:
-    """Counts arrivals on their way into a replay."""
+    """Counts arrivals while they pass into a replay."""
 
     def __init__(self) -> None:
         self._keys: dict[tuple[str, str], _Key] = {}
 
     def watch_batches(self, batches: Iterable[Sequence[Arrival]]) -> Iterator[Sequence[Arrival]]:
-        """The batches as they are."""
+        """The same batches, counted."""
         for batch in batches:
             self._count(batch)
             yield batch
 
     def watch(self, records: Iterable[Record]) -> Iterator[Record]:
-        """The records of an intake file as they are."""
+        """The same records of an intake file, counted."""
         for record in records:
             if isinstance(record, Arrival):
                 self._count((record,))
@@ -80,12 +80,12 @@ class Arrivals:
 
     @property
     def span(self) -> tuple[int, int]:
-        """The times of the first and of the last arrival, nanoseconds since the epoch; (0, 0) where there is none."""
+        """The times of the first and of the last arrival, nanoseconds since the epoch; (0, 0) if there are none."""
         keys = self._keys.values()
         return min((key.first for key in keys), default=0), max((key.last for key in keys), default=0)
 
     def follow(self, later: Arrivals) -> None:
-        """Count what another one counted that watched what came afterwards."""
+        """Add the counts of another object that observed the following arrivals."""
         for at, other in later._keys.items():
             seen = self._keys.get(at)
             if seen is None:
@@ -98,7 +98,7 @@ class Arrivals:
             seen.count += other.count
 
     def by_stream(self, detector: Detector, counters: Counters) -> list[StreamQuality]:
-        """What came on each stream of the Detector, in its order; the counters are the engine's."""
+        """The quality of each stream of the Detector, in its order; the counters are the engine's."""
         found = []
         for stream in detector.spec.streams:
             name = stream.name

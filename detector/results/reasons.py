@@ -1,4 +1,4 @@
-"""Why a condition is unknown, in a few words for people."""
+"""Why a condition is unknown, in a few words for users."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def of_stream(block: Block, stream: str, point: int) -> str:
 
 
 def of_variables(rule: CompiledRule, expression: Expression | None, variables: Mapping[str, Any]) -> str:
-    """Why a condition is unknown, by what it saw; for rules that are not in columns."""
+    """Why a condition is unknown, from its variables; for rules that are not in columns."""
     if expression is None:
         return _OTHERWISE
     if isinstance(rule.subject, PairSubject):

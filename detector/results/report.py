@@ -1,7 +1,7 @@
-"""report.html: one page that needs nothing else, to see what a replay found and why.
+"""report.html: one self-contained page that shows what a replay found and why.
 
-The page holds its data as compressed JSON, and BokehJS, which draws it. Times in the data are whole multiples of a unit
-after the beginning, each as the difference to the one before.
+The page contains its data as compressed JSON, and BokehJS, which draws it. Times in the data are whole multiples of a
+unit after the beginning, each as the difference to the previous one.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ from wayside.manifests import to_yaml
 from wayside.times import format_time
 
 MOST = 140_000
-"""Approximate limit of points of series in a page."""
+"""Approximate maximum number of points of series in a page."""
 _WIDEST = 1500
-"""Maximum number of parts of the time in a series: more than a plot has pixels."""
+"""Maximum number of periods in a series: more than a plot has pixels."""
 _WAY = 600
 """Maximum number of places of a client on the map."""
 _VALUES = 2000
-"""Maximum number of episodes of a page with values; the others have times only."""
+"""Maximum number of episodes with values in a page; the others have only times."""
 _DEEDS = 2000
-"""Maximum number of listed rows of what actions would have done; the page gives the number of all."""
+"""Maximum number of listed actions that would have run; the page gives the total number."""
 
 
 def write_report(path: Path, result: Result) -> None:
@@ -82,16 +82,17 @@ def html_page(title: str, body: str, *, style: str, policy: str) -> str:
 
 
 def data_of(result: Result) -> dict[str, Any]:
-    """All that the page shows."""
+    """The data of the page."""
     trace = result.trace
     episodes = result.episodes
     table = _Table(result)
     by_subject: dict[tuple[str, str], list[EpisodeRow]] = {}
-    told = {episode.episode for episode in episodes[:_VALUES]}
+    detailed = {episode.episode for episode in episodes[:_VALUES]}
     for episode in episodes:
         by_subject.setdefault((episode.rule, episode.subject), []).append(episode)
     subjects = [
-        _subject(result, each, by_subject.get((each.rule, each.subject), ()), table, told) for each in trace.subjects
+        _subject(result, each, by_subject.get((each.rule, each.subject), ()), table, detailed)
+        for each in trace.subjects
     ]
     deeds = deeds_of(result)
     return {
@@ -137,7 +138,7 @@ def data_of(result: Result) -> dict[str, Any]:
 
 
 class _Table:
-    """The series of a page: equal ones are in it once."""
+    """The series of a page; equal ones are stored once."""
 
     def __init__(self, result: Result) -> None:
         trace = result.trace
@@ -153,14 +154,14 @@ class _Table:
                 lengths[digest] = len(series.times)
                 exact.setdefault(digest, []).append(changes)
         self._exact = {digest: np.unique(np.concatenate(times)) for digest, times in exact.items()}
-        """By series, the times at which a condition of any of its rules changes."""
+        """By series, the times at which a condition of any rule with this series changes."""
         self._buckets = _buckets([*lengths.values()])
         named = [series.times for each in trace.subjects for series in each.signals.values()]
         steps = [steps.times for each in trace.subjects for steps in each.conditions.values()]
         self.unit = _unit([*named, *steps, *_event_times(result)], trace.begin)
 
     def add(self, series: Series) -> int:
-        """The place of a series."""
+        """Add a series; returns its index."""
         digest = _digest(series)
         place = self._places.get(digest)
         if place is None:
@@ -175,7 +176,7 @@ class _Table:
         return place
 
     def times(self, times: Integers) -> list[int]:
-        """Differences in units; the first is to the beginning."""
+        """Differences in units; the first is the distance from the beginning."""
         differences = np.diff(times, prepend=self._begin) // self.unit
         found: list[int] = differences.tolist()
         return found
@@ -190,7 +191,7 @@ def _digest(series: Series) -> bytes:
 
 
 def _buckets(lengths: Sequence[int]) -> int:
-    """Into how many parts the time is cut, so that all series together have about MOST points."""
+    """The number of periods, so that all series together have about MOST points."""
     low, high = 20, _WIDEST
     while low < high:
         middle = (low + high + 1) // 2
@@ -202,7 +203,7 @@ def _buckets(lengths: Sequence[int]) -> int:
 
 
 def _unit(times: Iterable[Integers], begin: int) -> int:
-    """The greatest unit, in nanoseconds, of which all times are whole multiples after the beginning."""
+    """The greatest unit, in nanoseconds, such that all times are whole multiples of it after the beginning."""
     found = 0
     for each in times:
         if len(each):
@@ -215,7 +216,7 @@ def _event_times(result: Result) -> list[Integers]:
 
 
 def _subject(
-    result: Result, subject: SubjectTrace, episodes: Sequence[EpisodeRow], table: _Table, told: Set[str]
+    result: Result, subject: SubjectTrace, episodes: Sequence[EpisodeRow], table: _Table, detailed: Set[str]
 ) -> dict[str, Any]:
     terms = result.terms.get((subject.rule, subject.subject))
     return {
@@ -227,7 +228,7 @@ def _subject(
                 "start": table.seconds(each.start_time),
                 "end": None if each.end_time is None else table.seconds(each.end_time),
                 "reason": each.reason,
-                "values": _values(each) if each.episode in told else {},
+                "values": _values(each) if each.episode in detailed else {},
             }
             for each in episodes
         ],
@@ -246,14 +247,14 @@ def _subject(
 
 
 def _values(episode: EpisodeRow) -> dict[str, Any]:
-    """Those that the page lists."""
+    """The values that the page lists."""
     shown = (".start", ".max")
     values = ((name, value) for name, value in episode.values.items() if name.endswith(shown) and value is not None)
     return {name: value for name, value in values if not isinstance(value, float) or math.isfinite(value)}
 
 
 def _series_of(result: Result, subject: SubjectTrace) -> dict[str, Series]:
-    """What a condition compares first, then the other signals."""
+    """First the signals that a condition compares, then the others."""
     terms = result.terms.get((subject.rule, subject.subject))
     return {**(terms.computed if terms is not None else {}), **subject.signals}
 
@@ -300,7 +301,7 @@ def _ways(result: Result, table: _Table) -> list[dict[str, Any]]:
 
 
 def _demands(deeds: Sequence[Deed], table: _Table) -> list[dict[str, Any]]:
-    """By template, how many tasks demand it over time."""
+    """By template, the number of tasks that demand it over time."""
     edges: dict[str, list[tuple[float, int]]] = {}
     for deed in deeds:
         if deed.what != "deploy":

@@ -1,4 +1,4 @@
-"""What one recording came to, for all results."""
+"""The result of one recording, the input of all outputs."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from wayside.rules import CompiledRule
 
 @dataclass(frozen=True)
 class Result:
-    """One recording."""
+    """The result of one recording."""
 
     recording: str
     """Its name."""
@@ -28,7 +28,7 @@ class Result:
     events: Sequence[Event]
     tasks: Sequence[ApplicationTask]
     rules: Mapping[str, CompiledRule]
-    """Those that were evaluated at the end, by name."""
+    """The rules that were evaluated at the end, by name."""
     documents: Mapping[str, EventRule]
     """The rules as written."""
     terms: Mapping[tuple[str, str], Terms]
@@ -37,7 +37,7 @@ class Result:
     counts: Mapping[str, tuple[int, int, int]]
     """By rule: evaluations, unknown values, errors."""
     notes: Sequence[str]
-    """What a person should know of the recording."""
+    """Notes about the recording for users."""
     samples: int
 
     @cached_property
@@ -52,10 +52,10 @@ class Result:
 
 
 def result_of(name: str, outcome: Outcome, tracer: Tracer, arrivals: Arrivals) -> Result:
-    """What a replay came to; `tracer` and `arrivals` looked on at it.
+    """The result of a replay; `tracer` and `arrivals` observed it.
 
     Raises:
-        ValueError: the tracer saw no engine.
+        ValueError: the tracer observed no engine.
     """
     engine = tracer.engine
     if engine is None:

@@ -29,20 +29,20 @@ from detector.results.result import Result
 from detector.results.series import Doubles
 
 FRAME = "map"
-"""The frame of all positions: that in which the rule's position is."""
+"""The frame of all positions: the frame of the rule's position."""
 
 _STEP = 200_000_000
-"""Nanoseconds: the scene is written no more often, but at each start and end of an episode."""
+"""Minimum nanoseconds between updates of the scene, except at starts and ends of episodes."""
 _MOST = 2000
 """Maximum number of further updates."""
 _KEPT = 1_000_000_000
-"""Nanoseconds: a client is shown for so long after its last place."""
+"""Nanoseconds for which a client is shown after its last place."""
 _EARTH = 6_371_000.0
 _CLIENT, _OPEN, _PLACE = (0.15, 0.45, 0.8, 1.0), (0.85, 0.25, 0.2, 1.0), (0.4, 0.6, 0.3, 0.9)
 
 
 class _Edge(NamedTuple):
-    """An episode starts or ends."""
+    """The start or end of an episode."""
 
     time: int
     starts: bool
@@ -52,7 +52,7 @@ class _Edge(NamedTuple):
 
 
 class Scene:
-    """The scene over time. Degrees become metres from the first place."""
+    """The scene over time. Degrees are converted to metres from the first place."""
 
     def __init__(self) -> None:
         self._origin: Doubles | None = None
@@ -60,7 +60,7 @@ class Scene:
         """The open episodes."""
 
     def updates(self, result: Result) -> Iterator[tuple[int, SceneUpdate]]:
-        """The updates of a result, which follows the one before; nothing where no position is known."""
+        """The updates of a result, which follows the previous one; nothing if no position is known."""
         trace, edges = result.trace, _edges(result)
         if not trace.ways:
             self._pass(edges, trace.end)
@@ -85,11 +85,11 @@ class Scene:
             yield time, SceneUpdate(entities=self._entities(there, time))
 
     def skip(self, result: Result) -> None:
-        """Nobody looks at this result: only know which episodes are open after it."""
+        """Skip this result: only track which episodes are open after it."""
         self._pass(_edges(result), result.trace.end)
 
     def _pass(self, edges: deque[_Edge], time: int) -> None:
-        """Know which episodes are open at a time."""
+        """Update the open episodes to this time."""
         while edges and edges[0].time <= time:
             edge = edges.popleft()
             if edge.starts:
@@ -109,7 +109,7 @@ class Scene:
 
 
 def _edges(result: Result) -> deque[_Edge]:
-    """Starts and ends of episodes, in order of time."""
+    """Starts and ends of episodes, in time order."""
     return deque(
         _Edge(
             event.start_time if event.end_time is None else event.end_time,
@@ -131,7 +131,7 @@ def _metres(axes: Doubles, origin: Doubles, *, geographic: bool) -> Doubles:
 
 
 def _entity(name: str, time: int, **primitives: Any) -> SceneEntity:
-    """It stays until it is written again, at most for two seconds."""
+    """Valid until it is updated, at most for two seconds."""
     return SceneEntity(timestamp=_stamp(time), frame_id=FRAME, id=name, lifetime=Duration(sec=2), **primitives)
 
 

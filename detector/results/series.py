@@ -1,4 +1,4 @@
-"""What values and conditions were over time. Each holds from its time until the next, as the engine saw it."""
+"""Values and conditions over time. Each is valid from its time until the next, as in the engine."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ Doubles = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 
 FALSE, TRUE, UNKNOWN, AWAY = 0, 1, 2, 3
-"""What a condition says; AWAY: the rule does not look at the subject, which is out of its scope or reach."""
+"""The values of a condition; AWAY: the rule does not evaluate the subject, which is out of its scope or reach."""
 
 WORDS = ("false", "true", "unknown", "away")
 
 
 Wanted = Callable[[str, str], bool]
-"""Whether somebody wants to see a subject, by the rule's name and the subject's text."""
+"""Whether a subject is wanted, by the rule's name and the subject's text."""
 
 
 class SeriesKind(StrEnum):
-    """What a series holds."""
+    """The kind of values in a series."""
 
     NUMBER = "number"
     BOOLEAN = "boolean"
@@ -36,14 +36,14 @@ class Series:
     """One value of a subject."""
 
     times: Integers
-    """int64[n], nanoseconds since the epoch, rising: where the value changes."""
+    """int64[n], nanoseconds since the epoch, ascending: the times of changes."""
     values: Doubles
     """float64[n]: the number, 1.0 or 0.0 of a boolean, an index into `texts`; NaN: unknown."""
     kind: SeriesKind = SeriesKind.NUMBER
     texts: Sequence[str] = ()
 
     def at(self, times: Integers) -> Doubles:
-        """The values that hold at these times; NaN before the first."""
+        """The values at these times; NaN before the first."""
         where = np.searchsorted(self.times, times, "right") - 1
         if not len(self.times):
             return np.full(len(times), np.nan)
@@ -51,7 +51,7 @@ class Series:
         return found
 
     def plain(self, value: float) -> float | bool | str | None:
-        """A value of the series as JSON has it; None: unknown."""
+        """A value of the series in JSON's form; None: unknown."""
         if value != value:  # noqa: PLR0124  NaN alone differs
             return None
         match self.kind:
@@ -64,17 +64,17 @@ class Series:
 
 @dataclass(frozen=True, slots=True)
 class Steps:
-    """What one condition said of a subject."""
+    """The values of one condition for a subject."""
 
     times: Integers
-    """int64[n], nanoseconds since the epoch, rising: where it changes."""
+    """int64[n], nanoseconds since the epoch, ascending: the times of changes."""
     codes: Bytes
     """uint8[n]: FALSE, TRUE, UNKNOWN or AWAY."""
     reasons: Mapping[int, str] = field(default_factory=dict)
-    """By place, why it is unknown from there on."""
+    """By index, why it is unknown from there on."""
 
     def at(self, times: Integers) -> Bytes:
-        """What it says at these times; AWAY before the first."""
+        """The values at these times; AWAY before the first."""
         where = np.searchsorted(self.times, times, "right") - 1
         if not len(self.times):
             return np.full(len(times), AWAY, np.uint8)
@@ -84,15 +84,15 @@ class Steps:
 
 @dataclass(slots=True)
 class SubjectTrace:
-    """What a rule saw of one subject."""
+    """The trace of a rule for one subject."""
 
     rule: str
     subject: str
     clients: tuple[str, ...]
     signals: dict[str, Series] = field(default_factory=dict)
-    """By the name that expressions use: `speed`, of a pair `distance` and `a.speed`."""
+    """By the name in expressions: `speed`, for a pair `distance` and `a.speed`."""
     conditions: dict[str, Steps] = field(default_factory=dict)
-    """`when`, and `until` where the rule has one."""
+    """`when`, and `until` if the rule has one."""
 
     @property
     def changes(self) -> Integers:
@@ -103,7 +103,7 @@ class SubjectTrace:
 
 @dataclass(frozen=True, slots=True)
 class Way:
-    """Where a client was."""
+    """The path of a client."""
 
     times: Integers
     axes: Doubles
@@ -111,13 +111,14 @@ class Way:
 
 
 _AXES = {("x", "y"): False, ("latitude", "longitude"): True}
-"""Signals that are a position, and whether it is in degrees."""
+"""Signals that form a position, and whether it is in degrees."""
 
 
 def ways_of(subjects: Sequence[SubjectTrace]) -> tuple[dict[str, Way], bool]:
-    """By client, its way, as the signals `x` and `y`, or `latitude` and `longitude`, of the first rule give it.
+    """By client, its path, from the signals `x` and `y`, or `latitude` and `longitude`, of the first rule that has
+    them.
 
-    And whether the ways are in degrees. Empty where no rule about clients has these signals.
+    Also whether the paths are in degrees. Empty if no rule about clients has these signals.
     """
     for axes, geographic in _AXES.items():
         having = [each for each in subjects if len(each.clients) == 1 and _have(each, axes)]
@@ -141,14 +142,14 @@ def _have(subject: SubjectTrace, axes: Sequence[str]) -> bool:
 
 @dataclass(slots=True)
 class Trace:
-    """All that a replay of one recording saw."""
+    """The trace of a replay of one recording."""
 
     subjects: list[SubjectTrace] = field(default_factory=list)
     """In order of the rules' names, then of the subjects."""
     ways: dict[str, Way] = field(default_factory=dict)
-    """By client, where they are known."""
+    """By client, if known."""
     geographic: bool = False
-    """Whether ways are in degrees."""
+    """Whether paths are in degrees."""
     begin: int = 0
     end: int = 0
     """The first and the last tick, nanoseconds since the epoch."""

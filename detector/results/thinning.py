@@ -1,4 +1,4 @@
-"""Long series made short: what is seen of them at a given width stays, and so does each point that matters."""
+"""Reduces long series: the visible shape at a given width is preserved, and so is each important point."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from detector.results.series import Integers, Series
 
 
 def thinned(series: Series, begin: int, end: int, buckets: int, exact: Integers) -> Series:
-    """The series with the minimum and the maximum of each of `buckets` equal parts of the time, and with exact points.
+    """The series with the minimum and the maximum of each of `buckets` equal periods, and with exact points.
 
-    What stays besides: the first and the last point, where it becomes known or unknown, and what holds at the times
-    `exact` and before each of them.
+    The following points are preserved as well: the first and the last, changes between known and unknown, and the
+    values at the times `exact` and before each of them.
 
     Args:
-        series: any; one with few points stays as it is.
+        series: any; one with few points is returned unchanged.
         begin: nanoseconds since the epoch.
         end: not before `begin`.
         buckets: at least one.

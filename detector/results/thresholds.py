@@ -1,4 +1,4 @@
-"""What a rule compares with constants: `speed > 21`, `fastest - speed > parameters.most`."""
+"""A rule's comparisons with constants: `speed > 21`, `fastest - speed > parameters.most`."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ class Threshold(NamedTuple):
     field: str
     """`when` or `until`."""
     term: str
-    """What is compared: a signal's name, or the arithmetic over several as text."""
+    """The compared term: a signal's name, or the arithmetic over several as text."""
     operator: str
     value: float
 
 
 class Terms(NamedTuple):
-    """What conditions compare, for one subject."""
+    """The terms that conditions compare, for one subject."""
 
     thresholds: tuple[Threshold, ...]
     computed: Mapping[str, Series]
-    """The terms that are no signal themselves."""
+    """The terms that are not signals themselves."""
 
 
 def terms_of(rule: CompiledRule, subject: SubjectTrace) -> Terms:
@@ -65,7 +65,7 @@ def terms_of(rule: CompiledRule, subject: SubjectTrace) -> Terms:
 
 
 class _Term(NamedTuple):
-    """What a comparison compares: a signal, or arithmetic over several."""
+    """The term of a comparison: a signal, or arithmetic over several."""
 
     node: Node
     text: str
@@ -74,7 +74,7 @@ class _Term(NamedTuple):
 
 @lru_cache(maxsize=1024)
 def _compared(expression: Expression) -> tuple[tuple[str, _Term, Node], ...]:
-    """The comparisons of a condition: the operator, a term, what it is compared with; each from both of its sides."""
+    """The comparisons of a condition: the operator, a term, and its counterpart; each from both sides."""
     found = []
     for operator, left, right in _comparisons(expression.tree):
         for node, other, sign in ((left, right, operator), (right, left, _TURNED[operator])):
@@ -93,7 +93,7 @@ def _comparisons(node: Node) -> Iterator[tuple[str, Node, Node]]:
 
 
 def _constant(node: Node, names: frozenset[str], values: Mapping[str, Any]) -> float | None:
-    """The number that the node always is; None: it is none."""
+    """The constant value of the node; None: it is not constant."""
     path = path_of(node, names)
     if path is not None:
         found: Any = values
@@ -115,7 +115,7 @@ def _constant(node: Node, names: frozenset[str], values: Mapping[str, Any]) -> f
 
 
 def _text(node: Node, names: frozenset[str]) -> str | None:
-    """The term as it is written; None where it is more than arithmetic over signals, or reads none."""
+    """The term as written; None if it is more than arithmetic over signals, or reads none."""
     if not any(True for _ in _names(node, names)):
         return None
     return _written(node, names)

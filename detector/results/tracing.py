@@ -1,4 +1,4 @@
-"""Takes the trace of a replay: looks on at the engine's columns, and at the rules that are not in them."""
+"""Records the trace of a replay: observes the engine's columns, and the rules that are not in columns."""
 
 from __future__ import annotations
 
@@ -42,48 +42,48 @@ from wayside.names import parse_subject
 from wayside.rules import CompiledRule, PairSubject
 
 _POINTS = 20_000
-"""Number of points (client and tick) that are noted together."""
+"""Number of points (client and tick) that are recorded together."""
 
 
 class _Plan(NamedTuple):
-    """What is noted of the blocks of one group."""
+    """What is recorded from the blocks of one group."""
 
     tracks: Sequence[Track]
     signals: Sequence[tuple[int, Track, str, Changes]]
-    """The place of each signal in the block, one that has it under a name, and its changes."""
+    """The index of each signal in the block, a track that uses it with its name there, and its changes."""
     conditions: Sequence[tuple[int, Track, str, Changes]]
-    """The row of a track, it, the field and its changes."""
+    """The row of a track, the track, the field and its changes."""
     seen: set[int]
-    """The clients of the block before."""
+    """The clients of the previous block."""
     waiting: list[Waiting]
-    """Small blocks, which are noted together: live and beside rules about pairs, blocks are of few ticks."""
+    """Small blocks, which are recorded together: live and beside rules about pairs, blocks have few ticks."""
 
 
 class Tracer:
-    """Looks on at a replay. The engine's observer; ask it for the trace at the end."""
+    """The engine's observer in a replay; returns the trace at the end."""
 
     def __init__(self, subjects: Mapping[str, Set[str] | None] | None = None, *, ways: bool = True) -> None:
-        """`subjects`: those to trace by rule, None: all; `ways`: note where clients are."""
+        """`subjects`: those to trace by rule, None: all; `ways`: record the clients' places."""
         self._subjects = subjects
         chosen = {rule: texts for rule, texts in (subjects or {}).items() if texts is not None}
         self._clients_by_rule = {rule: _clients_of(texts) for rule, texts in chosen.items()}
         self._traced: dict[str, set[int]] = {rule: set() for rule in chosen}
-        """The numbers of the clients that are traced, for each rule of which not all are."""
+        """The numbers of the traced clients, for each rule with a selection."""
         self._everybody = subjects is None or len(chosen) < len(subjects)
         self._with_ways = ways
         self.engine: Engine | None = None  # of the replay, for its counts
         self._plans: dict[int, _Plan] = {}
         self._signals: dict[str, Changes] = {}
         self._aliases: dict[tuple[str, str | None, str], dict[str, Changes]] = {}
-        """By rule, element and signal: where its values are; equal signals of several rules are kept once."""
+        """By rule, element and signal: the place of its values; equal signals of several rules are stored once."""
         self._conditions: dict[tuple[str, str | None, str], Changes] = {}
         self._reasons: dict[tuple[str, str | None, str], dict[tuple[int, int], str]] = {}
-        """Of conditions, by client and time, why they are unknown."""
+        """For conditions, by client and time, why they are unknown."""
         self._names: list[str] = []
         self._numbers: dict[str, int] = {}
         self._texts: dict[str, int] = {}
         self._odd: set[tuple[str, str | None, str]] = set()
-        """Signals that have lists or maps: these stand in events only."""
+        """Signals with lists or maps: these appear only in events."""
         self._clients: tuple[Sequence[str], Integers] = ((), np.zeros(0, np.int64))
         self._pairs: dict[tuple[str, str], PairLog] = {}
         """By rule and its digest."""
@@ -92,25 +92,25 @@ class Tracer:
         self._begin: int | None = None
         self._end = 0
 
-    # What happens
+    # Input
 
     def attend(self, engine: Engine) -> None:
-        """Rules were set: those that are not in columns are looked at by themselves."""
+        """Rules were set: those that are not in columns are observed separately."""
         self.engine = engine
         for name, run in engine.rules.items():
             if name not in engine.in_columns:
                 run.witness = self.witnessed(run.rule).saw
 
     def witnessed(self, rule: CompiledRule) -> Witnessed:
-        """What a rule that is not in columns sees goes there."""
+        """The record of a rule that is not in columns."""
         return self._witnessed.setdefault(rule.name, Witnessed(rule))
 
     def clients(self, tracks: Sequence[Track], block: Block, codes: Codes, looked: Truths | None) -> None:
-        """Note what changes in a block of rules about clients."""
+        """Record the changes in a block of rules about clients."""
         self._time(block.ticks[0], block.ticks[-1])
         plan = self._plans.get(id(tracks))
         if plan is None:
-            self.settle()  # rules that were evaluated otherwise until now
+            self.settle()  # for rules that were evaluated differently until now
             plan = self._plans[id(tracks)] = self._plan(tracks)
         if not plan.conditions:
             return
@@ -124,12 +124,12 @@ class Tracer:
         self._note(plan, Seen([block]), codes, numbers, looked)
 
     def settle(self) -> None:
-        """Note what waits. From here on, the trace no longer needs the engine."""
+        """Record what is queued. After this call, the trace no longer needs the engine."""
         for plan in self._plans.values():
             self._flush(plan)
 
     def _flush(self, plan: _Plan) -> None:
-        """Note the blocks that wait."""
+        """Record the queued blocks."""
         for joined in joined_blocks(plan.waiting):
             self._note(plan, joined.block, joined.codes, joined.numbers, None)
         plan.waiting.clear()
@@ -150,14 +150,14 @@ class Tracer:
             plan.seen.update(numbers.tolist())
 
     def _rows(self, numbers: Integers, looked: Truths | None) -> slice | Truths:
-        """The clients of a block that are traced, of those that the rule looks at."""
+        """The traced clients of a block, among those that the rule evaluates."""
         if self._everybody:
             return slice(None) if looked is None else looked
         traced = np.isin(numbers, [*set().union(*self._traced.values())])
         return traced if looked is None else traced & looked
 
     def fleet(self, tracks: Sequence[Track], block: FleetBlock) -> None:
-        """Note what changes in a block of rules about the fleet: the number of members, and conditions."""
+        """Record the changes in a block of rules about the fleet: the number of members, and conditions."""
         self._time(block.ticks[0], block.ticks[-1])
         numbers = np.array([self._number(FLEET)], np.int64)
         for track, members, verdicts in zip(tracks, block.members, block.verdicts, strict=True):
@@ -171,8 +171,8 @@ class Tracer:
             for field, verdict in verdicts.items():
                 name = track.rule.name, track.element.name, field
                 reasons = self._reasons.setdefault(name, {})
-                said = np.where(verdict.true, float(TRUE), np.where(verdict.false, float(FALSE), float(UNKNOWN)))
-                codes = said.reshape(1, -1)
+                states = np.where(verdict.true, float(TRUE), np.where(verdict.false, float(FALSE), float(UNKNOWN)))
+                codes = states.reshape(1, -1)
                 conditions = self._conditions.setdefault(name, Changes())
                 found = conditions.add(numbers, block.times, codes, np.zeros(codes.shape, np.uint8), None)
                 expression = track.rule.when if field == "when" else track.rule.until
@@ -181,7 +181,7 @@ class Tracer:
                     reasons[int(numbers[0]), block.ticks[tick]] = why
 
     def pairs(self, track: Track, these: PairBlock) -> None:
-        """Note what a rule about pairs sees at a tick."""
+        """Record the values of a rule about pairs at a tick."""
         time = these.block.ticks[0]
         self._time(time, time)
         if not self._with_ways and not self.looks_at(track.rule.name):
@@ -195,13 +195,13 @@ class Tracer:
             self._ways.add(track.rule.name, track.rule.subject.position.geographic, time, these, numbers)
 
     def looks_at(self, rule: str) -> bool:
-        """Whether the rule is one of those that are looked at."""
+        """Whether the rule is traced."""
         return self._subjects is None or rule in self._subjects
 
-    # What came of it
+    # Output
 
     def trace(self, wanted: Wanted = lambda rule, subject: True) -> Trace:
-        """All that was seen of the subjects that are wanted."""
+        """The trace of the wanted subjects."""
         self.settle()
         found: dict[tuple[str, str], SubjectTrace] = {}
         self._of_clients(found, wanted)
@@ -311,13 +311,13 @@ class Tracer:
     ) -> None:
         shape = block.shape
         true, false = (each[row].reshape(shape)[chosen] for each in block.verdicts[field])
-        said = np.where(true, float(TRUE), np.where(false, float(FALSE), float(UNKNOWN)))
-        said[codes[row][chosen] & OUTSIDE == OUTSIDE] = AWAY
-        if not len(said):
+        states = np.where(true, float(TRUE), np.where(false, float(FALSE), float(UNKNOWN)))
+        states[codes[row][chosen] & OUTSIDE == OUTSIDE] = AWAY
+        if not len(states):
             return
         present = None if block.present is None else block.present[chosen]
-        tags = np.zeros(said.shape, np.uint8)
-        found = changes.add(numbers[chosen], block.times, said, tags, present)
+        tags = np.zeros(states.shape, np.uint8)
+        found = changes.add(numbers[chosen], block.times, states, tags, present)
         expression = track.rule.when if field == "when" else track.rule.until
         reasons = self._reasons[track.rule.name, track.element.name, field]
         places = np.arange(shape[0])[chosen]
@@ -327,7 +327,7 @@ class Tracer:
             reasons[int(numbers[at]), block.ticks[tick]] = why
 
     def _lost(self, plan: _Plan, gone: Integers, times: Integers) -> None:
-        """Clients that were lost: there is nothing to see of them."""
+        """Record that clients were lost."""
         shape = (len(gone), 1)
         for _, _, _, changes in plan.signals:
             changes.add(gone, times, np.zeros(shape), np.full(shape, Tag.ABSENT, np.uint8), None)
@@ -357,7 +357,7 @@ class Tracer:
 
 
 def _clients_of(subjects: Set[str]) -> Set[str]:
-    """The clients of subjects of one client; FLEET in place of the fleet."""
+    """The clients of single-client subjects; FLEET for the fleet."""
     return {clients[0] if clients else FLEET for clients, _ in map(parse_subject, subjects) if len(clients) < 2}
 
 
@@ -380,7 +380,7 @@ def _steps(times: Integers, codes: Bytes, reasons: Mapping[tuple[int, int], str]
 
 
 def series_of(times: Integers, values: Doubles, tags: Bytes, texts: Sequence[str]) -> Series:
-    """The series of one signal of one subject; `tags` are those of its values, of which texts are places in `texts`."""
+    """The series of one signal of one subject; `tags` are those of its values, where texts are indices into `texts`."""
     if (tags == Tag.NUMBER).all():
         return Series(times, values)
     known = (tags != Tag.ABSENT) & (tags != Tag.UNREACHABLE)
@@ -390,7 +390,7 @@ def series_of(times: Integers, values: Doubles, tags: Bytes, texts: Sequence[str
 
 
 def _joined(parts: Sequence[Series]) -> Series:
-    """The same signal under several plans, which follow each other."""
+    """The same signal under several consecutive plans."""
     if len(parts) == 1:
         return parts[0]
     times = np.concatenate([part.times for part in parts])

@@ -1,4 +1,4 @@
-"""How variants of rules compare with the rules as written: a table, and variants.json."""
+"""The comparison of variants of rules with the rules as written: a table, and variants.json."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def comparisons(outcomes: Sequence[Outcome], variants: Sequence[Variant]) -> lis
 
 
 def write_variants(path: Path, variants: Sequence[Variant], found: Sequence[Comparison]) -> None:
-    """Write which episodes each variant has in common with its rule, has gained and has lost."""
+    """Write which episodes each variant shares with its rule, adds and loses."""
     documents = [
         {"rule": each.of, "variant": each.label, **comparison.to_json()}
         for each, comparison in zip(variants, found, strict=True)

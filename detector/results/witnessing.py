@@ -1,4 +1,4 @@
-"""What rules that are not in columns see: each evaluation by itself."""
+"""Records the values of rules that are not in columns: each evaluation separately."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class _Values:
     values: list[Plain] = field(default_factory=list)
 
     def add(self, time: int, value: Plain) -> bool:
-        """Whether it is another value than before."""
+        """Add a value; returns whether it differs from the previous one."""
         if self.values and type(self.values[-1]) is type(value) and self.values[-1] == value:
             return False
         self.times.append(time)
@@ -47,13 +47,13 @@ class _Values:
 class _Subject:
     clients: tuple[str, ...]
     values: dict[str, _Values] = field(default_factory=dict)
-    said: dict[str, _Values] = field(default_factory=dict)
+    conditions: dict[str, _Values] = field(default_factory=dict)
     reasons: dict[str, dict[int, str]] = field(default_factory=dict)
     last: int = 0
 
 
 class Witnessed:
-    """What one rule saw."""
+    """The recorded values of one rule."""
 
     def __init__(self, rule: CompiledRule) -> None:
         self._rule = rule
@@ -63,11 +63,11 @@ class Witnessed:
 
     @property
     def span(self) -> tuple[int, int]:
-        """The first and the last evaluation; there was one."""
+        """The first and the last evaluation; there must be one."""
         return self._begin or 0, self._end
 
     def saw(self, evaluated: Evaluated) -> None:
-        """Note what changed."""
+        """Record the changes."""
         candidate, now = evaluated.candidate, evaluated.now
         self._begin = now if self._begin is None else self._begin
         self._end = now
@@ -81,9 +81,9 @@ class Witnessed:
         conditions = {"when": (self._rule.when, evaluated.when)}
         if self._rule.until is not None:
             conditions["until"] = (self._rule.until, evaluated.until)
-        for name, (expression, said) in conditions.items():
-            code = AWAY if candidate.in_scope is False else UNKNOWN if said is NOT_KNOWN else TRUE if said else FALSE
-            if subject.said.setdefault(name, _Values()).add(now, float(code)) and code == UNKNOWN:
+        for name, (expression, value) in conditions.items():
+            code = AWAY if candidate.in_scope is False else UNKNOWN if value is NOT_KNOWN else TRUE if value else FALSE
+            if subject.conditions.setdefault(name, _Values()).add(now, float(code)) and code == UNKNOWN:
                 why = of_variables(self._rule, expression, candidate.variables)
                 subject.reasons.setdefault(name, {})[now] = why
 
@@ -92,7 +92,7 @@ class Witnessed:
         for text, subject in self._subjects.items():
             found = SubjectTrace(self._rule.name, text, subject.clients)
             found.signals = {name: values.series() for name, values in sorted(subject.values.items())}
-            for name, values in subject.said.items():
+            for name, values in subject.conditions.items():
                 series, reasons = values.series(), subject.reasons.get(name, {})
                 why = {at: reasons[time] for at, time in enumerate(values.times) if time in reasons}
                 found.conditions[name] = Steps(series.times, series.values.astype(np.uint8), why)
@@ -100,7 +100,7 @@ class Witnessed:
 
 
 def _plain(values: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Plain]]:
-    """Numbers, booleans and texts by the names that expressions use; lists stand in events only."""
+    """Numbers, booleans and texts by their names in expressions; lists appear only in events."""
     for name, value in values.items():
         if name == "client" and above:
             continue

@@ -25,40 +25,40 @@ _NEEDED = {ResultKind.REPORT: "bokeh", ResultKind.MCAP: "foxglove", ResultKind.E
 
 
 def check_installed(kinds: Iterable[ResultKind]) -> None:
-    """Raises MissingExtraError where a package of the extra is missing: before hours of replay, not after them."""
+    """Raises MissingExtraError if a package of the extra is missing: before hours of replay, not after them."""
     for kind in sorted(kinds):
         check_package(_NEEDED[kind], f"--results {kind}")
 
 
 class Look(NamedTuple):
-    """What looks on at the replay of one recording."""
+    """The observers of the replay of one recording."""
 
     tracer: Tracer
     arrivals: Arrivals
 
 
 class Looking:
-    """Looks on at the replay of several recordings, one after another."""
+    """Observes the replay of several recordings, one after another."""
 
     def __init__(self) -> None:
         self._looks: dict[str, Look] = {}
 
     def watch(self, name: str) -> Look:
-        """What looks on at the recording of that name, which comes next."""
+        """The observers of the recording of that name, which comes next."""
         look = self._looks[name] = Look(Tracer(), Arrivals())
         return look
 
     def batches(self, batches: Iterable[Sequence[Arrival]]) -> Iterator[Sequence[Arrival]]:
-        """The batches of the recording that came last, as they are."""
+        """The batches of the current recording, unchanged."""
         return [*self._looks.values()][-1].arrivals.watch_batches(batches)
 
     def results(self, outcomes: Mapping[str, Outcome]) -> list[Result]:
-        """What each recording came to."""
+        """The result of each recording."""
         return [result_of(name, outcome, *self._looks[name]) for name, outcome in outcomes.items()]
 
 
 def write_results(folder: Path, results: Sequence[Result], kinds: frozenset[ResultKind]) -> list[Path]:
-    """Write them; returns the files. Each of several recordings has files of its own, but all are in one table."""
+    """Write them; returns the files. Of several recordings, each has separate files, but all share one table."""
     written: list[Path] = []
 
     def path(name: str) -> Path:
@@ -115,7 +115,7 @@ def show_summary(console: Console, results: Sequence[Result]) -> None:
 
 
 def _nearest(results: Sequence[Result]) -> list[NearMoment]:
-    """What nearly happened in all recordings, rule by rule."""
+    """The near misses of all recordings, rule by rule."""
     every = [each for result in results for each in result.nearest]
     return [
         each for rule in sorted({each.rule for each in every}) for each in listed(e for e in every if e.rule == rule)

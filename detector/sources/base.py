@@ -1,4 +1,4 @@
-"""What a source is: a class with typed parameters and one method that delivers messages until it must stop."""
+"""Defines a source: a class with typed parameters and one method that delivers messages until it must stop."""
 
 from __future__ import annotations
 
@@ -17,22 +17,23 @@ P = TypeVar("P", bound=BaseModel)
 """The model of a source's parameters."""
 
 Put = Callable[[Sequence[tuple[str, bytes]]], None]
-"""Receives messages that came together: the key and the payload of each. Thread-safe, and never waits."""
+"""Receives messages that arrived together: the key and the payload of each. Thread-safe, and never waits."""
 
 
 class Putter(Protocol):
-    """Gives the function that receives the messages of some streams: each message goes to all of them, at one time."""
+    """Returns the function that receives the messages of some streams: each message goes to all of them, with the same
+    time."""
 
     def __call__(self, *streams: str) -> Put:
         """`streams` are their names."""
 
 
 _MAXIMUM_KEYS = 100_000
-"""The routes of this many keys are cached; then the cache is cleared."""
+"""Maximum number of keys whose routes are cached; beyond it, the cache is emptied."""
 
 
 class SourceError(Exception):
-    """Raised by a source that cannot continue, with a message for people. The source starts again after a pause."""
+    """Raised by a source that cannot continue; the message is shown to users. The source restarts after a pause."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,15 +42,15 @@ class FedStream:
 
     spec: Stream
     pattern: KeyPattern
-    """Which keys belong to it; its `expression` is the key with the captures replaced by their wildcards."""
+    """The keys that belong to it; its `expression` is the key with the captures replaced by their wildcards."""
 
 
 class Feed:
     """Connects one run of a source to the detector: its streams, where to put messages, and whether to stop."""
 
     def __init__(self, streams: Sequence[Stream], putter: Putter, on_unrouted: Callable[[str], None]) -> None:
-        """`putter` gives the function that receives the messages of named streams; `on_unrouted` is called with the key
-        of each message that belongs to no stream."""
+        """`putter` returns the function that receives the messages of named streams; `on_unrouted` is called with the
+        key of each message that belongs to no stream."""
         self.streams = tuple(FedStream(stream, KeyPattern.parse(stream.key)) for stream in streams)
         """The streams that name this source, in the Detector's order."""
         self._puts = {stream.name: putter(stream.name) for stream in streams}
@@ -59,10 +60,10 @@ class Feed:
         self._on_unrouted = on_unrouted
         self._stop = threading.Event()
         self.messages = 0
-        """How many messages were delivered."""
+        """Number of delivered messages."""
 
     def put(self, key: str, payload: bytes) -> None:
-        """Deliver a message to every stream that its key belongs to, at one time; never waits, thread-safe.
+        """Deliver a message to every stream that its key belongs to, with the same time; never waits, thread-safe.
 
         A message that belongs to no stream is dropped and counted. After the stop, all messages are ignored.
         """
@@ -91,7 +92,7 @@ class Feed:
         return self._stop.is_set()
 
     def wait(self, seconds: float) -> bool:
-        """Sleep, at most until `run` must return; gives whether it must."""
+        """Sleep until the time is over or `run` must return; returns whether it must."""
         return self._stop.wait(seconds)
 
     def stop(self) -> None:
@@ -99,7 +100,8 @@ class Feed:
         self._stop.set()
 
     def _route(self, key: str) -> Put | None:
-        """Find what receives the messages of the key, and cache it; None if the key belongs to no stream."""
+        """Find the function that receives the messages of the key, and cache it; None if the key belongs to no
+        stream."""
         streams = [each.spec.name for each in self.streams if each.pattern.match(key) is not None]
         if len(self._routes) >= _MAXIMUM_KEYS:
             self._routes.clear()
@@ -108,13 +110,13 @@ class Feed:
 
 
 class Source(ABC, Generic[P]):
-    """Brings messages from somewhere.
+    """Delivers messages from some origin.
 
-    The detector makes a new one for every run, on a thread of its own.
+    The detector creates a new object for every run, on a separate thread.
     """
 
     Parameters: ClassVar[type[BaseModel]]
-    """The model of `spec.sources[].parameters`; `detector check` reports what it rejects."""
+    """The model of `spec.sources[].parameters`; `detector check` reports invalid ones."""
 
     def __init__(self, parameters: P) -> None:
         self.parameters = parameters

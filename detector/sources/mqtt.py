@@ -1,7 +1,7 @@
-"""The plugin `mqtt`: streams come from topics of an MQTT broker.
+"""The plugin `mqtt`: receives streams from topics of an MQTT broker.
 
-A stream's key is its topic: `vehicles/${client:*}/pose` subscribes to `vehicles/+/pose`. Where the connection is lost
-the run fails, so it is the supervision that connects again, and counts it.
+A stream's key is its topic: `vehicles/${client:*}/pose` subscribes to `vehicles/+/pose`. If the connection is lost the
+run fails, and the supervision reconnects and counts the failure.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from detector.sources.base import Feed, Source, SourceError
 from wayside.api.access import Access
 
 _LOOK_EVERY = 0.2
-"""Maximum seconds of one wait for messages, and so of the stop of the source."""
+"""Maximum seconds of one wait for messages, and therefore until the source stops."""
 
 
 class MqttParameters(Access):
-    """Which broker, and how to take messages from it."""
+    """The broker, and how to receive messages from it."""
 
     host: str = Field(min_length=1, max_length=255, description="The name or address of the broker.")
     port: int | None = Field(default=None, ge=1, le=65535, description="Default: 1883; with TLS 8883.")
@@ -63,7 +63,7 @@ class MqttSource(Source[MqttParameters]):
     Parameters: ClassVar[type[BaseModel]] = MqttParameters
 
     def run(self, feed: Feed) -> None:
-        """Connect, subscribe, and take messages until the connection is lost. Raises SourceError, AccessError."""
+        """Connect, subscribe, and receive messages until the connection is lost. Raises SourceError, AccessError."""
         parameters = self.parameters
         filters = [(parameters.prefix + topic_filter(each.pattern.expression), parameters.qos) for each in feed.streams]
         client = self._client()
@@ -128,7 +128,8 @@ class MqttSource(Source[MqttParameters]):
 
 
 def topic_filter(expression: str) -> str:
-    """A key expression as an MQTT topic filter that matches at least the same; the stream's key decides finally."""
+    """A key expression as an MQTT topic filter that matches at least the same keys; the stream's key makes the final
+    decision."""
     chunks = expression.split("/")
     if "**" in chunks:
         chunks = [*chunks[: chunks.index("**")], "#"]

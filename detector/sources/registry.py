@@ -1,4 +1,4 @@
-"""Which sources are installed, and whether a Detector gives them the parameters that they require."""
+"""Finds the class of a source, and validates its parameters."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ OFFERS = Offers[Source[Any]](
 )
 
 Make = Callable[[], Source[Any]]
-"""Makes a source for one run."""
+"""Creates a source for one run."""
 
 
 def prepare_source(source: DataSource) -> Make:
@@ -32,7 +32,7 @@ def prepare_source(source: DataSource) -> Make:
 
 
 def source_plugin_problems(detector: Detector) -> Iterator[RuleProblem]:
-    """What is wrong with the Detector's sources, as far as their plugins can check here."""
+    """The problems of the Detector's sources, as far as their plugins can check here."""
     for index, source in enumerate(detector.spec.sources):
         try:
             prepare_source(source)

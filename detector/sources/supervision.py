@@ -1,4 +1,4 @@
-"""Runs sources: each on a thread of its own, restarted when it fails, and abandoned if it does not stop."""
+"""Runs sources: each on a separate thread, restarted when it fails, and abandoned if it does not stop."""
 
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ log = logging.getLogger(__name__)
 
 _FIRST_PAUSE = 0.5
 _LONGEST_PAUSE = 30.0
-"""Seconds before a source that failed is run again: doubling from the first to the longest."""
+"""Maximum seconds before a failed source restarts: the pause doubles from the first to the longest."""
 
 _STEADY = 60.0
-"""Seconds: a run that lasted this long was a good one, and resets the backoff."""
+"""Seconds: a run of at least this duration resets the backoff."""
 
 
 class SourceState(StrEnum):
-    """Where a source stands."""
+    """The state of a source."""
 
     RUNNING = "Running"
     PAUSING = "Pausing"
-    """It failed, and is run again after a pause."""
+    """It failed, and will be restarted after a pause."""
     FINISHED = "Finished"
-    """It has nothing more to deliver."""
+    """It has no more messages."""
     STOPPED = "Stopped"
 
 
 class SourceThread:
-    """One source at work."""
+    """One running source."""
 
     def __init__(
         self,
@@ -64,7 +64,7 @@ class SourceThread:
 
     @property
     def messages(self) -> int:
-        """How many messages it delivered."""
+        """Number of delivered messages."""
         return self._feed.messages
 
     def start(self) -> None:
@@ -120,17 +120,18 @@ class Sources:
     """The sources of a Detector, which may change."""
 
     def __init__(self, putter: Putter, tally: Tally, *, timeout: float = 2.0) -> None:
-        """`putter` gives what takes the messages of streams; `timeout`: seconds that sources have to stop."""
+        """`putter` returns the function that receives the messages of streams; `timeout`: seconds that sources have to
+        stop."""
         self._putter = putter
         self._tally = tally
         self._timeout = timeout
         self._threads: dict[str, SourceThread] = {}
 
     def follow(self, detector: Detector) -> None:
-        """Run the Detector's sources; those that are the same, with the same streams, go on. May wait for ends.
+        """Run the Detector's sources; unchanged ones with unchanged streams keep running. May wait for ends.
 
         Raises:
-            PluginError: a source cannot be loaded; nothing has changed then.
+            PluginError: a source cannot be loaded; then nothing has changed.
         """
         wanted = {
             source.name: (source, tuple(stream for stream in detector.spec.streams if stream.source == source.name))
@@ -150,11 +151,11 @@ class Sources:
 
     @property
     def threads(self) -> list[SourceThread]:
-        """The sources that run, or ended by themselves; for any thread."""
+        """The sources that are running, or ended by themselves; for any thread."""
         return list(self._threads.values())
 
     def close(self) -> None:
-        """Stop all; returns when they have, or after the timeout."""
+        """Stop all; returns when they have stopped, or after the timeout."""
         self._stop(dict(self._threads))
 
     def _stop(self, threads: Mapping[str, SourceThread]) -> None:

@@ -1,1 +1,1 @@
-"""What a running detector reports about itself: its status, the same as metrics, and the requests that it answers."""
+"""The status of a running detector, the same as metrics, and the requests that it handles."""

@@ -1,7 +1,7 @@
-"""Why a rule does or does not fire: what its next evaluation sees of each subject.
+"""Explains why a rule fires or not: the values that its next evaluation reads for each subject.
 
-The evaluation is watched, not repeated: it reports what it saw on the way, so looking changes nothing and nothing is
-computed for it beyond what is computed anyway.
+The evaluation is observed, not repeated: it reports its intermediate values, so observing changes no result and nothing
+is computed in addition.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ _MAXIMUM_NOTES = 20
 
 
 class Watching:
-    """Watches one rule until it has been evaluated. For the evaluation thread alone."""
+    """Watches one rule until it has been evaluated. Only for the evaluation thread."""
 
     def __init__(self, engine: Engine, rule: str, subject: str | None) -> None:
-        """Raises ValueError where there is no such rule, or it is watched already."""
+        """Raises ValueError if the rule does not exist, or is watched already."""
         run = engine.rules.get(rule)
         if run is None:
             raise ValueError(f"rule {rule} is not evaluated: see its state and message")
@@ -46,7 +46,8 @@ class Watching:
         run.counters.notes = []
 
     def is_over(self) -> bool:
-        """Whether the rule was evaluated meanwhile, is gone, or nothing waits any more; then the future is set."""
+        """Whether the rule was evaluated in the meantime, was removed, or nobody waits any more; then the future is
+        set."""
         gone = self._engine.rules.get(self._run.rule.name) is not self._run
         if self._run.counters.ticks == self._ticks and not gone and not self.future.cancelled():
             return False
@@ -82,7 +83,7 @@ class Watching:
         self._seen.append((order, status))
 
     def _unknowns(self, variables: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-        """By signal, as expressions name it, why it has no value."""
+        """By signal, as named in expressions, why it has no value."""
         for plugin in self._run.rule.plugins:
             if plugin.name not in variables:
                 yield (

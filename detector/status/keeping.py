@@ -1,8 +1,8 @@
-"""Keeps the status of a running detector: taken by the evaluation thread, at most once a second, read by any other.
+"""Updates the status of a running detector: written by the evaluation thread, at most once a second, read by any other.
 
-So a request neither waits for the evaluation nor delays it, and the engine's counters are only ever read by the
-thread that writes them. Work per sample is limited: latencies are those of the newest
-message of at most a few clients, once a second.
+A request therefore neither waits for the evaluation nor delays it, and only the thread that writes the engine's
+counters reads them. The cost per sample is limited: latencies are measured once a second, on the newest message of at
+most a few clients.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ from detector.status.model import (
 )
 
 BOUNDS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
-"""Of the latencies' histograms, in seconds."""
+"""Bounds of the latency histograms, in seconds."""
 
 _EVERY = 1_000_000_000
-"""Nanoseconds between two statuses, and between two looks at a latency."""
+"""Nanoseconds between two statuses, and between two measurements of a latency."""
 
 _LOOKED_AT = 16
-"""Number of clients whose newest sample counts for the latency of each stream or rule."""
+"""Maximum number of clients whose newest sample is measured for the latency of each stream or rule."""
 
 _RATES_OVER = 10
 """Number of statuses over which rates are averaged."""
@@ -50,7 +50,7 @@ _CLIENTS = 200
 
 
 class _Latencies:
-    """A histogram in the making."""
+    """A histogram in progress."""
 
     def __init__(self) -> None:
         self._counts = [0] * (len(BOUNDS) + 1)
@@ -65,10 +65,10 @@ class _Latencies:
 
 
 class StatusKeeper:
-    """The newest status, and what is needed to take the next one. All but `latest` is for the evaluation thread."""
+    """The latest status, and the data for the next one. Everything except `latest` is for the evaluation thread."""
 
     def __init__(self, engine: Engine, losses: Losses, now: Callable[[], int]) -> None:
-        """`now` gives nanoseconds since the epoch."""
+        """`now` returns nanoseconds since the epoch."""
         self._engine = engine
         self._losses = losses
         self._now = now
@@ -77,11 +77,12 @@ class StatusKeeper:
         self._taken = 0
         self._refusals: dict[str, RefusedRule] = {}
         self._last: dict[str, Arrival] = {}
-        """With clock Data, the last arrival of each stream: the buffer knows only stamps."""
+        """With clock Data, the last arrival of each stream: the buffer has only stamps."""
         self._looked: dict[str, int] = {}
-        """The tick at which a rule's latency was last looked at: samples up to there are counted."""
+        """The tick at which a rule's latency was last measured: samples up to there are counted."""
         self._ticks: dict[str, int] = {}
-        """By rule, how many ticks it had had at the last look. Kept like the engine's counters where a rule goes."""
+        """By rule, its number of ticks at the last measurement. Kept after the removal of a rule, like the engine's
+        counters."""
         self._counts: deque[tuple[int, dict[str, int]]] = deque(maxlen=_RATES_OVER + 1)
         self._stream_latencies: dict[str, _Latencies] = {}
         self._rule_latencies: dict[str, _Latencies] = {}
@@ -89,12 +90,12 @@ class StatusKeeper:
         self._watching: list[Watching] = []
         self.gaps = 0
         self.demands: Collection[str] = ()
-        """The names of the tasks that are demanded now."""
+        """The names of the currently demanded tasks."""
         self.latest: Status = self._take(self._started)
 
     @property
     def silence(self) -> float:
-        """Seconds since the last look of the evaluation; for any thread."""
+        """Seconds since the last cycle of the evaluation; for any thread."""
         return time.monotonic() - self._beat
 
     def arrived(self, arrivals: Sequence[Arrival]) -> None:
@@ -103,18 +104,18 @@ class StatusKeeper:
             self._last.update((arrival.stream, arrival) for arrival in arrivals)
 
     def refused(self, refusals: Iterable[RefusedRule]) -> None:
-        """Set the rules that are refused now."""
+        """Set the rules that are currently rejected."""
         self._refusals = {refusal.rule.name: refusal for refusal in refusals}
         self._taken = 0
 
     def watch(self, rule: str, subject: str | None) -> Future[RuleExplanation]:
-        """What the rule's next evaluation sees: of a subject, or of the first ones. Raises ValueError."""
+        """The values that the rule's next evaluation reads: for a subject, or for the first ones. Raises ValueError."""
         watching = Watching(self._engine, rule, subject)
         self._watching.append(watching)
         return watching.future
 
     def looked(self) -> None:
-        """The evaluation has done what was due."""
+        """The evaluation has finished a cycle."""
         self._beat = time.monotonic()
         self._watching = [watching for watching in self._watching if not watching.is_over()]
         now = self._now()
@@ -181,7 +182,7 @@ class StatusKeeper:
         )
 
     def _axis(self) -> int:
-        """The reference time of ages: with clock Wall now, also where ticks are rare."""
+        """The reference time of ages: with clock Wall the current time, even if ticks are rare."""
         return self._now() if self._engine.on_wall_clock else self._engine.now
 
     def _clients(self) -> Iterator[ClientStatus]:
@@ -220,7 +221,7 @@ class StatusKeeper:
             )
 
     def _look_at_stream(self, name: str, lanes: Sequence[Lane]) -> None:
-        """Note the latencies from stamp to receipt of what came since the last look."""
+        """Measure the latencies from stamp to receipt of the samples since the last measurement."""
         latencies = self._stream_latencies.setdefault(name, _Latencies())
         if not self._engine.on_wall_clock:
             arrival = self._last.pop(name, None)
@@ -235,10 +236,10 @@ class StatusKeeper:
                 latencies.add(latency)
 
     def _look_at_rule(self, run: RuleRun, now: int, seen: dict[tuple[frozenset[str], int, int], list[float]]) -> None:
-        """If the rule has just been evaluated, note how long ago the new samples were received that it saw.
+        """If the rule has just been evaluated, measure how long ago the new samples that it read were received.
 
-        Once a second, of a few clients the newest; no sample is counted twice. `seen` is shared by the rules of one
-        look: those that saw the same streams in the same time saw the same samples.
+        Once a second, the newest samples of a few clients; no sample is counted twice. `seen` is shared by the rules of
+        one cycle: those that read the same streams in the same period read the same samples.
         """
         name, tick, ticks = run.rule.name, run.counters.last_tick, run.counters.ticks
         evaluated = ticks != self._ticks.get(name, 0)
@@ -247,7 +248,7 @@ class StatusKeeper:
         if not evaluated or since <= tick < since + _EVERY:
             return
         self._looked[name] = tick
-        if tick < since:  # the wall clock stepped back: what is older was counted
+        if tick < since:  # the wall clock stepped back: older samples were counted
             return
         latencies = self._rule_latencies.setdefault(name, _Latencies())
         key = run.rule.streams, since, tick
@@ -257,13 +258,13 @@ class StatusKeeper:
             latencies.add(latency)
 
     def _receipts(self, streams: Collection[str], since: int, tick: int) -> Iterator[int]:
-        """When the newest samples after `since` and up to the tick were received, of a few clients."""
+        """The receive times of the newest samples after `since` and up to the tick, of a few clients."""
         lanes = (lane for lane in self._engine.buffer if lane.latest > since and lane.stream in streams)
         newest = (next(lane.newest_first(since, tick), None) for lane in lanes)
         return islice((sample.received for sample in newest if sample is not None), _LOOKED_AT)
 
     def _forget(self, streams: Iterable[str]) -> None:
-        """Forget streams and rules that are gone."""
+        """Forget removed streams and rules."""
         for of_streams in (self._stream_latencies, self._last):
             for name in of_streams.keys() - {*streams}:
                 of_streams.pop(name)

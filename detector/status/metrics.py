@@ -1,4 +1,4 @@
-"""A status as Prometheus metrics. Labels are streams, rules and causes, never clients: there may be too many."""
+"""A status as Prometheus metrics. Labels are streams, rules and causes, never clients, whose number is unbounded."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ Family = GaugeMetricFamily | CounterMetricFamily
 
 
 class Metrics(Collector):
-    """Metrics of the detector's newest status, and of its process."""
+    """Metrics of the detector's latest status, and of its process."""
 
     def __init__(self, status: Callable[[], Status]) -> None:
         self._status = status
@@ -138,7 +138,7 @@ class Metrics(Collector):
         ProcessCollector(registry=self._registry)
 
     def text(self) -> bytes:
-        """What a scrape gets, in Prometheus' text format."""
+        """The response to a scrape, in Prometheus' text format."""
         return generate_latest(self._registry)
 
     def collect(self) -> Iterable[Metric]:

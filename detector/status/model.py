@@ -1,4 +1,4 @@
-"""The status of a running detector, as it travels: JSON with camelCase names.
+"""The status of a running detector in its transmitted form: JSON with camelCase names.
 
 Counts are since the detector's start, times are seconds, sizes bytes.
 """
@@ -12,7 +12,7 @@ import msgspec
 
 
 class Histogram(msgspec.Struct, frozen=True, rename="camel"):
-    """How often a time in seconds was at most each bound; `counts` has one more, for what was longer."""
+    """Counts of times up to each bound, in seconds; `counts` has one more entry, for longer times."""
 
     bounds: tuple[float, ...]
     counts: tuple[int, ...]
@@ -20,11 +20,12 @@ class Histogram(msgspec.Struct, frozen=True, rename="camel"):
 
     @property
     def count(self) -> int:
-        """How many times were measured."""
+        """Number of measured times."""
         return sum(self.counts)
 
     def quantile(self, share: float) -> float | None:
-        """Seconds: the bound below which that share of the times lies; infinite beyond the last, None without any."""
+        """Seconds: the bound below which that share of the times lies; infinite beyond the last, None if there are
+        none."""
         seen, wanted = 0, share * self.count
         for bound, count in zip((*self.bounds, float("inf")), self.counts, strict=True):
             seen += count
@@ -34,7 +35,7 @@ class Histogram(msgspec.Struct, frozen=True, rename="camel"):
 
 
 class Drops(msgspec.Struct, frozen=True, rename="camel"):
-    """What was lost for one cause, or could not be used."""
+    """The losses or unusable data of one cause."""
 
     cause: str
     what: str
@@ -42,7 +43,7 @@ class Drops(msgspec.Struct, frozen=True, rename="camel"):
     stream: str = ""
     rule: str = ""
     last: str = ""
-    """The reason of the last one, where there is one."""
+    """The reason of the last one, if known."""
 
 
 class StreamStatus(msgspec.Struct, frozen=True, rename="camel"):
@@ -56,11 +57,11 @@ class StreamStatus(msgspec.Struct, frozen=True, rename="camel"):
     clients: int
     """Number of clients with samples in the buffer."""
     age: float | None
-    """Since the newest sample, on the detector's time axis; None where none is there."""
+    """Since the newest sample, on the detector's time axis; None if there is none."""
     buffered_samples: int
     buffered_bytes: int
     latency: Histogram
-    """From stamp to receipt, of the newest sample of some clients, looked at once a second."""
+    """From stamp to receipt, measured once a second on the newest sample of some clients."""
 
 
 class RuleState(StrEnum):
@@ -81,34 +82,34 @@ class RuleStatus(msgspec.Struct, frozen=True, rename="camel"):
     message: str = ""
     """Why it is not Accepted."""
     evaluations: int = 0
-    """Subjects looked at."""
+    """Number of evaluated subjects."""
     ticks: int = 0
-    """Times at which the rule was evaluated, for all its subjects."""
+    """Number of ticks at which the rule was evaluated, each for all its subjects."""
     time: float = 0.0
-    """Spent on evaluating it."""
+    """Time spent on its evaluation."""
     unknowns: int = 0
-    """Values that were not there when an expression needed them."""
+    """Values that were absent when an expression needed them."""
     absences: dict[str, int] = {}
-    """What was missing, as far as expressions reported it."""
+    """Missing values, as far as expressions reported them."""
     errors: int = 0
     last_error: str = ""
     started: int = 0
     ended: int = 0
     open: int = 0
-    """Episodes that are open now."""
+    """Number of open episodes."""
     pending: int = 0
-    """Subjects whose condition holds, but not yet for as long as `for`."""
+    """Subjects whose condition holds, but for less than `for`."""
     latency: Histogram | None = None
-    """From the receipt of the newest sample that an evaluation saw to the evaluation's end; clock Wall only."""
+    """From the receipt of the newest sample that an evaluation read to the end of the evaluation; clock Wall only."""
 
 
 class SubjectStatus(msgspec.Struct, frozen=True, rename="camel"):
-    """What one evaluation of a rule saw of a subject; None stands for unknown."""
+    """The values of one subject in an evaluation of a rule; None stands for unknown."""
 
     subject: str
     looked_at: bool
     why: str = ""
-    """Why it was not looked at."""
+    """Why it was not evaluated."""
     in_scope: bool | None = None
     near: bool | None = None
     """Whether an episode may start: a pair within reach."""
@@ -116,25 +117,25 @@ class SubjectStatus(msgspec.Struct, frozen=True, rename="camel"):
     until: bool | None = None
     open: bool = False
     pending: float | None = None
-    """For how long `when` has held, of a subject that waits for `for`."""
+    """How long `when` has held, for a subject that waits for `for`."""
     values: dict[str, Any] = {}
-    """As an event would have them."""
+    """The values in the form of an event."""
     unknown: dict[str, str] = {}
-    """The signals without a value, and why."""
+    """The signals without a value, and the reasons."""
 
 
 class RuleExplanation(msgspec.Struct, frozen=True, rename="camel"):
-    """What one evaluation of a rule saw."""
+    """The values of one evaluation of a rule."""
 
     tick: float
     """Its time on the detector's axis, seconds since the epoch."""
     subjects: list[SubjectStatus]
     notes: list[str]
-    """What expressions missed, or failed on."""
+    """Absent values and failures of expressions."""
 
 
 class ClientStatus(msgspec.Struct, frozen=True, rename="camel"):
-    """A client that is known."""
+    """A known client."""
 
     name: str
     age: float
@@ -142,29 +143,29 @@ class ClientStatus(msgspec.Struct, frozen=True, rename="camel"):
 
 
 class SourceStatus(msgspec.Struct, frozen=True, rename="camel"):
-    """A source beside Zenoh."""
+    """A source other than Zenoh."""
 
     name: str
     plugin: str
     state: str
-    """Running, Pausing (it failed and is run again), Finished or Stopped."""
+    """Running, Pausing (it failed and will be restarted), Finished or Stopped."""
     messages: int
     """Delivered since the start, or since it was last changed."""
     last_error: str = ""
 
 
 class ActionStatus(msgspec.Struct, frozen=True, rename="camel"):
-    """An action of a rule, other than deploy: what became of its work for episodes."""
+    """An action of a rule, other than deploy, and the outcomes of its episodes."""
 
     rule: str
     action: str
     kind: str
-    """What acts: record, database, trigger, notify, or a plugin."""
+    """The kind of action: record, database, trigger, notify, or a plugin."""
     running: int
     done: int
     failed: int
     samples: int
-    """Of runs that are done or failed, as are missing, bytes and files."""
+    """Of runs that are done or failed, like missing, bytes and files."""
     missing: int
     """Lost on the way."""
     bytes: int
@@ -183,7 +184,7 @@ class CertificateStatus(msgspec.Struct, frozen=True, rename="camel"):
     renewals: int = 0
     """Number of renewals of certificates or passwords."""
     problem: str = ""
-    """Why what the files hold now is not used."""
+    """Why the current contents of the files are not used."""
 
 
 class Status(msgspec.Struct, frozen=True, rename="camel"):
@@ -194,14 +195,14 @@ class Status(msgspec.Struct, frozen=True, rename="camel"):
     namespace: str
     version: str
     generation: int
-    """Of the Detector as it is followed; 0 where it comes from a file."""
+    """The generation of the Detector in use; 0 if it comes from a file."""
     clock: str
     started: float
     """Seconds since the epoch."""
     taken: float
-    """When this status was taken; seconds since the epoch."""
+    """The time of this status; seconds since the epoch."""
     now: float
-    """Up to here all ticks have run, on the detector's time axis; seconds since the epoch."""
+    """All ticks up to this time have run, on the detector's time axis; seconds since the epoch."""
     gaps: int
     buffered_bytes: int
     maximum_bytes: int
@@ -219,18 +220,18 @@ class Status(msgspec.Struct, frozen=True, rename="camel"):
     actions: list[ActionStatus] = []
     certificate: CertificateStatus = CertificateStatus()
     demands: list[str] = []
-    """The names of the tasks that are demanded now; at most 200."""
+    """The names of the currently demanded tasks; at most 200."""
     demand_count: int = 0
     missing: list[str] = []
-    """Expected clients without a token from which nothing has come for `clientTimeout`; at most 200, by name."""
+    """Expected clients without a token that have sent nothing for `clientTimeout`; at most 200, by name."""
     missing_count: int = 0
 
 
 def to_json(value: msgspec.Struct) -> bytes:
-    """The value as JSON, UTF-8; what is not finite as null."""
+    """The value as JSON, UTF-8; NaN and infinities as null."""
     return msgspec.json.encode(value)
 
 
 def read_status(payload: bytes) -> Status:
-    """What `to_json` made of a status; fields of later versions are left out. Raises ValueError."""
+    """The status from the output of `to_json`; fields of later versions are ignored. Raises ValueError."""
     return msgspec.json.decode(payload, type=Status)

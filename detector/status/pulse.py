@@ -1,4 +1,4 @@
-"""Whether an event loop still runs, measured on request: no heartbeat is needed."""
+"""Whether an event loop is still running, measured on request: no heartbeat is needed."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import time
 
 
 class LoopMonitor:
-    """Schedules a callback in the loop, and measures how long it does not run."""
+    """Schedules a callback in the loop, and measures its delay."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop

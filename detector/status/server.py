@@ -1,4 +1,4 @@
-"""/metrics, /healthz and /readyz over HTTP or HTTPS, on threads of their own."""
+"""/metrics, /healthz and /readyz over HTTP or HTTPS, on separate threads."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from typing import Any
 from wayside.process.servingcertificate import EVERY, ServingCertificate
 
 Page = Callable[[], tuple[bool, bytes]]
-"""Whether all is well, and the text."""
+"""Whether the check succeeded, and the text."""
 
 _TYPE = "text/plain; version=0.0.4; charset=utf-8"
 
 _POLL = 0.1
-"""Maximum seconds until the server notices its stop."""
+"""Maximum seconds until the server notices that it is to stop."""
 
 _PATIENCE = 10.0
-"""Seconds that a client may take to send its request, so that none keeps a thread for ever."""
+"""Seconds that a client may take to send its request, so that none occupies a thread forever."""
 
 
 @dataclass(frozen=True, slots=True)
 class PagesAddress:
-    """Where pages are served, on all addresses of the machine."""
+    """The port of the pages, on all addresses of the machine."""
 
     port: int
     """0 selects a free one."""
     certificates: Path | None = None
-    """The folder with tls.crt and tls.key, whose changes are followed; None: HTTP."""
+    """The folder with tls.crt and tls.key, which is watched for changes; None: HTTP."""
 
 
 class StatusServer:
@@ -44,7 +44,7 @@ class StatusServer:
 
         Raises:
             OSError: the port is in use.
-            CertificateError: the folder holds no valid certificate and key.
+            CertificateError: the folder contains no valid certificate and key.
         """
 
         class Handler(BaseHTTPRequestHandler):
@@ -66,7 +66,7 @@ class StatusServer:
                 self.wfile.write(text)
 
             def log_message(self, format: str, *args: object) -> None:  # noqa: A002  the base class names it
-                """Log nothing: a probe comes every few seconds."""
+                """Log nothing: a probe arrives every few seconds."""
 
         folder = address.certificates
         certificate = None if folder is None else ServingCertificate(folder, "--metrics-certificates")
@@ -85,11 +85,11 @@ class StatusServer:
         return int(self._server.server_address[1])
 
     def start(self) -> None:
-        """Begin to answer."""
+        """Begin to serve."""
         self._thread.start()
 
     def close(self) -> None:
-        """End; returns at once after the request that is being answered."""
+        """Stop; returns right after the request that is being served."""
         if self._thread.is_alive():
             self._server.shutdown()
             self._thread.join()
@@ -111,7 +111,7 @@ class _Server(ThreadingHTTPServer):
         connection, client = super().get_request()
         if self._certificate is None:
             return connection, client
-        # The handshake is made by the first read, on the thread of the connection and within its timeout.
+        # The first read makes the handshake, on the thread of the connection and within its timeout.
         context = self._certificate.context
         return context.wrap_socket(connection, server_side=True, do_handshake_on_connect=False), client
 
@@ -122,6 +122,6 @@ class _Server(ThreadingHTTPServer):
             self._certificate.refresh()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Log nothing of a client that closes early, or that speaks no TLS: it is no error of the detector."""
+        """Do not log clients that close early, or that do not use TLS: these are no errors of the detector."""
         if not isinstance(sys.exception(), OSError):
             super().handle_error(request, client_address)

@@ -1,4 +1,4 @@
-"""A status as tables for people."""
+"""A status as tables for terminals."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The statuses of several detectors, added up: of a city whose regions have a detector each."""
+"""The sum of the statuses of several detectors, e.g. of a city with one detector per region."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _BY_SEVERITY = (RuleState.REFUSED, RuleState.DEGRADED, RuleState.PAUSED, RuleSta
 
 
 class DetectorShare(msgspec.Struct, frozen=True, rename="camel"):
-    """What one detector contributes."""
+    """The part of one detector."""
 
     holder: str
     version: str
@@ -23,28 +23,28 @@ class DetectorShare(msgspec.Struct, frozen=True, rename="camel"):
     connected: bool
     clients: int
     rate: float
-    """Samples a second, over all streams."""
+    """Samples per second, over all streams."""
     buffered_bytes: int
     maximum_bytes: int
     behind: float
     """Seconds between the status and the last evaluated tick."""
     open: int
-    """Episodes that are open now."""
+    """Number of open episodes."""
     demands: int
     lost: int
-    """Of all causes."""
+    """Losses of all causes."""
 
 
 class Total(msgspec.Struct, frozen=True, rename="camel"):
-    """The sum of statuses. A client or an episode that several detectors see counts once for each of them."""
+    """The sum of statuses. A client or an episode seen by several detectors is counted once for each of them."""
 
     detectors: list[DetectorShare]
     """By holder."""
     missing_detectors: list[str]
-    """Expected, but without an answer: the sums lack them."""
+    """Expected detectors that did not respond: the sums do not include them."""
     client_count: int
     shared_client_count: int
-    """Clients that several detectors list; a lower bound where `clients_complete` is false."""
+    """Number of clients that several detectors list; a lower bound if `clients_complete` is false."""
     shared_clients: list[str]
     """At most 200 of them, by name."""
     clients_complete: bool
@@ -150,7 +150,7 @@ def _stream(found: Sequence[tuple[str, StreamStatus]]) -> StreamStatus:
 
 
 def _rule(found: Sequence[tuple[str, RuleStatus]]) -> RuleStatus:
-    """The state is the worst one; the message names the detectors that are in it."""
+    """The state is the worst one; the message names the detectors in that state."""
     rules = [rule for _, rule in found]
     state = min((each.state for each in rules), key=_BY_SEVERITY.index)
     worst = [(holder, each) for holder, each in found if each.state is state]
@@ -180,7 +180,7 @@ def _rule(found: Sequence[tuple[str, RuleStatus]]) -> RuleStatus:
 
 
 def _action(found: Sequence[tuple[str, ActionStatus]]) -> ActionStatus:
-    """Without `current`: the messages of running episodes are those of one detector."""
+    """Without `current`: the messages of running episodes belong to one detector."""
     actions = [action for _, action in found]
     return ActionStatus(
         rule=actions[0].rule,
@@ -215,7 +215,7 @@ def _named(texts: Iterable[tuple[str, str]]) -> str:
 
 
 def _histogram(histograms: Sequence[Histogram]) -> Histogram:
-    """The sum; of those whose bounds differ from the first (another version's), none counts."""
+    """The sum; histograms whose bounds differ from the first (of another version) are left out."""
     alike = [each for each in histograms if each.bounds == histograms[0].bounds]
     return Histogram(
         bounds=histograms[0].bounds,

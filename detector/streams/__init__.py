@@ -1,1 +1,1 @@
-"""Where the data comes from: keys, codecs and the Zenoh session."""
+"""The network input: keys, codecs and the Zenoh session."""

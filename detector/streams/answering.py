@@ -1,8 +1,8 @@
-"""Answers Zenoh queries about a detector: one queryable for its keys, on a thread of its own.
+"""Handles Zenoh queries about a detector: one queryable for its keys, on a separate thread.
 
     wayside/detectors/<holder>/<what>?name=value;…
 
-An answer is JSON. A request that cannot be answered gets an error reply with the reason.
+A response is JSON. A request that cannot be handled gets an error reply with the reason.
 """
 
 from __future__ import annotations
@@ -16,27 +16,27 @@ import zenoh
 _log = logging.getLogger(__name__)
 
 Answer = Callable[[str, Mapping[str, str], bytes], bytes]
-"""Takes the name of the request, its parameters and the payload of the query (often none); returns JSON.
+"""Receives the name of the request, its parameters and the payload of the query (often empty); returns JSON.
 
-Raises ValueError where it cannot.
+Raises ValueError if it cannot.
 """
 
 JSON = "application/json"
 
 _CHANNEL = 64
-"""Maximum number of waiting queries; Zenoh holds further ones back until their timeout."""
+"""Maximum number of queued queries; Zenoh holds back further ones until their timeout."""
 
 
 def status_key(holder: str, what: str) -> str:
-    """The key on which a detector answers; `*` for any."""
+    """The key on which a detector responds; `*` for any."""
     return f"wayside/detectors/{holder}/{what}"
 
 
 class Answering:
-    """Answers the queries of one session until that is closed."""
+    """Handles the queries of one session until that is closed."""
 
     def __init__(self, session: zenoh.Session, holder: str, answer: Answer) -> None:
-        """Raises zenoh.ZError where the queryable cannot be declared."""
+        """Raises zenoh.ZError if the queryable cannot be declared."""
         self._holder = holder
         self._answer = answer
         self._queryable = session.declare_queryable(
@@ -57,7 +57,7 @@ class Answering:
                 return
             try:
                 self._reply(query)
-            except Exception as error:  # noqa: BLE001  one bad query must not silence the detector
+            except Exception as error:  # noqa: BLE001  one bad query must not stop the thread
                 _log.warning("cannot answer a query of %s: %s", query.key_expr, error)
             finally:
                 query.drop()  # type: ignore[no-untyped-call]  # ends the query, whatever was replied

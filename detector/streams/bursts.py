@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 Put = Callable[[Sequence[tuple[str, bytes]]], None]
-"""Takes messages that came together: the key and the payload of each. Thread-safe, and never waits."""
+"""Receives messages that arrived together: the key and the payload of each. Thread-safe, and never waits."""
 
 LONGEST = 256
-"""The most messages that are queued at once: receiving them takes a fraction of a millisecond."""
+"""Maximum number of messages that are queued at once: receiving them takes a fraction of a millisecond."""

@@ -1,12 +1,12 @@
-"""The samples of a stream, over one session after another, each once and in order.
+"""The samples of a stream across sessions: each sample once, and in order.
 
-When one session takes the place of another, both are subscribed for a while. What comes over the old one goes on at
-once, and is noted; what comes over the new one waits. Then the old one is withdrawn, what it had received is taken, and
-after that what waited, without what was noted. So nothing is lost, nothing is taken twice, and on no key does a sample
-overtake another.
+When one session replaces another, both are subscribed for a while. Samples of the old one are delivered at once, and
+noted; samples of the new one are queued. Then the old one is undeclared, its remaining samples are delivered, and after
+them the queued ones, except those that were noted. So no sample is lost or delivered twice, and per key no sample
+overtakes another.
 
-A sample is known again by the timestamp that routers (and peers) give to each. Without timestamps, those that are equal
-in key and content count as the same, within the second or so in which both sessions are subscribed.
+A sample is identified by the timestamp that routers (and peers) add to it. Without timestamps, samples with equal key
+and content count as the same, within the second or so in which both sessions are subscribed.
 """
 
 from __future__ import annotations
@@ -23,29 +23,30 @@ from detector.streams.bursts import LONGEST
 from detector.streams.subscribing import Subscription
 
 MAXIMUM_NOTED = 1_000_000
-"""Maximum samples noted, and maximum samples waiting, for one stream; beyond, the sessions are exchanged at once."""
+"""Maximum number of noted samples, and of queued samples, for one stream; beyond it, the sessions are exchanged at
+once."""
 
 _MAXIMUM_KEYS = 200_000
 
 _LOOKED_AT = 100
-"""Number of samples of the new session that are searched among those of the old one: the first ones come there first
+"""Number of samples of the new session that are compared with those of the old one: the first ones arrive first there
 too.
 """
 
 _ECHO = 5.0
-"""Seconds after the exchange in which the new session may still deliver what the old one had: then all has come."""
+"""Seconds after the exchange in which the new session may still repeat samples of the old one."""
 
 
 class Inlet:
-    """Samples of one stream. `bursts` is for its thread, everything else for the one who exchanges sessions."""
+    """Samples of one stream. `bursts` is for its thread, everything else for the thread that exchanges sessions."""
 
     def __init__(self, subscription: Subscription, *, history: bool = False) -> None:
-        """`history`: a new subscription gives old samples again; then the newest of each key is remembered."""
+        """`history`: a new subscription repeats old samples; then the newest of each key is remembered."""
         self._subscription = subscription
         self._noted: Counter[Hashable] | None = None
         self._newest: dict[str, zenoh.Timestamp] | None = {} if history else None
         self._echo: Counter[Hashable] | None = None
-        """What came over the session before, and may come once more."""
+        """Samples of the previous session, which the new one may repeat."""
         self._echo_ends = 0.0
         self._held: list[zenoh.Sample] = []
         self._second: Subscription | None = None
@@ -54,7 +55,7 @@ class Inlet:
         self._over = False
 
     def bursts(self) -> Iterator[list[zenoh.Sample]]:
-        """What comes, without end. Raises ZError once the session is closed and no other takes its place."""
+        """The samples, without end. Raises ZError once the session is closed and no other replaces it."""
         while True:
             handler = self._subscription.handler
             receive, try_receive = handler.recv, handler.try_recv
@@ -62,7 +63,7 @@ class Inlet:
                 while True:
                     burst = [receive()]
                     burst.extend(islice(iter(try_receive, None), LONGEST - 1))
-                    # The hot path: where no sessions are exchanged, it costs three looks at attributes a burst.
+                    # The hot path: without an exchange, it costs three attribute reads per burst.
                     if self._echo is None and self._noted is None and self._newest is None:
                         yield burst
                         continue
@@ -91,13 +92,13 @@ class Inlet:
         self._noted = Counter()
 
     def try_second(self, second: Subscription) -> None:
-        """Take the samples of the new session's subscription; call it often, so that its queue does not fill."""
+        """Queue the samples of the new session's subscription; call it often, so that Zenoh's queue does not fill."""
         if not self.full:
             self._held.extend(each for each in iter(second.handler.try_recv, None) if not self._is_old(each))
 
     @property
     def waits(self) -> bool:
-        """Whether the old session still has to deliver what the new one has, or the other way round."""
+        """Whether one session still has to deliver samples that the other has delivered."""
         noted = self._noted or Counter()
         if not noted and not self._held:
             return False
@@ -105,12 +106,12 @@ class Inlet:
 
     @property
     def full(self) -> bool:
-        """Whether no more should wait, or be noted."""
+        """Whether the limit of noted or queued samples is reached."""
         return len(self._held) >= MAXIMUM_NOTED or len(self._noted or ()) >= MAXIMUM_NOTED
 
     @property
     def only_first(self) -> bool:
-        """Whether samples come over the old session, and none over the new one."""
+        """Whether samples arrive over the old session, but none over the new one."""
         return bool(self._noted) and not self._held
 
     def forget(self) -> None:
@@ -119,18 +120,18 @@ class Inlet:
         self._held = []
 
     def expect(self) -> None:
-        """The session that is used now will be withdrawn, and `follow` or `close` be called."""
+        """The current session will be closed, and `follow` or `close` will be called."""
         with self._changed:
             self._expecting = True
 
     def follow(self, second: Subscription) -> None:
-        """Go on with the new session once all that the old one received is taken."""
+        """Switch to the new session once all samples of the old one are delivered."""
         with self._changed:
             self._second = second
             self._changed.notify_all()
 
     def withdraw(self) -> None:
-        """Nothing more is wanted of the old session; what it has received is still taken."""
+        """Undeclare the old session's subscription; samples that it has received are still delivered."""
         self._subscription.undeclare()
 
     def close(self) -> None:
@@ -140,7 +141,7 @@ class Inlet:
             self._changed.notify_all()
 
     def _fresh(self, samples: Sequence[zenoh.Sample]) -> list[zenoh.Sample]:
-        """Without what came over the session before; once that has come again, nothing is looked for."""
+        """The samples without those of the previous session; the comparison ends once all of these were repeated."""
         echo = self._echo or Counter()
         fresh = []
         for sample in samples:
@@ -156,7 +157,7 @@ class Inlet:
         return fresh
 
     def _is_old(self, sample: zenoh.Sample) -> bool:
-        """Whether a history gives again what came long ago."""
+        """Whether a history repeats an old sample."""
         newest = None if self._newest is None else self._newest.get(str(sample.key_expr))
         return newest is not None and sample.timestamp is not None and sample.timestamp <= newest
 

@@ -1,6 +1,6 @@
-"""How a stream is subscribed to and its samples are handed over, by the layout of its keys.
+"""How a stream is subscribed to and its samples are delivered, by the layout of its keys.
 
-A layout has a pump of its own, so that the work per sample of one costs the others nothing.
+Each layout has a separate pump, so that its work per sample costs the others nothing.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from wayside.api.stream import Layout, Stream
 from wayside.keys import KeyPattern
 
 Pump = Callable[[Iterable[Sequence[zenoh.Sample]]], None]
-"""Hands over all samples, burst by burst; raises what taking the next burst raises."""
+"""Delivers all samples, burst by burst; raises the errors of receiving a burst."""
 
 
 def expression(stream: Stream) -> zenoh.KeyExpr:
-    """What to subscribe to. Raises KeyPatternError."""
+    """The key expression to subscribe to. Raises KeyPatternError."""
     topics = KeyPattern.parse(stream.key).expression
     match stream.layout:
         case Layout.PLAIN:
@@ -31,7 +31,7 @@ def expression(stream: Stream) -> zenoh.KeyExpr:
 
 
 def pump_for(stream: Stream, put: Put, tally: Tally) -> Pump:
-    """What takes the stream's samples; what goes wrong on the way goes into the tally."""
+    """The function that delivers the stream's samples; problems on the way are counted in the tally."""
     match stream.layout:
         case Layout.PLAIN:
             return partial(plain.pump, put=put)

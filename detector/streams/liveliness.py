@@ -1,8 +1,8 @@
 """Follows the clients' liveliness tokens, and passes their changes as arrivals to the intake.
 
-When our connection to a router ends, Zenoh reports all tokens behind it as gone, a moment before the connection
-itself. So a token that is gone is looked at again shortly after: only if no router left since the token was declared,
-or that is long ago, is it the client that is gone.
+When our connection to a router ends, Zenoh reports all tokens behind it as gone, a moment before the connection itself.
+Therefore a token that is gone is checked again shortly after. Only if no router left since the token was declared, or
+that was long ago, the client itself is gone.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _SETTLE = 0.2
 """Seconds until a reported loss of a token takes effect."""
 
 _DOUBT = 10.0
-"""Seconds after a router left in which losses of tokens declared before are ignored."""
+"""Seconds after a router left in which losses of tokens declared earlier are ignored."""
 
 _CHANNEL = 16_384
 
@@ -40,7 +40,7 @@ def subscribe_tokens(session: zenoh.Session, key: str) -> Tokens:
 
 
 class TokenWatch:
-    """Reports tokens while a session is open; at the end of the last one, that their state is unknown."""
+    """Reports tokens while a session is open; at the end of the last session it reports their state as unknown."""
 
     def __init__(
         self,
@@ -53,7 +53,7 @@ class TokenWatch:
         self._connections = connections
         self._stop = threading.Event()
         self._held: dict[str, int] = {}
-        """The existing tokens, and the number of routers that had left when they were declared."""
+        """The existing tokens, each with the number of routers that had left when it was declared."""
         self._subscriber = subscriber
         self._following: tuple[Tokens, Connections] | None = None
         self._changed = threading.Condition()
@@ -62,12 +62,12 @@ class TokenWatch:
         self._thread.start()
 
     def expect(self) -> None:
-        """The session that is used now will be closed, and `follow` or `close` be called."""
+        """The current session will be closed, and `follow` or `close` will be called."""
         with self._changed:
             self._expecting = True
 
     def follow(self, subscriber: Tokens, connections: Connections) -> None:
-        """Go on with this one, of another session, once the present one is undeclared or its session closed."""
+        """Switch to this subscriber of another session, once the current one is undeclared or its session closed."""
         with self._changed:
             self._following = subscriber, connections
             self._changed.notify_all()
@@ -103,7 +103,7 @@ class TokenWatch:
             self._compare()
 
     def _compare(self) -> None:
-        """Another session reports all existing tokens: those that it does not report are gone."""
+        """Another session reports all existing tokens: tokens that it does not report are gone."""
         self._held = dict.fromkeys(self._held, self._connections.departures)
         tokens = self._subscriber.handler
         reports = [_report(each) for each in iter(tokens.try_recv, None)]
@@ -114,7 +114,7 @@ class TokenWatch:
             self._apply([*gone, *new], tokens)
 
     def _apply(self, reports: list[Report], tokens: zenoh.handlers.Handler[zenoh.Sample]) -> None:
-        """Apply a report and those that follow it at once, a token at a time."""
+        """Apply a report and the immediately following ones, one token at a time."""
         if reports[0][1] == zenoh.SampleKind.DELETE and not self._stop.wait(_SETTLE):
             reports.extend(_report(each) for each in iter(tokens.try_recv, None))
         newest = dict(reports)

@@ -1,4 +1,4 @@
-"""One session of the detector's, with all that it has declared on it."""
+"""One session of the detector, with everything declared on it."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from wayside.api.stream import Stream
 
 _CHANNEL = 16_384
 """Maximum number of samples of a stream that wait for its thread while the evaluation holds the interpreter's lock.
-Once they are full Zenoh's own queues fill, and then it is the sender's congestion control that decides whether it
-waits or drops."""
+Once it is full, Zenoh's own queues fill, and then the sender's congestion control decides whether it waits or drops."""
 
 _PATIENCE = 10.0
-"""Seconds for which a session is kept that is not wanted any more, but on which an answer is still waited for."""
+"""Seconds for which a session is kept that is no longer needed, but on which a response is awaited."""
 
 
 class Membership:
-    """Subscribed to all streams and to the clients' tokens. Samples wait in `subscriptions`, in the streams' order."""
+    """Subscribed to all streams and to the clients' tokens. Samples are queued in `subscriptions`, in the streams'
+    order."""
 
     def __init__(
         self, session: zenoh.Session, material: Material, streams: Sequence[Stream], tokens: str | None, tally: Tally
@@ -43,12 +43,12 @@ class Membership:
         self._unused = threading.Condition()
 
     def answer(self, answering: Callable[[zenoh.Session], Answering]) -> None:
-        """From now on queries are answered here."""
+        """Handle queries on this session from now on."""
         self._answering = answering(self.session)
 
     @contextmanager
     def used(self) -> Iterator[zenoh.Session]:
-        """The session, which stays open until this is left, unless it is closed for good."""
+        """The session, which stays open until the context ends, unless it is closed for good."""
         with self._unused:
             self._users += 1
         try:
@@ -65,7 +65,7 @@ class Membership:
         self.close()
 
     def close(self, timeout: float = 2.0) -> None:
-        """Leave at once; this frees the threads that wait to receive or to send."""
+        """Leave at once; this unblocks the threads that wait to receive or to send."""
         self.connections.close()
         self.session.close()  # type: ignore[no-untyped-call]
         if self._answering is not None:

@@ -1,4 +1,4 @@
-"""The plain key layout: the key is the topic, and the sample holds nothing beside its payload that counts."""
+"""The plain key layout: the key is the topic, and only the payload of a sample matters."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _PAYLOAD = itemgetter(1)
 
 
 def pump(bursts: Iterable[Sequence[zenoh.Sample]], put: Put) -> None:
-    """Hands over every message, burst by burst; raises what taking the next burst raises."""
+    """Delivers every message, burst by burst; raises the errors of receiving a burst."""
     put_kind = zenoh.SampleKind.PUT
     for burst in bursts:
         messages = [(str(sample.key_expr), sample.payload.to_bytes()) for sample in burst]

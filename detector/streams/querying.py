@@ -1,4 +1,4 @@
-"""Queries running detectors over Zenoh; the other side of `answering`."""
+"""Queries running detectors over Zenoh; the counterpart of `answering`."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ _PATIENCE = 0.2
 
 
 class NoAnswerError(InputError, ValueError):
-    """There was no answer, or it was a refusal; the message gives the reason."""
+    """There was no response, or it was a refusal; the message gives the reason."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """One detector's answer, as JSON."""
+    """One detector's response, as JSON."""
 
     key: str
     payload: bytes
 
     @property
     def holder(self) -> str:
-        """Who answers."""
+        """The detector that responded."""
         return self.key.split("/")[2]
 
 
@@ -43,14 +43,14 @@ def query_detectors(
     payload: bytes | None = None,
     complete: Callable[[Sequence[Reply]], bool] = bool,
 ) -> list[Reply]:
-    """The answers of all detectors of that name (`*`: of any), within `timeout` seconds.
+    """The responses of all detectors with that name (`*`: with any), within `timeout` seconds.
 
-    Until the answers are `complete`, by default until there is one, the query is repeated. At the timeout, those of the
-    last query are returned.
+    The query is repeated until the responses are `complete`, by default until there is one. At the timeout, those of
+    the last query are returned.
 
     Raises:
         NetworkError: no session.
-        NoAnswerError: there was no answer, or every answer was a refusal.
+        NoAnswerError: there was no response, or every response was a refusal.
     """
     selector = status_key(holder, what) + "".join(
         f"{'?' if number == 0 else ';'}{name}={value}" for number, (name, value) in enumerate(given.items())

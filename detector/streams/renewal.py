@@ -1,10 +1,10 @@
 """Renews certificates and passwords when their files change: a second session replaces the first.
 
-The credentials of a running session cannot be changed, and a router closes the connection when the certificate
-expires. So the new material is tried with a session of its own, beside the first; `inlets` describes how no sample is
-lost between them. If the new session cannot be opened, or receives nothing, the first one is kept, and
-that is logged. A detector that others connect to cannot listen twice: its session is closed and reopened, with the
-old material if the new one fails, and samples sent in between are lost.
+The credentials of a running session cannot be changed, and a router closes the connection when the certificate expires.
+So the new material is tested with a separate session, beside the first; `inlets` describes how no sample is lost
+between them. If the new session cannot be opened, or receives nothing, the first one is kept, and that is logged. A
+listening detector cannot listen twice: its session is closed and reopened, with the old material if the new one fails,
+and samples sent in between are lost.
 """
 
 from __future__ import annotations
@@ -30,12 +30,13 @@ LOOK_EVERY = 10.0
 """Seconds between two checks of the files; a kubelet takes about a minute to change them."""
 
 _AT_LEAST, _AT_MOST = 1.0, 10.0
-"""Seconds for which both sessions are subscribed: time for the subscription to be known, and for both to be level."""
+"""Minimum and maximum seconds for which both sessions are subscribed, so that the new subscription is known and both
+have delivered the same samples."""
 
 _LOOK_AT_BOTH = 0.01
 
 _AGAIN = 60.0
-"""Seconds after which material that failed is tried once more: the other side may have been at fault."""
+"""Seconds after which material that failed is tried again: the other side may have been the cause."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,14 +44,14 @@ class CertificateState:
     """The state of the material in use."""
 
     expires: float | None = None
-    """When the first certificate of the own chain expires, seconds since the epoch; None: there is none."""
+    """When the first certificate of the own chain expires, seconds since the epoch; None: it has none."""
     renewals: int = 0
     problem: str = ""
-    """Why the present content of the files is not used."""
+    """Why the current content of the files is not used."""
 
 
 class Renewal:
-    """Watches the files of one network until it is stopped, on a thread of its own."""
+    """Watches the files of one network until it is stopped, on a separate thread."""
 
     def __init__(
         self,
@@ -82,7 +83,7 @@ class Renewal:
         self._thread = threading.Thread(target=self._run, name="certificates", daemon=True)
 
     def start(self) -> None:
-        """Start watching the files, if there are any that can change."""
+        """Start to watch the files, if there are any that can change."""
         config = self._config
         if any((config.tls, config.tls_secret_name, config.credentials, config.credentials_secret_name)):
             self._thread.start()
@@ -100,7 +101,7 @@ class Renewal:
         try:
             while not self._stop.wait(self._look_every):
                 self._look()
-        except Exception as error:  # noqa: BLE001  this thread's edge: certificates would expire unnoticed
+        except Exception as error:  # noqa: BLE001  otherwise certificates would expire unnoticed
             if not self._stop.is_set():
                 log.critical("watching certificates failed; they are no longer renewed: %s", error)
                 self._on_failure(error)
@@ -145,7 +146,7 @@ class Renewal:
     def _take_over(self, material: Material) -> None:
         first = self._member
         session = open_session(self._config, material)
-        for inlet in self._inlets:  # before the second subscription: whatever comes twice is noted
+        for inlet in self._inlets:  # before the second subscription: every sample that comes twice is noted
             inlet.note()
         second = self._join(session, material)
         try:
@@ -171,7 +172,8 @@ class Renewal:
         first.retire()
 
     def _run_both(self, first: Membership, second: Membership) -> None:
-        """Run both until they are level. Raises NetworkError if the second one receives nothing."""
+        """Run both until they have delivered the same samples. Raises NetworkError if the second one receives
+        nothing."""
         if first.connections.any and not second.await_connection(self._stop, _AT_MOST):
             raise NetworkError(f"zenoh: cannot connect with the new ones to {[*self._config.connect]}")
         begin = time.monotonic()

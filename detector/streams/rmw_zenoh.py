@@ -1,12 +1,12 @@
-"""ROS 2 over Zenoh as rmw_zenoh lays it out (its docs/design.md): the key gives the type, an attachment the sequence
-number.
+"""ROS 2 over Zenoh in the layout of rmw_zenoh (its docs/design.md): the key contains the type, an attachment the
+sequence number.
 
-A key reads `<domain>/<topic>/<type>/<type hash>`, the type as DDS writes it:
-`0/car1/odom/nav_msgs::msg::dds_::Odometry_/RIHS01_…`. What goes on from here is the topic alone: so the same Detector
-reads a recording of topics, and the intake records what its replay needs.
+A key has the form `<domain>/<topic>/<type>/<type hash>`, with the type in DDS notation:
+`0/car1/odom/nav_msgs::msg::dds_::Odometry_/RIHS01_…`. Only the topic is passed on, so the same Detector reads a
+recording of topics, and the intake records what its replay needs.
 
-The attachment holds sequence number and source timestamp (8 bytes each, little endian), then the publisher's id (its
-length in one byte, then 16 bytes); earlier versions wrote the field's name before each, with its length. The source
+The attachment has the sequence number and source timestamp (8 bytes each, little endian), then the publisher's id (its
+length in one byte, then 16 bytes); earlier versions wrote the field's name with its length before each. The source
 timestamp is not used: a recording of topics does not have it, and would give other events.
 """
 
@@ -21,7 +21,7 @@ from detector.streams.sequences import Sequences
 from detector.streams.tally import Cause, Tally
 
 _TOPICS = 200_000
-"""Maximum number of cached keys of a stream; beyond, they are parsed again."""
+"""Maximum number of cached keys of a stream; beyond it, they are parsed again."""
 
 _GID = 16
 _NAMED = b"\x0fsequence_number"
@@ -29,11 +29,11 @@ _NAMED_GID = b"\x0asource_gid\x10"
 
 
 class MisfitError(ValueError):
-    """A key that does not belong to the stream; the message gives the reason."""
+    """A key does not belong to the stream; the message gives the reason."""
 
 
 def topics_expression(topics: str, domain: int | None) -> str:
-    """The key expression for topics, given as one; `domain` None: of every domain."""
+    """The key expression for topics, given as a key expression; `domain` None: of every domain."""
     return f"{'*' if domain is None else domain}/{topics}/*/*"
 
 
@@ -53,7 +53,7 @@ def split(key: str) -> tuple[str, str]:
 
 
 def numbered(attachment: bytes) -> tuple[bytes, int] | None:
-    """The publisher and the number of its sample; None where the attachment is of neither form."""
+    """The publisher and the number of its sample; None if the attachment has neither form."""
     if len(attachment) == 17 + _GID and attachment[16] == _GID:
         return attachment[17:], int.from_bytes(attachment[:8], "little", signed=True)
     if attachment.startswith(_NAMED) and attachment[-_GID - len(_NAMED_GID) : -_GID] == _NAMED_GID:
@@ -63,10 +63,10 @@ def numbered(attachment: bytes) -> tuple[bytes, int] | None:
 
 
 class RmwReader:
-    """Reads keys and attachments of one stream; for the one thread that receives it."""
+    """Reads keys and attachments of one stream; only for the thread that receives it."""
 
     def __init__(self, stream: str, type_name: str | None, tally: Tally) -> None:
-        """`type_name`: the type that the keys must give, None for any."""
+        """`type_name`: the type that the keys must have, None for any."""
         self._stream = stream
         self._type = type_name
         self._tally = tally
@@ -74,7 +74,7 @@ class RmwReader:
         self._topics: dict[str, str] = {}
 
     def topic(self, key: str) -> str | None:
-        """The topic of a key; None, and counted, for one of another type or layout."""
+        """The topic of a key; None, and counted, for a key of another type or layout."""
         topic = self._topics.get(key)
         if topic is None:
             try:
@@ -92,7 +92,7 @@ class RmwReader:
         return topic
 
     def follow(self, topic: str, attachment: bytes | None) -> None:
-        """A sample came on the topic with this attachment."""
+        """Track the attachment of a sample on the topic."""
         given = None if attachment is None else numbered(attachment)
         if given is None:
             self._tally.add(Cause.UNNUMBERED, self._stream, last=topic)
@@ -101,7 +101,7 @@ class RmwReader:
 
 
 def pump(bursts: Iterable[Sequence[zenoh.Sample]], put: Put, reader: RmwReader) -> None:
-    """Hands over every message by its topic, as `plain.pump` does by its key."""
+    """Delivers every message by its topic, as `plain.pump` does by its key."""
     put_kind = zenoh.SampleKind.PUT
     for burst in bursts:
         messages = []

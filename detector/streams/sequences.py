@@ -1,7 +1,7 @@
-"""Losses before the detector, seen by the numbers that publishers give their samples.
+"""Losses before the detector, detected by the publishers' sequence numbers.
 
 A publisher counts its samples one by one. The first sample gives the current number; a later step of more than one
-gives the number of losses. A lower number is a late sample; one far off means that counting restarted.
+gives the number of losses. A lower number is a late sample; a number far off means that the publisher restarted.
 """
 
 from __future__ import annotations
@@ -9,17 +9,17 @@ from __future__ import annotations
 from detector.streams.tally import Cause, Tally
 
 MAXIMUM_PUBLISHERS = 10_000
-"""Maximum number of tracked publishers of a stream; beyond, the oldest one is forgotten."""
+"""Maximum number of tracked publishers of a stream; beyond it, the oldest one is forgotten."""
 
 _RESTARTED = 2**32
-"""A step this far is no loss, but a restart: no publisher sends that many unnoticed."""
+"""A step of this size is no loss, but a restart: no publisher sends that many samples unnoticed."""
 
 _BACK = 1000
 """A number this far back is no late sample."""
 
 
 class Sequences:
-    """Follows the numbers of a stream's publishers; for the one thread that receives the stream."""
+    """Tracks the sequence numbers of a stream's publishers; only for the thread that receives the stream."""
 
     __slots__ = ("_last", "_stream", "_tally")
 
@@ -29,7 +29,7 @@ class Sequences:
         self._last: dict[bytes, int] = {}
 
     def follow(self, publisher: bytes, number: int, topic: str) -> None:
-        """A sample with this number came from the publisher."""
+        """A sample with this number arrived from the publisher."""
         last = self._last.get(publisher)
         if last is not None and number == last + 1:
             self._last[publisher] = number

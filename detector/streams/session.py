@@ -1,4 +1,4 @@
-"""Zenoh sessions as a Detector configures them: how one is opened, and when its connections come and go."""
+"""Zenoh sessions of a Detector: how one is opened, and when its connections open and close."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ _FIELD = "spec.zenoh"
 
 
 class NetworkError(InputError, ValueError):
-    """The Zenoh session cannot be opened as configured; the message names the field and the reason."""
+    """The Zenoh session cannot be opened with this configuration; the message names the field and the reason."""
 
 
 def material_of(config: Zenoh) -> Material:
-    """The present certificates and credentials. Raises NetworkError."""
+    """The current certificates and credentials. Raises NetworkError."""
     try:
         return read_material(config, _FIELD)
     except AccessError as error:
@@ -66,7 +66,7 @@ def await_session(config: Zenoh, stop: threading.Event) -> tuple[zenoh.Session, 
 
 
 class Connections:
-    """The connections of a session: logs when the last one is lost, and when one is back."""
+    """The connections of a session: logs when the last one is lost, and when one is restored."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self._lock = threading.Lock()
@@ -74,7 +74,7 @@ class Connections:
         self._alone = False
         self._router_left: float | None = None
         self.departures = 0
-        """How often the connection to a router ended."""
+        """How often a connection to a router ended."""
         self._closing = False
         self._listener = session.info.declare_transport_events_listener(self._take, history=True)
 
@@ -84,16 +84,16 @@ class Connections:
         return bool(self._others)
 
     def router_left_within(self, seconds: float) -> bool:
-        """Whether the connection to a router ended in the last seconds."""
+        """Whether a connection to a router ended in the last seconds."""
         left = self._router_left
         return left is not None and time.monotonic() - left <= seconds
 
     def close(self) -> None:
-        """From now on, connections end because we end them: nothing is logged."""
+        """We end the connections from now on: nothing is logged."""
         self._closing = True
 
     def _take(self, event: zenoh.TransportEvent) -> None:
-        """Zenoh's thread calls it for every connection that opens or closes."""
+        """Called by Zenoh's thread for every connection that opens or closes."""
         other = str(event.transport.zid)
         role = str(event.transport.whatami)
         with self._lock:
@@ -117,7 +117,7 @@ def _settings(config: Zenoh, material: Material) -> zenoh.Config:
     values: dict[str, object] = {
         "mode": config.mode.value,
         "connect/endpoints": [*config.connect],
-        # A peer goes on trying in the background. A client's open() would not return: `await_session` tries for it.
+        # A peer keeps trying in the background. A client's open() would not return: `await_session` tries for it.
         "connect/timeout_ms": 0 if waits else -1,
         "connect/exit_on_failure": waits,
         "connect/retry": {"period_init_ms": 200, "period_max_ms": 2000, "period_increase_factor": 2},
@@ -138,7 +138,7 @@ def _settings(config: Zenoh, material: Material) -> zenoh.Config:
 
 
 def _tls(material: Material) -> dict[str, object]:
-    """As contents and not as files: those may change while Zenoh reads them, one after the other."""
+    """Contents instead of files: the files may change one after the other while Zenoh reads them."""
     if not material.tls:
         return {}
     at = "transport/link/tls/"

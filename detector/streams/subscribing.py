@@ -1,6 +1,6 @@
-"""How a stream is subscribed to: plainly, or as an Advanced Subscriber that requests missed samples from publishers.
+"""How a stream is subscribed to: plainly, or by an Advanced Subscriber that requests missed samples from publishers.
 
-A plain subscriber is the faster one, so streams without history and recovery get it.
+A plain subscriber is faster, so streams without history and recovery use it.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from wayside.api.stream import Layout, Stream
 
 
 class Subscription(Protocol):
-    """A subscriber of either kind; withdrawn when nothing refers to it any more."""
+    """A subscriber of either kind; undeclared when nothing refers to it any more."""
 
     @property
     def handler(self) -> zenoh.handlers.Handler[zenoh.Sample]:
-        """The channel in which samples wait."""
+        """The channel in which samples are queued."""
 
     def undeclare(self) -> None:
-        """Withdraws it; what waits in the channel can still be taken."""
+        """Undeclare it; samples in the channel can still be taken."""
 
 
 class _Watched:
-    """An Advanced Subscriber and what listens to its misses, which live as long as each other."""
+    """An Advanced Subscriber and its listener for misses, which have the same lifetime."""
 
     def __init__(
         self, subscriber: ext.AdvancedSubscriber[zenoh.handlers.Handler[zenoh.Sample]], missed: Callable[[int], None]
@@ -45,7 +45,7 @@ class _Watched:
 
 
 def subscribe(session: zenoh.Session, stream: Stream, capacity: int, tally: Tally) -> Subscription:
-    """Subscribes to the stream's key; at most `capacity` samples wait. Raises KeyPatternError, zenoh.ZError."""
+    """Subscribes to the stream's key; at most `capacity` samples are queued. Raises KeyPatternError, zenoh.ZError."""
     channel: zenoh.handlers.FifoChannel[zenoh.Sample] = zenoh.handlers.FifoChannel(capacity)
     if stream.history is None and not stream.recover:
         return session.declare_subscriber(expression(stream), channel)
@@ -65,7 +65,7 @@ def subscribe(session: zenoh.Session, stream: Stream, capacity: int, tally: Tall
     )
 
     def missed(count: int) -> None:
-        if stream.layout is Layout.PLAIN:  # rmw_zenoh numbers its samples itself: these would be counted twice
+        if stream.layout is Layout.PLAIN:  # rmw_zenoh numbers its samples itself: losses are counted once
             tally.add(Cause.MISSED, stream.name, count)
 
     return _Watched(subscriber, missed)

@@ -1,4 +1,4 @@
-"""What goes wrong before the intake, counted by cause and by stream or source. It outlives sessions and sources."""
+"""Problems before the intake, counted by cause and by stream or source. The counts survive sessions and sources."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from enum import StrEnum
 
 
 class Cause(StrEnum):
-    """Why something did not reach the intake. The texts are those of the log."""
+    """Why something did not reach the intake. The texts are used in the log."""
 
     MISSED = "samples of stream {} lost before the detector, by the sequence numbers of their publishers"
     OVERTAKEN = "samples of stream {} arrived after later ones, and were counted as lost"
@@ -28,28 +28,28 @@ class TallyEntry:
     """The stream, or the source."""
     count: int
     last: str
-    """The reason of the last one, where there is one."""
+    """The reason of the last one, if known."""
 
     @property
     def text(self) -> str:
-        """What happened, in words."""
+        """The cause in words."""
         return self.cause.value.format(self.name)
 
 
 class Tally:
-    """Counts, thread-safe. There is an entry for each cause and each stream or source: their number is bounded."""
+    """Counters, thread-safe. There is an entry for each cause and each stream or source, so their number is bounded."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._counts: dict[tuple[Cause, str], tuple[int, str]] = {}
 
     def add(self, cause: Cause, name: str, count: int = 1, last: str = "") -> None:
-        """It happened `count` times more to the stream or source of that name."""
+        """Count it `count` times for the stream or source of that name."""
         with self._lock:
             before, _ = self._counts.get((cause, name), (0, ""))
             self._counts[cause, name] = before + count, last
 
     def entries(self) -> list[TallyEntry]:
-        """All that happened so far, in order of cause and name."""
+        """All entries, in order of cause and name."""
         with self._lock:
             return [TallyEntry(*key, *value) for key, value in sorted(self._counts.items())]

@@ -1,9 +1,9 @@
-"""The detector's place in the Zenoh network: samples come in, events go out.
+"""The detector's connection to the Zenoh network: samples in, events out.
 
-Each stream has a thread that does nothing but hand key and bytes of its samples to the intake, so that the vehicle is
-never slowed. It takes them from a channel and not by a callback: a burst is taken in one go, where callbacks would pass
-the interpreter's lock on for every message (`benchmarks/intake_rate.py`). Events wait in a bounded queue for a thread
-of their own, so that the network never slows the evaluation.
+Each stream has a thread that only passes key and bytes of its samples to the intake, so that the vehicle is never
+slowed. It takes them from a channel and not by a callback: a burst is taken at once, while callbacks would pass on the
+interpreter's lock for every message (`benchmarks/intake_rate.py`). Events wait in a bounded queue with a separate
+thread, so that the network never slows the evaluation.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ EVENT_ENCODING = "application/cloudevents+json"
 
 
 class Network:
-    """Subscribed to all streams, and the way out for events: one session, or another after it with new certificates."""
+    """Subscriptions to all streams, and the publisher of events: over one session, replaced by another for new
+    certificates."""
 
     def __init__(
         self,
@@ -51,9 +52,9 @@ class Network:
         tally: Tally | None = None,
         look_every: float = LOOK_EVERY,
     ) -> None:
-        """`putter` gives what takes a stream's messages; at most `capacity` events wait to be published.
+        """`putter` returns the function that receives a stream's messages; at most `capacity` events are queued.
 
-        `answering` answers queries once there is a session. What was lost before the detector goes into the `tally`.
+        `answering` handles queries once there is a session. Losses before the detector are counted in the `tally`.
         `on_failure` is called if a thread dies of an error. Certificates are checked every `look_every` seconds.
         """
         self._on_failure = on_failure
@@ -85,7 +86,7 @@ class Network:
         self._thread.start()
 
     def publish(self, key: str, payload: bytes, encoding: str = EVENT_ENCODING) -> None:
-        """Enqueues an event or a message of an action; never waits. With the queue full it is dropped and counted."""
+        """Enqueues an event or a message of an action; never waits. If the queue is full, it is dropped and counted."""
         with self._changed:
             if len(self._events) >= self._capacity or self._stop.is_set():
                 self.dropped_events += 1
@@ -96,9 +97,9 @@ class Network:
     def query(
         self, selector: str, payload: bytes | None, timeout: float, attachment: bytes | None = None
     ) -> list[bytes]:
-        """Sends a query to everyone who answers it, and waits at most `timeout` seconds for the answers.
+        """Sends a query to all that can answer it, and waits at most `timeout` seconds for the answers.
 
-        Raises NetworkError if there is no session, no answer in time, or an error as answer.
+        Raises NetworkError if there is no session, no answer in time, or an error as the answer.
         """
         member = self._member
         if member is None:
@@ -129,13 +130,13 @@ class Network:
 
     @property
     def connected(self) -> bool:
-        """Whether a router, a peer or a client is connected right now."""
+        """Whether a router, a peer or a client is currently connected."""
         member = self._member
         return member is not None and member.connections.any
 
     @property
     def listens(self) -> bool:
-        """Whether others may come by themselves, and it need not connect itself."""
+        """Whether others can connect to it, so that it need not connect itself."""
         return self._config.mode is not ZenohMode.CLIENT
 
     @property
@@ -146,7 +147,7 @@ class Network:
 
     @property
     def dead(self) -> str | None:
-        """What has ended that never should, so that nothing comes in any more; None where all is alive.
+        """The part that has ended unexpectedly, so that no samples arrive any more; None if all parts are alive.
 
         A router that is unavailable does not count: the session reconnects.
         """
@@ -158,7 +159,7 @@ class Network:
         return f"the thread of {ended[0]} has ended" if ended else None
 
     def close(self, timeout: float = 2.0) -> None:
-        """Publishes what still waits, for at most `timeout` seconds, and leaves the network."""
+        """Publishes the queued events, for at most `timeout` seconds, and leaves the network."""
         if self._renewal is not None:
             self._renewal.stop()
         with self._changed:
@@ -172,7 +173,7 @@ class Network:
             inlet.close()
         if (member := self._member) is not None:
             self._member = None
-            member.close(timeout)  # frees the threads: of a put that waits, and of receiving
+            member.close(timeout)  # unblocks the threads that wait to put or to receive
         for receiver in self._receivers:
             receiver.join(timeout)
         if self._tokens is not None:
@@ -209,16 +210,16 @@ class Network:
         self._renewal.start()
 
     def _use(self, member: Membership) -> None:
-        """Events go out here from now on, and queries are answered."""
+        """Publish events and handle queries here from now on."""
         self._member = member
         if self._make_answering is not None:
             member.answer(self._make_answering)
 
     def _receive(self, inlet: Inlet, pump: Pump) -> None:
-        """Hands over what comes on a stream, until the session is closed."""
+        """Delivers the samples of a stream, until the session is closed."""
         try:
             pump(inlet.bursts())
-        except Exception as error:  # noqa: BLE001  this thread's edge: without it, the stream would be silent for ever
+        except Exception as error:  # noqa: BLE001  otherwise the stream would stay silent
             if not self._stop.is_set():
                 log.critical("the thread of a stream ended; receiving from it has stopped: %s", error)
                 self._on_failure(error)
@@ -226,7 +227,7 @@ class Network:
     def _run(self) -> None:
         try:
             self._serve()
-        except Exception as error:  # noqa: BLE001  this thread's edge: without it, events would wait for ever
+        except Exception as error:  # noqa: BLE001  otherwise events would stay queued
             log.critical("the network thread ended; publishing events has stopped: %s", error)
             self._on_failure(error)
 
@@ -240,14 +241,14 @@ class Network:
             self._send(*event)
 
     def _next(self) -> tuple[str, bytes, str] | None:
-        """The next event; None once closing and nothing waits."""
+        """The next event; None when closing and the queue is empty."""
         with self._changed:
             self._changed.wait_for(lambda: self._events or self._stop.is_set())
             return self._events.popleft() if self._events else None
 
     def _send(self, key: str, payload: bytes, encoding: str) -> None:
         member = self._member
-        while member is not None:  # None: closed meanwhile, the time for what still waited being over
+        while member is not None:  # None: closed in the meantime, after the time for queued events
             try:
                 # BLOCK: events are few and should survive a short congestion; only this thread waits for it.
                 with member.used() as session:
@@ -267,7 +268,7 @@ class Network:
         self.dropped_events += 1
 
     def _successor(self, member: Membership) -> Membership | None:
-        """What has taken its place, or will in a moment; itself where nothing has, None once all is closed."""
+        """The membership that replaces it, now or in a moment; itself if there is none, None once all is closed."""
         renewal = self._renewal
         while renewal is not None and renewal.reopening.is_set() and self._member is member:
             if self._stop.wait(0.01):

@@ -2,7 +2,7 @@
 
 Three parts that know nothing of each other: fifteen vehicles (drive.py), a detector (`detector run`), and here the
 core of the application manager, which looks at the tasks that the detector leaves in a folder. The vehicles' data and
-the events go over Zenoh. What is told is also compared with what the vehicles' positions alone say.
+the events go over Zenoh. The published events are also compared with those computed from the vehicles' positions.
 """
 
 from __future__ import annotations
@@ -219,7 +219,7 @@ def _verdict(console: Console, output: Path, expected: list[str], running: list[
     lines = (output / "events.jsonl").read_text(encoding="utf-8").splitlines()
     found = sorted(event["subject"] for event in map(json.loads, lines) if event["type"].endswith("started"))
     console.print(
-        f"[bold]{len(found)} episodes; the vehicles' positions alone say {len(expected)}."
+        f"[bold]{len(found)} episodes; the vehicles' positions alone give {len(expected)}."
         f" {len(running) or 'No'} application{'s' if len(running) > 1 else ''} would still run.[/]"
     )
     console.print(f"See {output}/events.jsonl, {output}/tasks.yaml, {output}/manifests.yaml (and detector.log).")

@@ -1,6 +1,6 @@
 """The whole chain live: vehicles on real Zenoh, both programs as processes, a real API server.
 
-What exists over time is compared with what the simulated positions alone say should exist
+What exists over time is compared with what the simulated positions alone give should exist
 (`cooperative_recording.expected`, which shares no code with either program).
 """
 

@@ -1,8 +1,8 @@
-"""A list of objects that is kept current: list, watch from there, and list again whenever in doubt.
+"""A list of objects that is kept current: list, watch from there, and list again when in doubt.
 
-A watch may lose its connection, or the server the history that it needs (410); and no watch proves that nothing was
-missed. So each watch lasts one resync period only, and whatever ends it, a fresh list follows. What the world looked
-like in the meantime does not matter: the list is the current state.
+A watch may lose its connection, or the server may lose the history that it needs (410), and no watch proves that
+nothing was missed. So each watch lasts one resync period only, and a new list follows however it ends. Intermediate
+states do not matter: the list is the current state.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Changed:
 
 @dataclass(frozen=True)
 class Deleted:
-    """An object is gone; its last state."""
+    """An object was deleted; has its last state."""
 
     object: Object
 
@@ -56,7 +56,7 @@ def version_of(obj: Object) -> int:
 
 
 class Reflector:
-    """Follows the objects of one kind in one namespace, for as long as one iterates."""
+    """Follows the objects of one kind in one namespace, as long as the caller iterates."""
 
     def __init__(
         self,
@@ -86,9 +86,9 @@ class Reflector:
         self._resync = resync
         self._backoff = Backoff(0.1, 5.0)
         self.lists = 0
-        """Lists so far."""
+        """Number of lists so far."""
         self.outages = 0
-        """How often the server stopped answering or refused."""
+        """How often the server stopped responding or refused."""
 
     async def follow(self) -> AsyncGenerator[Change, None]:
         """The list, then its changes. Never ends and raises nothing; errors are logged, counted and retried."""

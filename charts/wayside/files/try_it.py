@@ -1,7 +1,7 @@
-"""`helm test`: the manager is ready, and what the API server asks it, it answers with a certificate that is trusted.
+"""`helm test`: the manager is ready, and its webhook responds to the API server with a trusted certificate.
 
-Arguments: where /readyz is served, and the file of its authority, empty without TLS; with the webhook also where that
-is, the file of its authority, and a namespace that the manager looks after.
+Arguments: the URL of /readyz, and the file of its authority, empty without TLS; with the webhook also its URL,
+the file of its authority, and a namespace that the manager manages.
 """
 
 import json
@@ -10,7 +10,7 @@ import sys
 import time
 import urllib.request
 
-PATIENCE = 60.0  # s; just after an install the Services lead nowhere yet
+PATIENCE = 60.0  # s; just after an install the Services have no endpoints yet
 WRONG = {
     "apiVersion": "wayside.dev/v1alpha1",
     "kind": "ApplicationTemplate",
@@ -20,14 +20,14 @@ WRONG = {
 
 
 def ready(base, authority):
-    """Say that the manager is ready; OSError where it is not."""
+    """Report that the manager is ready. Raises OSError if it is not."""
     context = ssl.create_default_context(cafile=authority) if authority else None
     with urllib.request.urlopen(f"{base}/readyz", timeout=5, context=context) as answer:
         print("the manager is ready:", answer.read().decode().strip())
 
 
 def refuses(base, authority, namespace):
-    """Say that the webhook refuses what is wrong; OSError where it does not, or has a certificate of somebody else."""
+    """Report that the webhook rejects an invalid template; OSError if not, or if its certificate is invalid."""
     group = {"group": "wayside.dev", "version": "v1alpha1"}
     request = {
         "uid": "test",
@@ -41,8 +41,8 @@ def refuses(base, authority, namespace):
         "dryRun": True,
     }
     review = json.dumps({"apiVersion": "admission.k8s.io/v1", "kind": "AdmissionReview", "request": request})
-    asked = urllib.request.Request(f"{base}/admission", review.encode(), {"Content-Type": "application/json"})
-    with urllib.request.urlopen(asked, timeout=5, context=ssl.create_default_context(cafile=authority)) as answer:
+    query = urllib.request.Request(f"{base}/admission", review.encode(), {"Content-Type": "application/json"})
+    with urllib.request.urlopen(query, timeout=5, context=ssl.create_default_context(cafile=authority)) as answer:
         response = json.load(answer)["response"]
     if response["allowed"]:
         raise OSError("a template that is wrong is not refused")
@@ -50,7 +50,7 @@ def refuses(base, authority, namespace):
 
 
 def wait(check, *arguments):
-    """Try until it succeeds; exit with what is wrong where that takes too long."""
+    """Retry until it succeeds; exit with the error if that takes too long."""
     end = time.monotonic() + PATIENCE
     while True:
         try:

@@ -46,7 +46,7 @@ and the object. */}}
 {{- $namespace -}}
 {{- end -}}
 
-{{/* What the pods bear of the detector of this name, which the manager runs. */}}
+{{/* The labels of the pods of the detector of this name, which the manager runs. */}}
 {{- define "wayside.detectorSelector" -}}
 app.kubernetes.io/managed-by: application-manager
 wayside.dev/runs: {{ . }}

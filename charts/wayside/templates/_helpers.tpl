@@ -23,7 +23,7 @@ helm.sh/chart: {{ printf "%s-%s" .Chart.Name .Chart.Version | replace "+" "_" }}
 {{- end }}
 {{- end -}}
 
-{{/* Of pods: without the chart's version, with which each pod would be made anew. */}}
+{{/* Labels of pods: without the chart's version, because a new version would restart each pod. */}}
 {{- define "wayside.podLabels" -}}
 {{ include "wayside.selector" . }}
 app.kubernetes.io/part-of: wayside

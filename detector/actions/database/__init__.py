@@ -1,7 +1,7 @@
 """The database action: episodes become scenarios in MongoDB, with the samples of their windows as documents.
 
-From samples to documents it is pure (documents, values, attachments, png, pcd, scenario). Documents wait in one queue
-of the process (queue), on disk while the server is away (spool), and are sent in their order (store, server).
+The conversion from samples to documents is pure (documents, values, attachments, png, pcd, scenario). Documents wait in
+one queue of the process (queue), on disk while the server is away (spool), and are sent in order (store, server).
 """
 
 from detector.actions.database.action import Database

@@ -29,7 +29,7 @@ from wayside.api.database import DatabaseConnection as Place
 _log = logging.getLogger(__name__)
 
 FLUSH = 0.2
-"""Maximum seconds that a document waits for others, to be sent in one batch."""
+"""Maximum time in seconds that a document waits for others, to be sent in one batch."""
 
 
 @dataclass(slots=True)
@@ -58,10 +58,10 @@ class Database(Action[DatabaseAction]):
         self._reported_away = False
 
     def started(self, episode: Episode) -> None:
-        """Make the scenario known in the database, as one that is not complete."""
+        """Insert the scenario into the database, marked as incomplete."""
         self._connect()
         renew = self.parameters.renew_after
-        # What an earlier run wrote of the episode may be complete: with renewAfter this one gets a name of its own.
+        # The documents of an earlier run may be complete: with renewAfter this scenario gets a different name.
         part = f"resumed-{time.time_ns()}" if episode.resumed and renew else ""
         scenario, documents = self._open(episode, part, resumed=episode.resumed)
         if why := episode.unrendered.get("metadata"):
@@ -87,7 +87,7 @@ class Database(Action[DatabaseAction]):
         return scenario, Documents(name, f"{database}/{rule.name}/{name}", streams, around.decoders, above)
 
     def samples(self, episode: Episode, samples: Sequence[EpisodeSample]) -> None:
-        """Turn them into documents; those that are many enough are queued."""
+        """Convert them to documents; batches that are large enough are queued."""
         writing = self._writings[episode.id]
         while samples:
             now, samples = writing.parted(samples)
@@ -105,7 +105,7 @@ class Database(Action[DatabaseAction]):
             self._add(writing.scenario, made)
 
     def _renew(self, writing: Writing, begin: int) -> None:
-        """Complete the scenario; the episode goes on in another."""
+        """Complete the scenario; the episode continues in the next one."""
         self._finish(writing, Completion(), continues=True)
         writing.go_on(*self._open(writing.episode, str(begin), resumed=False))
         self._take(writing, list(writing.latest.values()))
@@ -129,7 +129,7 @@ class Database(Action[DatabaseAction]):
             self._flush(made.collection)
 
     def _with_files(self, scenario: Scenario, made: Made) -> bytes:
-        """The document, once the files that it refers to are written; it names those that could not be."""
+        """The document, after writing the files that it refers to; it names those that could not be written."""
         if self.parameters.dry_run or self._folder is None:
             scenario.files += len(made.files)
             return made.document
@@ -162,7 +162,7 @@ class Database(Action[DatabaseAction]):
         open_ones = {each.scenario.id: each.scenario for each in self._writings.values()}
         why = "the queue is full" if not self._store.away else "the queue is full while the database is unavailable"
         for name, count in batch.owners.items():
-            if name in open_ones:  # else it failed meanwhile
+            if name in open_ones:  # otherwise it failed in the meantime
                 self._lose(open_ones[name], count, why)
             else:
                 losing(count, why)
@@ -195,9 +195,7 @@ class Database(Action[DatabaseAction]):
             self._store.put_change(write, confirm if write.completes else None)
 
     def wake(self) -> float | None:
-        """Enqueue documents that have waited long enough. The first call also resumes what an earlier run left on
-        disk.
-        """
+        """Enqueue documents that have waited long enough. The first call also resumes what an earlier run left."""
         if not self._awake:
             self._awake = True
             try:
@@ -215,7 +213,7 @@ class Database(Action[DatabaseAction]):
         return None
 
     def _report_availability(self) -> None:
-        """Report for each open episode whether its documents have to wait."""
+        """Report for each open episode whether its documents are waiting for the server."""
         away = self._store.away if self._store is not None else ""
         if bool(away) != self._reported_away:
             self._reported_away = bool(away)
@@ -223,7 +221,7 @@ class Database(Action[DatabaseAction]):
                 self._report(writing.episode, OutcomeState.RUNNING, away and f"the database is unavailable: {away}")
 
     def close(self) -> None:
-        """Release the queue; the last action that does so waits a few seconds for it."""
+        """Release the queue; the last action that does so waits a few seconds for it to empty."""
         for collection in list(self._batches):
             self._flush(collection)
         if self._place is not None:
@@ -231,7 +229,7 @@ class Database(Action[DatabaseAction]):
             self._place = self._store = None
 
     def _connect(self) -> None:
-        """Use the database that the Detector has now. Raises ActionError."""
+        """Connect to the Detector's current database. Raises ActionError."""
         place = self.setting.surroundings().detector.spec.database
         if self.parameters.dry_run or place is None or place == self._place:
             return

@@ -1,4 +1,4 @@
-"""Large binary fields of a message leave it: images as PNG, point clouds as PCD, others as they are."""
+"""Moves large binary fields out of a message: images as PNG, point clouds as PCD, others unchanged."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Attachment:
     content: bytes
 
     def reference(self) -> dict[str, Any]:
-        """What stands in the document in place of the content."""
+        """The reference in the document in place of the content."""
         return {
             "file": self.path,
             "format": self.path.rpartition(".")[2].upper(),
@@ -36,7 +36,7 @@ class Attachment:
 def detach(message: Any, above: int, place: str) -> tuple[Any, list[Attachment]]:
     """The message with references in place of its binary fields of more than `above` bytes, and the files.
 
-    `place` is what the files' paths begin with.
+    `place` is the beginning of the files' paths.
     """
     files: list[Attachment] = []
 
@@ -63,14 +63,14 @@ def detach(message: Any, above: int, place: str) -> tuple[Any, list[Attachment]]
 
 
 def _form(around: Mapping[str, Any], name: str, content: bytes) -> tuple[bytes, str]:
-    """What the field's file holds, and its suffix."""
+    """The content of the field's file, and its suffix."""
     if name == "data":
         try:
             if around.keys() >= _IMAGE and (image := png(around)) is not None:
                 return image, "png"
             if around.keys() >= _CLOUD and (cloud := pcd(around)) is not None:
                 return cloud, "pcd"
-        except (TypeError, ValueError, KeyError):  # looks like one, and is none
+        except (TypeError, ValueError, KeyError):  # looks like one, but is not
             return content, "bin"
         encoding = str(around.get("format", "")).lower()
         for word, suffix in _COMPRESSED:

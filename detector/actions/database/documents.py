@@ -1,6 +1,6 @@
-"""From a sample of a scenario to its document: content, sender and time.
+"""Converts a sample of a scenario to its document: content, sender and time.
 
-A document's id is made of the scenario and the sample alone, so however often it is sent, it is there once.
+A document's id depends only on the scenario and the sample, so repeated inserts store it once.
 """
 
 from __future__ import annotations
@@ -21,25 +21,25 @@ from detector.engine.samples.sample import DecodeError, Decoder, NearDecoder
 from wayside.api.stream import Stream
 
 LARGEST = 16 * 2**20 - 2**14
-"""MongoDB takes documents of 16 MiB; a little is left for what servers add."""
+"""MongoDB accepts documents of 16 MiB; a small part is reserved for what servers add."""
 
 
 _RECENT = 256
-"""Number of times of a client's stream among which equal samples are distinguished."""
+"""Number of recent times of a client's stream among which equal samples are distinguished."""
 
 
 @dataclass(frozen=True, slots=True)
 class Made:
-    """What a sample became."""
+    """The result of converting a sample."""
 
     collection: str
     document: bytes
     """BSON."""
     files: tuple[Attachment, ...] = ()
     cut: str = ""
-    """Why the message itself is not in the document; empty where it is."""
+    """Why the message itself is not in the document; empty if it is."""
     undecoded: bool = False
-    """The payload is in the document as it came."""
+    """The document contains the payload as received."""
 
 
 def collection_of(stream: Stream) -> str:
@@ -53,14 +53,14 @@ class Documents:
 
     scenario: str
     place: str
-    """What the paths of its files begin with."""
+    """The beginning of its files' paths."""
     streams: Mapping[str, Stream]
     decoders: Mapping[str, Decoder]
     above: int | None
-    """Binary fields of more bytes go to files; None: they stay."""
+    """Binary fields of more bytes go to files; None: they stay in the document."""
     _near: dict[str, bool] = field(default_factory=dict)
     _recent: dict[tuple[str, str], dict[int, Counter[bytes]]] = field(default_factory=dict)
-    """Of each client's stream, what its samples of the last times were."""
+    """By client and stream, the number of equal samples at recent times."""
 
     def make(self, sample: EpisodeSample) -> Made:
         """The sample's document."""
@@ -131,9 +131,10 @@ class Documents:
         return f"{self.place}/{sample.stream}/{sample.client}/{sample.time}-{identity[8:14].hex()}"
 
     def _identity(self, sample: EpisodeSample) -> bytes:
-        """20 bytes: the time first, so that documents lie in the index as they come, then what distinguishes samples.
+        """20 bytes: first the time, so that documents are indexed in order of arrival, then a hash that distinguishes
+        samples.
 
-        With clock Data a client may send the same bytes twice with one stamp: the second one gets another number.
+        With clock Data a client may send the same bytes twice with the same stamp: the second one gets another number.
         """
         digest = hashlib.blake2b(sample.payload, digest_size=12)
         identity = (self.scenario, sample.client, sample.stream, sample.key, str(sample.received))

@@ -1,4 +1,4 @@
-"""What of an episode is being written: its scenario, or with `renewAfter` one scenario after the other."""
+"""The writing state of an episode: its scenario, or with `renewAfter` one scenario after the other."""
 
 from __future__ import annotations
 
@@ -13,31 +13,31 @@ from detector.actions.episode import Episode, EpisodeSample
 
 @dataclass(slots=True)
 class Writing:
-    """An episode's present scenario, and what became of those before."""
+    """An episode's current scenario, and the totals of the previous ones."""
 
     episode: Episode
     scenario: Scenario
     documents: Documents
     latched: frozenset[str]
-    """The streams of which each scenario gets the last samples."""
+    """The streams whose last samples each scenario receives."""
     renew_after: int | None
     """Nanoseconds."""
     seam: int | None = None
-    """From here on samples belong to the next scenario; None while this is unknown."""
+    """Samples from this time on belong to the next scenario; None while this is unknown."""
     latest: dict[tuple[str, str, str], EpisodeSample] = field(default_factory=dict)
     """The newest samples of latched streams."""
     trouble: str = ""
-    """Why a scenario before is not complete, the first time."""
+    """Why a previous scenario is incomplete; the first reason."""
     undecoded: int = 0
     scenarios: int = 1
     messages: Counter[str] = field(default_factory=Counter)
-    """Of the scenarios before, as are bytes, files and lost."""
+    """Of the previous scenarios, like bytes, files and lost."""
     bytes: int = 0
     files: int = 0
     lost: int = 0
 
     def parted(self, samples: Sequence[EpisodeSample]) -> tuple[Sequence[EpisodeSample], Sequence[EpisodeSample]]:
-        """What belongs to the present scenario, and what to those after it."""
+        """The samples of the current scenario, and those of later ones."""
         if self.renew_after is None:
             return samples, ()
         own = [sample.time for sample in samples if sample.stream not in self.latched]
@@ -52,7 +52,7 @@ class Writing:
         return now, rest
 
     def go_on(self, scenario: Scenario, documents: Documents) -> None:
-        """The present scenario has all its samples: this is the next."""
+        """The current scenario has all its samples: switch to the next one."""
         self.messages += self.scenario.messages
         self.bytes += self.scenario.bytes
         self.files += self.scenario.files

@@ -1,4 +1,4 @@
-"""The folder for files beside the database: a file appears there only when it is whole and on the disk."""
+"""The folder for files beside the database: a file appears there only when it is complete and on disk."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class FolderError(Exception):
 
 
 class AttachmentFolder:
-    """Where attachments go, up to a number of bytes."""
+    """Stores attachments, up to a number of bytes."""
 
     def __init__(self, path: Path, capacity: int | None) -> None:
         self.path = path
@@ -22,7 +22,7 @@ class AttachmentFolder:
         self._used = 0 if capacity is None else _size(path)
 
     def write(self, attachment: Attachment) -> None:
-        """Write it, or leave it where the same is there. Raises FolderError."""
+        """Write it, unless the same file exists. Raises FolderError."""
         target = self.path / attachment.path
         if self._capacity is not None and self._used + len(attachment.content) > self._capacity:
             raise FolderError(f"the folder for files is full ({self._capacity} bytes)")
@@ -47,6 +47,6 @@ def _size(path: Path) -> int:
         for name in names:
             try:
                 total += (Path(folder) / name).stat().st_size
-            except OSError:  # removed meanwhile
+            except OSError:  # removed in the meantime
                 continue
     return total

@@ -15,10 +15,10 @@ _TYPES = {1: ("I", 1), 2: ("U", 1), 3: ("I", 2), 4: ("U", 2), 5: ("I", 4), 6: ("
 
 
 def pcd(cloud: Mapping[str, Any]) -> bytes | None:
-    """A sensor_msgs/msg/PointCloud2 as PCD; None where its fields overlap or do not fit into its data.
+    """A sensor_msgs/msg/PointCloud2 as PCD; None if its fields overlap or do not fit into its data.
 
-    Bytes between the fields become fields of the name `_`, so that the points stay as they were sent. Fields of one
-    name with spaces in it are written with `_` in their place.
+    Bytes between the fields become fields named `_`, so that the points stay as they were sent. Spaces in the names of
+    fields are replaced by `_`.
     """
     width, height = int(cloud["width"]), int(cloud["height"])
     step, row, data = int(cloud["point_step"]), int(cloud["row_step"]), cloud["data"]

@@ -1,6 +1,6 @@
 """ROS images as PNG, without loss.
 
-Sources: sensor_msgs/image_encodings.hpp for what the encodings mean, RFC 2083 for PNG.
+Sources: sensor_msgs/image_encodings.hpp for the meaning of the encodings, RFC 2083 for PNG.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ _GRAY, _RGB, _RGBA = 0, 2, 6
 
 class _Pixel(NamedTuple):
     octets: int
-    """Of one channel."""
+    """Bytes per channel."""
     channels: tuple[int, ...]
-    """Which of the message's channels PNG's are."""
+    """The order of the message's channels in the PNG."""
     colour: int
     """PNG's colour type."""
 
@@ -39,7 +39,7 @@ _ENCODINGS = {
 
 
 def png(image: Mapping[str, Any]) -> bytes | None:
-    """A sensor_msgs/msg/Image as PNG; None where PNG has no such pixels (e.g. 32FC1), or the sizes do not fit."""
+    """A sensor_msgs/msg/Image as PNG; None if PNG has no such pixels (e.g. 32FC1), or if the sizes do not fit."""
     pixel = _ENCODINGS.get(image["encoding"])
     width, height, step = int(image["width"]), int(image["height"]), int(image["step"])
     data = image["data"]
@@ -52,7 +52,7 @@ def png(image: Mapping[str, Any]) -> bytes | None:
     rows = np.frombuffer(data, np.uint8, step * height).reshape(height, step)[:, :row]
     pixels = np.ascontiguousarray(rows).view(f"{order}u{pixel.octets}").reshape(height, width, len(pixel.channels))
     pixels = pixels[:, :, list(pixel.channels)].astype(f">u{pixel.octets}")
-    lines = np.zeros((height, 1 + row), np.uint8)  # each line begins with its filter: none
+    lines = np.zeros((height, 1 + row), np.uint8)  # each line begins with its filter type: none
     lines[:, 1:] = pixels.reshape(height, -1).view(np.uint8)
     header = struct.pack(">IIBBBBB", width, height, 8 * pixel.octets, pixel.colour, 0, 0, 0)
     compressed = zlib.compress(lines.tobytes(), 1)

@@ -1,7 +1,7 @@
-"""Requests in their order: in memory, and on disk while the server is away.
+"""A queue of requests: in memory, and on disk while the server is away.
 
-The spool's records are always older than what is in memory. If both are full, *new* requests are rejected, and
-the caller learns that at once; what is in the queue stays whole.
+The spool's records are always older than those in memory. If both are full, *new* requests are rejected immediately;
+requests in the queue are never dropped.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ MEMORY = 64 * 2**20
 
 
 class Queue:
-    """Several threads put and move to the disk, one takes."""
+    """Several threads add and move to disk, one takes."""
 
     def __init__(self, spool: Spool | None, lose: Callable[[str, int, str], None]) -> None:
-        """`lose` receives what cannot be read from the spool."""
+        """`lose` receives the losses of unreadable spool records."""
         self.changed = threading.Condition()
-        """Held briefly while the memory changes, and notified of it."""
+        """Held briefly while the memory changes, and notified of changes."""
         self._disk = threading.Lock()
-        """Held while records are moved, taken or removed; taken before the other."""
+        """Held while records are moved, taken or removed; acquired before the other lock."""
         self._spool = spool
         self._lose = lose
         self._capacity = MEMORY
@@ -40,7 +40,7 @@ class Queue:
         self.full = spool is None
         """The disk accepts nothing more for now."""
         self.damaged = False
-        """Something in the spool could not be read in this run."""
+        """Some record of the spool could not be read in this run."""
         if spool is not None and spool.damaged:
             lose("bytes of the database's spool", spool.damaged, "corrupted by a crash or by the disk")
         if spool is not None and spool.records:
@@ -48,12 +48,12 @@ class Queue:
 
     @property
     def inherited(self) -> bool:
-        """Whether the oldest request is an earlier run's: it is not known what that run lost before it."""
+        """Whether the oldest request comes from an earlier run, whose losses are unknown."""
         return self._inherited > 0
 
     @property
     def bytes(self) -> int:
-        """That wait, in memory and on disk."""
+        """Bytes that are queued, in memory and on disk."""
         return self._bytes + (0 if self._spool is None else self._spool.bytes)
 
     def has_room(self, size: int) -> bool:
@@ -61,13 +61,13 @@ class Queue:
         return not self._bytes or self._bytes + size <= self._capacity
 
     def add(self, write: Write) -> None:
-        """Put it at the end, into the memory; `changed` is held."""
+        """Append it, in memory; `changed` is held."""
         self._memory.append(write)
         self._bytes += write.size
         self.changed.notify_all()
 
     def first(self) -> Write | None:
-        """The oldest request, which stays where it is; None where there is none."""
+        """The oldest request, which stays in the queue; None if there is none."""
         with self._disk:
             if (write := self._from_disk()) is not None:
                 return write
@@ -75,7 +75,7 @@ class Queue:
                 return self._memory[0] if self._memory else None
 
     def _from_disk(self) -> Write | None:
-        """The oldest in the spool. What cannot be read is left out: its scenarios then lack documents."""
+        """The oldest in the spool. Unreadable records are skipped: their scenarios then lack documents."""
         while self._spool is not None:
             try:
                 record = self._spool.first()
@@ -88,7 +88,7 @@ class Queue:
         return None
 
     def done(self) -> None:
-        """The oldest request is not needed any more."""
+        """Remove the oldest request."""
         with self._disk, self.changed:
             if self._spool is not None and self._spool.records:
                 self._spool.done()
@@ -99,7 +99,7 @@ class Queue:
             self.changed.notify_all()
 
     def spill(self) -> None:
-        """Move what is in memory to the disk, oldest first, as far as there is room."""
+        """Move requests from memory to disk, oldest first, as far as there is room."""
         if self._spool is None:
             return
         with self._disk:
@@ -113,7 +113,7 @@ class Queue:
                 self.full = True
 
     def _move(self, spool: Spool) -> bool:
-        """False where there is no room for more."""
+        """False if there is no more room."""
         moved = 0
         while self._memory:
             write = self._memory[0]
@@ -129,7 +129,7 @@ class Queue:
         return not self._memory
 
     def close(self) -> list[Write]:
-        """Bytes that do not fit on the disk, and are lost with the process."""
+        """Returns the bytes that do not fit on the disk and are lost with the process."""
         self.spill()
         with self._disk, self.changed:
             left = list(self._memory)

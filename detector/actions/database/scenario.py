@@ -1,6 +1,6 @@
-"""The documents about a scenario: what it is, what kind it is of, and which clients were there.
+"""The documents about a scenario: its description, its type, and its clients.
 
-A scenario is complete only where `complete` is true. That is written last, once all its samples are.
+A scenario is complete only if `complete` is true. This is written last, after all its samples.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ OPEN, COMPLETE, INCOMPLETE, INTERRUPTED = "Open", "Complete", "Incomplete", "Int
 
 
 def scenario_id(episode: Episode, action: str, part: str = "") -> str:
-    """The same for the same episode, action and part, whichever process writes it."""
+    """The same id for the same episode, action and part, whichever process writes it."""
     return f"{episode.id}.{action}{part and f'.{part}'}"
 
 
 @dataclass(slots=True)
 class Scenario:
-    """What is known of one while it is written."""
+    """The state of a scenario while it is written."""
 
     id: str
     holder: str
@@ -43,22 +43,22 @@ class Scenario:
     messages: Counter[str] = field(default_factory=Counter)
     """Documents handed over, by collection."""
     clients: dict[str, tuple[int, int, set[str]]] = field(default_factory=dict)
-    """Of each client the first and last time, and its streams."""
+    """By client, the first and last time, and its streams."""
     bytes: int = 0
     files: int = 0
     lost: Counter[str] = field(default_factory=Counter)
     """Missing parts, by reason."""
 
     def saw(self, client: str, stream: str, time: int) -> None:
-        """Note a client's sample."""
+        """Note a sample of a client."""
         first, last, streams = self.clients.get(client, (time, time, set()))
         streams.add(stream)
         self.clients[client] = (min(first, time), max(last, time), streams)
 
 
 def type_id(rule: EventRule) -> str:
-    """A version of a rule: its scenarios are of one type. A rule from a file has no generation: its text identifies
-    it.
+    """The id of a rule's version: its scenarios have this type. A rule from a file has no generation and is identified
+    by its text.
     """
     version = str(rule.metadata.generation)
     if not rule.metadata.generation:
@@ -71,7 +71,7 @@ def _text(rule: EventRule) -> str:
 
 
 def begin(scenario: Scenario, episode: Episode, metadata: Mapping[str, JsonValue]) -> list[Write]:
-    """Make it known, as one that is not complete."""
+    """Insert it, marked as incomplete."""
     rule = scenario.rule
     of_type = {
         "rule": rule.name,
@@ -79,7 +79,7 @@ def begin(scenario: Scenario, episode: Episode, metadata: Mapping[str, JsonValue
         "generation": Int64(rule.metadata.generation),
         "description": rule.spec.description,
         "classification": None if rule.spec.classification is None else rule.spec.classification.to_json(),
-        "spec": _text(rule),  # as text: its names may be none of MongoDB's
+        "spec": _text(rule),  # as text: its names may be invalid in MongoDB
     }
     known = {
         "rule": rule.name,
@@ -110,7 +110,7 @@ def begin(scenario: Scenario, episode: Episode, metadata: Mapping[str, JsonValue
 
 
 def leave_behind(database: str, holder: str, rule: str, action: str) -> Write:
-    """Scenarios that an earlier run left open: nothing writes them any more."""
+    """Handle scenarios that an earlier run left open: no process writes them any more."""
     find = {"holder": holder, "rule": rule, "action": action, "state": OPEN}
     change = {"find": find, "change": {"$set": {"state": INTERRUPTED, "interrupted": True}}, "many": True}
     return Write(database, SCENARIOS, changes=[change])
@@ -119,7 +119,7 @@ def leave_behind(database: str, holder: str, rule: str, action: str) -> Write:
 def finish(
     scenario: Scenario, episode: Episode, completion: Completion, detector: Detector, incomplete: str
 ) -> list[Write]:
-    """Write the final documents. The last request makes it complete, where it is not `incomplete`."""
+    """Write the final documents. The last request marks it as complete, unless it is `incomplete`."""
     labels = {client.name: client.labels for client in detector.spec.clients}
     clients = [
         {
@@ -178,7 +178,7 @@ def why_incomplete(scenario: Scenario, episode: Episode | None, completion: Comp
 
 
 def missing(scenario: Scenario, completion: Completion) -> int:
-    """How many samples, or parts of them, are not there."""
+    """How many samples, or parts of them, are missing."""
     return completion.missing + sum(scenario.lost.values())
 
 
@@ -189,7 +189,7 @@ def reject(database: str, scenario: str, why: str) -> Write:
 
 
 def give_up(write: Write, why: str) -> Write:
-    """In place of the request that would have made a scenario complete."""
+    """Replaces the request that would have marked a scenario as complete."""
     change = {"find": {"_id": write.completes}, "change": {"$set": {"state": INCOMPLETE, "cut": why}}, "many": False}
     return Write(write.database, SCENARIOS, changes=[change])
 

@@ -1,4 +1,4 @@
-"""The MongoDB server, as far as it is written to: one request at a time, and nothing of the credentials gets out."""
+"""Writes to the MongoDB server: one request at a time, and without revealing credentials."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ logging.getLogger("pymongo").setLevel(logging.INFO)  # it would log every docume
 
 _DUPLICATE = 11000
 _SECONDS = 10.0
-"""How long one request may take before the connection counts as broken."""
+"""Maximum time in seconds of one request before the connection counts as broken."""
 
 
 _COUNTING = 60.0
-"""How long it may take to count a scenario's documents."""
+"""Maximum time in seconds to count a scenario's documents."""
 
 
 class DatabaseUnavailableError(Exception):
@@ -47,16 +47,16 @@ class DatabaseUnavailableError(Exception):
     def __init__(self, text: str, *, broke: bool = False) -> None:
         super().__init__(text)
         self.broke = broke
-        """The connection ended with this request: it may be the request's own doing."""
+        """The connection ended during this request, which may be the cause."""
 
 
 class WriteRefusedError(Exception):
-    """The request as a whole cannot be done, now or later; the message gives the reason."""
+    """The whole request is impossible, now and later; the message gives the reason."""
 
 
 @dataclass(frozen=True, slots=True)
 class RefusedWrite:
-    """One document or change that the server does not take."""
+    """One document or change that the server rejects."""
 
     index: int
     why: str
@@ -90,13 +90,13 @@ class Redactor:
 
 
 class Server:
-    """A connection to it, which is made when it is first needed."""
+    """A connection to the server, opened on first use."""
 
     def __init__(self, uri: str, *, majority: bool) -> None:
-        """Raises ValueError where the connection string is wrong, without showing it."""
+        """Raises ValueError if the connection string is wrong, without showing it."""
         self.redact = Redactor(uri)
         self.sure = majority
-        """Whether what was written stays written."""
+        """Whether written documents are durable."""
         self._indexed: set[tuple[str, str]] = set()
         self._concern = WriteConcern("majority" if majority else 1, wtimeout=int(_SECONDS * 500))
         self._sure = WriteConcern("majority", wtimeout=int(_SECONDS * 500))
@@ -110,13 +110,13 @@ class Server:
                     serverSelectionTimeoutMS=1000,
                     connectTimeoutMS=3000,
                     socketTimeoutMS=int(_SECONDS * 1000),
-                    retryWrites=False,  # the queue before it tries again, in order
+                    retryWrites=False,  # the queue retries, in order
                 )
         except (PyMongoError, ValueError, TypeError, Warning) as error:
             raise ValueError(self.redact(error)) from None
 
     def write(self, write: Write) -> tuple[int, list[RefusedWrite]]:
-        """Do it: how many documents changes have matched, and what was refused of it; all else is done.
+        """Execute it; returns how many documents the changes matched, and the rejected parts. Everything else is done.
 
         Raises DatabaseUnavailableError, WriteRefusedError.
         """
@@ -127,7 +127,7 @@ class Server:
                 return 0, self._refused(error.details, inserting=bool(write.documents))
 
     def lacks(self, write: Write) -> str:
-        """What the scenario that the request completes does not have of its documents; empty where it has all.
+        """The documents missing from the scenario that the request completes; empty if there are none.
 
         Raises DatabaseUnavailableError, WriteRefusedError.
         """
@@ -140,7 +140,7 @@ class Server:
 
     @contextmanager
     def _driver_errors(self) -> Iterator[None]:
-        """The driver's errors as ours."""
+        """Converts the driver's errors to ours."""
         try:
             yield
         except DocumentTooLarge as error:
@@ -159,8 +159,8 @@ class Server:
         collection = self._client.get_database(write.database, write_concern=self._concern)[write.collection]
         if (write.database, write.collection) not in self._indexed:
             try:
-                collection.create_index("scenario")  # what most queries filter by
-            except OperationFailure as error:  # it goes without
+                collection.create_index("scenario")  # the filter of most queries
+            except OperationFailure as error:  # continue without it
                 _log.warning("database: cannot create the index on %s: %s", write.collection, self._short(error))
             self._indexed.add((write.database, write.collection))
         collection.insert_many([RawBSONDocument(document) for document in write.documents], ordered=False)
@@ -178,9 +178,10 @@ class Server:
         return done.matched_count, []
 
     def _refused(self, details: Mapping[str, Any], *, inserting: bool) -> list[RefusedWrite]:
-        """What of a request was refused; that a document is there already is as it should be.
+        """The rejected parts of a request; documents that exist already are fine.
 
-        Raises DatabaseUnavailableError if the rest is not safe yet, or another client made the same at the same time.
+        Raises DatabaseUnavailableError if the rest is not durable yet, or another client created the same at the same
+        time.
         """
         if not inserting and any(_there_already(each) for each in details.get("writeErrors", ())):
             raise DatabaseUnavailableError("another client is writing the same document")
@@ -195,12 +196,12 @@ class Server:
         return refused
 
     def _short(self, error: PyMongoError) -> str:
-        """What happened, without the driver's account of its topology."""
+        """The error, without the driver's description of its topology."""
         text = str(error).partition(", Topology Description")[0].partition(" (configured timeouts")[0]
         return self.redact(text.partition(", full error:")[0])
 
     def answers(self) -> bool:
-        """Whether it can be spoken to at all."""
+        """Whether the server responds."""
         try:
             self._client.admin.command("ping")
         except PyMongoError:
@@ -208,7 +209,7 @@ class Server:
         return True
 
     def close(self) -> None:
-        """End the connection."""
+        """Close the connection."""
         self._client.close()
 
 

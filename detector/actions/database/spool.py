@@ -1,8 +1,8 @@
-"""A queue of records on disk, bounded in bytes, which outlives the process.
+"""A queue of records on disk, bounded in bytes, that survives the process.
 
-Records are appended to segments (files that are numbered in their order) and synced before they count as kept. They
-are read in the same order; a segment is removed once all its records are done, so after a crash a few records come
-again. Each record carries its length and checksum: what a crash cut off is found, left out and reported.
+Records are appended to segments (files numbered in order) and synced before they count as stored. They are read in the
+same order; a segment is removed once all its records are done, so after a crash some records are repeated. Each record
+has its length and a checksum, so truncated records are detected, skipped and reported.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pathlib import Path
 
 _HEAD = struct.Struct("<II")
 SEGMENT = 8 * 2**20
-"""A segment that has reached this many bytes gets no more records."""
+"""A segment that has reached this many bytes receives no more records."""
 
 
 class SpoolError(Exception):
@@ -29,11 +29,11 @@ class _Segment:
     path: Path
     bytes: int = 0
     records: int = 0
-    """That are not done."""
+    """Number of records that are not done."""
 
 
 class Spool:
-    """A queue of records, first in, first out. For one thread."""
+    """A first-in, first-out queue of records. For one thread."""
 
     def __init__(self, folder: Path, capacity: int) -> None:
         """Open the queue in a folder, with at most `capacity` bytes. Raises SpoolError."""
@@ -74,9 +74,9 @@ class Spool:
             self.bytes += segment.bytes
 
     def append(self, record: bytes) -> bool:
-        """Keep a record; False where there is no room. What is appended is kept once `sync` was called.
+        """Append a record; False if there is no room. It is stored once `sync` was called.
 
-        Raises OSError where the disk refuses; the queue is then as it was.
+        Raises OSError if the disk refuses; the queue is then unchanged.
         """
         size = _HEAD.size + len(record)
         if self.bytes + size > self._capacity:
@@ -101,12 +101,12 @@ class Spool:
         return True
 
     def sync(self) -> None:
-        """Make sure that what was appended outlives a loss of power. Raises OSError."""
+        """Make sure that appended records survive a loss of power. Raises OSError."""
         if self._tail is not None:
             os.fsync(self._tail)
 
     def first(self) -> bytes | None:
-        """The oldest record, which stays; None where there is none. Raises OSError."""
+        """The oldest record, which stays in the queue; None if there is none. Raises OSError."""
         while self._current is None and self._segments:
             with self._segments[0].path.open("rb") as file:
                 file.seek(self._offset)
@@ -118,7 +118,7 @@ class Spool:
         return self._current
 
     def done(self) -> None:
-        """The oldest record is not needed any more. Raises OSError."""
+        """Remove the oldest record. Raises OSError."""
         record = self.first()
         if record is None:
             return
@@ -130,7 +130,7 @@ class Spool:
             self._remove()
 
     def give_up(self) -> int:
-        """Leave out the oldest segment, since it cannot be read; gives the number of records that are lost."""
+        """Skip the oldest segment, because it cannot be read; returns the number of records lost."""
         lost = self._segments[0].records
         self.records -= lost
         self._current = None
@@ -165,13 +165,13 @@ class Spool:
             self._tail = None
 
     def close(self) -> None:
-        """Release the folder; the records stay."""
+        """Release the folder; the records stay on disk."""
         self._close_tail()
         self._lock.close()
 
 
 def _sound(segment: Path) -> tuple[int, int]:
-    """Up to which byte a segment can be read, and how many records that are."""
+    """Up to which byte a segment can be read, and the number of records there."""
     reached = records = 0
     for size in _records(segment):
         reached += size
@@ -180,7 +180,7 @@ def _sound(segment: Path) -> tuple[int, int]:
 
 
 def _records(segment: Path) -> Iterator[int]:
-    """The sizes of its records, with their heads, as long as they are whole."""
+    """The sizes of its intact records, including their headers."""
     with segment.open("rb") as file:
         while len(head := file.read(_HEAD.size)) == _HEAD.size:
             length, checksum = _HEAD.unpack(head)

@@ -1,7 +1,7 @@
-"""What is put into it is written in its order, each once, or counted as lost.
+"""Writes requests in order, each exactly once, or counts them as lost.
 
-A thread of its own sends what is in the queue, again and again until the server has it. What the server refuses is
-found among what it takes. One queue and one thread serve all database actions of the process.
+A separate thread sends the queued requests and retries until the server accepts them. Rejected documents are isolated
+from the accepted ones. All database actions of the process share one queue and one thread.
 """
 
 from __future__ import annotations
@@ -26,13 +26,14 @@ _log = logging.getLogger(__name__)
 _FIRST, _LONGEST = 0.1, 5.0
 """Seconds between two attempts."""
 _SUSPECT = 3
-"""Number of connections lost with one request, while the server answers others, after which the request is to blame."""
+"""Number of connections lost during one request, while the server responds otherwise, after which the request is the
+suspect."""
 
 _PATIENCE = 10
 """Tenths of a second that a producer waits for room before the disk is used."""
 
 _LAST_TRY = 0.5
-"""Extra seconds at the end for a server that is unavailable."""
+"""Additional seconds at the end for a server that is unavailable."""
 
 _RESTART_DELAY = 1.0
 """Seconds that the queue pauses after an unexpected error."""
@@ -45,7 +46,7 @@ class DatabaseWriter:
     """The queue, and the thread that empties it."""
 
     def __init__(self, server: Server, spool: Spool | None, lose: Callable[[str, int, str], None]) -> None:
-        """`lose` receives what is lost of the records of an earlier run."""
+        """`lose` receives the losses among the records of an earlier run."""
         self._server = server
         self._lose = lose
         self._queue = Queue(spool, lose)
@@ -58,20 +59,20 @@ class DatabaseWriter:
         self._confirms: dict[str, Confirm] = {}
         self._seen: set[Any] = set()
         self._doubts = not server.sure or (spool is not None and spool.damaged > 0)
-        """Documents may be missing of which it is not known: each scenario's are counted before it is completed."""
+        """Documents may be missing without notice: each scenario's are counted before it is completed."""
         self.written = 0
-        """Documents that are in the database."""
+        """Number of documents in the database."""
         self._thread = threading.Thread(target=self._work, name="database", daemon=True)
         self._thread.start()
 
     @property
     def away(self) -> str:
-        """Why the server cannot be written to; empty while it can."""
+        """Why the server cannot be written to; empty if it can."""
         return self._away
 
     @property
     def waiting(self) -> int:
-        """How many bytes wait, in memory and on disk."""
+        """Number of bytes that are queued, in memory and on disk."""
         return self._queue.bytes
 
     def first_time(self, what: object) -> bool:
@@ -82,7 +83,7 @@ class DatabaseWriter:
             return new
 
     def put(self, write: Write, closing: threading.Event) -> bool:
-        """Queue documents. Waits while the server is only slow; False where there is no room: they are dropped."""
+        """Queue documents. Waits while the server is only slow; False if there is no room: they are dropped."""
         waited = 0
         while True:
             with self._lock:
@@ -98,7 +99,7 @@ class DatabaseWriter:
                 if not ending:
                     self._lock.wait(0.1)
             waited = _PATIENCE if ending else waited + 1
-            if waited >= _PATIENCE:  # the server hangs on a request, or there is no time: the disk makes room
+            if waited >= _PATIENCE:  # the server hangs on a request, or there is no time: use the disk to make room
                 self._queue.spill()
 
     def put_change(self, write: Write, confirm: Confirm | None = None) -> None:
@@ -113,17 +114,17 @@ class DatabaseWriter:
             confirm(False, self._end_text())
 
     def close(self, seconds: float) -> None:
-        """Write what there is, at most for so long; the rest goes to the spool, or is lost where there is none."""
+        """Write what is queued, for at most this time; the rest goes to the spool, or is lost if there is none."""
         with self._lock:
             self._closing = True
             self._deadline = time.monotonic() + (seconds if not self._away else min(seconds, _LAST_TRY))
             self._lock.notify_all()
         self._thread.join(seconds + 1)
-        if self._thread.is_alive():  # a request hangs; whether it was done or not, its documents come again
+        if self._thread.is_alive():  # a request hangs; done or not, its documents will be sent again
             self._leave()
         self._server.close()
 
-    # The thread; only it speaks to the server.
+    # The thread; only this code uses the server.
 
     def _work(self) -> None:
         while not self._late():
@@ -133,7 +134,7 @@ class DatabaseWriter:
                     break
                 if self._send(write) and not self._left:
                     self._queue.done()
-            except Exception as error:  # noqa: BLE001  a defect, or a disk: the queue goes on, since doing twice is doing once
+            except Exception as error:  # noqa: BLE001  a defect, or a disk: the queue continues, since requests are idempotent
                 self._lose("times the database queue was restarted", 1, self._server.redact(error))
                 _log.error("database: restarting the queue: %s", type(error).__name__)
                 _log.debug("in the queue", exc_info=error)
@@ -144,7 +145,7 @@ class DatabaseWriter:
         return self._closing and time.monotonic() >= self._deadline
 
     def _next(self) -> Write | None:
-        """The oldest request, which stays where it is; None at the end."""
+        """The oldest request, which stays in the queue; None at the end."""
         while (write := self._queue.first()) is None:
             with self._lock:
                 if self._closing:
@@ -154,9 +155,9 @@ class DatabaseWriter:
         return write
 
     def _send(self, write: Write, patience: int = _SUSPECT) -> bool:
-        """Write it, however often that takes; False where there is no more time.
+        """Write it, with retries; False if there is no more time.
 
-        `patience`: after this number of connections lost with it, the documents to blame are searched.
+        `patience`: after this number of connections lost during it, search for the documents that cause this.
         """
         backoff, broke = Backoff(_FIRST, _LONGEST), 0
         while True:
@@ -185,7 +186,7 @@ class DatabaseWriter:
             return True
 
     def _divide(self, write: Write, why: str) -> bool:
-        """Find the documents that cannot be written among those that can."""
+        """Separate the documents that cannot be written from those that can."""
         if len(write.documents) > 1:
             return all(self._send(half, 1 if len(half.documents) > 1 else _SUSPECT) for half in write.halves())
         if not self._reject(write, 0, why):
@@ -195,9 +196,9 @@ class DatabaseWriter:
         return True
 
     def _reject(self, write: Write, index: int, why: str) -> bool:
-        """A document is lost: its scenario must not become complete, whatever happens now.
+        """A document is lost: its scenario must never become complete.
 
-        False where that could not be written: then the request must come again.
+        False if that could not be written: then the request must be repeated.
         """
         lose = write.losing or self._lost_earlier
         if not write.documents:
@@ -218,7 +219,7 @@ class DatabaseWriter:
             confirm(bool(matched) and not why, why or "the database rejected some of it")
 
     def _pause(self, seconds: float) -> bool:
-        """Wait before the next attempt; what comes meanwhile goes to the disk. False where there is no more time."""
+        """Wait before the next attempt; new requests go to the disk. False if there is no more time."""
         until = time.monotonic() + seconds
         while True:
             self._queue.spill()
@@ -229,7 +230,7 @@ class DatabaseWriter:
                 self._lock.wait(min(left, 0.2))
 
     def _leave(self) -> None:
-        """What is not written waits on disk for the next run, or is lost."""
+        """Unwritten requests stay on disk for the next run, or are lost."""
         with self._lock:
             if self._left:
                 return

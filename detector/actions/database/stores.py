@@ -1,4 +1,4 @@
-"""One queue for each database of the process, shared by its actions; it ends with the last of them."""
+"""One queue per database of the process, shared by its actions; it ends with the last of them."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from wayside.api.database import DatabaseConnection, WriteConcern
 
 _FIELD = "spec.database"
 _CLOSING = 3.0
-"""Seconds at the end to write what is queued."""
+"""Seconds at the end to write the queued requests."""
 
 _lock = threading.Lock()
 _stores: dict[DatabaseConnection, tuple[DatabaseWriter, int]] = {}
 
 
 def acquire(database: DatabaseConnection, lose: Callable[[str, int, str], None]) -> DatabaseWriter:
-    """The database's queue. Raises ActionError where it cannot be made, without showing what is secret."""
+    """The database's queue. Raises ActionError if it cannot be created, without showing secrets."""
     key = _key(database)
     with _lock:
         store, users = _stores.get(key, (None, 0))
@@ -33,7 +33,7 @@ def acquire(database: DatabaseConnection, lose: Callable[[str, int, str], None])
 
 
 def release(database: DatabaseConnection) -> None:
-    """The caller needs the queue no more."""
+    """The caller no longer needs the queue."""
     key = _key(database)
     with _lock:
         store, users = _stores[key]

@@ -1,4 +1,4 @@
-"""Any decoded message as BSON: fast where its values are plain, with care where they are not."""
+"""Any decoded message as BSON: fast for plain values, with conversions for others."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from bson.decimal128 import Decimal128
 
 _INT64 = range(-(2**63), 2**63)
 _DEPTH = 100
-"""MongoDB refuses documents that are nested deeper."""
+"""MongoDB refuses documents with deeper nesting."""
 
 
 class UnfitError(ValueError):
-    """A message that cannot be a document; the error gives the reason."""
+    """A message that cannot be a document; the message of the error gives the reason."""
 
 
 def bson_bytes(document: Mapping[str, Any]) -> bytes:
     """The document as BSON.
 
-    Numbers stay what they are: NaN and infinities are doubles, integers beyond 64 bits become Decimal128, or text
-    where that has too few digits. Raises UnfitError where it is nested too deeply.
+    Numbers are preserved: NaN and infinities are doubles, integers beyond 64 bits become Decimal128, or text if that
+    has too few digits. Raises UnfitError if it is nested too deeply.
     """
     try:
         return bson.encode(document)
@@ -32,7 +32,7 @@ def bson_bytes(document: Mapping[str, Any]) -> bytes:
 
 
 def bson_values(document: Mapping[str, Any]) -> dict[str, Any]:
-    """The document with values that BSON knows. Raises UnfitError where it is nested too deeply."""
+    """The document with BSON's types only. Raises UnfitError if it is nested too deeply."""
     made: dict[str, Any] = _plain(document, 0)
     return made
 
@@ -48,7 +48,7 @@ def _plain(value: Any, depth: int) -> Any:
         case int():
             return value if value in _INT64 else _wide(value)
         case str():
-            return value.encode("utf-8", "replace").decode()  # lone surrogates are no text for BSON
+            return value.encode("utf-8", "replace").decode()  # lone surrogates are invalid in BSON text
         case bytes() | bytearray() | memoryview():
             return bytes(value)
         case Mapping():
@@ -60,7 +60,7 @@ def _plain(value: Any, depth: int) -> Any:
         case set() | frozenset():
             return [_plain(each, depth + 1) for each in sorted(value, key=repr)]
         case _:
-            return str(value)  # what CBOR tags hold: dates, fractions, UUIDs
+            return str(value)  # values of CBOR tags: dates, fractions, UUIDs
 
 
 def _wide(value: int) -> Decimal128 | str:
@@ -68,6 +68,6 @@ def _wide(value: int) -> Decimal128 | str:
 
 
 def _name(key: Any) -> str:
-    """A field's name. BSON ends names at NUL: it is shown as its picture."""
+    """A field's name. BSON ends names at NUL: it is replaced by its symbol."""
     text = key if isinstance(key, str) else str(key)
     return text.replace("\0", "\N{SYMBOL FOR NULL}").encode("utf-8", "replace").decode()

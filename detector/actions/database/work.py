@@ -1,4 +1,4 @@
-"""What waits for the database: requests in their order, which a spool on disk can hold as bytes."""
+"""Requests that wait for the database, in a form that a spool on disk can store."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ BATCH_BYTES = 8 * 2**20
 
 @dataclass(frozen=True, slots=True)
 class Write:
-    """One request: documents to insert, or changes to make. Doing it twice is doing it once."""
+    """One request: documents to insert, or changes to apply. Requests are idempotent."""
 
     database: str
     collection: str
     documents: Sequence[bytes] = ()
-    """To insert; BSON with an `_id`. One that is there already stays as it is."""
+    """To insert; BSON with an `_id`. An existing one is left unchanged."""
     changes: Sequence[Mapping[str, Any]] = ()
-    """Each with `find`, `change` (MongoDB's update) and `many`; without `many`, what is not found is made."""
+    """Each with `find`, `change` (MongoDB's update) and `many`; without `many`, a missing document is inserted."""
     completes: str = ""
-    """The scenario that has all its documents with this; the others before it must have been written."""
+    """The scenario that is complete after this request; earlier requests must have been written."""
     expected: Mapping[str, int] = field(default_factory=dict)
     """By collection, how many documents the scenario must have by then."""
     losing: Callable[[int, str], None] | None = field(default=None, compare=False)
@@ -32,11 +32,11 @@ class Write:
 
     @property
     def size(self) -> int:
-        """About how many bytes it holds."""
+        """Approximate size in bytes."""
         return sum(map(len, self.documents)) + 512 * len(self.changes) + 64
 
     def packed(self) -> bytes:
-        """As bytes."""
+        """The request as bytes."""
         return bson.encode(
             {
                 "database": self.database,
@@ -49,7 +49,7 @@ class Write:
         )
 
     def halves(self) -> tuple[Write, Write]:
-        """Its documents in two requests."""
+        """The documents split into two requests."""
         middle = len(self.documents) // 2
         first, second = self.documents[:middle], self.documents[middle:]
         return (
@@ -59,7 +59,7 @@ class Write:
 
 
 def unpacked(record: bytes) -> Write:
-    """What was packed. Raises bson.errors.BSONError or KeyError for anything else."""
+    """The request from bytes. Raises bson.errors.BSONError or KeyError for anything else."""
     content = bson.decode(record)
     return Write(
         content["database"],

@@ -1,4 +1,4 @@
-"""Tasks as files, one each: the same loop works without a cluster, and the folder shows the demands."""
+"""Tasks as files, one each: the same reconciler works without a cluster, and the folder shows the demands."""
 
 from __future__ import annotations
 
@@ -33,8 +33,7 @@ Result = TypeVar("Result")
 
 
 class FileTaskStore:
-    """The tasks of one holder in a folder: `<name>.yaml` each, replaced in one step, so that no reader sees half a
-    task.
+    """The tasks of one holder in a folder: `<name>.yaml` each, replaced atomically, so that no reader sees half a task.
 
     A task's creationTimestamp is its event's start, to the second: the same drive gives the same files.
     """
@@ -61,7 +60,7 @@ class FileTaskStore:
             await asyncio.sleep(self._interval)
 
     async def all(self) -> dict[str, ApplicationTask]:
-        """All tasks of the holder, ended ones too, by name."""
+        """All tasks of the holder, including ended ones, by name."""
         snapshot = await self._run(self._folder.look)
         return {name: stored.task for name, stored in snapshot.tasks.items()}
 
@@ -87,7 +86,7 @@ class FileTaskStore:
         await self._run(lambda: self._folder.remove(stored.task.name))
 
     async def _run(self, work: Callable[[], Result]) -> Result:
-        """Disk work, one at a time and off the event loop."""
+        """Run disk work, one at a time and off the event loop."""
         async with self._lock:
             try:
                 return await asyncio.to_thread(work)
@@ -102,14 +101,14 @@ def write_tasks_yaml(path: Path, tasks: Iterable[ApplicationTask]) -> None:
 
 
 class _Read(NamedTuple):
-    """A file as it was last read; read again only when its inode, size or time of change differ."""
+    """A file when it was last read; it is read again only when its inode, size or modification time differ."""
 
     mark: tuple[int, int, int]
     stored: StoredTask | None
 
 
 class _Folder:
-    """The files, without any waiting."""
+    """The files, with blocking access."""
 
     def __init__(self, path: Path, holder: str) -> None:
         self.path = path
@@ -118,7 +117,7 @@ class _Folder:
         self._version = 0
 
     def look(self) -> Snapshot:
-        """Read what changed since the last look."""
+        """Read the files that changed since the last call."""
         self.path.mkdir(parents=True, exist_ok=True)
         found: dict[str, _Read] = {}
         for file in os.scandir(self.path):
@@ -127,7 +126,7 @@ class _Folder:
             try:
                 status = file.stat()
             except FileNotFoundError:
-                continue  # removed just now
+                continue  # removed in the meantime
             mark = (status.st_ino, status.st_size, status.st_mtime_ns)
             known = self._files.get(file.name)
             found[file.name] = known if known and known.mark == mark else _Read(mark, self._read(Path(file.path)))

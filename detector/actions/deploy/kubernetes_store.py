@@ -34,7 +34,7 @@ TASKS = Resource(API_VERSION, ApplicationTask.__name__, ApplicationTask.plural)
 
 
 class KubernetesTaskStore:
-    """The tasks of one holder in one namespace. Others' tasks are neither seen nor touched."""
+    """The tasks of one holder in one namespace. Tasks of others are neither listed nor changed."""
 
     def __init__(self, client: Client, namespace: str, holder: str, resync: float = 30.0) -> None:
         """Prepare; `resync`: seconds after which all is listed again, even if nothing seems to be missing."""
@@ -95,7 +95,8 @@ class KubernetesTaskStore:
             return _stored(await self._client.patch(TASKS, self._namespace, metadata.name, metadata.uid, [add]))
 
     def _own(self, obj: Object) -> StoredTask | None:
-        """The task if it is the holder's and can be read; one of a newer version is ignored, and logged once."""
+        """The task if it belongs to the holder and can be read; a task of a newer version is ignored, and logged
+        once."""
         try:
             stored = _stored(obj)
         except ValidationError as error:
@@ -108,9 +109,9 @@ class KubernetesTaskStore:
 
 
 def _stored(obj: Object) -> StoredTask:
-    # The status is the manager's business, and a newer manager's may have fields that we do not know.
+    # The manager owns the status, and a newer manager's may have unknown fields.
     read = {key: value for key, value in obj.items() if key != "status"}
-    shape = {"apiVersion": API_VERSION, "kind": ApplicationTask.__name__}  # items of a list come without
+    shape = {"apiVersion": API_VERSION, "kind": ApplicationTask.__name__}  # list items have neither
     return StoredTask(ApplicationTask.model_validate(shape | read), version_of(obj))
 
 

@@ -1,17 +1,18 @@
-"""The holder's Lease: the sign of life by which the manager knows that the holder's demands still count.
+"""The holder's Lease: the heartbeat by which the manager knows that the holder's demands still count.
 
-At most one process emits tasks as a holder. The process named by the Lease (`holderIdentity`) renews it; another
-process with the same holder waits until it has itself seen the Lease unchanged for its duration, so the clocks of two
-machines are never compared. A process takes over at once
+At most one process emits tasks as a holder. The process named by the Lease (`holderIdentity`) renews it. Another
+process with the same holder waits until it has itself observed the Lease unchanged for its duration, so the clocks of
+two machines are never compared. A process takes over at once
 
-- what was released: an orderly end clears the identity, and leaves all else, so that the manager keeps the demands for
+- a released Lease: an orderly end clears only the identity, so that the manager keeps the demands for
   the usual time;
-- what its own predecessor held: in a pod, one of the same pod (a container that was restarted); elsewhere, a process of
+- a Lease of its own predecessor: in a pod, one of the same pod (a container that was restarted); elsewhere, a process
+of
   the same machine that is no longer alive. A restart after a crash thus finds its tasks while the manager still
   counts them.
 
-A Standalone detector's next pod has another name than the last. It waits at most one duration where the last one was
-killed, unless the Lease went with that pod, which owns it.
+A Standalone detector's next pod has a different name. It waits at most one duration if the previous pod was killed,
+unless the Lease was deleted with that pod, which owns it.
 
 The identity of the pod comes from the downward API: the environment variables POD_NAME and POD_UID.
 """
@@ -37,7 +38,7 @@ from wayside.process.backoff import Backoff
 _log = logging.getLogger(__name__)
 
 _RELEASE_DEADLINE = 2.0
-"""Seconds that the end of the process may wait for an API server that does not answer."""
+"""Seconds that the end of the process may wait for an API server that does not respond."""
 
 Owner = dict[str, str]
 """An ownerReference."""
@@ -48,7 +49,7 @@ class ProcessIdentity:
     """Which process this is."""
 
     text: str
-    """As `holderIdentity` has it."""
+    """The text of `holderIdentity`."""
     owner: Owner | None = None
     """The own pod."""
 
@@ -62,7 +63,7 @@ class ProcessIdentity:
         return cls(f"{_machine()}_{os.getpid()}")
 
     def succeeds(self, other: str) -> bool:
-        """Whether this process may take over from the other at once: a predecessor that cannot be alive any more."""
+        """Whether this process may take over from the other at once: it is a predecessor that cannot be alive."""
         if other in {"", self.text}:
             return True
         machine, _, process = other.rpartition("_")
@@ -203,7 +204,7 @@ class HolderLease:
 
 
 def _machine() -> str:
-    """The host and its process namespace: where process ids mean the same."""
+    """The host and its process namespace, in which process ids are unique."""
     try:
         namespace = str(Path("/proc/self/ns/pid").stat().st_ino)
     except OSError:  # no Linux

@@ -1,4 +1,4 @@
-"""The demanded and the stored tasks, and the next step for each. No waiting, no I/O."""
+"""The demanded and the stored tasks, and the next step for each. Never waits, no I/O."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from detector.engine.episodes.demands import Demand
 _log = logging.getLogger(__name__)
 
 _REMEMBERED_ENDS = 10_000
-"""Ends of episodes whose tasks are not known to have ended. Beyond it the oldest are forgotten."""
+"""Ends of episodes whose tasks are not known to have ended. Beyond this number the oldest are forgotten."""
 
 
 class Ledger:
-    """The newest knowledge of both sides, by task name.
+    """The latest knowledge of both sides, by task name.
 
-    `accept` and `see` return the names for which something is now to be done.
+    `accept` and `see` return the names that need work.
     """
 
     def __init__(self) -> None:
         self.demands: Mapping[str, Demand] | None = None
-        """None before the first `accept`: until then nothing may be changed, least of all ended."""
+        """None before the first `accept`: until then nothing may be changed, and above all nothing ended."""
         self.stored: dict[str, StoredTask] | None = None
         """None before the first snapshot: until then the content of the store is unknown."""
         self.held: set[str] = set()
@@ -33,7 +33,7 @@ class Ledger:
         self._ends: dict[str, int] = {}
 
     def accept(self, demands: Mapping[str, Demand], ended: Mapping[str, int]) -> list[str]:
-        """Take over the full set of demands, and the ends of some that are gone (ns since the epoch)."""
+        """Replace the full set of demands, and note the ends of some that are gone (ns since the epoch)."""
         before = self.demands
         self.demands = demands
         self._ends.update(ended)
@@ -50,7 +50,7 @@ class Ledger:
         """Apply a change of the store."""
         known = self.stored or {}
         if isinstance(change, Snapshot):
-            # What we wrote after the snapshot was taken is newer than it.
+            # Our own writes after the snapshot are newer than it.
             newer = {name: stored for name, stored in known.items() if stored.version > change.version}
             self.stored = {**change.tasks, **newer}
             return self._due(self.stored.keys() | (self.demands or {}).keys())
@@ -70,7 +70,7 @@ class Ledger:
             self.stored[name] = stored
 
     def next(self, name: str) -> StoreChange:
-        """What to do next about a task."""
+        """The next step for a task."""
         if self.demands is None or self.stored is None:
             return StoreChange.NOTHING
         demand, stored = self.demands.get(name), self.stored.get(name)

@@ -1,6 +1,9 @@
 """The deploy action: the demands of open episodes, kept equal to the ApplicationTasks in a store.
 
-The engine hands over the full set of demands whenever it changes; the reconciler makes the store match, whatever it
+The engine passes the full set of demands whenever it changes. The reconciler makes the store match it, whatever it
+missed: it creates missing tasks (including tasks deleted by hand), sets the end of tasks that are over, and patches
+those that changed. It is level-triggered, not edge-triggered, so an outage of the store delays it and loses nothing; an
+episode that starts and ends within one outage leaves no task, because nothing is demanded any more.
 missed: it creates what is missing (a task deleted by hand comes back), sets the end of what is over, and patches what
 changed. It looks at levels, not at edges, so an outage of the store delays it and loses nothing; an episode that
 starts and ends within one outage leaves no task, since nothing is demanded any more.
@@ -38,25 +41,26 @@ _log = logging.getLogger(__name__)
 
 @dataclass
 class DeployCounts:
-    """What the reconciler did since its start, in tasks."""
+    """What the reconciler did since its start, as numbers of tasks."""
 
     created: int = 0
     recreated: int = 0
-    """Recreated, because another client deleted them while they were demanded."""
+    """Recreated because another client deleted them while they were demanded."""
     adopted: int = 0
-    """Found there when they were to be created: made by a request whose answer was lost."""
+    """Adopted because they existed when they were to be created: the response to an earlier request was lost."""
     replaced: int = 0
-    """Deleted to be recreated, because the demand differs in an immutable field."""
+    """Deleted and recreated because the demand differs in an immutable field."""
     patched: int = 0
     ended: int = 0
     retried: int = 0
     """Attempts that failed because the store was unavailable or busy."""
     refused: Counter[str] = field(default_factory=Counter)
-    """Attempts that the store refused, by its reason. Each is retried at the next resync."""
+    """Attempts that the store rejected, by its reason. Each is retried at the next resync."""
 
 
 class DemandReconciler:
-    """Keeps the tasks of one holder equal to its demands. `update` from any thread; all else in one event loop."""
+    """Keeps the tasks of one holder equal to its demands. `update` may be called from any thread, all else in one event
+    loop."""
 
     def __init__(
         self,
@@ -102,7 +106,7 @@ class DemandReconciler:
         return len(self._queue)
 
     def update(self, demands: Mapping[str, Demand], ended: Mapping[str, int]) -> None:
-        """Hand over what is demanded now. Never waits for the store; only the newest set counts.
+        """Pass the current demands. Never waits for the store; only the latest set counts.
 
         Args:
             demands: all that is demanded, by task name.
@@ -135,12 +139,12 @@ class DemandReconciler:
                 task.cancel()
 
     def stop(self, deadline: float = 3.0) -> None:
-        """Let `run` finish its work within `deadline` seconds, and return. Live tasks stay alive."""
+        """Let `run` finish its work within `deadline` seconds, and return. Live tasks are kept."""
         self._deadline = deadline
         self._stopping.set()
 
     def _accept(self) -> None:
-        """Take over what `update` left."""
+        """Take over the demands of the last `update`."""
         with self._lock:
             handed, self._handed = self._handed, None
         if handed is not None:
@@ -166,6 +170,7 @@ class DemandReconciler:
         if self._away.failures:
             async with self._probing:  # one task alone finds out whether the store is back
                 if self._away.failures:
+                    # A single task probes whether the store is back.
                     with suppress(TimeoutError):
                         await asyncio.wait_for(self._reachable.wait(), self._pause)
                     await self._attend(name)
@@ -173,7 +178,7 @@ class DemandReconciler:
         await self._attend(name)
 
     async def _attend(self, name: str) -> None:
-        """Take the steps that a task needs, one after the other."""
+        """Carry out the steps that a task needs, one after the other."""
         failures = self._away.failures
         step = StoreChange.NOTHING
         try:
@@ -182,7 +187,7 @@ class DemandReconciler:
                 self._away.succeed()
         except StoreUnavailableError as error:
             self.counts.retried += 1
-            if failures == self._away.failures:  # else another task has counted this outage's newest failure
+            if failures == self._away.failures:  # otherwise another task has counted this outage's newest failure
                 self._unavailable(error)
             self._queue.add(name)
         except TaskRefusedError as error:

@@ -1,6 +1,4 @@
-"""What to do next about one task, from what is demanded and what is stored. Pure: the same input gives the same
-step.
-"""
+"""The next step for one task, from the demanded and the stored state. Pure: the same input gives the same step."""
 
 from __future__ import annotations
 
@@ -50,7 +48,7 @@ def next_step(demand: Demand | None, stored: StoredTask | None, held: bool) -> S
 
 
 def differences(demand: Demand, stored: StoredTask) -> list[str]:
-    """The fields, among those that cannot be changed, in which the task is not what is demanded."""
+    """The immutable fields in which the task differs from the demand."""
     spec = stored.task.spec
     event = spec.event
     pairs: dict[str, tuple[Any, Any]] = {

@@ -1,4 +1,4 @@
-"""What a store of tasks offers to the reconciler, be it the API server or a folder of files."""
+"""The interface of a task store for the reconciler: the API server or a folder of files."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from wayside.api.base import JsonValue
 
 @dataclass(frozen=True)
 class StoredTask:
-    """A task as the store has it."""
+    """A stored task."""
 
     task: ApplicationTask
     version: int
-    """Grows with each change of anything in the store, so that the newer one of two states is known."""
+    """Grows with each change of anything in the store, so that the newer of two states is known."""
 
     @property
     def live(self) -> bool:
@@ -33,7 +33,7 @@ class StoredTask:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """All tasks of the holder that there are, by name."""
+    """All existing tasks of the holder, by name."""
 
     tasks: Mapping[str, StoredTask]
     version: int
@@ -41,7 +41,7 @@ class Snapshot:
 
 @dataclass(frozen=True)
 class Update:
-    """One task changed, or is gone (`stored` is None)."""
+    """One task changed, or was removed (`stored` is None)."""
 
     name: str
     stored: StoredTask | None
@@ -49,7 +49,7 @@ class Update:
 
 
 class StoreError(Exception):
-    """The store did not carry out a request."""
+    """The store could not carry out a request."""
 
     def __init__(self, reason: str, message: str) -> None:
         super().__init__(message)
@@ -63,11 +63,11 @@ class StoreUnavailableError(StoreError):
     def __init__(self, reason: str, message: str, retry_after: float = 0.0) -> None:
         super().__init__(reason, message)
         self.retry_after = retry_after
-        """Seconds to wait as the store requests; 0 if it gives none."""
+        """Seconds to wait as requested by the store; 0 if not given."""
 
 
 class TaskRefusedError(StoreError):
-    """The store refuses it; retrying without a change is useless."""
+    """The store rejects it; retrying without a change is useless."""
 
 
 class TaskExistsError(StoreError):
@@ -81,7 +81,7 @@ class TaskStore(Protocol):
         """A snapshot, then changes, with a new snapshot at least every half minute. Never ends, raises nothing."""
 
     async def get(self, name: str) -> StoredTask | None:
-        """The holder's task of this name; None if there is none, or it belongs to another holder."""
+        """The holder's task of this name; None if there is none, or if it belongs to another holder."""
 
     async def create(self, task: ApplicationTask) -> StoredTask:
         """Store a new task. `TaskExistsError` if the name is taken."""
@@ -99,7 +99,7 @@ class TaskStore(Protocol):
 async def restore(store: TaskStore) -> list[Demand]:
     """The demands of the holder's live tasks, oldest first: the episodes that were open when the detector stopped.
 
-    Waits for as long as the store is away; cancel it to give up.
+    Waits as long as the store is unavailable; cancel it to give up.
     """
     async with aclosing(store.follow()) as changes:
         async for change in changes:
@@ -115,12 +115,12 @@ def live_demands(snapshot: Snapshot) -> list[Demand]:
 
 
 def belongs_to(task: ApplicationTask, holder: str) -> bool:
-    """Whether the holder emitted this task, and so may change it."""
+    """Whether the holder emitted this task, and may therefore change it."""
     return task.spec.requester.holder == holder and from_task(task) is not None
 
 
 def task_manifest(task: ApplicationTask) -> dict[str, Any]:
-    """The task as it is sent or written: without empty fields."""
+    """The task in the form that is sent or written: without empty fields."""
     document = task.to_json()
     document["metadata"] = {key: value for key, value in document["metadata"].items() if value}
     event = task.spec.event

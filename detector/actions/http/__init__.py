@@ -1,4 +1,4 @@
-"""The way out to HTTP endpoints that actions share: one request at a time, with a deadline that always holds."""
+"""The HTTP client that actions share: one request at a time, with a deadline that always holds."""
 
 from detector.actions.http.answer import Answer, Disposition, judge
 from detector.actions.http.client import HttpClient, HttpError

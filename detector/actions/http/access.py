@@ -1,4 +1,4 @@
-"""Headers and certificates of a request, read again for each: a renewed Secret takes effect at once."""
+"""Headers and certificates of a request, read for each request: a renewed Secret takes effect at once."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from wayside.api.actions.http import HttpAccess, HttpHeader
 
 @dataclass(frozen=True, slots=True)
 class Headers:
-    """The headers that the resource gives, and which texts in them are secret."""
+    """The headers of the resource, and the secret texts in them."""
 
     values: Mapping[str, str]
     secrets: tuple[str, ...]
@@ -24,7 +24,7 @@ class Headers:
         return f"Headers({', '.join(self.values)})"
 
     def strike_out(self, text: str) -> str:
-        """The text without secrets: an endpoint may well repeat what it was sent."""
+        """The text without secrets: an endpoint may repeat what it received."""
         for secret in sorted(self.secrets, key=len, reverse=True):
             text = text.replace(secret, "***")
         return text

@@ -1,4 +1,4 @@
-"""What an endpoint's answer means: done, try again, or never."""
+"""The meaning of an endpoint's response: done, retry, or final failure."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from email.utils import parsedate_to_datetime
 from enum import Enum
 
 _AGAIN = frozenset({408, 425, 429})
-"""Refusals that are about the moment, not about the request (RFC 9110, RFC 8470, RFC 6585)."""
+"""Refusals that are temporary and not about the request (RFC 9110, RFC 8470, RFC 6585)."""
 
 _BUSY = frozenset({429, 502, 503, 504})
 """Responses of an endpoint that is busy, whatever the request."""
 
 
 class Disposition(Enum):
-    """What follows from an answer."""
+    """The consequence of a response."""
 
     DONE = "done"
     AGAIN = "again"
@@ -27,7 +27,7 @@ class Disposition(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What an endpoint answered."""
+    """The response of an endpoint."""
 
     status: int
     body: bytes = b""
@@ -37,21 +37,21 @@ class Answer:
     headers: Mapping[str, str] | None = None
     """By lower-case name."""
     excerpt: str = ""
-    """Of a refusal, its first words, with secrets of the request struck out."""
+    """Of a refusal, its beginning, with secrets of the request removed."""
 
     @property
     def retry_after(self) -> str:
-        """The header of that name, or nothing."""
+        """The header of that name, or an empty text."""
         return (self.headers or {}).get("retry-after", "")
 
     @property
     def busy(self) -> bool:
-        """Whether the endpoint as a whole wants to be left alone for a while."""
+        """Whether the whole endpoint requests a pause."""
         return self.status in _BUSY
 
 
 def judge(answer: Answer) -> tuple[Disposition, str]:
-    """What follows, and why, for people."""
+    """The consequence, and a reason for users."""
     if 200 <= answer.status < 300:
         return Disposition.DONE, f"answered {answer.status}"
     response = f"answered {answer.status}" + (f": {answer.excerpt}" if answer.excerpt else "")

@@ -1,8 +1,8 @@
-"""One HTTP request and its answer, in the calling thread, with a deadline that holds whatever the other side does.
+"""One HTTP request and its response, in the calling thread, with a deadline that always holds.
 
-An endpoint may hang, send a byte a second, announce more than it sends, or send without end. aiohttp runs the exchange
-as a task of an event loop that lives as long as the request: a task can be ended at any moment, which a blocking socket
-cannot. Each request has a connection of its own, nothing of it stays, and no more is read than requested.
+An endpoint may hang, send a byte a second, announce more than it sends, or send endlessly. aiohttp runs the exchange as
+a task of an event loop that lives as long as the request: a task can be ended at any moment, which a blocking socket
+cannot. Each request uses a separate connection that is closed afterwards, and reads no more than requested.
 
 The message of a failure names the endpoint's scheme, host and port only: paths and queries may hold secrets.
 """
@@ -24,13 +24,13 @@ from detector.actions.http.resolving import Resolver
 from wayside.api.actions.http import HttpAccess
 
 _REFUSAL = 4096
-"""Bytes that are read of a refusal, for its excerpt."""
+"""Maximum bytes read of a refusal, for its excerpt."""
 _REFUSAL_TIME = 1.0
-"""Seconds that are spent on it."""
+"""Maximum seconds spent on it."""
 _EXCERPT = 200
 """Maximum characters of it in a message."""
 _LOOK = 0.05
-"""Seconds between two looks at whether to give up."""
+"""Seconds between two checks of whether to give up."""
 
 
 class HttpError(Exception):
@@ -54,10 +54,10 @@ class _Exchange:
 
 
 class HttpClient:
-    """Sends requests to endpoints that are entered in one way. One request at a time."""
+    """Sends requests to endpoints with the same access settings. One request at a time."""
 
     def __init__(self, access: HttpAccess, field: str) -> None:
-        """`field` is where `access` stands in the rule: texts of errors begin with it."""
+        """`field` is the place of `access` in the rule: error messages begin with it."""
         self._access, self._field = access, field
         self._tls = TlsContexts()
 
@@ -71,7 +71,7 @@ class HttpClient:
         want: int = 0,
         give_up: Callable[[], bool] = lambda: False,
     ) -> Answer:
-        """Send a request and wait for its answer, at most for the timeout of the access.
+        """Send a request and wait for its response, at most for the timeout of the access.
 
         Args:
             method: e.g. POST.
@@ -175,7 +175,7 @@ async def _read(exchange: _Exchange, response: aiohttp.ClientResponse) -> Answer
 
 
 async def _body(response: aiohttp.ClientResponse, limit: int) -> tuple[bytes, bool]:
-    """At most `want` bytes, and whether these were all."""
+    """At most `want` bytes, and whether this is the whole body."""
     read = bytearray()
     try:
         while len(read) <= limit:
@@ -183,13 +183,13 @@ async def _body(response: aiohttp.ClientResponse, limit: int) -> tuple[bytes, bo
             if not chunk:
                 return bytes(read), True
             read += chunk
-    except aiohttp.ClientError:  # less came than was announced
+    except aiohttp.ClientError:  # less arrived than was announced
         return bytes(read), False
     return bytes(read[:limit]), False
 
 
 def _why(error: Exception) -> str:
-    """Without the URL, which aiohttp's texts may hold."""
+    """The error without the URL, which aiohttp's messages may contain."""
     match error:
         case aiohttp.ClientConnectorCertificateError():
             found = error.certificate_error

@@ -1,7 +1,7 @@
-"""Names to addresses, in threads that are never joined.
+"""Resolves names to addresses, in threads that are never joined.
 
-The system's resolver cannot be interrupted. On a vehicle without a network it hangs for many seconds, and the threads
-of an executor are waited for when the process ends: these are not.
+The system's resolver cannot be interrupted. On a vehicle without a network it hangs for many seconds, and the process
+waits at its end for the threads of an executor, but not for these.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from aiohttp.abc import AbstractResolver, ResolveResult
 
 
 class Resolver(AbstractResolver):
-    """Asks the system, in a daemon thread for each question."""
+    """Queries the system, in a daemon thread per query."""
 
     async def resolve(
         self, host: str, port: int = 0, family: socket.AddressFamily = socket.AF_UNSPEC
     ) -> list[ResolveResult]:
-        """The host's addresses. Raises OSError where there are none."""
+        """The host's addresses. Raises OSError if there are none."""
         loop = asyncio.get_running_loop()
         found: asyncio.Future[list[ResolveResult]] = loop.create_future()
 
@@ -37,7 +37,7 @@ class Resolver(AbstractResolver):
         return await found
 
     async def close(self) -> None:
-        """Nothing is kept."""
+        """There is nothing to close."""
 
 
 def _addresses(host: str, port: int, family: socket.AddressFamily) -> list[ResolveResult]:

@@ -1,10 +1,10 @@
-"""The notify action: sends a notification of the episodes of a rule.
+"""The notify action: sends notifications about the episodes of a rule.
 
 Notify (the action's thread) ─▶ queue: EventQueue or AlertQueue ◀─ Sender (a thread of its own) ─▶ target
                                   └▶ keeping: journal, dead letters
 
-Notifications wait in the queue; the sender sends one request at a time, so that an endpoint that hangs delays
-only its own notifications.
+Notifications wait in the queue. The sender sends one request at a time, so an endpoint that hangs delays only its own
+notifications.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ __all__ = ["Notify"]
 
 
 class Notify(Action[api.NotifyAction]):
-    """Enqueues notifications. The sender does what takes time: here only the disk blocks."""
+    """Enqueues notifications. The sender does the slow work: here only the disk blocks."""
 
     Parameters: ClassVar[type[BaseModel]] = api.NotifyAction
 
@@ -49,7 +49,7 @@ class Notify(Action[api.NotifyAction]):
             self._work = _Alerts(parameters, parameters.alertmanager, setting, self._keeping, name, field)
 
     def started(self, episode: Episode) -> None:
-        """Notify of the start, unless another run of the action has."""
+        """Notify of the start, unless another run of the action has done so."""
         with self._work.changing():
             kept = self._keeping.rendered(episode.id) if episode.resumed else None
             rendered = texts(episode.rendered) if kept is None else kept
@@ -63,15 +63,15 @@ class Notify(Action[api.NotifyAction]):
             self._work.ended(episode, kept or texts(episode.rendered))
 
     def completed(self, episode: Episode, completion: Completion) -> None:
-        """Nothing more will come of it."""
+        """No further notifications of the episode follow."""
         with self._work.changing():
             if episode.ended is not None:
                 self._keeping.over(episode.id)
             self._work.completed(episode)
 
     def close(self) -> None:
-        """Try what waits once more, for a few seconds."""
-        keep = self.setting.closing.is_set()  # else the rule has no such action any more
+        """Make a last attempt for the queued notifications, for a few seconds."""
+        keep = self.setting.closing.is_set()  # otherwise the rule no longer has this action
         self._work.close(keep)
         self._keeping.close(keep)
 

@@ -1,4 +1,4 @@
-"""The alerts of one action, from the episodes to the Alertmanager and back to what is reported."""
+"""The alerts of one action: from its episodes to the Alertmanager, and back to the reported outcomes."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class AlertQueue:
         self._episodes: dict[str, tuple[Episode, NoticeTexts]] = {}
 
     def opened(self, episode: Episode, texts: NoticeTexts) -> None:
-        """An alert fires from now on."""
+        """Add a firing alert."""
         labels = labels_of(texts, episode.rule, self._setting.holder, episode.subject, episode.id, episode.element)
         given = {"summary": texts.title, "description": texts.text}
         annotations = {name: value for name, value in given.items() if value is not None}
@@ -42,7 +42,7 @@ class AlertQueue:
             self._lose(alert, FULL)
 
     def over(self, episode: Episode) -> None:
-        """Resolve its alert."""
+        """Resolve the alert of the episode."""
         if episode.id in self._episodes:
             self._episodes[episode.id] = episode, self._episodes[episode.id][1]
             now = time.time_ns()
@@ -54,7 +54,7 @@ class AlertQueue:
         return self._alerts.take(now)
 
     def wait(self, now: float) -> float | None:
-        """The seconds until alerts are due."""
+        """Seconds until alerts are due."""
         return self._alerts.wait(now)
 
     def hurry(self) -> None:
@@ -62,7 +62,7 @@ class AlertQueue:
         self._alerts.hurry()
 
     def settle(self, sent: AlertBatch, delivery: Delivery, now: float) -> None:
-        """What came of a request."""
+        """Apply the result of a request."""
         ended, given_up = self._alerts.settle(sent, delivery, now)
         if delivery.fate is Fate.REFUSED:
             self._setting.lose("alerts rejected by the Alertmanager", len(sent.alerts), delivery.why)
@@ -77,7 +77,8 @@ class AlertQueue:
                 self._report(alert, OutcomeState.RUNNING, text)
 
     def drain(self) -> None:
-        """The end. Undelivered alerts are lost. Firing alerts expire, or continue after the next start."""
+        """Remove all alerts at the end. Undelivered ones are lost; firing ones expire, or continue after the next
+        start."""
         for alert in self._alerts.drain():
             if alert.delivered and alert.ends_at is None:
                 self._report(

@@ -1,8 +1,8 @@
-"""Alerts as an Alertmanager has them: firing alerts are repeated, resolved ones are sent until delivered. Pure.
+"""Alerts in the Alertmanager's form: firing alerts are repeated, resolved ones are sent until delivered. Pure.
 
-An alert is known by its labels, and those of an episode never change: alertname (the rule), detector, subject, episode,
-the element of `each` where there is one, and the rule's own. Without an update for four times `repeat` the Alertmanager
-resolves it, so nothing fires for ever when a detector is lost.
+An alert is identified by its labels, and those of an episode never change: alertname (the rule), detector, subject,
+episode, the element of `each` where there is one, and the rule's own. Without an update for four times `repeat` the
+Alertmanager resolves it, so no alert fires forever when a detector is lost.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from wayside.process.backoff import Backoff
 from wayside.times import format_time
 
 BATCH = 100
-"""So many alerts go into one request."""
+"""Maximum number of alerts in one request."""
 _LAPSES = 4
-"""Times `repeat` after which an alert is over without word."""
+"""An alert expires after this multiple of `repeat` without an update."""
 
 
 @dataclass(eq=False, slots=True)
 class Alert:
-    """One episode. Times of the outside world are nanoseconds since the epoch, `due` and `since` monotonic seconds."""
+    """One episode. Times from outside are nanoseconds since the epoch; `due` and `since` are monotonic seconds."""
 
     episode: str
     labels: Mapping[str, str]
@@ -33,7 +33,7 @@ class Alert:
     due: float
     ends_at: int | None = None
     since: float = 0.0
-    """When it was over."""
+    """When it was resolved."""
     delivered: bool = False
     """Whether it was ever delivered."""
     attempts: int = 0
@@ -45,19 +45,19 @@ class AlertBatch:
 
     alerts: Sequence[Alert]
     over: frozenset[str]
-    """The episodes of the resolved alerts: during the request, more may end."""
+    """The episodes of the resolved alerts: more may end during the request."""
 
 
 def labels_of(
     texts: NoticeTexts, rule: str, holder: str, subject: str, episode: str, element: str | None
 ) -> dict[str, str]:
-    """An alert's labels; those that make it what it is come before the rule's own of the same name."""
+    """An alert's labels; the identifying ones take precedence over the rule's labels of the same name."""
     own = {"alertname": rule, "detector": holder, "subject": subject, "episode": episode}
     return {**texts.labels, **own, **({} if element is None else {"element": element})}
 
 
 def document(alert: Alert, over: bool, now: int, repeat: float) -> dict[str, Any]:
-    """As the Alertmanager's API v2 has it; `now` is nanoseconds since the epoch, `repeat` seconds."""
+    """The alert for the Alertmanager's API v2; `now` is nanoseconds since the epoch, `repeat` seconds."""
     ends_at = alert.ends_at if over and alert.ends_at is not None else now + int(repeat * _LAPSES * 1e9)
     return {
         "labels": {name: value for name, value in alert.labels.items() if value},
@@ -68,7 +68,7 @@ def document(alert: Alert, over: bool, now: int, repeat: float) -> dict[str, Any
 
 
 class Alerts:
-    """Firing alerts, and resolved ones that are not yet delivered. `now` is in seconds of a monotonic clock."""
+    """Firing alerts, and resolved ones that are not delivered yet. `now` is in seconds of a monotonic clock."""
 
     def __init__(self, repeat: float, give_up_after: float, capacity: int) -> None:
         self._repeat, self._give_up_after, self._capacity = repeat, give_up_after, capacity
@@ -78,24 +78,24 @@ class Alerts:
         self._last_tries: set[str] | None = None
 
     def fire(self, alert: Alert) -> bool:
-        """False: there are as many already as may be."""
+        """False: the maximum number is reached."""
         if len(self._alerts) >= self._capacity:
             return False
         self._alerts[alert.episode] = alert
         return True
 
     def over(self, episode: str, ends_at: int, now: float) -> None:
-        """The episode ended, if there is such an alert."""
+        """The episode ended; resolve its alert, if there is one."""
         alert = self._alerts.get(episode)
         if alert is not None:
             alert.ends_at, alert.since, alert.due = ends_at, now, now
 
     def hurry(self) -> None:
-        """From now on, only undelivered alerts are sent, once more and at once."""
+        """From now on, send only undelivered alerts, once more and at once."""
         self._last_tries = set()
 
     def take(self, now: float) -> AlertBatch | None:
-        """What to send now, in one request."""
+        """The alerts to send now, in one request."""
         if self._last_tries is not None:
             pending = (alert for alert in self._alerts.values() if alert.ends_at is not None or not alert.delivered)
             chosen = [alert for alert in pending if alert.episode not in self._last_tries][:BATCH]
@@ -108,14 +108,14 @@ class Alerts:
         return AlertBatch(chosen, over) if chosen else None
 
     def wait(self, now: float) -> float | None:
-        """The seconds until `take` may have something; None: there are no alerts."""
+        """Seconds until `take` may return something; None: there are no alerts."""
         due = min((alert.due for alert in self._alerts.values()), default=None)
         return None if due is None else max(0.0, due - now, self._paused_until - now)
 
     def settle(self, sent: AlertBatch, delivery: Delivery, now: float) -> tuple[list[Alert], list[Alert]]:
-        """Resolved alerts that were delivered, and resolved alerts that were given up; both are removed.
+        """The resolved alerts that were delivered, and those that were given up; both are removed.
 
-        Those that fire go on: a refusal holds until the next time they are due.
+        Firing alerts stay: after a refusal they are sent again when they are next due.
         """
         if delivery.fate is Fate.AGAIN:
             self._paused_until = now + max(min(delivery.retry_after, LONGEST_RETRY_AFTER), self._pause.fail())
@@ -139,7 +139,7 @@ class Alerts:
         return ended, given_up
 
     def drain(self) -> list[Alert]:
-        """All that are here; they are here no more."""
+        """Remove and return all alerts."""
         drained = list(self._alerts.values())
         self._alerts.clear()
         return drained

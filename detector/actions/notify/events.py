@@ -1,4 +1,4 @@
-"""CloudEvents to send: kept, grouped, sent, and finally delivered or dead letters."""
+"""CloudEvents to send: stored, grouped, sent, and finally delivered or dead letters."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class EventQueue:
         return self._outbox.take(now)
 
     def wait(self, now: float) -> float | None:
-        """The seconds until a message or a group is due."""
+        """Seconds until a message or a group is due."""
         group = None if self._groups is None else self._groups.next_due()
         waits = [self._outbox.wait(now), None if group is None else max(0.0, group - now)]
         return min((wait for wait in waits if wait is not None), default=None)
@@ -89,13 +89,14 @@ class EventQueue:
                 self.ledger.retried(episode, delivery.why)
 
     def hurry(self) -> None:
-        """No group waits any longer, and each message is tried once more."""
+        """Close all groups at once, and try each message once more."""
         self._hurrying = True
         self._close_groups(0.0)
         self._outbox.hurry()
 
     def drain(self, keep: bool) -> None:
-        """The end: events that wait are sent after the next start if they are kept, else they are lost."""
+        """Remove all events at the end: stored ones are sent after the next start if `keep` is set, otherwise they are
+        lost."""
         for message in self._outbox.drain():
             if keep and all(map(self._keeping.keeps_notice, message.notices)):
                 for episode in message.episodes:
@@ -109,5 +110,5 @@ class EventQueue:
             self.ledger.failed(notice.episode, why)
 
     def opened(self, episode: Episode) -> None:
-        """There is this episode."""
+        """Register the episode."""
         self.ledger.open(episode)

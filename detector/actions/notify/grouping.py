@@ -1,4 +1,4 @@
-"""Events that belong in one message: they wait for each other, a bounded time and in bounded number. Pure."""
+"""Groups events into one message: they wait for each other, for a bounded time and in a bounded number. Pure."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class _Group:
 
 
 class Groups:
-    """Open groups, by the values of the labels that events are grouped by. Times are seconds of any one clock."""
+    """Open groups, by the values of the grouping labels. Times are seconds of any one clock."""
 
     def __init__(self, by: Sequence[str], wait: float, most: int = MOST) -> None:
         self._by, self._wait, self._most = tuple(by), wait, most
@@ -26,7 +26,7 @@ class Groups:
         self._count = 0
 
     def add(self, notice: Notice, now: float) -> None:
-        """Into its group, which is opened where there is none."""
+        """Add it to its group, which is opened if necessary."""
         key = tuple(notice.texts.labels.get(name, "") for name in self._by)
         if key not in self._open:
             self._open[key] = _Group(now + self._wait)
@@ -34,7 +34,7 @@ class Groups:
         self._count += 1
 
     def closed(self, now: float, everything: bool = False) -> list[list[Notice]]:
-        """The groups whose time has come, in the order in which they were opened; they are open no more."""
+        """Remove and return the groups that are due, in the order in which they were opened."""
         found: list[list[Notice]] = []
         for key, group in list(self._open.items()):
             if everything or group.due <= now or self._count > self._most:
@@ -44,5 +44,5 @@ class Groups:
         return found
 
     def next_due(self) -> float | None:
-        """When the next group's time comes; None: there is none."""
+        """When the next group is due; None: there is none."""
         return min((group.due for group in self._open.values()), default=None)

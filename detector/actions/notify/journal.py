@@ -1,11 +1,11 @@
 """Undelivered events, in a file that survives a kill -9.
 
-One JSON object a line: `{"put": key, "document": {…}}` or `{"drop": [keys]}`. What the system was given survives the
-process; a power cut may take the last seconds. A line that was cut by the end is skipped. The file is rewritten, in
-one step, when it holds much that is dropped.
+One JSON object per line: `{"put": key, "document": {…}}` or `{"drop": [keys]}`. Data passed to the operating system
+survives the process; a power failure may lose the last seconds. A truncated last line is skipped. The file is rewritten
+atomically when it holds many dropped documents.
 
-A changed action works beside its predecessor for as long as that has episodes to complete: each has a file that it
-locks, and takes over those that are not locked.
+A changed action runs beside its predecessor while that has episodes to complete. Each has a file that it locks, and
+takes over files that are not locked.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from typing import Any, BinaryIO
 _log = logging.getLogger(__name__)
 
 _FILES = 16
-"""Maximum number of files of an action: its own, and those of predecessors that still run."""
+"""Maximum number of files of an action: its own, and those of predecessors that are still running."""
 _SLACK = 1 << 20
-"""Bytes of what is dropped that a file may hold beside what is not."""
+"""Maximum bytes of dropped documents in a file beyond those of live ones."""
 
 
 class JournalError(Exception):
@@ -32,14 +32,14 @@ class JournalError(Exception):
 
 
 class Journal:
-    """Documents by key, as they were put. Not thread-safe."""
+    """Documents by key. Not thread-safe."""
 
     def __init__(self, folder: Path, name: str) -> None:
-        """Take over what earlier runs left in `folder` under `name`. Raises JournalError."""
+        """Take over the files of earlier runs in `folder` under `name`. Raises JournalError."""
         self.live: dict[str, dict[str, Any]] = {}
-        """What was put and not dropped, oldest first."""
+        """Documents that were put and not dropped, oldest first."""
         self.unreadable = 0
-        """Lines of earlier runs that are no JSON of ours, but for a last one that was cut."""
+        """Invalid lines in the files of earlier runs, except a truncated last one."""
         self._sizes: dict[str, int] = {}
         self._live_bytes = self._written = 0
         taken: list[tuple[Path, BinaryIO]] = []
@@ -67,13 +67,13 @@ class Journal:
             raise JournalError(f"cannot write {folder} ({error.strerror})") from error
 
     def put(self, key: str, document: Mapping[str, Any]) -> None:
-        """Keep a document. Raises OSError where the disk refuses; it is then not kept."""
+        """Store a document. Raises OSError if the disk refuses; it is then not stored."""
         line = _line({"put": key, "document": document})
         self._append(line)
         self._remember(key, dict(document), len(line))
 
     def drop(self, keys: Iterable[str]) -> None:
-        """Keep these no more. Raises OSError where the disk refuses: they come back after a restart, then."""
+        """Remove documents. Raises OSError if the disk refuses: they then reappear after a restart."""
         known = [key for key in keys if key in self.live]
         if not known:
             return
@@ -85,7 +85,7 @@ class Journal:
             self._rewrite()
 
     def close(self) -> None:
-        """Leave the file to the next run, or remove it where nothing is left in it. Raises OSError."""
+        """Leave the file to the next run, or remove it if it is empty. Raises OSError."""
         if not self.live:
             self._path.unlink(missing_ok=True)
         self._file.close()
@@ -97,7 +97,7 @@ class Journal:
     def _append(self, line: bytes) -> None:
         begun = self._file.tell()
         if self._file.write(line) != len(line):
-            self._file.truncate(begun)  # no half lines, should there be room again
+            self._file.truncate(begun)  # remove a partial line
             self._file.seek(begun)
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         self._written += len(line)
@@ -116,7 +116,7 @@ class Journal:
                 self.unreadable += line.endswith(b"\n")
 
     def _rewrite(self) -> None:
-        """Only what is live; the file keeps its lock, so it is replaced by one that is locked as well."""
+        """Write only live documents; the file keeps its lock, so it is replaced by one that is locked as well."""
         lines = b"".join(_line({"put": key, "document": document}) for key, document in self.live.items())
         draft = self._path.with_suffix(".new")
         file = draft.open("w+b", buffering=0)
@@ -133,7 +133,7 @@ class Journal:
 
 
 def _locked(path: Path) -> BinaryIO | None:
-    """The file, made where there is none; None if it is locked."""
+    """The file, created if it is missing; None if it is locked."""
     file = path.open("a+b", buffering=0)
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -141,7 +141,7 @@ def _locked(path: Path) -> BinaryIO | None:
         file.close()
         return None
     if not path.exists() or os.stat(path).st_ino != os.fstat(file.fileno()).st_ino:
-        file.close()  # it was removed or replaced between opening and locking
+        file.close()  # removed or replaced between opening and locking
         return None
     return file
 

@@ -1,7 +1,7 @@
-"""What an action keeps on the state volume: undelivered events, rendered texts of open episodes, dead letters.
+"""What an action stores on the state volume: undelivered events, rendered texts of open episodes, dead letters.
 
-Without a state volume, or if its disk fails, everything else continues: events that would not survive are counted,
-and so are undelivered ones.
+Without a state volume, or if its disk fails, everything else continues; events that would not survive a restart are
+counted, and so are undelivered ones.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Keeping:
         self._journal: Journal | None = None
         self._letters: DeadLetters | None = None
         self._claimed: set[str] = set()
-        """The keys of episodes that are open in this run: others of before are over."""
+        """The keys of episodes that are open in this run: other stored ones have ended."""
         detector = setting.surroundings().detector
         state = detector.spec.state
         if state is None:
@@ -67,40 +67,40 @@ class Keeping:
         return found
 
     def keep(self, notice: Notice) -> None:
-        """Until `delivered`."""
+        """Store it until `delivered`."""
         self._put(_NOTICE + notice.id, notice.to_json())
 
     def delivered(self, notices: Iterable[Notice]) -> None:
-        """These need not be kept any more."""
+        """Remove these."""
         self._drop([_NOTICE + notice.id for notice in notices])
 
     @property
     def keeps(self) -> bool:
-        """Whether what waits at the end is there at the next start."""
+        """Whether events queued at the end are sent after the next start."""
         return self._journal is not None
 
     def keeps_notice(self, notice: Notice) -> bool:
-        """Whether this one is."""
+        """Whether this event is stored."""
         return self._journal is not None and _NOTICE + notice.id in self._journal.live
 
     def open(self, episode: str, rendered: NoticeTexts) -> None:
-        """Keep what was rendered for an episode until its end: after a restart it cannot be rendered again."""
+        """Store the rendered texts of an episode until its end: after a restart they cannot be rendered again."""
         key = _OPEN + episode
         self._claimed.add(key)
         self._put(key, rendered.to_json())
 
     def rendered(self, episode: str) -> NoticeTexts | None:
-        """What was kept for it."""
+        """The stored texts of the episode."""
         document = None if self._journal is None else self._journal.live.get(_OPEN + episode)
         return None if document is None else texts(document)
 
     def over(self, episode: str) -> None:
-        """It has ended."""
+        """The episode has ended: remove its texts."""
         self._claimed.discard(_OPEN + episode)
         self._drop([_OPEN + episode])
 
     def lose(self, notices: Iterable[Notice], why: str, attempts: int) -> None:
-        """These are given up: they become dead letters, and are counted."""
+        """Give up these events: they become dead letters, and are counted."""
         lost = list(notices)
         self._setting.lose(_LOST, len(lost), why)
         for notice in lost:
@@ -123,7 +123,7 @@ class Keeping:
         self.delivered(lost)
 
     def close(self, keep: bool) -> None:
-        """The last call. Without `keep` nothing is left for the next start."""
+        """The last call. Without `keep` everything is removed."""
         self._drop([key for key in self._kept(_OPEN) if not keep or key not in self._claimed])
         if self._journal is not None:
             try:

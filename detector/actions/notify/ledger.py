@@ -1,4 +1,4 @@
-"""How far an episode's messages have come, from which its outcome follows. Pure but for what it reports to."""
+"""The progress of each episode's messages, and the outcome that follows from it. Pure except for the reports."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from detector.actions.episode import Episode, Outcome, OutcomeState
 @dataclass(slots=True)
 class _Entry:
     episode: Episode | None = None
-    """None: it is from before the restart."""
+    """None: the episode is from before the restart."""
     open: bool = False
     waiting: int = 0
     delivered: int = 0
@@ -22,27 +22,27 @@ class _Entry:
 
 
 class DeliveryLedger:
-    """Counts by episode. An episode is done with once nothing of it waits and nothing more will come."""
+    """Counts by episode. An episode is finished once none of its messages is queued and no more will follow."""
 
     def __init__(self, report: Callable[[Episode, Outcome], None]) -> None:
         self._report = report
         self._entries: dict[str, _Entry] = {}
 
     def open(self, episode: Episode) -> None:
-        """There is this episode."""
+        """Register the episode."""
         entry = self._entry(episode.id)
         entry.episode, entry.open = episode, True
         if episode.unrendered:
             entry.remark = "; ".join(f"{name}: {why}" for name, why in sorted(episode.unrendered.items()))
 
     def close(self, episode: str) -> None:
-        """No more messages are to be expected of it than those that wait."""
+        """No further messages of the episode will follow."""
         if episode in self._entries:
             self._entries[episode].open = False
             self._settle(episode)
 
     def expect(self, episode: str) -> None:
-        """A message about it waits."""
+        """A message of the episode was queued."""
         self._entry(episode).waiting += 1
 
     def delivered(self, episode: str, size: int) -> None:
@@ -57,18 +57,18 @@ class DeliveryLedger:
         self._settle(episode)
 
     def retried(self, episode: str, why: str) -> None:
-        """One was not delivered, and is tried again."""
+        """A message was not delivered, and will be retried."""
         entry = self._entry(episode)
         entry.attempts += 1
         self._report_entry(entry, OutcomeState.RUNNING, f"not delivered yet: {why}")
 
     def kept(self, episode: str) -> None:
-        """One is left to the next start of the detector."""
+        """A message is left for the next start of the detector."""
         entry = self._entry(episode)
         self._report_entry(entry, OutcomeState.RUNNING, "not delivered yet: the detector retries after its next start")
 
     def failed(self, episode: str, why: str) -> None:
-        """One was given up."""
+        """A message was given up."""
         entry = self._entry(episode)
         entry.waiting -= 1
         entry.attempts += 1

@@ -1,4 +1,4 @@
-"""A notification: one event of an episode, with the texts that the rule gives it."""
+"""A notification: one event of an episode, with the rule's texts."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 from wayside.api.actions.notify import Moment
 
 GROUP_TYPE = "dev.wayside.event.group"
-"""The type of the CloudEvent that stands for several."""
+"""The type of a CloudEvent that combines several events."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,13 +23,13 @@ class NoticeTexts:
     labels: Mapping[str, str] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
-        """As it goes into events and the journal: what is absent is left out."""
+        """As a JSON object for events and the journal; absent parts are left out."""
         given = {"title": self.title, "text": self.text, "labels": dict(self.labels) or None}
         return {name: value for name, value in given.items() if value is not None}
 
 
 def texts(rendered: Mapping[str, Any]) -> NoticeTexts:
-    """From what was rendered; values that are no text become one."""
+    """The texts from the rendered templates; other values are converted to text."""
     labels = rendered.get("labels")
     return NoticeTexts(
         _text(rendered.get("title")),
@@ -48,7 +48,7 @@ def _text(value: Any) -> str | None:
 
 @dataclass(frozen=True, slots=True)
 class Notice:
-    """One event to notify of."""
+    """One event for a notification."""
 
     episode: str
     event: Mapping[str, Any]
@@ -59,7 +59,7 @@ class Notice:
 
     @property
     def id(self) -> str:
-        """That of the event, which is the same for every attempt."""
+        """The id of the event, which is the same for every attempt."""
         return str(self.event["id"])
 
     @property
@@ -68,7 +68,7 @@ class Notice:
         return Moment.STARTED if str(self.event["type"]).endswith(".started") else Moment.ENDED
 
     def to_json(self) -> dict[str, Any]:
-        """For the journal."""
+        """As a JSON object for the journal."""
         return {
             "episode": self.episode,
             "event": dict(self.event),
@@ -78,7 +78,7 @@ class Notice:
 
 
 def notice_from(document: Mapping[str, Any]) -> Notice:
-    """What `to_json` gave. Raises KeyError, TypeError or ValueError where it is something else."""
+    """The notification from what `to_json` returned. Raises KeyError, TypeError or ValueError for anything else."""
     event = document["event"]
     if not isinstance(event, dict) or not isinstance(event["data"], dict) or not isinstance(event["type"], str):
         raise ValueError("no event")
@@ -86,22 +86,22 @@ def notice_from(document: Mapping[str, Any]) -> Notice:
 
 
 def event_of(notice: Notice) -> dict[str, Any]:
-    """The CloudEvent of a single event: as published on Zenoh, its data with the rule's texts."""
+    """The CloudEvent of a single event: as published on Zenoh, with the rule's texts added to its data."""
     notification = notice.texts.to_json()
     data = {**notice.event["data"], **({"notification": notification} if notification else {})}
     return {**notice.event, "data": data}
 
 
 def event_of_group(notices: Sequence[Notice], action: str, by: Sequence[str], maximum: int) -> dict[str, Any]:
-    """One CloudEvent for several events of a rule, in the order in which they came.
+    """One CloudEvent for several events of a rule, in order of their arrival.
 
-    Its id follows from theirs: the same events always have the same. The texts are those of the first; `labels` has
-    those that the events have in common, which is those that they are grouped by.
+    Its id is derived from theirs: the same events always have the same id. The texts are those of the first event;
+    `labels` has the common labels of all events, which are the grouping labels.
 
     Args:
         notices: at least one.
         action: the action's name in the rule.
-        by: the labels that they are grouped by.
+        by: the grouping labels.
         maximum: number of events given in full.
     """
     first, last = notices[0], notices[-1]

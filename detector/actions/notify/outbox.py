@@ -1,7 +1,7 @@
-"""Messages that wait to be delivered: which is next, when, and when it is given up. Pure: `now` comes in.
+"""Messages that wait for delivery: which is next, when, and when it is given up. Pure: the caller passes `now`.
 
-A message that fails waits longer each time, and others pass it by, but never those of the same episode: the end is not
-sent before the start. An endpoint that does not answer, or reports that it is busy, is paused as a whole.
+A message that fails waits longer each time. Others overtake it, but never those of the same episode: the end is not
+sent before the start. An endpoint that does not respond, or reports that it is busy, is paused as a whole.
 """
 
 from __future__ import annotations
@@ -16,30 +16,30 @@ from detector.actions.notify.notice import Notice
 from wayside.process.backoff import Backoff
 
 FIRST, LONGEST = 1.0, 300.0
-"""Seconds until the second attempt, and between two attempts at most."""
+"""Seconds until the second attempt, and maximum seconds between two attempts."""
 LONGEST_RETRY_AFTER = 3600.0
-"""Seconds that a Retry-After is heeded at most."""
+"""Maximum seconds of a Retry-After that are respected."""
 
 
 class Fate(Enum):
-    """What follows for a message."""
+    """The result of an attempt for the message."""
 
     DELIVERED = "delivered"
     AGAIN = "again"
     REFUSED = "refused"
-    """It would be refused again."""
+    """It would be rejected again."""
 
 
 @dataclass(frozen=True, slots=True)
 class Delivery:
-    """What came of an attempt."""
+    """The result of an attempt."""
 
     fate: Fate
     why: str = ""
     retry_after: float = 0.0
     """Minimum seconds until the next attempt, as the endpoint requests."""
     whole: bool = False
-    """The endpoint as a whole is unavailable or busy; the message is not at fault."""
+    """The whole endpoint is unavailable or busy; the message is not the cause."""
 
 
 @dataclass(eq=False, slots=True)
@@ -64,21 +64,21 @@ class OutboxMessage:
 
 
 class RateLimit:
-    """At most `messages` messages in any period of `per` seconds."""
+    """A rate limit: at most `messages` messages in any period of `per` seconds."""
 
     def __init__(self, messages: int, per: float) -> None:
         self._per = per
         self._sent: deque[float] = deque(maxlen=messages)
-        """When the last ones went."""
+        """When the last messages were sent."""
 
     def wait(self, now: float) -> float:
-        """The seconds until the next message may go."""
+        """Seconds until the next message may be sent."""
         if len(self._sent) < (self._sent.maxlen or 0):
             return 0.0
         return max(0.0, self._sent[0] + self._per - now)
 
     def spend(self, now: float) -> None:
-        """One goes."""
+        """Count a message as sent."""
         self._sent.append(now)
 
 
@@ -91,20 +91,20 @@ class Outbox:
         self._pause = Backoff(FIRST, LONGEST)
         self._paused_until = 0.0
         self._last_tries: set[int] | None = None
-        """Once the end is near: which messages were tried since."""
+        """In the last round, the messages that were tried; None before."""
 
     def __len__(self) -> int:
         return len(self._waiting)
 
     def add(self, message: OutboxMessage) -> bool:
-        """False: it found no place."""
+        """False: there was no room."""
         if len(self._waiting) >= self._capacity:
             return False
         self._waiting.append(message)
         return True
 
     def hurry(self) -> None:
-        """From now on, each message is tried once more, without waiting for its time."""
+        """From now on, try each message once more, without waiting for its time."""
         self._last_tries = set()
 
     def take(self, now: float) -> OutboxMessage | None:
@@ -124,7 +124,7 @@ class Outbox:
         return None
 
     def _first_of_their_episodes(self) -> Iterator[OutboxMessage]:
-        """The messages that no earlier one about the same episode holds up."""
+        """The messages that do not wait for an earlier one of the same episode."""
         held: set[str] = set()
         for message in self._waiting:
             if not held & message.episodes:
@@ -137,7 +137,7 @@ class Outbox:
         return message.due <= now
 
     def wait(self, now: float) -> float | None:
-        """The seconds after which `take` may have something; None: nothing waits."""
+        """Seconds after which `take` may return something; None: the outbox is empty."""
         due = min((message.due for message in self._first_of_their_episodes()), default=None)
         if due is None:
             return None
@@ -145,7 +145,7 @@ class Outbox:
         return wait if self._budget is None else max(wait, self._budget.wait(now))
 
     def settle(self, message: OutboxMessage, delivery: Delivery, now: float, wall: float) -> Fate:
-        """What became of the message that `take` gave: DELIVERED or REFUSED, and it waits no more; or AGAIN."""
+        """Apply the result for the message from `take`: DELIVERED or REFUSED remove it; AGAIN queues it again."""
         if not delivery.whole:
             self._pause.succeed()
         fate = delivery.fate
@@ -161,6 +161,6 @@ class Outbox:
         return fate
 
     def drain(self) -> list[OutboxMessage]:
-        """What still waits; it is here no more."""
+        """Remove and return the remaining messages."""
         drained, self._waiting = self._waiting, []
         return drained

@@ -1,7 +1,7 @@
-"""The thread that sends: it takes from its queue what to send now, sends it, and reports the result to the queue.
+"""The thread that sends: it takes the next item from its queue, sends it, and reports the result to the queue.
 
-The queue makes all decisions; it does no I/O over the network and is only used under the lock of the
-sender. Sending does not hold the lock, so a producer never waits for it.
+The queue makes all decisions; it does no network I/O and is only used under the lock of the sender. The lock is not
+held during sending, so a producer never waits for it.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ T = TypeVar("T")
 """An item of a queue."""
 
 GRACE = 3.0
-"""Seconds that remain for last attempts when the detector ends."""
+"""Seconds for last attempts when the detector ends."""
 _LONGEST_WAIT = 60.0
 
 
 class SendQueue(Protocol[T]):
-    """Decides what is sent, and when. `now` is in seconds of a monotonic clock."""
+    """Decides what is sent and when. `now` is in seconds of a monotonic clock."""
 
     def take(self, now: float) -> T | None:
-        """What to send now."""
+        """The item to send now."""
 
     def wait(self, now: float) -> float | None:
-        """In how many seconds `take` may have something; None: not before something new comes."""
+        """Seconds until `take` may return something; None: not before something new is added."""
 
     def settle(self, sent: T, delivery: Delivery, now: float) -> None:
-        """What came of it."""
+        """Apply the result."""
 
     def hurry(self) -> None:
-        """The end is near: give everything that waits once more."""
+        """The end is near: return each queued item once more."""
 
 
 class Sender(Generic[T]):
@@ -73,14 +73,14 @@ class Sender(Generic[T]):
         while (parcel := self._next()) is not None:
             try:
                 delivery = self._send(parcel, self._over)
-            except Exception as error:  # noqa: BLE001  a message that cannot be sent ends no thread
+            except Exception as error:  # noqa: BLE001  a message that cannot be sent must not end the thread
                 _log.error("cannot send a notification", exc_info=error)
                 delivery = Delivery(Fate.AGAIN, f"{type(error).__name__}: {error}")
             with self._changed:
                 self._queue.settle(parcel, delivery, time.monotonic())
 
     def _next(self) -> T | None:
-        """The next item, after waiting for it; None: there are no more."""
+        """The next item, after waiting for it; None at the end."""
         with self._changed:
             while not self._over():
                 now = time.monotonic()

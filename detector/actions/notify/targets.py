@@ -1,4 +1,4 @@
-"""Where CloudEvents go: an HTTP endpoint, or a Zenoh key.
+"""The targets of CloudEvents: an HTTP endpoint, or a Zenoh key.
 
 HTTP requests follow CloudEvents' HTTP protocol binding 1.0: structured mode (section 3.2) or binary mode (3.1), whose
 header values are percent-encoded (3.1.3.2).
@@ -23,24 +23,24 @@ STRUCTURED = "application/cloudevents+json"
 
 
 class Target(Protocol):
-    """Takes CloudEvents."""
+    """Receives CloudEvents."""
 
     def send(self, event: Mapping[str, Any], give_up: Callable[[], bool]) -> Delivery:
-        """Try once. Waits as long as the target's timeout, or until `give_up` is true."""
+        """Try once. Waits at most for the target's timeout, or until `give_up` is true."""
 
 
 def event_json(event: Mapping[str, Any]) -> bytes:
-    """A CloudEvent in JSON. Raises ValueError where it holds what JSON cannot."""
+    """A CloudEvent in JSON. Raises ValueError if a value has no form in JSON."""
     return json.dumps(event, separators=(",", ":"), ensure_ascii=False, allow_nan=False).encode()
 
 
 def structured(event: Mapping[str, Any]) -> tuple[dict[str, str], bytes]:
-    """Headers and body of a request whose body is the whole event."""
+    """Headers and body of a request with the whole event as its body."""
     return {"Content-Type": f"{STRUCTURED}; charset=utf-8"}, event_json(event)
 
 
 def binary(event: Mapping[str, Any]) -> tuple[dict[str, str], bytes]:
-    """Headers and body of a request whose body is the event's data."""
+    """Headers and body of a request with the event's data as its body."""
     attributes = {name: value for name, value in event.items() if name not in ("data", "datacontenttype")}
     headers = {f"ce-{name}": _header_value(str(value)) for name, value in attributes.items()}
     return {"Content-Type": str(event["datacontenttype"]), **headers}, event_json(event["data"])
@@ -59,7 +59,7 @@ class Poster:
     """Posts to one endpoint, and interprets its response."""
 
     def __init__(self, access: HttpAccess, field: str) -> None:
-        """`field` is where `access` stands in the rule."""
+        """`field` is the place of `access` in the rule."""
         self._client = HttpClient(access, field)
 
     def post(self, url: str, headers: Mapping[str, str], body: bytes, give_up: Callable[[], bool]) -> Delivery:
@@ -79,7 +79,7 @@ class Poster:
 
 
 class HttpTarget:
-    """An endpoint that takes CloudEvents by POST."""
+    """An endpoint that receives CloudEvents by POST."""
 
     def __init__(self, http: NotifyHttp, field: str) -> None:
         self._http, self._field = http, field
@@ -109,13 +109,13 @@ class HttpTarget:
 
 
 class ZenohTarget:
-    """A key of the detector's session. What the session cannot send, it counts."""
+    """A key of the detector's session. The session counts what it cannot send."""
 
     def __init__(self, zenoh: NotifyZenoh, messenger: Messenger) -> None:
         self._key, self._messenger = zenoh.key, messenger
 
     def send(self, event: Mapping[str, Any], give_up: Callable[[], bool]) -> Delivery:
-        """Hand over."""
+        """Pass it to the session."""
         try:
             self._messenger.publish(self._key, event_json(event), STRUCTURED)
         except ValueError as error:

@@ -26,7 +26,7 @@ from wayside.api.actions import record as api
 log = logging.getLogger(__name__)
 
 _FLUSH_SECONDS = 0.5
-"""What a sample waits at most before the kernel has it: about what a kill -9 costs."""
+"""Maximum seconds until a sample is passed to the kernel: the loss caused by a kill -9."""
 _REPORT_SECONDS = 5.0
 _EXPIRE_SECONDS = 30.0
 
@@ -51,7 +51,7 @@ class Record(Action[api.RecordAction]):
         self._flushed = self._expired = -math.inf
 
     def started(self, episode: Episode) -> None:
-        """Begins a recording. Raises ActionError where there is no room for one, unless another is tried later."""
+        """Begins a recording. Raises ActionError if there is no room, unless another attempt follows later."""
         surroundings = self.setting.surroundings()
         renew = self.parameters.renew_after
         start = None if episode.resumed else episode.onset_time - self.parameters.before.ns
@@ -68,9 +68,9 @@ class Record(Action[api.RecordAction]):
         self.setting.report(episode, Outcome(OutcomeState.RUNNING, series.problem))
 
     def samples(self, episode: Episode, samples: Sequence[EpisodeSample]) -> None:
-        """Adds them to the recording. What goes wrong ends it, and it is kept as cut."""
+        """Adds them to the recording. An error ends the recording, which is kept as cut."""
         current = self._open.get(episode.id)
-        if current is None:  # its recording ended early: that is reported
+        if current is None:  # its recording ended early, which was reported
             self._lose(len(samples))
             return
         current.series.take(samples, self.setting.surroundings())
@@ -109,7 +109,7 @@ class Record(Action[api.RecordAction]):
             self._settle(current, over=True)
 
     def _know(self, episode: Episode) -> _Open | None:
-        """Update what the recording describes with the present state of the episode."""
+        """Update the recording's description with the current state of the episode."""
         current = self._open.get(episode.id)
         if current is not None:
             current.episode = episode
@@ -124,7 +124,7 @@ class Record(Action[api.RecordAction]):
             self.setting.report(current.episode, current.series.outcome(OutcomeState.RUNNING))
 
     def _settle(self, current: _Open, *, over: bool = False) -> None:
-        """Says what became of a recording that is over: done is what is whole, anything else has failed."""
+        """Reports the outcome of a finished recording: done if it is complete, otherwise failed."""
         series, episode = current.series, current.episode
         lost, series.lost = series.lost, 0
         self._lose(lost)
@@ -148,7 +148,7 @@ class Record(Action[api.RecordAction]):
         return Recording(folder, description.fields(), self.parameters, surroundings, start=start)
 
     def _tidy(self) -> None:
-        """What earlier runs left behind is completed, beside this thread; what is too old is deleted."""
+        """Completes the recordings of earlier runs, on another thread, and deletes those that are too old."""
         try:
             place = self._destination(self.setting.surroundings())
             if left := place.take_left():
@@ -163,7 +163,7 @@ class Record(Action[api.RecordAction]):
     def _recover(self, place: Destination, left: Sequence[Path]) -> None:
         try:
             kept = recover(place, left)
-        except Exception as error:  # what a kill left may be anything, and must not keep new recordings from being made
+        except Exception as error:  # remains of a kill may be malformed, and must not prevent new recordings
             log.exception("cannot complete interrupted recordings")
             self.setting.lose("times interrupted recordings could not be completed", 1, str(error))
             return

@@ -1,7 +1,7 @@
-"""rosbag2's metadata.yaml: what makes a folder of MCAP files a bag. Pure.
+"""rosbag2's metadata.yaml, which makes a folder of MCAP files a bag. Pure.
 
-It lists the ROS topics alone: rosbag2 and its like refuse a bag that has others, and pass over those in the files that
-are not listed. Version 8 is what every ROS 2 since Humble reads.
+It lists only ROS topics: rosbag2 and similar tools reject a bag with other topics, and skip topics in the files that
+are not listed. Every ROS 2 since Humble reads version 8.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class BagFile:
 
 
 def metadata_yaml(parts: Sequence[BagFile], custom: Mapping[str, str]) -> str:
-    """The text of metadata.yaml. `custom` is further metadata of the bag."""
+    """The text of metadata.yaml. `custom` is additional metadata of the bag."""
     topics: dict[tuple[str, str], dict[str, Any]] = {}
     for part in parts:
         for name, type_name, digest, latched, count in _topics(part.contents):
@@ -75,7 +75,7 @@ def _file(part: BagFile) -> dict[str, Any]:
 
 
 def _topics(contents: Contents) -> Iterable[tuple[str, str, str, bool, int]]:
-    """Of each ROS topic in a file: its name, type and hash, whether it is latched, and how many messages it has."""
+    """For each ROS topic in a file: its name, type and hash, whether it is latched, and its number of messages."""
     counts = contents.by_channel
     for number, channel in contents.channels.items():
         if "offered_qos_profiles" in channel.metadata:

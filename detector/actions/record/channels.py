@@ -1,7 +1,7 @@
-"""How the samples of a stream stand in a recording: topic, encoding, schema, and what ROS wants to know of a topic.
+"""The channels of a recording: topic, encoding, schema, and ROS metadata of each stream.
 
-Schemas are written for ROS 2 messages only. JSON, CBOR, ETSI ITS and raw messages have none (MCAP's schema 0), their
-encoding gives their format.
+Only ROS 2 messages have schemas. JSON, CBOR, ETSI ITS and raw messages have none (MCAP's schema 0); their encoding
+determines their format.
 """
 
 from __future__ import annotations
@@ -18,41 +18,41 @@ from wayside.api.stream import Encoding, Stream
 from wayside.keys import KeyPattern
 
 _FOREVER = {"sec": 9223372036, "nsec": 854775807}
-"""How rosbag2 writes a time that is not limited."""
+"""rosbag2's form of an unlimited duration."""
 _MAXIMUM_CHANNELS = 60_000
-"""MCAP numbers channels with 16 bits: samples on more keys than this are left out, and missing."""
+"""MCAP numbers channels with 16 bits: samples on further keys are left out, and counted as missing."""
 
 Place = tuple[str, str, str]
-"""A stream, a key and a client: what has a channel of its own."""
+"""A stream, a key and a client: each combination has a separate channel."""
 
 _HISTORY = 100
-"""Maximum number of publishers of a latched topic: the last message of each is played again."""
+"""Maximum number of publishers of a latched topic: the last message of each is republished on playback."""
 
 
 @dataclass(frozen=True, slots=True)
 class ChannelFormat:
-    """How the messages of a stream read. Where it changes, the stream goes on in another channel."""
+    """The format of a stream's messages. When it changes, the stream continues in another channel."""
 
     encoding: str
-    """As MCAP names it."""
+    """MCAP's name of the encoding."""
     type: str | None
     """The ROS 2 message type."""
     definition: str | None
-    """Of the type, with all that it refers to."""
+    """The definition of the type, including all types that it refers to."""
     digest: str
-    """The type's hash, as ROS 2 has it."""
+    """The ROS 2 hash of the type."""
     latched: bool
 
     @property
     def metadata(self) -> Mapping[str, str]:
-        """What rosbag2 wants to know of a topic; empty for what is no ROS topic."""
+        """rosbag2's metadata of a topic; empty if it is not a ROS topic."""
         if self.type is None:
             return {}
         return {"offered_qos_profiles": yaml.safe_dump(qos(self.latched)).strip(), "topic_type_hash": self.digest}
 
 
 def channel_format(stream: Stream, types: RosTypes) -> ChannelFormat:
-    """How the stream's messages read."""
+    """The format of the stream's messages."""
     if stream.encoding is not Encoding.CDR or stream.type is None or not types.known(stream.type):
         return ChannelFormat(stream.encoding.value, None, None, "", stream.latched)
     digest = types.store.hash_rihs01(stream.type)
@@ -60,7 +60,7 @@ def channel_format(stream: Stream, types: RosTypes) -> ChannelFormat:
 
 
 def qos(latched: bool) -> list[dict[str, Any]]:
-    """The quality of service with which rosbag2 is to play a topic, in the notation that every ROS 2 reads."""
+    """The quality of service for rosbag2 to play a topic with, in the notation that every ROS 2 reads."""
     return [
         {
             "history": 1,  # keep last
@@ -77,7 +77,7 @@ def qos(latched: bool) -> list[dict[str, Any]]:
 
 
 class FileChannels:
-    """The channels of one file, made as they are needed."""
+    """The channels of one file, created on first use."""
 
     def __init__(self, file: McapFile) -> None:
         self._file = file
@@ -85,11 +85,11 @@ class FileChannels:
         self._schemas: dict[tuple[str, str], int] = {}
 
     def keep(self, streams: Collection[str]) -> None:
-        """Samples of other streams than these go into new channels from now on."""
+        """Samples of all streams except these go into new channels from now on."""
         self._numbers = {place: number for place, number in self._numbers.items() if place[0] in streams}
 
     def number(self, place: Place, known: ChannelFormat | None) -> int | None:
-        """The number of a channel in the file; None where there are too many."""
+        """The number of a channel in the file; None if there are too many."""
         number = self._numbers.get(place)
         if number is None and len(self._file.contents.channels) < _MAXIMUM_CHANNELS:
             number = self._numbers[place] = self._new(place, known or ChannelFormat("raw", None, None, "", False))
@@ -107,7 +107,8 @@ class FileChannels:
 
 
 class Owners:
-    """Tells, of streams that share a key, whose samples are recorded: each message came once, and is written once."""
+    """For streams that share a key, decides whose samples are recorded: each message is received once and written
+    once."""
 
     def __init__(self, streams: Mapping[str, Stream]) -> None:
         """The streams of the window, in the Detector's order."""
@@ -122,7 +123,7 @@ class Owners:
         return owner == stream
 
     def _owner(self, name: str, key: str) -> str:
-        """The first that can read the messages; else the first."""
+        """The first stream that can read the messages; otherwise the first."""
         mine = next((_origin(stream) for stream, _ in self._streams if stream.name == name), None)
         same = [stream for stream, pattern in self._streams if _origin(stream) == mine and pattern.match(key)]
         if mine is None or not same:
@@ -131,5 +132,5 @@ class Owners:
 
 
 def _origin(stream: Stream) -> Hashable:
-    """Streams of the same key get the same messages where this is equal."""
+    """Streams of the same key receive the same messages if this is equal."""
     return stream.source, stream.layout, stream.domain, stream.client

@@ -1,4 +1,4 @@
-"""How the chunks of a recording are compressed. Compressing runs beside other threads."""
+"""The compression of a recording's chunks. Other threads run during compression."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from wayside.api.actions.record import Compression
 Pieces = Sequence[bytes | bytearray]
 """A chunk, not joined."""
 Compress = Callable[[Pieces], tuple[str, Pieces]]
-"""Makes of a chunk its compressed form; and gives the name that MCAP has for it."""
+"""Compresses a chunk; also returns MCAP's name of the compression."""
 
 
 def compressor(compression: Compression) -> Compress:
-    """What compresses the chunks of one recording; for one thread."""
+    """The function that compresses the chunks of one recording; for one thread."""
     match compression:
         case Compression.NONE:
             return lambda pieces: ("", pieces)
         case Compression.LZ4:
             return lambda pieces: ("lz4", (lz4.frame.compress(b"".join(pieces)),))
         case Compression.ZSTD:
-            zstd = zstandard.ZstdCompressor(level=1)  # near lz4's speed, and much smaller
+            zstd = zstandard.ZstdCompressor(level=1)  # almost as fast as lz4, and much smaller
             return lambda pieces: ("zstd", (zstd.compress(b"".join(pieces)),))
 
 
 def decompress(name: str, data: bytes, size: int) -> bytes:
-    """The chunk of `size` bytes. Raises ValueError where it cannot be read."""
+    """The chunk of `size` bytes. Raises ValueError if it cannot be read."""
     try:
         match name:
             case "":

@@ -14,9 +14,9 @@ from wayside.names import encode
 from wayside.times import format_time
 
 FORMAT = "wayside recording 1"
-"""Under `format`, in the description: by this a recording is known as one. The number is the version."""
+"""The value of `format` in the description, which identifies a recording. The number is the version."""
 DESCRIPTION = "recording.json"
-"""The description's file, in the recording's folder."""
+"""The name of the description's file, in the recording's folder."""
 METADATA = "wayside"
 """The MCAP metadata record about the episode, at the start of each file."""
 METADATA_END = "wayside/end"
@@ -24,34 +24,34 @@ METADATA_END = "wayside/end"
 METADATA_CUT = "cut"
 """The metadata record with the reason why the file is incomplete."""
 METADATA_USER = "metadata"
-"""The one with what the rule gives as `metadata`."""
+"""The metadata record with the rule's `metadata`."""
 
 _SUBJECT = 60
-"""A longer subject is shortened in names: they have 255 characters at most. The id of the episode distinguishes
-them.
+"""Maximum length of a subject in names, which have 255 characters at most; longer ones are shortened. The id of the
+episode distinguishes them.
 """
 
 
 @dataclass(frozen=True)
 class Description:
-    """An episode, and what records it."""
+    """An episode, and its recorder."""
 
     holder: str
     detector: str
     rule: str
     generation: int
-    """Of the EventRule; 0 where it comes from a file."""
+    """The generation of the EventRule; 0 if it comes from a file."""
     action: str
     episode: Episode
     continued: bool = False
-    """There was an earlier recording of the episode."""
+    """The episode was recorded before."""
 
     part: int = 0
-    """Counts the recordings of an episode that has several, from 1."""
+    """The number of the recording, from 1, if the episode has several."""
 
     @property
     def name(self) -> str:
-        """Of the folder, with nothing about how it ended."""
+        """The name of the folder, without the suffix for how it ended."""
         start = re.sub("[:.]", "-", format_time(self.episode.start_time)[:23]) + "Z"
         parts = [start, self.rule, self.episode.subject[:_SUBJECT], self.action, encode(self.episode.id)[:16]]
         if self.episode.resumed:
@@ -61,7 +61,7 @@ class Description:
         return "_".join(parts)
 
     def fields(self) -> dict[str, Any]:
-        """All of it, as the description's file and the metadata have it."""
+        """All fields, for the description's file and the metadata."""
         episode = self.episode
         fields: dict[str, Any] = {
             "format": FORMAT,
@@ -89,7 +89,7 @@ class Description:
 
 
 def with_ending(fields: Mapping[str, Any], **changes: JsonValue) -> dict[str, Any]:
-    """The same, with other values; None takes one out."""
+    """The same with other values; None removes a field."""
     return {name: value for name, value in {**fields, **changes}.items() if value is not None}
 
 
@@ -100,18 +100,18 @@ _BEGINNING = (
 
 
 def beginning(fields: Mapping[str, Any]) -> dict[str, str]:
-    """What is known at the start of a file, as MCAP's metadata have it: text, and JSON where it is more."""
+    """The fields known at the start of a file, as MCAP metadata: text, or JSON for structured values."""
     return as_text({name: value for name, value in fields.items() if name in _BEGINNING})
 
 
 def ending(fields: Mapping[str, Any]) -> dict[str, str]:
-    """What is known at the end."""
+    """The fields known at the end."""
     names = ("rule", "episode", "endTime", "reason", "samples", "missing", "cut", "continues")
     return as_text({name: fields[name] for name in names if name in fields})
 
 
 def as_text(values: Mapping[str, JsonValue]) -> dict[str, str]:
-    """Values as metadata have them."""
+    """Values as text for metadata."""
     return {
         name: value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
         for name, value in values.items()

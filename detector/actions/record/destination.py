@@ -1,8 +1,8 @@
-"""The folder of all recordings: how much room they take together, and what gives way for new ones.
+"""The folder of all recordings: its disk space, and the deletion of old recordings.
 
-There is one object for a folder in a process, shared by all actions. Bytes are claimed before they are written, so the
-limits hold at any time, over all recordings in progress; those that stand under their final name are known from the
-folder itself. A recording in progress stands under a hidden name, and is never dropped.
+There is one object per folder in a process, shared by all actions. Bytes are claimed before they are written, so the
+limits hold at any time over all recordings in progress; complete recordings are found in the folder itself. A recording
+in progress has a hidden name, and is never dropped.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from detector.actions.record.description import DESCRIPTION, FORMAT
 from wayside.api.recordings import Recordings, WhenFull
 
 PARTIAL = ".partial"
-"""The ending of the hidden folder of a recording in progress."""
+"""The suffix of the hidden folder of a recording in progress."""
 DROPPED = ".dropped"
-"""The ending of the hidden folder of a recording that is being deleted."""
+"""The suffix of the hidden folder of a recording that is being deleted."""
 
 _SCAN_SECONDS = 2.0
 """Minimum seconds between two scans of a full folder."""
 
 
 class NoRoomError(Exception):
-    """A recording that finds no room; the text names the limit and the remedy."""
+    """There is no room for a recording; the text names the limit and the remedy."""
 
 
 @dataclass(frozen=True, slots=True, order=True)
 class Kept:
-    """A recording under its final name."""
+    """A complete recording under its final name."""
 
     ended: float
     """Seconds since the epoch."""
@@ -44,10 +44,10 @@ class Kept:
 
 
 class Destination:
-    """The room for recordings in one folder. Thread-safe."""
+    """The disk space for recordings in one folder. Thread-safe."""
 
     def __init__(self, limits: Recordings) -> None:
-        """Raises OSError where the folder cannot be made or read."""
+        """Raises OSError if the folder cannot be created or read."""
         self.path = Path(limits.path)
         self.path.mkdir(parents=True, exist_ok=True)
         self._lock = threading.Lock()
@@ -58,33 +58,33 @@ class Destination:
         self._scan()
 
     def take_left(self) -> list[Path]:
-        """The hidden folders that were there before this process recorded here; empty from the second call on."""
+        """The hidden folders that existed before this process recorded here; empty from the second call on."""
         with self._lock:
             left, self._left = self._left, []
             return left
 
     def limit(self, limits: Recordings) -> None:
-        """From now on these are the limits."""
+        """Use these limits from now on."""
         with self._lock:
             self._limits = limits
 
     @property
     def used(self) -> int:
-        """Bytes of all recordings, with what those in progress have claimed."""
+        """Bytes of all recordings, including the claims of those in progress."""
         with self._lock:
             return self._total
 
     def claim(self, now: int, later: int, files: int = 0, *, forced: bool = False) -> list[Kept]:
         """Reserve room for the bytes that are written now, and for those that complete the recording later.
 
-        Negative numbers give room back; forced, no limit counts. Returns what was dropped for it. Raises NoRoomError,
-        OSError.
+        Negative numbers release room; `forced` ignores the limits. Returns the recordings that were dropped for it.
+        Raises NoRoomError, OSError.
         """
         with self._lock:
             needed = now + later
             dropped: list[Kept] = []
             while not forced and (needed > 0 or files > 0) and (short := self._short(needed, files)):
-                if time.monotonic() - self._scanned > _SCAN_SECONDS:  # files may have been deleted by hand
+                if time.monotonic() - self._scanned > _SCAN_SECONDS:  # files may have been deleted manually
                     self._scan()
                     continue
                 if self._limits.when_full is WhenFull.STOP:
@@ -98,7 +98,7 @@ class Destination:
             return dropped
 
     def settle(self, claimed: tuple[int, int, int], kept: Kept | None) -> None:
-        """A recording is no longer in progress: what it had claimed in all is what it takes, or nothing."""
+        """A recording is no longer in progress: replace its claims by its actual size, or by nothing."""
         now, later, files = claimed
         with self._lock:
             self._bytes -= now + later
@@ -108,7 +108,7 @@ class Destination:
                 self._keep([*self._kept, kept])
 
     def expire(self) -> list[Kept]:
-        """Drops what is older than it may be. Returns it. Raises OSError."""
+        """Drops recordings that have exceeded their maximum age, and returns them. Raises OSError."""
         with self._lock:
             age = self._limits.age
             if age is None:
@@ -138,13 +138,13 @@ class Destination:
         return stat.f_bavail * stat.f_frsize
 
     def _drop(self, kept: Kept) -> Kept:
-        """Delete a recording; in between it has no name under which it looks whole."""
+        """Delete a recording; during deletion its name is hidden, so it never looks complete."""
         self._keep(each for each in self._kept if each is not kept)
         hidden = hidden_path(kept.path, DROPPED)
         try:
             kept.path.rename(hidden)
         except FileNotFoundError:
-            return kept  # another process did
+            return kept  # another process deleted it
         shutil.rmtree(hidden)
         return kept
 
@@ -159,12 +159,12 @@ class Destination:
 
 
 def hidden_path(path: Path, ending: str) -> Path:
-    """Where a recording stands that is to have this final path, or had it."""
+    """The hidden path of a recording with this final path."""
     return path.with_name(f".{path.name}{ending}")
 
 
 def finished_recordings(path: Path) -> Iterator[Kept]:
-    """The recordings in a folder that have their final names. What is not of our making is left alone."""
+    """The complete recordings in a folder. Other files are left alone."""
     for rule in _folders(path):
         for folder in _folders(rule):
             if not folder.name.startswith(".") and (kept := _kept(folder)) is not None:
@@ -172,7 +172,7 @@ def finished_recordings(path: Path) -> Iterator[Kept]:
 
 
 def hidden(path: Path, ending: str) -> Iterator[Path]:
-    """The folders in the making, or being deleted."""
+    """The folders of recordings that are in progress or being deleted."""
     for rule in _folders(path):
         yield from (each for each in _folders(rule) if each.name.startswith(".") and each.name.endswith(ending))
 
@@ -202,7 +202,7 @@ _PLACES_LOCK = threading.Lock()
 
 
 def destination(limits: Recordings) -> Destination:
-    """The one object for that folder in this process, from now on with these limits. Raises OSError."""
+    """The one object for that folder in this process, with these limits from now on. Raises OSError."""
     with _PLACES_LOCK:
         name = os.path.realpath(limits.path)
         place = _PLACES.get(name)

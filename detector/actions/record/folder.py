@@ -1,4 +1,4 @@
-"""The folder of a recording in the making: hidden and locked, until it gets its final name in one step.
+"""The folder of a recording in progress: hidden and locked, until it is renamed atomically to its final name.
 
 The lock distinguishes a recording in progress from one that a killed process left behind.
 """
@@ -19,24 +19,24 @@ from detector.actions.record.description import DESCRIPTION, as_text
 from detector.actions.record.destination import PARTIAL, Destination, Kept, hidden_path
 
 CUT = "_cut"
-"""What the names of recordings end in of whose window something is missing."""
+"""The suffix of the names of incomplete recordings."""
 _ROOM = ".room"
-"""A file that keeps room on the disk for what completes the recording."""
+"""A file that reserves disk space for completing the recording."""
 _ROOM_BYTES = 64 * 1024
 
 Dropped = Callable[[Sequence[Kept]], None]
-"""Told of recordings that were deleted to make room."""
+"""Receives the recordings that were deleted to make room."""
 
 
 class RecordingFolder:
-    """A hidden folder, locked by this process. Counts what it claims of the destination."""
+    """A hidden folder, locked by this process. Tracks its claims on the destination."""
 
     def __init__(
         self, destination: Destination, path: Path, name: str, dropped: Dropped, *, forced: bool = False
     ) -> None:
-        """Locks the folder. `forced`: whatever it claims, it gets.
+        """Locks the folder. `forced`: all its claims succeed.
 
-        Raises BlockingIOError where another process has it, and other OSErrors.
+        Raises BlockingIOError if another process has locked it, and other OSErrors.
         """
         self.path = path
         self.name = name
@@ -54,7 +54,7 @@ class RecordingFolder:
 
     @classmethod
     def create(cls, destination: Destination, rule: str, name: str, dropped: Dropped) -> RecordingFolder:
-        """A new one. A number is added to the name where there is one already. Raises NoRoomError, OSError."""
+        """Create a new one. A number is appended to the name if it exists already. Raises NoRoomError, OSError."""
         parent = destination.path / rule
         parent.mkdir(exist_ok=True)
         number, chosen = 1, name
@@ -79,7 +79,7 @@ class RecordingFolder:
             self._dropped(gone)
 
     def use_room(self) -> None:
-        """Gives back the room that was kept: to be called before the recording is completed. Raises OSError."""
+        """Releases the reserved disk space: call it before the recording is completed. Raises OSError."""
         room = self.path / _ROOM
         if room.exists():
             room.unlink()
@@ -90,7 +90,7 @@ class RecordingFolder:
         _write(self.path / DESCRIPTION, json.dumps(fields, ensure_ascii=False, indent=1))
 
     def described(self) -> dict[str, Any] | None:
-        """The description that is there; None where there is none that can be read."""
+        """The existing description; None if there is none that can be read."""
         try:
             fields = json.loads((self.path / DESCRIPTION).read_bytes())
         except (OSError, ValueError):
@@ -98,7 +98,7 @@ class RecordingFolder:
         return fields if isinstance(fields, dict) else None
 
     def publish(self, parts: Sequence[BagFile], fields: Mapping[str, Any]) -> Kept:
-        """Gives the folder its final name, once the disk has everything. Raises OSError: then it is as it was."""
+        """Renames the folder to its final name, after syncing it to disk. Raises OSError: then it is unchanged."""
         _write(self.path / "metadata.yaml", metadata_yaml(parts, as_text(fields)))
         self.describe(fields)
         os.fsync(self._lock)
@@ -111,12 +111,12 @@ class RecordingFolder:
         return kept
 
     def remove(self) -> None:
-        """Nothing of it is worth keeping. Raises OSError."""
+        """Remove the folder, because nothing in it is worth keeping. Raises OSError."""
         shutil.rmtree(self.path, ignore_errors=True)
         self._settle(None)
 
     def leave(self) -> None:
-        """It stays as it is, for the next start of the detector; its room stays claimed."""
+        """Leave it for the next start of the detector; its room stays claimed."""
         os.close(self._lock)
 
     def _settle(self, kept: Kept | None) -> None:
@@ -141,7 +141,7 @@ def _keep_room(path: Path) -> None:
 
 
 def _write(path: Path, text: str) -> None:
-    """The whole file or none of it."""
+    """Write the whole file or nothing."""
     beside = path.with_name(f".{path.name}")
     with beside.open("w", encoding="utf-8") as file:
         file.write(text)

@@ -1,6 +1,4 @@
-"""The content of an MCAP file, as far as its summary describes it: enough to complete a file, newly written or found
-cut.
-"""
+"""The contents of an MCAP file as described by its summary: enough to complete a new or truncated file."""
 
 from __future__ import annotations
 
@@ -25,23 +23,23 @@ from mcap.records import (
 
 MAGIC = b"\x89MCAP0\r\n"
 LIBRARY = "wayside recording 1"
-"""The library in the header; the number is the version of what a recording holds."""
+"""The library in the header; the number is the version of the recording's contents."""
 
 _INDEX_HEAD = struct.Struct("<BQHI")
 
 ChunkMessages = Mapping[int, list[int]]
-"""Of each channel in a chunk: the log time of a message (nanoseconds), its place in the chunk, those of the next …"""
+"""By channel of a chunk: the log time of a message (nanoseconds), its offset in the chunk, those of the next …"""
 
 
 def packed(record: McapRecord) -> bytes:
-    """The record as the file has it."""
+    """The record in its binary form."""
     builder = RecordBuilder()
     record.write(builder)
     return bytes(builder.end())  # type: ignore[no-untyped-call]
 
 
 def packed_message_indexes(messages: ChunkMessages, at: int) -> tuple[dict[int, int], bytes]:
-    """The message indexes that stand behind a chunk, at that offset of the file; and where that of each channel is."""
+    """The message indexes that follow a chunk, at that offset of the file, and the offset of each channel's index."""
     offsets: dict[int, int] = {}
     data = bytearray()
     for channel, pairs in messages.items():
@@ -53,23 +51,23 @@ def packed_message_indexes(messages: ChunkMessages, at: int) -> tuple[dict[int, 
 
 @dataclass(slots=True)
 class Contents:
-    """Schemas, channels, chunks and metadata of a file, in the order in which they stand there."""
+    """Schemas, channels, chunks and metadata of a file, in the order of the file."""
 
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     chunks: list[ChunkIndex] = field(default_factory=list)
     counts: list[Mapping[int, int]] = field(default_factory=list)
-    """Of each chunk: how many messages of each channel."""
+    """By chunk, the number of messages of each channel."""
     metadata: list[MetadataIndex] = field(default_factory=list)
 
     @property
     def messages(self) -> int:
-        """How many messages the chunks hold."""
+        """Number of messages in the chunks."""
         return sum(sum(counts.values()) for counts in self.counts)
 
     @property
     def by_channel(self) -> Mapping[int, int]:
-        """How many messages of each channel the chunks hold."""
+        """Number of messages of each channel in the chunks."""
         total: Counter[int] = Counter()
         for counts in self.counts:
             total.update(counts)
@@ -77,7 +75,7 @@ class Contents:
 
     @property
     def span(self) -> tuple[int, int]:
-        """The first and the last log time; zeros without messages."""
+        """The first and the last log time; zeros if there are no messages."""
         if not self.chunks:
             return 0, 0
         return (
@@ -86,7 +84,7 @@ class Contents:
         )
 
     def summary(self, start: int) -> bytes:
-        """All that stands behind the data's end, which is at offset `start`."""
+        """Everything that follows the end of the data, which is at offset `start`."""
         first, last = self.span
         statistics = Statistics(
             attachment_count=0,

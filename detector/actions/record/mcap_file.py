@@ -1,9 +1,9 @@
-"""Writes an MCAP file so that a large message is never copied, and so that a file that was cut can be completed.
+"""Writes an MCAP file without copying large messages, so that a truncated file can still be completed.
 
-Messages gather in a chunk in memory. A chunk goes to the kernel in one call, the schemas and channels that are new
-before it and its index behind it. Payloads are handed over where they are: point clouds cost no copies, and other
-threads run meanwhile. What the kernel has outlives the process. Where a write fails the file is cut back to the
-last whole chunk, so it never holds half of one; what was in the chunk is lost and counted.
+Messages are collected in a chunk in memory. A chunk is passed to the kernel in one call, preceded by new schemas and
+channels, and followed by its index. Payloads are passed by reference: point clouds cost no copies, and other threads
+run during the call. Data in the kernel survives the process. If a write fails, the file is truncated to the last whole
+chunk, so it never contains a partial one; the messages of the failed chunk are lost and counted.
 """
 
 from __future__ import annotations
@@ -28,28 +28,28 @@ _APART = 2**15
 _MESSAGE = struct.Struct("<BQHIQQ")
 _CHUNK_HEAD = struct.Struct("<BQQQQI")
 _ENDING = 512
-"""Bytes that complete a file, beside what its summary has of each chunk, schema and channel."""
+"""Bytes that complete a file, apart from its summary's entries for chunks, schemas and channels."""
 
 Claim = Callable[[int, int], None]
-"""Asked before bytes are written: how many now, and how many more when the file is completed. Raises where there is no
-room. With negative numbers: they were not written."""
+"""Called before bytes are written: how many now, and how many more when the file is completed. Raises an error if there
+is no room. Negative numbers: they were not written."""
 
 
 class SyncError(OSError):
-    """The kernel could not write accepted data to the disk: how much of it was written is unknown."""
+    """The kernel could not write accepted data to the disk; it is unknown how much was written."""
 
 
 class McapFile:
-    """A file in the making. Whatever it raises (OSError, or what `claim` raises), it can still be completed."""
+    """A file in progress. After any of its exceptions (OSError, or those of `claim`), it can still be completed."""
 
     def __init__(self, path: Path, compress: Compress, claim: Claim, fd: int, contents: Contents, end: int) -> None:
-        """A file that there is: `end` is up to where it holds the contents, and nothing behind that counts."""
+        """An existing file: the contents are valid up to `end`, and the rest is ignored."""
         self.path = path
         self.contents = contents
         self.end = end
-        """Bytes that are written and whole."""
+        """Number of bytes that are completely written."""
         self.lost = 0
-        """Messages that were added, and are not in the file since a write failed."""
+        """Messages that were added, but are not in the file because a write failed."""
         self._compress = compress
         self._claim = claim
         self._fd = fd
@@ -72,27 +72,27 @@ class McapFile:
 
     def _begin_chunk(self) -> None:
         self._pieces: list[bytes | bytearray] = []
-        self._run = bytearray()  # what follows the pieces, as long as it is small
+        self._run = bytearray()  # the data after the pieces, while it is small
         self._size = 0
         self._first = self._last = 0
         self._index: dict[int, list[int]] = defaultdict(list)
         self.waiting = 0
-        """Messages that the kernel does not have yet."""
+        """Number of messages that are not in the kernel yet."""
 
     @property
     def size(self) -> int:
-        """Bytes that are written, and that wait to be, those without compression."""
+        """Number of bytes written and queued, the latter uncompressed."""
         return self.end + self._size
 
     def schema(self, name: str, encoding: str, data: bytes) -> int:
-        """The number of a new schema."""
+        """Add a schema; returns its number."""
         number = len(self.contents.schemas) + 1
         self.contents.schemas[number] = Schema(id=number, name=name, encoding=encoding, data=data)
         self._new += packed(self.contents.schemas[number])
         return number
 
     def channel(self, topic: str, encoding: str, schema: int, metadata: Mapping[str, str]) -> int:
-        """The number of a new channel. Schema 0: none."""
+        """Add a channel; returns its number. Schema 0: none."""
         number = len(self.contents.channels) + 1
         self.contents.channels[number] = Channel(
             id=number, topic=topic, message_encoding=encoding, schema_id=schema, metadata=dict(metadata)
@@ -101,7 +101,7 @@ class McapFile:
         return number
 
     def add(self, channel: int, sequence: int, log_time: int, publish_time: int, payload: bytes) -> None:
-        """A message, which is written with its chunk. Times are nanoseconds since the epoch."""
+        """Add a message, which is written with its chunk. Times are nanoseconds since the epoch."""
         length = len(payload)
         if self.waiting and self._size + length > _CHUNK:
             try:
@@ -128,7 +128,7 @@ class McapFile:
             self.flush()
 
     def flush(self) -> None:
-        """Hands to the kernel what waits."""
+        """Passes queued messages to the kernel."""
         if not self.waiting:
             return
         pieces, size, messages = [*self._pieces, self._run], self._size, dict(self._index)
@@ -169,7 +169,7 @@ class McapFile:
         self.contents.counts.append({channel: len(pairs) // 2 for channel, pairs in messages.items()})
 
     def add_metadata(self, name: str, data: Mapping[str, str]) -> None:
-        """A metadata record, such as Foxglove shows."""
+        """Add a metadata record, which tools such as Foxglove display."""
         self.flush()
         record = packed(Metadata(name=name, metadata=dict(data)))
         index = MetadataIndex(offset=self.end, length=len(record), name=name)
@@ -177,7 +177,8 @@ class McapFile:
         self.contents.metadata.append(index)
 
     def drop_last_chunk(self) -> bool:
-        """Take the last chunk out again, and all behind it: room to complete the file. False where there is none."""
+        """Remove the last chunk and everything after it, to make room for completing the file. False if there is
+        none."""
         if not self.contents.chunks:
             return False
         self.end = self.contents.chunks.pop().chunk_start_offset
@@ -187,7 +188,7 @@ class McapFile:
         return True
 
     def finish(self) -> None:
-        """Completes and closes the file, once the disk has it. It can be tried again, but after a SyncError."""
+        """Completes and closes the file, after syncing it. It can be retried, except after a SyncError."""
         self.flush()
         end, later = self.end, self._later
         tail = [self._new, packed(DataEnd(0))]
@@ -200,7 +201,7 @@ class McapFile:
             self.give_up()
 
     def give_up(self) -> None:
-        """Closes the file as it is."""
+        """Closes the file without completing it."""
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
@@ -219,7 +220,7 @@ class McapFile:
 
 
 def write_at(fd: int, pieces: Pieces, offset: int) -> None:
-    """All of the pieces, one behind the other, from that offset on. Raises OSError."""
+    """Write all pieces in sequence, from that offset. Raises OSError."""
     waiting = [memoryview(piece) for piece in pieces if piece]
     while waiting:
         written = os.pwritev(fd, waiting[:1024], offset)

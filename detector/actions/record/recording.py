@@ -1,7 +1,7 @@
-"""The recording of one episode: its samples, in one file or in several of which each can be read alone.
+"""The recording of one episode: its samples, in one file or in several, each of which can be read alone.
 
-Where something goes wrong (no room, a disk that fails) the recording ends there: what was written is completed, marked
-as cut and kept. If even that fails, its hidden folder stays, and the next start of the detector tries again.
+On an error (no room, a disk failure) the recording ends: what was written is completed, marked as cut and kept. If even
+that fails, its hidden folder stays, and the next start of the detector tries again.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from wayside.api.actions.record import RecordAction
 
 
 class _Latched(NamedTuple):
-    """The last samples of a latched stream: the following files begin with them."""
+    """The last samples of a latched stream: each further file begins with them."""
 
     sample: EpisodeSample
     number: int
 
 
 class Recording:
-    """Takes the samples of an episode's window, from one thread."""
+    """Receives the samples of an episode's window, from one thread."""
 
     def __init__(
         self,
@@ -52,9 +52,9 @@ class Recording:
         *,
         start: int | None,
     ) -> None:
-        """`description` is its description; `start` is the window's, in nanoseconds, where it is known.
+        """`description` describes the recording; `start` is the start of the window in nanoseconds, if known.
 
-        Raises NoRoomError, OSError: nothing of it is left then.
+        Raises NoRoomError, OSError: then nothing of it remains.
         """
         self._folder = folder
         self._description = description
@@ -65,12 +65,12 @@ class Recording:
         self._numbers: Counter[Place] = Counter()
         self._held: list[EpisodeSample] = []
         self._readings: dict[str, ChannelFormat] = {}
-        self._first: int | None = None  # the earliest time in the file, but for latched streams
+        self._first: int | None = None  # the earliest time in the file, except for latched streams
         self._file: McapFile | None = None
         self._began: int | None = None
         self._closed_bytes = self._taken = self._lost = 0
         self.given = 0
-        """Samples that it got, each message counted once."""
+        """Samples that it received, each message counted once."""
         self.follow(surroundings)
         try:
             folder.describe(description)
@@ -81,7 +81,7 @@ class Recording:
             raise
 
     def follow(self, surroundings: Surroundings) -> None:
-        """From here on the Detector is this one: a stream that reads otherwise goes on in another channel."""
+        """Use this Detector from now on: a stream whose format changed continues in another channel."""
         spec, wanted = surroundings.detector.spec, self._parameters.streams
         streams = {s.name: s for s in spec.streams if wanted is None or s.latched or s.name in wanted}
         self._surroundings = surroundings
@@ -95,7 +95,7 @@ class Recording:
             self._channels.keep({name for name, each in self._readings.items() if old.get(name) == each})
 
     def take(self, samples: Sequence[EpisodeSample], surroundings: Surroundings) -> None:
-        """The next samples. Raises NoRoomError, OSError: then it takes no more, and `finish` keeps what there is."""
+        """Add samples. Raises NoRoomError, OSError: then it accepts no more, and `finish` keeps what was written."""
         if surroundings.detector is not self._surroundings.detector:
             self.follow(surroundings)
         mine = [sample for sample in samples if self._owners.owns(sample.stream, sample.key)]
@@ -110,47 +110,48 @@ class Recording:
             self._take(sample)
 
     def began_with(self, samples: Sequence[EpisodeSample]) -> int | None:
-        """When it begins if these come next, but for what is latched; nanoseconds. None: not yet."""
+        """The start of the recording if these samples follow, except for latched ones; nanoseconds. None: unknown so
+        far."""
         if self._began is None:
             return min((sample.time for sample in samples if sample.stream not in self._topics), default=None)
         return self._began
 
     @property
     def latched(self) -> list[EpisodeSample]:
-        """The last samples of latched streams, in order of time."""
+        """The last samples of latched streams, in time order."""
         known = sorted(self._latched.values(), key=lambda each: each.sample.time)
         return [*(each.sample for each in known), *self._held]
 
     def flush(self) -> None:
-        """Hands to the kernel what waits: it then outlives the process. Raises NoRoomError, OSError."""
+        """Passes queued samples to the kernel, so that they survive the process. Raises NoRoomError, OSError."""
         if self._file is not None:
             self._file.flush()
 
     @property
     def bytes(self) -> int:
-        """Written so far."""
+        """Bytes written so far."""
         return self._closed_bytes + (0 if self._file is None else self._file.end)
 
     @property
     def written(self) -> int:
-        """Samples that are in the files, each counted once."""
+        """Number of samples in the files, each counted once."""
         return self._taken - self._lost - (0 if self._file is None else self._file.lost)
 
     @property
     def waiting(self) -> bool:
-        """Whether there is something to flush."""
+        """Whether there are samples to flush."""
         return self._file is not None and self._file.waiting > 0
 
     def finish(self, description: Mapping[str, Any], cut: str, missing: int) -> tuple[Kept | None, dict[str, Any]]:
-        """Completes the recording under its final name; also gives the last description of it.
+        """Completes the recording under its final name; also returns its last description.
 
         Args:
-            description: the description, now that the episode ended.
-            cut: why something of the window is missing; empty where nothing is.
-            missing: samples of the window that never came here.
+            description: the description after the end of the episode.
+            cut: why part of the window is missing; empty if nothing is.
+            missing: samples of the window that never arrived here.
 
-        Returns None for a cut recording of which nothing is worth keeping. Raises OSError where it could not be
-        completed, and waits for the next start of the detector.
+        Returns None for a cut recording without contents worth keeping. Raises OSError if it could not be completed,
+        and leaves it for the next start of the detector.
         """
         try:
             self._release()
@@ -184,7 +185,7 @@ class Recording:
         except SyncError:
             raise
         except (NoRoomError, OSError) as error:
-            if not file.drop_last_chunk():  # nothing is left of it
+            if not file.drop_last_chunk():  # nothing remains of it
                 self._close(file)
                 self._parts.pop()
                 file.path.unlink()
@@ -211,7 +212,7 @@ class Recording:
         return with_ending(description, samples=self.written, missing=missing or None, cut=cut or None, files=names)
 
     def _release(self) -> None:
-        """The last samples of latched streams before the window are written at its start."""
+        """Write the last samples of latched streams before the window at its start."""
         held, self._held = self._held, []
         for sample in held:
             self._take(sample)
@@ -250,7 +251,7 @@ class Recording:
         return self._file
 
     def _split(self, time: int, size: int) -> None:
-        """Goes on in another file where it is time for it; that begins with the last samples of latched streams."""
+        """Starts another file when it is due, beginning with the last samples of latched streams."""
         split, first, file = self._parameters.split, self._first, self._writer
         if first is None:
             return
@@ -287,5 +288,5 @@ class Recording:
 
 
 def reason(error: Exception) -> str:
-    """Why a recording ended, for people."""
+    """Why a recording ended, for users."""
     return str(error) if isinstance(error, NoRoomError) else f"writing failed: {error}"

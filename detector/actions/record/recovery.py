@@ -1,4 +1,4 @@
-"""Recordings that a killed process left behind: at the next start they are completed, marked as cut, and named."""
+"""Recovers the recordings of a killed process: at the next start they are completed, marked as cut, and renamed."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ from detector.actions.record.salvage import contents_of, salvage
 log = logging.getLogger(__name__)
 
 REASON = "the detector was killed while it recorded"
-"""Why such recordings are cut."""
+"""The reason that such recordings are marked with."""
 
 
 def recover(destination: Destination, left: Iterable[Path]) -> list[Kept]:
-    """Completes what these hidden folders hold; one that another process has locked is in progress and left alone.
+    """Completes the recordings in these hidden folders; one that another process has locked is in progress and left
+    alone.
 
-    What cannot be completed stays as it is, and is logged.
+    Recordings that cannot be completed are left unchanged, and logged.
     """
     for path in hidden(destination.path, DROPPED):
         shutil.rmtree(path, ignore_errors=True)
@@ -66,9 +67,9 @@ def _recovered(destination: Destination, path: Path) -> Kept | None:
 
 
 def _part(path: Path, folder: RecordingFolder, fields: dict[str, Any], last: bool) -> BagFile | None:
-    """The file, completed; None where nothing of it can be read: it is deleted.
+    """The completed file; None if nothing in it can be read: it is deleted.
 
-    The last one is looked through even if it seems complete: the disk may not have had all of it.
+    The last file is checked even if it seems complete: the disk may not have received all of it.
     """
     contents = None if last else contents_of(path)
     if contents is None:

@@ -1,4 +1,4 @@
-"""Reads an MCAP file that a process left behind: what is whole of it counts, so that it can be completed."""
+"""Reads an MCAP file that a process left incomplete: the intact part counts, so that the file can be completed."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _UNREADABLE = (EOFError, McapError, UnicodeDecodeError, ValueError, struct.error
 
 
 def contents_of(path: Path) -> Contents | None:
-    """What a whole file holds; None where it was not completed. Raises OSError."""
+    """The contents of a complete file; None if it was not completed. Raises OSError."""
     with path.open("rb") as file:
         try:
             summary = SeekingReader(file).get_summary()
@@ -41,7 +41,7 @@ def contents_of(path: Path) -> Contents | None:
 
 
 def salvage(path: Path, claim: Claim) -> McapFile | None:
-    """The file, ready to be completed behind the last chunk that is whole; None where not even its head is.
+    """The file, ready to be completed after its last intact chunk; None if not even its header is intact.
 
     Raises OSError.
     """
@@ -65,19 +65,19 @@ def salvage(path: Path, claim: Claim) -> McapFile | None:
 
 
 class _Salvage:
-    """Goes through a file record by record, up to the first that is not whole."""
+    """Reads a file record by record, up to the first one that is not intact."""
 
     def __init__(self, file: BinaryIO, size: int) -> None:
         self._file = file
         self._size = size
         self.contents = Contents()
         self.end = 0
-        """Up to here the file is whole."""
+        """Up to here the file is intact."""
         self.missing_index = b""
-        """What the last chunk's index lacks, behind that."""
+        """The missing part of the last chunk's index after that."""
 
     def head(self) -> bool:
-        """Whether it begins as a recording does."""
+        """Whether it begins like a recording."""
         if self._file.read(len(MAGIC)) != MAGIC:
             return False
         self.end = len(MAGIC)
@@ -88,7 +88,7 @@ class _Salvage:
             return False
 
     def step(self) -> bool:
-        """Takes in the next record; False at the end of what is whole, or of the data."""
+        """Read the next record; False at the end of the intact part, or of the data."""
         at = self.end
         try:
             opcode, data = self._record()
@@ -140,7 +140,7 @@ class _Salvage:
         return False
 
     def _record(self) -> tuple[int, bytes]:
-        """The next record, whole. Raises EOFError where it is not."""
+        """The next intact record. Raises EOFError if there is none."""
         head = self._file.read(_RECORD.size)
         if len(head) < _RECORD.size:
             raise EOFError
@@ -157,7 +157,7 @@ def _stream(data: bytes) -> ReadDataStream:
 
 
 def _messages(data: bytes) -> dict[int, list[int]]:
-    """Of each channel in a chunk, the log times and places of its messages. Raises struct.error, ValueError."""
+    """By channel in a chunk, the log times and offsets of its messages. Raises struct.error, ValueError."""
     messages: dict[int, list[int]] = defaultdict(list)
     at = 0
     while at < len(data):

@@ -1,6 +1,6 @@
-"""The recordings of one episode: one, or with `renewAfter` one after the other.
+"""The recordings of one episode: one, or several in sequence with `renewAfter`.
 
-Where a recording ends early, the episode has none any more; with `renewAfter` another is tried soon.
+If a recording ends early, the episode has none any more; with `renewAfter` another one is attempted soon.
 """
 
 from __future__ import annotations
@@ -15,17 +15,18 @@ from detector.actions.record.destination import Kept, NoRoomError
 from detector.actions.record.recording import Recording, reason
 
 _AGAIN = 10 * 10**9
-"""Nanoseconds after which another recording is tried where one ended early."""
+"""Nanoseconds after which another recording is attempted when one ended early."""
 
 Begin = Callable[[Description, int | None], Recording]
-"""Begins a recording whose window starts then, where that is known. Raises NoRoomError, OSError."""
+"""Begins a recording whose window starts at the given time, if known. Raises NoRoomError, OSError."""
 
 
 class RecordedSeries:
-    """Takes the samples of an episode, and keeps account of what became of them."""
+    """Receives the samples of an episode, and tracks what became of them."""
 
     def __init__(self, begin: Begin, description: Description, *, start: int | None, renew_after: int | None) -> None:
-        """`start` is the window's, `renew_after` in nanoseconds. Raises NoRoomError, OSError without `renew_after`."""
+        """`start` is the start of the window, `renew_after` is in nanoseconds. Raises NoRoomError, OSError without
+        `renew_after`."""
         self.description = description
         self._begin = begin
         self._renew_after = renew_after
@@ -36,9 +37,9 @@ class RecordedSeries:
         self._files: list[str] = []
         self._count = self._samples = self._bytes = self._missing = 0
         self.problem = ""
-        """Why something of the window is missing, the first time."""
+        """Why part of the window is missing; the first reason."""
         self.lost = 0
-        """Samples without a recording, since the last read."""
+        """Samples without a recording since the last read."""
         try:
             self._recording = begin(description, start)
         except (NoRoomError, OSError) as error:
@@ -48,16 +49,16 @@ class RecordedSeries:
 
     @property
     def over(self) -> bool:
-        """Whether there is nothing to be expected any more."""
+        """Whether no recording is running or will follow."""
         return self._recording is None and self._renew_after is None
 
     @property
     def waiting(self) -> bool:
-        """Whether there is something to flush."""
+        """Whether there are samples to flush."""
         return self._recording is not None and self._recording.waiting
 
     def take(self, samples: Sequence[EpisodeSample], surroundings: Surroundings) -> None:
-        """The next samples."""
+        """Add samples."""
         while samples:
             recording = self._recording
             if recording is None:
@@ -79,7 +80,7 @@ class RecordedSeries:
                 self._next(surroundings)
 
     def flush(self) -> None:
-        """Hands to the kernel what waits."""
+        """Passes queued samples to the kernel."""
         if self._recording is not None:
             try:
                 self._recording.flush()
@@ -87,14 +88,14 @@ class RecordedSeries:
                 self._end(self._recording, reason(error), 0)
 
     def finish(self, cut: str, missing: int) -> None:
-        """Nothing more comes: see `Recording.finish`."""
+        """No more samples follow: see `Recording.finish`."""
         if self._recording is not None:
             self._end(self._recording, cut, missing)
         else:
             self.lost += missing
 
     def outcome(self, state: OutcomeState) -> Outcome:
-        """What became of it so far; the files are those of the last recording."""
+        """The outcome so far; the files are those of the last recording."""
         open_one = self._recording
         return Outcome(
             state,
@@ -109,7 +110,7 @@ class RecordedSeries:
     def _parted(
         self, recording: Recording, samples: Sequence[EpisodeSample]
     ) -> tuple[Sequence[EpisodeSample], Sequence[EpisodeSample]]:
-        """What belongs to the recording that there is, and what to those after it."""
+        """The samples of the current recording, and those of later ones."""
         began = recording.began_with(samples)
         if self._renew_after is None or began is None:
             return samples, ()
@@ -124,7 +125,7 @@ class RecordedSeries:
             self._next(surroundings)
 
     def _next(self, surroundings: Surroundings) -> None:
-        """Begins the next recording, which knows the last samples of latched streams."""
+        """Begins the next recording, with the last samples of latched streams."""
         description = self.description
         self.description = replace(description, part=description.part + 1, continued=True)
         try:

@@ -1,4 +1,4 @@
-"""When a message was published, if it carries that time."""
+"""The publish time of a message, if it contains one."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _LATEST = 2**63 - 1
 
 
 class Stamps:
-    """Reads the stamps of messages, as the Detector defines for each stream."""
+    """Reads the stamps of messages, as defined by the Detector for each stream."""
 
     def __init__(self, surroundings: Surroundings) -> None:
         self._surroundings = surroundings
@@ -24,7 +24,7 @@ class Stamps:
         self._stamps: dict[str, _Stamp] = {}
 
     def publish_time(self, sample: EpisodeSample) -> int:
-        """Nanoseconds since the epoch: the message's stamp, or when it was received where it has none."""
+        """Nanoseconds since the epoch: the message's stamp, or its receive time if it has none."""
         if self._data:
             return sample.time  # which is the stamp
         read = self._stamps.get(sample.stream)
@@ -50,7 +50,7 @@ class Stamps:
 
 
 def _nanoseconds(seconds: object) -> int | None:
-    """To the microsecond: a double holds no more of a time since the epoch."""
+    """To the microsecond: a double has no greater precision for a time since the epoch."""
     if not isinstance(seconds, int | float) or not 0 <= seconds < 1e11:
         return None
     return round(seconds * 1e6) * 1000

@@ -1,1 +1,1 @@
-"""The trigger action: another system records for as long as an episode lasts."""
+"""The trigger action: another system records while an episode lasts."""

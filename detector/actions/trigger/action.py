@@ -1,7 +1,7 @@
-"""The action: one course for each episode, and one request after the other.
+"""The action: a state machine per episode, and one request at a time.
 
-Requests wait for the network, on the action's own thread. While a system is silent, all requests to it wait a
-while, so that a dead one costs one timeout at a time and not one for each episode.
+Requests wait for the network, on the action's own thread. While a system does not respond, all requests to it are
+delayed, so that an unavailable system costs one timeout at a time and not one per episode.
 """
 
 from __future__ import annotations
@@ -31,26 +31,26 @@ from wayside.names import encode
 _log = logging.getLogger(__name__)
 
 _MOST = 1000
-"""So many recordings are under way at a time; those of further episodes are refused."""
+"""Maximum number of concurrent recordings; those of further episodes are refused."""
 
 _SILENCES = (1.0, 2.0, 5.0, 10.0)
-"""Seconds that a silent system is left alone; the last one repeats."""
+"""Backoff in seconds for a system that does not respond; the last value repeats."""
 
 _CLAIM = 3.0
-"""Seconds after the start in which an episode of the last run is resumed, if it is."""
+"""Seconds after the start in which an episode of the previous run may be resumed."""
 
 _LEAVE = 2.0
-"""Seconds at the end for what still is to be stopped."""
+"""Seconds at the end for the remaining stop requests."""
 
 
 class Trigger(Action[api.TriggerAction]):
-    """Has another system record as long as an episode lasts."""
+    """Makes another system record while an episode lasts."""
 
     Parameters = api.TriggerAction
 
     @classmethod
     def problems(cls, parameters: api.TriggerAction, detector: Detector) -> Iterable[tuple[FieldPath, str]]:
-        """Services that are not known, and requests that do not fit."""
+        """Unknown services, and requests that do not match."""
         return call_problems(parameters, detector)
 
     def __init__(self, parameters: api.TriggerAction, setting: Setting) -> None:
@@ -65,11 +65,11 @@ class Trigger(Action[api.TriggerAction]):
         self._episodes: dict[str, Episode] = {}
         self._reported: dict[str, Outcome] = {}
         self._silent: dict[str, tuple[int, float]] = {}
-        """Places that did not answer: how often in a row, and when to try again."""
+        """Places that did not respond: the number of consecutive failures, and the time of the next attempt."""
         self._digest = _digest(parameters)
         self._journal = self._make_journal()
         self._left = {} if self._journal is None else self._journal.load()
-        """Of the last run: what no episode has claimed yet."""
+        """Orders of the previous run that no episode has claimed yet."""
         self._claim = time.monotonic() + _CLAIM
 
     def started(self, episode: Episode) -> None:
@@ -87,14 +87,14 @@ class Trigger(Action[api.TriggerAction]):
         self._save()
 
     def ended(self, episode: Episode) -> None:
-        """Stop its recording."""
+        """Stop the recording of the episode."""
         course = self._courses.get(f"{self._prefix}.{encode(episode.id)}")
         if course is not None and episode.end_time is not None:
             now = time.monotonic()
             course.end(now, now - self._ago(episode.end_time, episode.end_time))
 
     def completed(self, episode: Episode, completion: Completion) -> None:
-        """Where the episode has not ended, the recording goes on for as long as the next run may take it up."""
+        """If the episode has not ended, the recording continues, so that the next run may resume it."""
         identity = f"{self._prefix}.{encode(episode.id)}"
         course = self._courses.get(identity)
         if course is None or course.ended is not None:
@@ -108,7 +108,7 @@ class Trigger(Action[api.TriggerAction]):
             course.end(now, now)
 
     def wake(self) -> float | None:
-        """Send what is due, one request at a time."""
+        """Send the requests that are due, one at a time."""
         now = time.monotonic()
         if self._left and now >= self._claim:
             self._stop_left(now)
@@ -128,7 +128,7 @@ class Trigger(Action[api.TriggerAction]):
         return None if soonest == FOREVER else max(0.0, soonest - time.monotonic())
 
     def close(self) -> None:
-        """Stop recordings that nothing stops later, as far as that is quick."""
+        """Stop recordings that nothing stops later, as far as this is quick."""
         end = time.monotonic() + _LEAVE
         self._system.timeout = min(self._system.timeout, 1.0)
         while time.monotonic() < end:
@@ -154,7 +154,7 @@ class Trigger(Action[api.TriggerAction]):
 
     @property
     def _prefix(self) -> str:
-        """Ids begin so. With other parameters it is another action: the one that it replaces stops its recordings."""
+        """The prefix of ids. It changes with the parameters: an action that replaces another stops its recordings."""
         return f"{encode(self.setting.holder)}.{self.setting.rule.name}.{self.setting.action}.{self._digest}"
 
     def _make_system(self) -> System:
@@ -171,7 +171,7 @@ class Trigger(Action[api.TriggerAction]):
         return OrderJournal(Path(state.path) / "triggers" / f"{self._prefix}.json")
 
     def _rendered(self, episode: Episode) -> Mapping[str, Any]:
-        """The templates; of an episode that is resumed, those that need nothing of its start."""
+        """The rendered templates; for a resumed episode, those that need no values of its start."""
         if not episode.unrendered:
             return episode.rendered
         templates = self.parameters.templates
@@ -181,7 +181,7 @@ class Trigger(Action[api.TriggerAction]):
         raise ActionError(f"{name}: {why}")
 
     def _ago(self, then: int, reached: int) -> float:
-        """Seconds since `then`; with clock Data, until `reached`, since that time is not ours."""
+        """Seconds since `then`; with clock Data up to `reached`, because that time axis differs from ours."""
         if self.setting.surroundings().detector.spec.clock is Clock.WALL:
             reached = time.time_ns()
         return max(0.0, (reached - then) / 1e9)
@@ -220,10 +220,10 @@ class Trigger(Action[api.TriggerAction]):
         return self._system.start(order, now - course.onset, again=course.confirmed)
 
     def _stop_left(self, now: float) -> None:
-        """The last run did not get to stop these: their episodes ended, or are not known any more."""
+        """Stop the orders that the previous run could not stop: their episodes ended, or are no longer known."""
         for identity, order in self._left.items():
             course = Course(order, self._limits, now, now, resumed=True)
-            course.confirmed = False  # that it is not known there any more is as good as stopped
+            course.confirmed = False  # a recording that is no longer known there counts as stopped
             course.step = CourseStep.STOP
             course.end(now, now)
             self._courses[identity] = course

@@ -1,4 +1,4 @@
-"""Plain maps made ROS 2 messages: a request in YAML becomes what rosbags serialises."""
+"""Converts plain maps to ROS 2 messages: a request in YAML becomes an object that rosbags serialises."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from rosbags.typesys.store import Typestore
 
 
 class ServiceError(ValueError):
-    """A service that is not known or badly defined, or a request that does not match; the message gives the remedy."""
+    """A service that is unknown or badly defined, or a request that does not match; the message gives the remedy."""
 
 
 def message(store: Typestore, name: str, values: object, where: str) -> object:
     """A message of rosbags with these values; `where` is its place, for errors.
 
-    Raises ServiceError where a value is of no field, or does not fit its field.
+    Raises ServiceError if a value belongs to no field, or does not fit its field.
     """
     if not isinstance(values, Mapping):
         raise ServiceError(f"{where} is {values!r:.80}, but {name} is a map of fields")

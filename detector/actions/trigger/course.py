@@ -1,12 +1,12 @@
-"""The course of one recording elsewhere: what is confirmed, and the next request and its time.
+"""The state machine of one recording elsewhere: what is confirmed, and the next request and its time.
 
-Level, not edge: as long as the episode lasts, the other system is to record, and afterwards it is not to. What is not
-confirmed is requested again with backoff, until it is given up. A start is requested even if the episode is over
-meanwhile, since the other system may hold what led to it in its buffer.
+Level-triggered: the other system should record as long as the episode lasts, and not afterwards. Unconfirmed requests
+are retried with backoff until they are given up. A start is requested even if the episode has ended in the meantime,
+because the other system may have the time before in its buffer.
 
     START ─confirmed→ HOLD ─end or maximumDuration→ STOP ─confirmed→ AWAIT ─over→ FINISHED
 
-Pure: times are seconds of a clock that never steps back, given from outside.
+Pure: the caller passes times, in seconds of a monotonic clock.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from detector.actions.trigger.orders import Order, Progress, Report
 _FIRST_WAIT = 0.5
 _LONGEST_WAIT = 15.0
 _POLL = 1.0
-"""Seconds between two looks at a recording that is ending."""
+"""Seconds between two status requests for a recording that is ending."""
 
 FOREVER = float("inf")
 
@@ -36,12 +36,12 @@ class CourseStep(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Timeouts:
-    """How long things may take, in seconds."""
+    """Maximum durations, in seconds."""
 
     maximum: float
-    """The recording, where the other system does not end it by itself."""
+    """Of the recording, if the other system does not end it by itself."""
     give_up: float
-    """A request that is not confirmed."""
+    """Of a request that is not confirmed."""
     renew: float | None
     """Until a start is repeated."""
 
@@ -50,7 +50,8 @@ class Course:
     """One recording elsewhere."""
 
     def __init__(self, order: Order, limits: Timeouts, now: float, onset: float, *, resumed: bool = False) -> None:
-        """`onset` is when the condition began to hold; `resumed`: another run of the detector may have requested it."""
+        """`onset` is when the condition began to hold; `resumed`: an earlier run of the detector may have requested
+        it."""
         self.order = order
         self._limits = limits
         self.onset = onset
@@ -60,13 +61,13 @@ class Course:
         self.due = now
         """Time of the next request."""
         self.failures = 0
-        """Requests in a row that were not confirmed."""
+        """Number of consecutive requests that were not confirmed."""
         self.confirmed = resumed
-        """Whether the other system has confirmed that it records, or may have to an earlier run."""
+        """Whether the other system has confirmed that it records, or may have confirmed it to an earlier run."""
         self.unanswered = resumed
-        """Whether a start may have arrived that was not confirmed."""
+        """Whether an unconfirmed start may have arrived."""
         self.problem = ""
-        """Why it did not go as it should; empty where it did."""
+        """Why it failed; empty if it did not."""
         self.note = ""
         """Further information."""
         self.report = Report(Progress.UNKNOWN)
@@ -89,20 +90,20 @@ class Course:
                 self._to(CourseStep.STOP, now)
 
     def look(self, now: float) -> CourseStep | None:
-        """The request to send now; None: none yet."""
+        """The request to send now; None: none is due."""
         if self.step is CourseStep.HOLD and now >= self._limit:
             self.note = "its maximumDuration ended it before the episode ended" if self.ended is None else self.note
             self._to(CourseStep.STOP, now)
         return self.step if now >= self.due and not self.finished else None
 
     def next_look(self) -> float:
-        """When `look` may have something, if nothing happens before."""
+        """When `look` may return something, if nothing happens before."""
         if self.finished:
             return FOREVER
         return min(self.due, self._limit) if self.step is CourseStep.HOLD else self.due
 
     def failed(self, now: float, why: str, *, silent: bool) -> None:
-        """The request was not confirmed; `silent`: there was no answer, so it may have arrived nevertheless."""
+        """The request was not confirmed; `silent`: there was no response, so it may have arrived nevertheless."""
         self.failures += 1
         self.unanswered = self.unanswered or silent
         self.due = now + min(_FIRST_WAIT * 2 ** min(self.failures - 1, 10), _LONGEST_WAIT)
@@ -111,7 +112,7 @@ class Course:
         if self.step is CourseStep.START:
             self.problem = f"gave up starting it: {why}"
             if self.unanswered:
-                self._to(CourseStep.STOP, now)  # else it might record for nothing
+                self._to(CourseStep.STOP, now)  # otherwise it might record for nothing
             else:
                 self.step = CourseStep.FINISHED
         elif self.step is CourseStep.STOP:
@@ -123,7 +124,7 @@ class Course:
             self.step = CourseStep.FINISHED
 
     def answered(self, now: float, report: Report) -> None:
-        """The other system answered the request that `look` returned."""
+        """The other system responded to the request that `look` returned."""
         if report.progress is Progress.REFUSED and self.step in (CourseStep.START, CourseStep.STOP):
             self.failed(now, report.message, silent=False)
             return
@@ -143,7 +144,7 @@ class Course:
             self.due = now + _POLL
         else:
             if (report.samples, report.progress) != (before.samples, before.progress):
-                self._since = now  # it goes on
+                self._since = now  # it continues
             self.failures = 0
             self.due = now + _POLL
             if now - self._since >= self._limits.give_up:
@@ -162,7 +163,7 @@ class Course:
             self.due = FOREVER if self._limits.renew is None else now + self._limits.renew
 
     def _over(self, report: Report) -> None:
-        """It has ended there."""
+        """The recording has ended there."""
         if report.progress is not Progress.DONE:
             self.problem = self.problem or report.message or "it failed on the other system"
         elif self.step in (CourseStep.START, CourseStep.HOLD):

@@ -1,4 +1,4 @@
-"""Another detector that records: it receives queries of `wayside/detectors/<name>/recordings`."""
+"""Another detector as the recording system: it receives queries on `wayside/detectors/<name>/recordings`."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from wayside.api.actions.window import WindowClients
 from wayside.api.base import Duration
 
 _RENEW = 5.0
-"""Seconds: a detector that was restarted knows nothing of what it recorded, and goes on with the next start."""
+"""Seconds between repeated starts: a restarted detector has lost its recordings, and continues with the next start."""
 
 _HOLDER = re.compile(r"[A-Za-z0-9_.-]{1,253}")
 
 
 class OtherDetector:
-    """Asks another detector to record."""
+    """Requests recordings from another detector."""
 
     renew: float | None = _RENEW
     ends_by_itself = True
 
     def __init__(self, parameters: TriggerAction, messenger: Messenger) -> None:
-        assert parameters.detector is not None  # noqa: S101  that is what it is made for
+        assert parameters.detector is not None  # noqa: S101  the caller checked it
         self._wanted = parameters.detector
         self._maximum = parameters.maximum_duration
         self.timeout = parameters.timeout.seconds
@@ -49,7 +49,7 @@ class OtherDetector:
         return name
 
     def start(self, order: Order, ago: float, *, again: bool) -> Report:
-        """Record; where it was confirmed before, nothing that was earlier."""
+        """Start; if it was confirmed before, without samples from earlier."""
         wanted = self._wanted
         subjects = nested_value(order.event, "data", "subjects")
         clients = None
@@ -70,13 +70,13 @@ class OtherDetector:
         return self._request(order, request)
 
     def stop(self, order: Order, ago: float) -> Report:
-        """End it, `after` later."""
+        """Stop, `after` later."""
         return self._request(
             order, RecordingRequest(do="stop", id=order.id, after=self._wanted.after, ago=duration(ago))
         )
 
     def status(self, order: Order) -> Report:
-        """How far it is."""
+        """Request its progress."""
         return self._request(order, RecordingRequest(id=order.id))
 
     def _request(self, order: Order, request: RecordingRequest) -> Report:

@@ -1,7 +1,7 @@
 """An HTTP endpoint that records: it receives a request at the start and one at the end.
 
-The header Idempotency-Key identifies a repeated request. The response counts: a start that it refuses for
-good is not sent again, and a stop of what is not there (404, 410) is as good as done.
+The header Idempotency-Key identifies a repeated request. The response decides: a start that is finally rejected is not
+sent again, and a stop of an unknown recording (404, 410) counts as done.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ _CONFLICT = 409
 
 
 class HttpEndpoint:
-    """Tells an HTTP endpoint to record."""
+    """Requests recordings from an HTTP endpoint."""
 
     renew: float | None = None
     ends_by_itself = False
 
     def __init__(self, parameters: TriggerAction, closing: threading.Event) -> None:
-        """Once `closing` is set, a request that is under way is given up; a further one may take its time."""
-        assert parameters.http is not None  # noqa: S101  that is what it is made for
+        """Once `closing` is set, a running request is aborted; a later one may take its full time."""
+        assert parameters.http is not None  # noqa: S101  the caller checked it
         self._wanted = parameters.http
         self._maximum = parameters.maximum_duration
         self.timeout = parameters.http.timeout.seconds
         self._closing = closing
         self._client = HttpClient(parameters.http, "trigger.http")
         self._unanswered: set[str] = set()
-        """The recordings whose start went out and was not answered."""
+        """The recordings whose start was sent without a response."""
 
     def place(self, order: Order) -> str:
         """Scheme, host and port of the first request."""
@@ -69,11 +69,11 @@ class HttpEndpoint:
         return Report(Progress.DONE if status in _GONE else Progress.REFUSED, message)
 
     def status(self, order: Order) -> Report:
-        """There is no more information than the responses gave."""
+        """There is no more information than in the responses."""
         return Report(Progress.DONE)
 
     def _send(self, name: str, call: HttpCall, order: Order) -> tuple[int, Disposition, str]:
-        """The status, what follows from it and the message. Raises ActionError if a retry is worthwhile."""
+        """The status, its consequence and the message. Raises ActionError if a retry is worthwhile."""
         body = nested_value(order.rendered, "http", name, "body")
         if body is None:
             body = {"id": order.id, "do": name, "maximumDuration": str(self._maximum), "event": order.event}

@@ -1,8 +1,8 @@
-"""The recordings on other systems that were requested and not yet stopped: kept on the state volume, for the next
+"""The recordings on other systems that were requested and not stopped yet: stored on the state volume for the next
 start.
 
-Without it, a recording whose episode ended just when the detector was killed would go on until its maximumDuration. The
-file is small and replaced in one step; it is written by the action's own thread.
+Without it, a recording whose episode ended just when the detector was killed would continue until its maximumDuration.
+The file is small and replaced atomically; the action's own thread writes it.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ _VERSION = 1
 
 
 class OrderJournal:
-    """The orders of one action that are not finished."""
+    """The unfinished orders of one action."""
 
     def __init__(self, path: Path) -> None:
         """Raises nothing: a journal that cannot be read or written is logged, and ignored."""
         self._path = path
         self._written: list[str] | None = None
         self.failures = 0
-        """Times that it could not be written."""
+        """Number of failed writes."""
 
     def load(self) -> dict[str, Order]:
-        """What the last run of the detector left, by id."""
+        """The unfinished orders of the previous run, by id."""
         try:
             document: Any = json.loads(self._path.read_bytes())
             if document["version"] != _VERSION:
@@ -45,7 +45,7 @@ class OrderJournal:
             return {}
 
     def save(self, orders: Iterable[Order]) -> None:
-        """These are not finished; writes only where that is new."""
+        """Store the unfinished orders; writes only if they changed."""
         wanted = {order.id: order for order in orders}
         if list(wanted) == self._written or (self._written is None and not wanted):
             return

@@ -11,21 +11,21 @@ from wayside.api.base import JsonValue
 
 
 class Progress(StrEnum):
-    """How far a recording elsewhere has come."""
+    """The progress of a recording elsewhere."""
 
     RECORDING = "Recording"
     ENDING = "Ending"
-    """Told to stop; the last samples are still to come."""
+    """Stop requested; the last samples are still to come."""
     DONE = "Done"
     FAILED = "Failed"
     REFUSED = "Refused"
     """It was not started; the message gives the reason."""
     UNKNOWN = "Unknown"
-    """Nothing is known of such a recording."""
+    """The recording is unknown."""
 
     @property
     def over(self) -> bool:
-        """Whether nothing is recorded any more, and never will be."""
+        """Whether the recording has ended for good."""
         return self in (Progress.DONE, Progress.FAILED, Progress.REFUSED, Progress.UNKNOWN)
 
 
@@ -43,10 +43,10 @@ class Report:
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """One recording in another system. All that is needed to request it again after a restart."""
+    """One recording in another system, with everything needed to request it again after a restart."""
 
     id: str
-    """`<holder>.<rule>.<action>.<episode>`: a repeated request with it has no further effect."""
+    """`<holder>.<rule>.<action>.<episode>`: a repeated request with this id has no further effect."""
     rendered: Mapping[str, JsonValue]
     """The action's templates."""
     event: Mapping[str, Any] = field(default_factory=dict)
@@ -54,32 +54,32 @@ class Order:
 
 
 class System(Protocol):
-    """Another system that records. Its methods wait for the network, and raise ActionError if there is no answer."""
+    """Another system that records. Its methods wait for the network, and raise ActionError if there is no response."""
 
     renew: float | None
     """Seconds after which a start is repeated, so that a restarted system continues; None: never."""
     timeout: float
-    """Seconds to wait for an answer."""
+    """Seconds to wait for a response."""
     ends_by_itself: bool
-    """Whether it ends a recording after maximumDuration by itself."""
+    """Whether it ends a recording by itself after maximumDuration."""
 
     def place(self, order: Order) -> str:
-        """The system that receives it: all orders of one place are silent together. Raises ActionError if the order
-        names none.
+        """The system that receives the order: if it does not respond, all orders with this place wait. Raises
+        ActionError if the order names none.
         """
 
     def start(self, order: Order, ago: float, *, again: bool) -> Report:
-        """Record from the onset, `ago` seconds ago; `again` if it was confirmed before."""
+        """Start recording from the onset, `ago` seconds ago; `again` if it was confirmed before."""
 
     def stop(self, order: Order, ago: float) -> Report:
-        """End the recording; the episode ended `ago` seconds ago."""
+        """Stop recording; the episode ended `ago` seconds ago."""
 
     def status(self, order: Order) -> Report:
-        """How far it is."""
+        """Request its progress."""
 
 
 def nested_value(value: Any, *names: str) -> Any:
-    """What lies under these names in maps within maps; None where there is none."""
+    """The value under these names in nested maps; None if there is none."""
     for name in names:
         value = value.get(name) if isinstance(value, Mapping) else None
     return value

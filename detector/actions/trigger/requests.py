@@ -1,7 +1,7 @@
-"""Requests of one detector to another about recordings, and the responses, in JSON.
+"""Recording requests from one detector to another, and the responses, in JSON.
 
-A request is the payload of a query of `wayside/detectors/<name>/recordings`. Without one, the query requests the status
-of all recordings.
+A request is the payload of a query on `wayside/detectors/<name>/recordings`. Without a payload, the query requests the
+status of all recordings.
 """
 
 from __future__ import annotations
@@ -17,37 +17,38 @@ from wayside.api.base import ClientName, Duration, JsonValue, Model, ObjectName,
 from wayside.times import format_time
 
 RECORDINGS = "recordings"
-"""The request, in the key of the detector."""
+"""The name of the request in the key of the detector."""
 
 MAXIMUM_BYTES = 65_536
-"""Of a request."""
+"""Maximum size of a request."""
 
 MAXIMUM_CLIENTS = 256
-"""Of a request. Who means more means all."""
+"""Maximum number of clients in a request. A requester with more clients requests all."""
 
 RecordingId = Annotated[str, Field(min_length=1, max_length=512, pattern=r"^[A-Za-z0-9_.:~+%-]+$")]
 
 
 class RecordingRequest(Model):
-    """A question or an order about a recording."""
+    """A query or an order about a recording."""
 
     do: Literal["start", "stop", "status"] = "status"
     id: RecordingId | None = None
-    """The requester chooses it. A repeated request with it has no further effect."""
+    """Chosen by the requester. A repeated request with this id has no further effect."""
     streams: list[ObjectName] | None = Field(default=None, max_length=128)
-    """Start: default: all that the detector records on request."""
+    """For a start; default: all that the detector records on request."""
     clients: list[ClientName] | None = Field(default=None, max_length=MAXIMUM_CLIENTS)
-    """Start: default: all."""
+    """For a start; default: all."""
     before: Duration = Duration("0s")
-    """Start: from so long before `ago`."""
+    """For a start: the duration before `ago` that is recorded."""
     after: Duration = Duration("0s")
-    """Stop: until so long after `ago`."""
+    """For a stop: the duration after `ago` that is still recorded."""
     ago: Duration = Duration("0s")
-    """Start: when the cause began. Stop: when it ended. Relative, since two machines seldom agree on the time."""
+    """For a start: how long ago the cause began. For a stop: how long ago it ended. Relative, since clocks of two
+    machines rarely agree."""
     maximum_duration: PositiveDuration = PositiveDuration("10m")
-    """Start: it ends then, whatever happens."""
+    """For a start: the maximum duration."""
     event: dict[str, JsonValue] = Field(default_factory=dict)
-    """Start: the CloudEvent that it is about; it goes into the recording."""
+    """For a start: the CloudEvent that causes it; it is stored in the recording."""
 
 
 class RecordingReport(msgspec.Struct, frozen=True, rename="camel"):
@@ -58,23 +59,23 @@ class RecordingReport(msgspec.Struct, frozen=True, rename="camel"):
     message: str = ""
     streams: list[str] = []
     since: str = ""
-    """RFC 3339, of the detector that records."""
+    """RFC 3339, by the clock of the recording detector."""
     until: str = ""
-    """When it ended, or will at the latest."""
+    """When it ended, or will end at the latest."""
     samples: int = 0
     bytes: int = 0
     missing: int = 0
     files: list[str] = []
-    """As the detector that records sees them."""
+    """Paths on the recording detector."""
 
 
 def duration(seconds: float) -> Duration:
-    """The duration to the millisecond, as requests write it."""
+    """The duration to the millisecond, in the form of requests."""
     return Duration(f"{min(max(0, round(seconds * 1000)), 999_999_999)}ms")
 
 
 def short(event: Mapping[str, Any]) -> dict[str, Any]:
-    """The event as a request carries it: without its values where they make it too long, as a fleet's may."""
+    """The event in the form of a request: without its values if they make it too long, as a fleet's may."""
     if len(msgspec.json.encode(event)) <= MAXIMUM_BYTES // 2:
         return dict(event)
     cause: dict[str, Any] = {key: value for key, value in event.items() if key != "data"}
@@ -85,7 +86,7 @@ def short(event: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def read_request(payload: bytes) -> RecordingRequest:
-    """The request that a query carries. Raises ValueError."""
+    """The request in a query. Raises ValueError."""
     if not payload:
         return RecordingRequest()
     if len(payload) > MAXIMUM_BYTES:
@@ -107,21 +108,21 @@ def write_request(request: RecordingRequest) -> bytes:
 
 
 def write_reports(reports: RecordingReport | list[RecordingReport]) -> bytes:
-    """The answer: one report, or those of all recordings."""
+    """The response: one report, or those of all recordings."""
     return msgspec.json.encode(reports)
 
 
 def read_report(payload: bytes) -> RecordingReport:
-    """What was answered about one recording. Raises ValueError."""
+    """The report about one recording from a response. Raises ValueError."""
     return msgspec.json.decode(payload, type=RecordingReport)
 
 
 def read_reports(payload: bytes) -> list[RecordingReport]:
-    """What was answered about all recordings, or about one. Raises ValueError."""
+    """The reports about all recordings, or about one, from a response. Raises ValueError."""
     answer: Any = msgspec.json.decode(payload)
     return msgspec.convert(answer if isinstance(answer, list) else [answer], list[RecordingReport])
 
 
 def time_text(nanoseconds: int | None) -> str:
-    """A time since the epoch as reports write it; empty for None."""
+    """A time since the epoch in the form of reports; empty for None."""
     return "" if nanoseconds is None else format_time(nanoseconds)

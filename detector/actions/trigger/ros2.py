@@ -2,10 +2,10 @@
 
 With rmw_zenoh (its docs/design.md) a service is a queryable on `<domain>/<service>/<type>/<type hash>`; a query carries
 the request as CDR and an attachment: its number and time (8 bytes each, little endian), and the id of the client (a
-length of one byte, then 16 bytes). The type hash is the service's, so a node whose service is made of something else
+length of one byte, then 16 bytes). The type hash is the service's, so a node with a different definition of the service
 is not reached. With zenoh-bridge-ros2dds it is a queryable on the service's name, and needs no attachment.
 
-A service knows nothing of episodes: where it is both started and stopped, all episodes of the action share one
+A service does not distinguish episodes: if it is both started and stopped, all episodes of the action share one
 recording.
 """
 
@@ -32,13 +32,13 @@ from wayside.api.wording import FieldPath
 
 
 class Ros2Services:
-    """Calls a service when the episode starts, and one when it ends."""
+    """Calls one service when the episode starts, and one when it ends."""
 
     renew: float | None = None
     ends_by_itself = False
 
     def __init__(self, parameters: TriggerAction, messenger: Messenger, types: Callable[[], RosTypes]) -> None:
-        assert parameters.ros2 is not None  # noqa: S101  that is what it is made for
+        assert parameters.ros2 is not None  # noqa: S101  the caller checked it
         self._wanted = parameters.ros2
         self.timeout = parameters.timeout.seconds
         self._messenger = messenger
@@ -48,14 +48,14 @@ class Ros2Services:
         self._recording: set[str] = set()
         """The orders for which the recorder has been started."""
         self._unanswered: set[tuple[str, str]] = set()
-        """Orders whose call went out and was not answered, with the call's name."""
+        """Orders whose call was sent without a response, with the call's name."""
 
     def place(self, order: Order) -> str:
-        """The first of the services: if it is silent, so is the other."""
+        """The first of the services: if it does not respond, neither does the other."""
         return next(iter(self._wanted.calls.values())).service
 
     def start(self, order: Order, ago: float, *, again: bool) -> Report:
-        """Call `start`, unless another episode has."""
+        """Call `start`, unless another episode has done so."""
         shared = self._wanted.stop is not None and bool(self._recording)
         if self._wanted.start is not None and not shared:
             if again:
@@ -67,7 +67,7 @@ class Ros2Services:
         return Report(Progress.RECORDING, "the recorder already runs for another episode" if shared else "")
 
     def stop(self, order: Order, ago: float) -> Report:
-        """Call `stop`, unless another episode goes on."""
+        """Call `stop`, unless another episode is still open."""
         shared = self._wanted.start is not None and bool(self._recording - {order.id})
         if self._wanted.stop is not None and not shared:
             report = self._call("stop", self._wanted.stop, order)
@@ -77,11 +77,11 @@ class Ros2Services:
         return Report(Progress.DONE, "the recorder keeps running for another episode" if shared else "")
 
     def status(self, order: Order) -> Report:
-        """There is no more information than the responses gave."""
+        """There is no more information than in the responses."""
         return Report(Progress.RECORDING if order.id in self._recording else Progress.DONE)
 
     def _call(self, name: str, call: ServiceCall, order: Order) -> Report | None:
-        """None where it succeeded."""
+        """None if it succeeded."""
         key, fields = (order.id, name), self._request(name, order)
         try:
             of_type = service(call.type, call.definition, self._types())
@@ -108,7 +108,7 @@ class Ros2Services:
         repeated = key in self._unanswered
         self._unanswered.discard(key)
         if refusal is None or (repeated and "return_code" in response):
-            # rosbag2 also returns 1 if it is already in the wanted state: then the call before had arrived.
+            # rosbag2 also returns 1 if it is already in the requested state: then an earlier call had arrived.
             return None
         return Report(Progress.REFUSED, f"{call.service} refused: {refusal}")
 
@@ -119,7 +119,7 @@ class Ros2Services:
 
 
 def _refusal(response: Mapping[str, Any]) -> str | None:
-    """Why the service did not do it, in the words of rosbag2 and std_srvs; None where it did."""
+    """Why the service refused, in the words of rosbag2 and std_srvs; None if it succeeded."""
     if response.get("success", True) is not False and response.get("return_code", 0) == 0:
         return None
     why = response.get("error_string") or response.get("message")
@@ -127,7 +127,7 @@ def _refusal(response: Mapping[str, Any]) -> str | None:
 
 
 def call_problems(parameters: TriggerAction, detector: Detector) -> Iterator[tuple[FieldPath, str]]:
-    """What is wrong with the calls, as far as that is known without an episode."""
+    """The problems of the calls, as far as they are known without an episode."""
     if parameters.ros2 is None:
         return
     try:

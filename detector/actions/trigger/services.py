@@ -1,7 +1,7 @@
-"""ROS 2 services: what their requests and responses are made of, as CDR and as plain maps.
+"""ROS 2 services: the definitions of their requests and responses, as CDR and as plain maps.
 
-A `.srv` file holds two message definitions with a line of `---` between them. Known without one are the services of
-rosbag2's recorder and of std_srvs, as the release Jazzy has them.
+A `.srv` file contains two message definitions separated by a line of `---`. The services of rosbag2's recorder and of
+std_srvs are known without a file, in the version of the release Jazzy.
 """
 
 from __future__ import annotations
@@ -52,17 +52,17 @@ class ServiceType:
 
     name: str
     store: Typestore
-    """It has the service's messages and all that they refer to."""
+    """Contains the service's messages and all types that they refer to."""
 
     @property
     def type_hash(self) -> str:
-        """RIHS01_ and 64 hexadecimal digits: of the whole service, as REP 2016 defines it."""
+        """RIHS01_ and 64 hexadecimal digits: the hash of the whole service, defined by REP 2016."""
         return self.store.hash_rihs01(self.name)
 
     def request(self, values: Mapping[str, Any]) -> bytes:
         """A request as CDR with its encapsulation; fields that are not given are zero or empty.
 
-        Raises ServiceError where a value is of no field, or does not fit its field.
+        Raises ServiceError if a value belongs to no field, or does not fit its field.
         """
         name = f"{self.name}_Request"
         try:
@@ -73,7 +73,7 @@ class ServiceType:
             raise ServiceError(f"the request does not match {self.name}: {error}") from error
 
     def response(self, payload: bytes) -> dict[str, Any]:
-        """A response as a map. Raises ServiceError where the bytes are none."""
+        """A response as a map. Raises ServiceError if the bytes are not one."""
         try:
             decoded: dict[str, Any] = CdrDecoder(f"{self.name}_Response", RosTypes(lambda: self.store)).decode(payload)
         except DecodeError as error:
@@ -83,7 +83,7 @@ class ServiceType:
 
 @lru_cache(maxsize=64)
 def service(name: str, definition: str | None, types: RosTypes) -> ServiceType:
-    """The service of that type: with the definition where one is given, else as it is known.
+    """The service of that type: with the given definition, or else the known one.
 
     Raises ServiceError.
     """
@@ -137,7 +137,7 @@ def _parsed(name: str, text: str) -> Typesdict:
 
 
 def _event(name: str) -> Typesdict:
-    """What belongs to every service's type beside request and response, and so to its hash."""
+    """The part of every service's type beside request and response, which its hash includes."""
 
     def named(of: str) -> FieldDesc:
         return Nodetype.NAME, of
@@ -148,7 +148,7 @@ def _event(name: str) -> Typesdict:
     request, response, event = (f"{name}_{part}" for part in ("Request", "Response", "Event"))
     octets: FieldDesc = (Nodetype.ARRAY, ((Nodetype.BASE, ("uint8", 0)), 16))
     return {
-        # In ROS 2's own hashes its `char` is a uint8; rosbags has a number of its own for it.
+        # In ROS 2's own hashes `char` is a uint8; rosbags has a separate number for it.
         _EVENT_INFO: (
             [],
             [

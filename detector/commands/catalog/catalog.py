@@ -1,4 +1,4 @@
-"""Rules by the dimensions and values of the scheme. Pure: others read them, and others show them."""
+"""Rules by the dimensions and values of the scheme. Pure: other modules read and render them."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from wayside.api.classification import Classification
 from wayside.api.scheme import SCHEME, CharacteristicValue, Dimension
 
 Chosen = Mapping[Dimension, frozenset[CharacteristicValue]]
-"""Of some dimensions, values of which a rule must have one."""
+"""For some dimensions, the values of which a rule must have at least one."""
 
 
 class ChoiceError(ValueError):
-    """A dimension or value that the scheme does not have."""
+    """A dimension or value that is not in the scheme."""
 
 
 @dataclass(frozen=True, eq=False)
 class CatalogEntry:
-    """A rule as the catalog has it; each is one of its own, whatever they have in common."""
+    """A rule in the catalog; entries are distinct even if their contents are equal."""
 
     name: str
     place: str
-    """Where it was found: file and line, or the namespace."""
+    """Where it was found: file and line, or namespace."""
     description: str
     classification: Classification
-    """Without values if the rule gives none."""
+    """Without values if the rule has none."""
 
     @property
     def classified(self) -> bool:
@@ -42,7 +42,7 @@ class CatalogEntry:
 
 
 def entry(rule: EventRule, place: str) -> CatalogEntry:
-    """The rule as the catalog has it."""
+    """The catalog entry of the rule."""
     return CatalogEntry(rule.name, place, rule.spec.description, rule.spec.classification or Classification())
 
 
@@ -53,7 +53,7 @@ class Catalog:
     entries: tuple[CatalogEntry, ...]
 
     def having(self, value: CharacteristicValue) -> tuple[CatalogEntry, ...]:
-        """The rules that have the value; values of two dimensions differ even where they are written alike."""
+        """The rules that have the value; equally written values of two dimensions differ."""
         dimension = next(each for each in SCHEME if isinstance(value, each.values))
         return tuple(each for each in self.entries if value in each.values(dimension))
 
@@ -67,13 +67,13 @@ class Catalog:
         return tuple(each for each in self.entries if not each.classified)
 
     def labels(self) -> Mapping[CatalogEntry, str]:
-        """What the rules are called: by name, and with the folder or file where several have the same name."""
+        """The labels of the rules: the name, and the folder or file if several have the same name."""
         return dict(_labelled(self.entries))
 
 
 @dataclass(frozen=True)
 class Read:
-    """Rules, and what could not be read."""
+    """Rules, and errors about those that could not be read."""
 
     entries: tuple[CatalogEntry, ...]
     unreadable: tuple[str, ...] = ()
@@ -90,7 +90,7 @@ def choose(texts: Iterable[str]) -> Chosen:
     """The choice given as `dimension=value`; several values of a dimension are alternatives.
 
     Raises:
-        ChoiceError: there is no such dimension or value; the message lists the valid ones.
+        ChoiceError: the dimension or value does not exist; the message lists the valid ones.
     """
     chosen: dict[Dimension, frozenset[CharacteristicValue]] = {}
     for text in texts:
@@ -113,7 +113,7 @@ def _listed(names: Iterable[str]) -> str:
 
 
 def _labelled(entries: Iterable[CatalogEntry]) -> Iterator[tuple[CatalogEntry, str]]:
-    """By name; where several share one, with their place, without what all these places begin with."""
+    """By name; if several share one, with their place, without the common beginning of these places."""
     for name, group in groupby(entries, key=lambda each: each.name):
         same = list(group)
         if len(same) == 1:

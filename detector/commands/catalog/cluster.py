@@ -13,14 +13,13 @@ _OTHERWISE = "give either files or folders with EventRules, or --cluster"
 
 
 async def read_cluster(namespace: str | None) -> Read:
-    """The EventRules of the namespace. Those that cannot be read, such as of a newer version, are reported and left
-    out.
+    """The EventRules of the namespace. Unreadable ones, e.g. of a newer version, are reported and left out.
 
     Args:
         namespace: default: the kubeconfig context's, or the pod's own.
 
     Raises:
-        ConfigurationError: there is neither a kubeconfig nor a pod's account, or the API server does not let us list.
+        ConfigurationError: there is neither a kubeconfig nor a pod's account, or the API server forbids the list.
     """
     entries: list[CatalogEntry] = []
     unreadable: list[str] = []
@@ -34,7 +33,7 @@ async def read_cluster(namespace: str | None) -> Read:
                 "eventrules.wayside.dev there"
             ) from error
         for each in listed:
-            # The status is the manager's business, and a newer manager's may have fields that we do not know.
+            # The manager owns the status, and a newer manager's may have unknown fields.
             read = {name: value for name, value in each.items() if name != "status"}
             try:
                 rule = parse_object({"apiVersion": API_VERSION, "kind": EventRule.__name__} | read)

@@ -1,4 +1,4 @@
-"""The command `detector catalog`. It imports what it runs when it runs, so that `--help` need not."""
+"""The command `detector catalog`. It imports its implementation when it runs, so that `--help` stays fast."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ if TYPE_CHECKING:
     from detector.commands.catalog.catalog import Catalog, Read
 
 _WIDTH = 160
-"""Columns of a table that goes into a pipe or a file."""
+"""Width in columns of a table that goes into a pipe or a file."""
 
 
 class Format(StrEnum):
-    """How the catalog is shown."""
+    """The output format of the catalog."""
 
     TABLE = "table"
     MARKDOWN = "markdown"
@@ -82,7 +82,7 @@ def _read_cluster(namespace: str | None) -> Read:
 
 
 def _text(found: Catalog, form: Format, *, into_file: bool) -> str:
-    """The catalog as it is shown; a table depends on where it goes."""
+    """The catalog in this format; the width of a table depends on the destination."""
     match form:
         case Format.MARKDOWN:
             from detector.commands.catalog.markdown import markdown_view

@@ -11,7 +11,7 @@ from wayside.api.documents import load_documents
 
 
 def read_files(paths: Sequence[Path]) -> Read:
-    """The EventRules of the files and folders; their other objects are not looked at.
+    """The EventRules of the files and folders; other objects are ignored.
 
     Raises:
         DocumentError: with every problem of every file.

@@ -1,4 +1,4 @@
-"""The catalog as Markdown: one table of all values, then one for each rule, as the paper has one for each use case."""
+"""The catalog as Markdown: one table of all values, then one per rule, like the paper's tables of use cases."""
 
 from __future__ import annotations
 
@@ -49,5 +49,5 @@ def _rules(catalog: Catalog) -> Iterator[str]:
 
 
 def _text(text: str) -> str:
-    """Text that means nothing to Markdown, on one line."""
+    """The text escaped for Markdown, on one line."""
     return _MEANINGFUL.sub(r"\\\1", " ".join(text.split()))

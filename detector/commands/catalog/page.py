@@ -1,8 +1,8 @@
-"""The catalog as one HTML page that needs nothing else: the scheme as a chart, and a table for each rule.
+"""The catalog as one self-contained HTML page: the scheme as a chart, and a table for each rule.
 
 The chart has a row for each dimension and a cell for each value, after the paper's Figure 1; the tables are like its
-Tables 2 to 7. Choosing values leaves the rules that have one of them in each dimension where any is chosen; without
-scripts the page still shows everything.
+Tables 2 to 7. Selecting values filters the rules: a rule must have a selected value in each dimension with a selection;
+without scripts the page still shows everything.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def _key(dimension: Dimension, value: CharacteristicValue) -> str:
 
 
 def _hue(index: int) -> str:
-    """A colour of its own for each dimension, all equally bright."""
+    """A distinct colour for each dimension, all equally bright."""
     red, green, blue = colorsys.hls_to_rgb(index / len(SCHEME), 0.42, 0.55)
     return f"rgb({red * 255:.0f} {green * 255:.0f} {blue * 255:.0f})"
 

@@ -16,7 +16,7 @@ class DraftError(InputError, ValueError):
 
 
 def drafts() -> Mapping[str, str]:
-    """The first line of each draft, which says what it is, by use case."""
+    """The first line of each draft, its description, by use case."""
     found = sorted(each.name for each in files(__name__).iterdir() if each.name.endswith(".yaml"))
     return {name.removesuffix(".yaml"): _text(name).split("\n", 1)[0].removeprefix("# ") for name in found}
 

@@ -1,1 +1,1 @@
-"""What is in a recording: topics with their rates and fields, and streams that would take them."""
+"""The topics of a recording with their rates and fields, and proposals of streams for them."""

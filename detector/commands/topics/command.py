@@ -1,4 +1,4 @@
-"""What `detector topics` runs: recordings or a network in, a list of what they hold out."""
+"""The implementation of `detector topics`: recordings or a network in, a list of their contents out."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from wayside.process.commandline import refuse
 
 
 class NothingHeardError(InputError, ValueError):
-    """Nothing came over the network."""
+    """No samples were received over the network."""
 
 
 def list_topics(recordings: Sequence[Path], *, as_yaml: bool) -> None:
-    """Print what the recordings hold, or a Detector that takes it.
+    """Print the contents of the recordings, or a Detector for them.
 
     Raises:
-        RecordingError: a recording is missing or damaged, or holds no message.
+        RecordingError: a recording is missing, damaged or empty.
     """
     if intake_file_of(recordings) is not None:
         refuse("an intake file brings its Detector along: its streams are known; give another recording")

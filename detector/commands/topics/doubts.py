@@ -1,4 +1,5 @@
-"""What a recording shows of Detectors and rules before anything runs: misspelt fields, streams that match nothing."""
+"""Doubts that a recording raises about Detectors and rules before anything runs: misspelt fields, streams that match
+nothing."""
 
 from __future__ import annotations
 
@@ -47,7 +48,7 @@ def topic_doubts(documents: Sequence[Document], topics: Sequence[Topic]) -> Iter
 
 
 def _fields_missing(detector: Detector, rules: Sequence[Document], fields: dict[str, Fields]) -> Iterator[Problem]:
-    """Fields that rules name, and no message that was looked at has."""
+    """Fields that rules name, but no inspected message has."""
     selected = {rule.name for rule in select(detector, [_rule(document) for document in rules]).rules}
     for document in rules:
         if document.object.name not in selected or document.ignores(FIELD_NOT_RECORDED.name):
@@ -71,13 +72,14 @@ def _topics_of(stream: Stream, topics: Sequence[Topic]) -> list[Topic]:
 
 
 def fields_of(found: Sequence[Proposal]) -> dict[str, Fields]:
-    """By stream, the fields of JSON and CBOR by the samples; without those whose messages are no maps."""
+    """By stream, the fields of JSON and CBOR messages found in the samples; without streams whose messages are not
+    maps."""
     named = {each.name: _seen(each.encoding, each.topics) for each in found}
     return {name: fields for name, fields in named.items() if fields is not None}
 
 
 def _seen(encoding: Encoding, topics: Sequence[Topic]) -> Fields | None:
-    """The fields of JSON and CBOR by the samples of all topics; None where they are not maps."""
+    """The fields of JSON and CBOR messages found in the samples of all topics; None if they are not maps."""
     if encoding not in (Encoding.JSON, Encoding.CBOR) or not topics:
         return None
     whole = MessageShape()

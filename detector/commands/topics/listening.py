@@ -1,4 +1,4 @@
-"""Listens on a Zenoh network for a while, and surveys each key as a recording is surveyed."""
+"""Listens on a Zenoh network for a while, and surveys each key like those of a recording."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from wayside.api.stream import Encoding, Layout
 from wayside.api.zenoh import Zenoh
 
 _OURS = "wayside/"
-"""Keys of detectors: events, follow-ups and answers."""
+"""Keys of detectors: events, follow-ups and responses."""
 _ENCODINGS = {"application/json": Encoding.JSON, "application/cbor": Encoding.CBOR, "application/cdr": Encoding.CDR}
 
 

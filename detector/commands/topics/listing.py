@@ -1,4 +1,4 @@
-"""The topics of recordings as text: a block for each stream, its fields ready to paste."""
+"""The topics of recordings as text: a block for each stream, with fields ready to paste."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from wayside.times import format_time
 
 
 def lines(found: Sequence[Proposal], recordings: Sequence[Recording]) -> Iterator[str]:
-    """For people. Raises RecordingError where a recording's definitions cannot be read."""
+    """The text for users. Raises RecordingError if a recording's definitions cannot be read."""
     types = _types(found, recordings)
     for each in found:
         yield each.key
@@ -68,11 +68,11 @@ def _completed(found: Sequence[Proposal], recordings: Sequence[Recording]) -> De
 
 
 def _types(found: Sequence[Proposal], recordings: Sequence[Recording]) -> dict[str, Fields]:
-    """The fields of streams whose messages have a type that is known."""
+    """The fields of streams whose messages have a known type."""
     try:
         return {**inlets(_completed(found, recordings)).fields}
     except DetectorError:
-        return {}  # a type that is known from nowhere
+        return {}  # a type without any definition
 
 
 def _some(names: Sequence[str]) -> str:

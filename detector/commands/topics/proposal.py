@@ -1,4 +1,4 @@
-"""Streams that would take what a recording holds: which keys belong together, and which part of them is the client."""
+"""Proposes streams for a recording: which keys belong together, and which part of them is the client."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from wayside.api.stream import Encoding, Layout
 _STALE_S = 5.0
 """The default of staleAfter."""
 _MISSED = 3
-"""A stream is stale when this number of samples in a row is missing."""
+"""Number of consecutive missing samples after which a stream is stale."""
 _ALONE = "vehicle"
 """The client of keys that name none."""
 
 
 @dataclass(frozen=True, slots=True)
 class Proposal:
-    """A stream, and the topics that belong to it."""
+    """A proposed stream, and its topics."""
 
     name: str
     key: str
@@ -34,12 +34,12 @@ class Proposal:
 
     @property
     def count(self) -> int:
-        """Messages."""
+        """Number of messages."""
         return sum(topic.count for topic in self.topics)
 
     @property
     def rate(self) -> float | None:
-        """Messages a second of one client, the median."""
+        """Messages per second of one client, the median."""
         rates = sorted(topic.rate for topic in self.topics if topic.rate is not None)
         return rates[len(rates) // 2] if rates else None
 
@@ -49,7 +49,7 @@ class Proposal:
         return max(self.topics, key=lambda topic: topic.gap)
 
     def document(self) -> dict[str, Any]:
-        """As `spec.streams` has it."""
+        """The entry in `spec.streams`."""
         found: dict[str, Any] = {"name": self.name, "key": self.key}
         if self.client is not None:
             found["client"] = self.client
@@ -67,11 +67,12 @@ class Proposal:
 
 
 def proposals(topics: Sequence[Topic]) -> list[Proposal]:
-    """A stream for each kind of data, in order of the keys. Keys that differ in one chunk alone are of several clients.
+    """A stream for each kind of data, in order of the keys. Keys that differ in only one chunk belong to several
+    clients.
 
-    Messages without a type are of one kind if they have the same fields. The clients' chunk is the first in which such
-    keys differ; other keys with the same text there are of that client,
-    too. Where no key has a sibling, nothing distinguishes the client from the rest.
+    Messages without a type are of one kind if they have the same fields. The client's chunk is the first in which such
+    keys differ; other keys with the same text in that chunk belong to that client, too. If no key has a sibling,
+    nothing distinguishes the client from the rest.
     """
     places = _places(topics)
     grouped: dict[tuple[str, int | None, Encoding, str | None], list[Topic]] = {}
@@ -92,7 +93,7 @@ def proposals(topics: Sequence[Topic]) -> list[Proposal]:
 def detector_document(
     found: Sequence[Proposal], messages: Sequence[Mapping[str, str]] = (), zenoh: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
-    """A Detector with these streams; `messages`: definitions of types that are known from the recording alone."""
+    """A Detector with these streams; `messages`: definitions of types that only the recording has."""
     spec: dict[str, Any] = {"mode": "Standalone", "streams": [each.document() for each in found]}
     if zenoh is not None:
         spec = {"zenoh": zenoh, **spec}
@@ -102,7 +103,7 @@ def detector_document(
 
 
 def _places(topics: Sequence[Topic]) -> dict[str, int]:
-    """By key, which of its chunks is the client's."""
+    """By key, the index of the client's chunk."""
     siblings: dict[tuple[object, ...], set[str]] = {}
     for topic in topics:
         for place, group in _without_each(topic):
@@ -123,7 +124,7 @@ def _places(topics: Sequence[Topic]) -> dict[str, int]:
 
 
 def _without_each(topic: Topic) -> Iterator[tuple[int, tuple[object, ...]]]:
-    """Each chunk's place, and what the key is without it."""
+    """The index of each chunk, and the key without it."""
     chunks, kind = topic.key.split("/"), _kind(topic)
     for place in range(len(chunks)):
         if re.fullmatch(r"[A-Za-z0-9._:-]{1,63}", chunks[place]):
@@ -131,13 +132,13 @@ def _without_each(topic: Topic) -> Iterator[tuple[int, tuple[object, ...]]]:
 
 
 def _kind(topic: Topic) -> tuple[object, ...]:
-    """What topics of one stream have in common; of messages without a type, the names of their fields."""
+    """The common properties of the topics of one stream; for messages without a type, the names of their fields."""
     shape = topic_shape(topic) if topic.type is None else None
     return topic.recorded_as, topic.type, None if shape is None else frozenset(shape.fields)
 
 
 def _name(key: str, taken: set[str]) -> str:
-    """A name for the stream, after the last chunks of its key."""
+    """A name for the stream, from the last chunks of its key."""
     chunks = [chunk for chunk in key.split("/") if not chunk.startswith("${")]
     parts: list[str] = []
     for chunk in reversed(chunks or ["stream"]):

@@ -1,4 +1,4 @@
-"""What plain values look like: the fields of maps, the items of lists, and what kinds of values they hold."""
+"""The shape of plain values: the fields of maps, the items of lists, and the kinds of values in them."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import Any
 from wayside.rules import Fields, ItemFields
 
 _FIELDS = 500
-"""A map with more different names is a table, not a message: no more of them are noted."""
+"""Maximum number of names in a map: one with more is a table, not a message."""
 _DEPTH = 12
 
 
 class MessageShape:
-    """Values of one place in messages."""
+    """The values at one place in messages."""
 
     def __init__(self) -> None:
         self.kinds: set[str] = set()
@@ -22,7 +22,7 @@ class MessageShape:
         self.items: MessageShape | None = None
 
     def add(self, value: Any, depth: int = 0) -> None:
-        """Look at one more value."""
+        """Add one more value."""
         kind = _kind(value)
         self.kinds.add(kind)
         if depth >= _DEPTH:
@@ -41,7 +41,7 @@ class MessageShape:
                 self.items.add(child, depth + 1)
 
     def join(self, other: MessageShape) -> None:
-        """Take in what another has seen."""
+        """Merge another shape into this one."""
         self.kinds |= other.kinds
         for name, child in other.fields.items():
             self.fields.setdefault(name, MessageShape()).join(child)
@@ -51,7 +51,8 @@ class MessageShape:
 
     @property
     def known_fields(self) -> Fields | None:
-        """As for checking paths; None where the values are not maps or lists of maps, or there are too many names."""
+        """The fields for checking paths; None if the values are not maps or lists of maps, or if there are too many
+        names."""
         if self.items is not None and self.kinds <= {"list", "null"}:
             known = self.items.known_fields
             return None if known is None or isinstance(known, ItemFields) else ItemFields(known)
@@ -60,7 +61,7 @@ class MessageShape:
         return {name: child.known_fields for name, child in self.fields.items()}
 
     def paths(self, above: str = "msg") -> Iterator[tuple[str, str]]:
-        """Each place with its kinds, as expressions write it."""
+        """Each place with its kinds, in the notation of expressions."""
         for name, child in self.fields.items():
             yield from child.paths(f"{above}.{name}" if name.isidentifier() else f'{above}["{name}"]')
         if self.items is not None and self.items.fields:
@@ -71,7 +72,7 @@ class MessageShape:
 
 
 def message_paths(fields: Fields | None, above: str = "msg", depth: int = 0) -> Iterator[tuple[str, str]]:
-    """The places of a message whose type is known."""
+    """The places of a message of a known type."""
     if not fields or depth >= _DEPTH:
         yield above, ""
         return

@@ -1,4 +1,4 @@
-"""Reads recordings once, and reports for each key the amount, the regularity and the shape of its messages."""
+"""Reads recordings once, and reports for each key the number, the regularity and the shape of its messages."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from detector.streams.codecs.cbor import CborDecoder
 from wayside.api.stream import Encoding, Layout
 
 _SAMPLES = 512
-"""Maximum number of messages of a key that are looked at, spread evenly."""
+"""Maximum number of messages of a key that are inspected, spread evenly."""
 _BYTES = 64 << 20
 """Maximum number of bytes of samples kept for a key."""
 
@@ -28,30 +28,30 @@ class Topic:
 
     key: str
     recorded_as: str
-    """The encoding as the recording has it."""
+    """The encoding in the recording."""
     type: str | None
     decode: Callable[[bytes], object] | None
     layout: Layout = Layout.PLAIN
-    """How the key was laid out on the network."""
+    """The layout of the key on the network."""
     count: int = 0
     gap: int = 0
     """The longest time between two messages of one recording."""
     gap_time: int = 0
-    """When it begins."""
+    """When that time begins."""
     samples: list[bytes] = field(default_factory=list)
     _last: int | None = None
-    """The message before, of the same recording."""
+    """The previous message of the same recording."""
     _lasted: int = 0
     _intervals: int = 0
     _stride: int = 1
     _bytes: int = 0
 
     def begin(self) -> None:
-        """Another recording follows."""
+        """Start the next recording."""
         self._last = None
 
     def add(self, time: int, payload: bytes) -> None:
-        """One more message."""
+        """Add a message."""
         if self.count % self._stride == 0 and self._bytes < _BYTES:
             self.samples.append(payload)
             self._bytes += len(payload)
@@ -69,13 +69,13 @@ class Topic:
 
     @property
     def rate(self) -> float | None:
-        """Messages a second; None where there are less than two."""
+        """Messages per second; None if there are fewer than two."""
         return self._intervals * 1e9 / self._lasted if self._lasted else None
 
 
 @dataclass(frozen=True, slots=True)
 class Survey:
-    """What was found in some recordings."""
+    """The result for some recordings."""
 
     topics: Sequence[Topic]
     """In order of their keys."""
@@ -83,7 +83,7 @@ class Survey:
 
 
 def survey(recordings: Iterable[Recording]) -> Survey:
-    """Look at recordings, each a sequence of files. Raises RecordingError."""
+    """Survey recordings, each a sequence of files. Raises RecordingError."""
     topics: dict[tuple[str, str, str | None], Topic] = {}
     cuts: list[Cut] = []
     for recording in recordings:
@@ -105,7 +105,7 @@ def _add(batch: Batch, topics: dict[tuple[str, str, str | None], Topic], by_chan
 
 
 def encoding_of(topic: Topic) -> Encoding:
-    """How a stream reads the topic: as it is recorded, else by looking at its samples."""
+    """The encoding of a stream for the topic: as recorded, else guessed from its samples."""
     if topic.decode is not None:
         return Encoding.JSON
     if topic.recorded_as in {each.value for each in Encoding} - {Encoding.RAW.value}:
@@ -114,7 +114,7 @@ def encoding_of(topic: Topic) -> Encoding:
 
 
 def topic_shape(topic: Topic, encoding: Encoding | None = None) -> MessageShape | None:
-    """What its samples look like; None where one is not of that encoding, or it is none of plain values."""
+    """The shape of its samples; None if one does not have that encoding, or if the encoding has no plain values."""
     encoding = encoding or encoding_of(topic)
     if encoding not in (Encoding.JSON, Encoding.CBOR):
         return None

@@ -1,1 +1,1 @@
-"""The samples of the last seconds: whose they are, where they are kept, and how they are read."""
+"""The samples of the last seconds: which client sent them, where they are stored, and how they are read."""

@@ -1,11 +1,11 @@
 """The samples of the last seconds, per client and stream, within a duration and a number of bytes.
 
-Inserting costs the same however much is held: a sample is appended, and one that comes late moves only past those that
-are newer than it.
+The cost of inserting does not depend on how much is stored: a sample is appended, and a late one moves only past those
+that are newer.
 
-A sample is not seen any more when it is older than its duration, and its memory is freed at the next whole second. Caps
-act on what is held, on each sample as it enters: so neither the batches in which samples come nor the rules that look
-at them decide what is there. The oldest sample goes first. Of equal times, that which entered first; over all lanes, by
+A sample becomes invisible when it is older than its duration; its memory is freed at the next whole second. Caps are
+enforced on each sample as it enters, so the contents depend neither on the batches in which samples arrive nor on the
+rules that read them. The oldest sample is evicted first; of equal times, the one that entered first; over all lanes, by
 client and then stream.
 """
 
@@ -20,7 +20,7 @@ from operator import attrgetter
 from detector.engine.samples.sample import SAMPLE_OVERHEAD, Item, Sample
 
 NEVER = -(2**63)
-"""Before all times: nothing has come yet."""
+"""Before all times: no sample has arrived yet."""
 
 HOUSEKEEPING = 1_000_000_000
 """Old samples are forgotten this often, in nanoseconds, and there is a tick for it, also without rules."""
@@ -28,16 +28,17 @@ HOUSEKEEPING = 1_000_000_000
 _RECEIVED = attrgetter("received")
 
 _SLACK = 64
-"""Beyond the cap over all streams, 1/64 of it is freed at once, so that the search for the oldest pays off."""
+"""When the cap over all streams is exceeded, 1/64 of it is freed at once, so that the search for the oldest pays
+off."""
 
 
 def bytes_of(samples: Sequence[Sample]) -> int:
-    """What the samples take in the buffer."""
+    """The memory that the samples take in the buffer, in bytes."""
     return sum([len(sample.payload) for sample in samples]) + SAMPLE_OVERHEAD * len(samples)
 
 
 class Lane:
-    """The samples of one client on one stream, in order of time."""
+    """The samples of one client on one stream, in time order."""
 
     __slots__ = (
         "_pushed_out", "bytes", "came", "capped", "client", "duration", "evicted", "maximum_bytes", "maximum_count",
@@ -61,34 +62,34 @@ class Lane:
         self.number = -1
         """The client's number in the tables (see columns/tables.py); -1 while it has none."""
         self.came: list[Sample] | None = None
-        """What was put in since `record`; None while nobody wants to know."""
+        """What was inserted since `record`; None if nobody records."""
         self.limit(duration, maximum_bytes, maximum_count)
         self.samples: deque[Sample] = deque()
         self.bytes = 0
         self._pushed_out = NEVER
         """The time of the newest sample, if a cap pushed it out."""
         self.evicted = 0
-        """Samples that a cap pushed out before their time."""
+        """Samples that a cap evicted before they expired."""
 
     def limit(self, duration: int, maximum_bytes: int | None, maximum_count: int | None) -> None:
-        """Keep to these from the next sample and tick on; `duration` is in nanoseconds."""
+        """Apply these limits from the next sample and tick on; `duration` is in nanoseconds."""
         self.duration = duration
         self.maximum_bytes = maximum_bytes
         self.maximum_count = maximum_count
         self._decide()
 
     def record(self, came: list[Sample] | None) -> None:
-        """Add what is put in from now on to the list, in the order in which it comes; or (None) do so no more."""
+        """Append inserted samples to the list from now on, in order of arrival; None: stop."""
         self.came = came
         self._decide()
 
     def _decide(self) -> None:
         self.capped = self.maximum_bytes is not None or self.maximum_count is not None or self.came is not None
-        """Whether samples have to come in through `insert`, which looks at the caps and at `came`."""
+        """Whether samples must go through `insert`, which enforces the caps and fills `came`."""
 
     @property
     def newest(self) -> Sample | None:
-        """The sample of the greatest time; of several, the one that arrived last."""
+        """The sample with the greatest time; of several, the one that arrived last."""
         return self.samples[-1] if self.samples else None
 
     @property
@@ -97,7 +98,7 @@ class Lane:
         return max(self.samples[-1].received, self._pushed_out) if self.samples else self._pushed_out
 
     def insert(self, sample: Sample) -> int:
-        """Put the sample in its place; returns by how many bytes the lane grew."""
+        """Insert the sample in time order; returns by how many bytes the lane grew."""
         if self.came is not None:
             self.came.append(sample)
         samples = self.samples
@@ -128,7 +129,7 @@ class Lane:
         return size
 
     def size_of(self, sample: Sample) -> int:
-        """What the sample takes in the buffer, in bytes."""
+        """The memory that the sample takes in the buffer, in bytes."""
         return len(sample.payload) + SAMPLE_OVERHEAD
 
     def expire(self, now: int) -> int:
@@ -146,15 +147,15 @@ class Lane:
         return sum([len(pop().payload) for _ in range(count)]) + SAMPLE_OVERHEAD * count
 
     def step_back(self, to: int) -> None:
-        """Time goes on from `to`, which is earlier: forget all samples, and that there were any."""
+        """Time continues at the earlier time `to`: forget all samples, as if none had ever arrived."""
         self.samples.clear()
         self.bytes = 0
         self._pushed_out = NEVER
 
     def newest_first(self, after: int | None, until: int, now: int | None = None) -> Iterator[Sample]:
-        """The samples of (after, until] from the newest on; all up to `until` where `after` is None.
+        """The samples of (after, until], newest first; all up to `until` if `after` is None.
 
-        Without what is older than the duration `now` (None: at `until`), but for the newest of all.
+        Excludes samples older than the duration at `now` (None: at `until`), except the newest of all.
         """
         horizon = (until if now is None else now) - self.duration
         for newer, sample in enumerate(reversed(self.samples)):
@@ -170,7 +171,7 @@ class ItemLane(Lane):
     __slots__ = ()
 
     def _decide(self) -> None:
-        """Every sample comes through `insert`."""
+        """Every sample goes through `insert`."""
         self.capped = True
 
     def size_of(self, sample: Sample) -> int:
@@ -192,11 +193,12 @@ class Buffer:
         self._lanes: dict[str, dict[str, Lane]] = {}
         """By client and stream."""
         self.on_added: Callable[[Lane], None] = lambda lane: None
-        """Told each lane that is new."""
+        """Called with each new lane."""
         self._evicted_before = 0
-        """Evicted from lanes that are gone."""
+        """Samples evicted from lanes that no longer exist."""
         self.evictions = 0
-        """Changes when samples go before their time: pushed out by the cap over all, or with their lane."""
+        """Changes when samples leave before they expire: evicted by the cap over all lanes, or dropped with their
+        lane."""
 
     def lane(self, client: str, stream: str) -> Lane | None:
         """The client's lane of the stream, if it has one."""
@@ -208,7 +210,7 @@ class Buffer:
         return (lane for client in clients for lane in self._lanes.get(client, {}).values())
 
     def add(self, lane: Lane) -> Lane:
-        """Take the lane in; the one that is there already where there is one."""
+        """Add the lane; returns the existing one if there is one."""
         lanes = self._lanes.setdefault(lane.client, {})
         if lane.stream not in lanes:
             lanes[lane.stream] = lane
@@ -216,17 +218,17 @@ class Buffer:
         return lanes[lane.stream]
 
     def takes(self, size: int) -> bool:
-        """Whether so much comes in without pushing anything out."""
+        """Whether an insertion of this size (bytes) evicts nothing."""
         return self.bytes + size <= self.maximum_bytes
 
     def grew(self, size: int) -> None:
-        """Account for what was inserted, and keep to the cap."""
+        """Account for inserted bytes, and enforce the cap."""
         self.bytes += size
         if self.bytes > self.maximum_bytes:
             self.shrink()
 
     def expire(self, now: int) -> None:
-        """Forget what is older than the lanes' durations."""
+        """Drop samples that are older than their lanes' durations."""
         for lane in self:
             self.bytes -= lane.expire(now)
 
@@ -235,7 +237,7 @@ class Buffer:
         return max([lane.latest for lane in self._lanes.get(client, {}).values()], default=NEVER)
 
     def forget(self, client: str, streams: Collection[str] | None = None) -> None:
-        """Drop all lanes of a client, or those of some streams."""
+        """Drop all lanes of a client, or only those of some streams."""
         lanes = self._lanes.pop(client, {})
         for stream in list(lanes):
             if streams is None or stream in streams:
@@ -252,14 +254,14 @@ class Buffer:
                 del self._lanes[client]
 
     def step_back(self, to: int) -> None:
-        """Time goes on from `to`, which is earlier: forget all samples but latched ones; the lanes stay."""
+        """Time continues at the earlier time `to`: forget all samples except latched ones; the lanes are kept."""
         for lane in self:
             lane.step_back(to)
         self.bytes = sum(lane.bytes for lane in self)
 
     @property
     def evicted(self) -> int:
-        """Samples that a cap pushed out before their time."""
+        """Samples that a cap evicted before they expired."""
         return self._evicted_before + sum(lane.evicted for lane in self)
 
     def __iter__(self) -> Iterator[Lane]:
@@ -271,7 +273,7 @@ class Buffer:
         self.evictions += 1
 
     def shrink(self) -> None:
-        """Free the oldest samples over all lanes, those of latched lanes only where nothing else is left."""
+        """Evict the oldest samples over all lanes; those of latched lanes only if nothing else is left."""
         self.evictions += 1
         self._shrink(latched=False)
         if self.bytes > self.maximum_bytes:

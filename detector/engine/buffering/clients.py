@@ -1,7 +1,7 @@
-"""Who is there: a client is known from its first sample until nothing was received from it for `clientTimeout`.
+"""The known clients: a client is known from its first sample until nothing was received from it for `clientTimeout`.
 
-One with a liveliness token is known as long as it has one, and lost at the first tick after its last one was dropped.
-One that is expected is known from the detector's start on, whether or not anything comes from it.
+A client with a liveliness token is known as long as it has one, and lost at the first tick after its last one was
+dropped. An expected client is known from the detector's start, even if it sends nothing.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from detector.engine.samples.liveliness import Tokens
 
 @dataclass(slots=True)
 class Presence:
-    """Since when a client is known, and when something was last received from it or before; nanoseconds."""
+    """When a client became known, and when something was last received from it; nanoseconds."""
 
     since: int
     last: int
@@ -23,7 +23,7 @@ class Presence:
     patience: int | None = None
     """How long it is known without a sample, in nanoseconds; None: for the Detector's `clientTimeout`."""
     restored: bool = False
-    """Whether nothing has come from it yet: an episode about it was restored."""
+    """Whether nothing was received from it yet: it is known because an episode about it was restored."""
 
 
 class Clients:
@@ -37,19 +37,20 @@ class Clients:
         self._expected: frozenset[str] = frozenset()
         self._present: dict[str, Presence] = {}
         self._sorted: list[str] | None = None
-        """Their names, in order; None: someone came or went since."""
+        """Their names, sorted; None: to be sorted again, because a client was added or removed."""
         self.tokens = Tokens()
         self.newest = NEVER
-        """Since when the client is known that came last, or later; nanoseconds."""
+        """When the newest client became known, or later; nanoseconds."""
         self._loss: int | None = NEVER
-        """No client is lost before this time by its timeout (nanoseconds); None: not as things are."""
+        """The earliest time at which a client can be lost by its timeout (nanoseconds); None: never in the current
+        state."""
 
     def configure(
         self, labels: Mapping[str, Mapping[str, str]], timeout: int, expected: Collection[str], now: int
     ) -> None:
-        """The Detector changed: other labels, another timeout, other clients that are expected from `now` on.
+        """Apply a changed Detector: its labels, its timeout, and the clients that are expected from `now` on.
 
-        The timeout of one that no longer is counts from `now` at the earliest.
+        The timeout of a client that is no longer expected counts from `now` at the earliest.
         """
         self._look()  # streams may go from the buffer
         self._labels, self._timeout = labels, timeout
@@ -66,7 +67,7 @@ class Clients:
     def heard(self, client: str, time: int, patience: int | None = None) -> None:
         """The first sample of the client on a stream, or its liveliness token.
 
-        `patience` (ns) is given for a stream with items: a client of several streams has the longest of all.
+        `patience` (ns) is given for a stream with items: a client of several streams gets the longest of all.
         """
         presence = self._present.get(client)
         if presence is None:
@@ -83,13 +84,13 @@ class Clients:
         self.still_heard(client, time)
 
     def restore(self, client: str, time: int) -> None:
-        """An episode about the client was restored: it is known until `clientTimeout` unless something comes."""
+        """An episode about the client was restored: without samples, it stays known until `clientTimeout`."""
         known = client in self._present
         self.heard(client, time)
         self._present[client].restored = not known
 
     def still_heard(self, client: str, time: int) -> None:
-        """The newest sample of the client is of this time; one that is not known stays unknown."""
+        """The client's newest sample has this time; an unknown client stays unknown."""
         presence = self._present.get(client)
         if presence is not None and time > presence.last:
             presence.last = time
@@ -112,9 +113,9 @@ class Clients:
         self._loss = min(waited, default=None)
 
     def lose(self, now: int) -> list[str]:
-        """Forget the clients that have timed out without a token, or dropped their last one; returns them.
+        """Remove the clients that have timed out without a token, or whose last token was dropped; returns them.
 
-        One that is expected is never lost.
+        Expected clients are never lost.
         """
         tokens = self.tokens
         self._look()
@@ -134,7 +135,7 @@ class Clients:
         return self._timeout if presence.patience is None else presence.patience
 
     def gap(self, time: int) -> None:
-        """Nobody could be heard up to `time`: timeouts count from there at the earliest."""
+        """Nothing could be received up to `time`: timeouts count from there at the earliest."""
         self.newest = min(self.newest, time)
         for presence in self._present.values():
             presence.since = min(presence.since, time)
@@ -149,12 +150,12 @@ class Clients:
         ]
 
     def knows(self, client: str, time: int) -> bool:
-        """Whether the client is known since this time at least; nanoseconds."""
+        """Whether the client has been known since this time or longer; nanoseconds."""
         presence = self._present.get(client)
         return presence is not None and presence.since <= time
 
     def since(self, client: str) -> int:
-        """Since when the client is known, in nanoseconds since the epoch."""
+        """The time at which the client became known, in nanoseconds since the epoch."""
         return self._present[client].since
 
     def last(self, client: str) -> int:
@@ -162,7 +163,7 @@ class Clients:
         return max(self._present[client].last, self._buffer.latest(client))
 
     def labels(self, client: str) -> Mapping[str, str]:
-        """The labels that the Detector gives the client."""
+        """The client's labels in the Detector."""
         return self._labels.get(client, {})
 
     def __len__(self) -> int:

@@ -1,7 +1,7 @@
-"""The way of a sample into the buffer: whose it is, and which lane takes it.
+"""How a sample enters the buffer: which client sent it, and which lane stores it.
 
-Keys and clients come from outside, so there are bounds on how many are remembered: a publisher that makes up names
-costs no more memory than the bounds allow, and does not push out the clients that are there.
+Keys and clients come from outside, so their number is bounded: a publisher that invents names costs no more memory than
+the bounds allow, and does not displace existing clients.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ MAXIMUM_CLIENTS = 100_000
 """Maximum number of known clients; samples of further ones are dropped and counted."""
 
 MAXIMUM_OBJECTS = 50_000
-"""Maximum number of known clients beyond which no item becomes a new one: object lists leave room for vehicles."""
+"""Maximum number of known clients up to which items add new ones: object lists leave room for vehicles."""
 
 MAXIMUM_KEYS = 200_000
-"""Maximum number of cached keys of a stream; further ones are read each time, which is only slower."""
+"""Maximum number of cached keys per stream; further keys are parsed each time, which is only slower."""
 
 MAXIMUM_LOST = 1_000
-"""Maximum number of lost clients whose newest samples are kept, in case they return; the oldest go first."""
+"""Maximum number of lost clients whose newest samples are kept in case they return; the oldest are dropped first."""
 
 _STREAM = attrgetter("stream")
 
 _BY_CLIENT = "/"
-"""Begins what lanes are remembered under that no key stands for: no key begins with a slash."""
+"""Prefix of the cache entries of lanes that are not found by key: no key begins with a slash."""
 
 _NO_LANES: Mapping[str, Lane] = {}
 
@@ -55,9 +55,9 @@ class Ingest:
         """The lane of each of these."""
         self.noting = False
         self.linked: frozenset[str] = frozenset()
-        """The streams whose samples take along the one before: some rule reads it."""
+        """The streams whose samples keep the previous one, because some rule reads it."""
         self._lost: dict[str, None] = {}
-        """The lost clients of which samples are kept, in the order of their loss."""
+        """The lost clients whose samples are kept, in the order of their loss."""
 
     def configure(
         self,
@@ -66,7 +66,7 @@ class Ingest:
         lane_makers: Mapping[str, LaneMaker],
         message_clients: MessageClients,
     ) -> None:
-        """Take in the streams of this Detector from now on; `lane_makers` has one for each."""
+        """Use the streams of this Detector from now on; `lane_makers` has one for each."""
         self._message_clients = message_clients
         self._read_key = read_key
         self._lane_makers = lane_makers
@@ -74,9 +74,9 @@ class Ingest:
         self._stale_after = {stream.name: detector.spec.stale_after_ns(stream) for stream in detector.spec.streams}
         timeout = detector.spec.client_timeout.ns
         self._patience = {stream: min(self._stale_after[stream] or timeout, timeout) for stream in self._of_items}
-        """By stream with items, how long a client that is nothing but such items is known without one; nanoseconds."""
+        """By stream with items, how long a client known only from such items stays known without one; nanoseconds."""
         self._lanes: dict[str, dict[str, Lane]] = {stream.name: {} for stream in detector.spec.streams}
-        """By key; of streams whose messages name their client, by client, which no key is: see `_lane_of_message`."""
+        """By key; of streams whose messages name their client, by client: see `_lane_of_message`."""
 
     def insert(self, arrivals: Sequence[Arrival], times: Sequence[int] | None, size: int) -> None:
         """Everything that is received comes through here.
@@ -114,7 +114,7 @@ class Ingest:
         return size
 
     def _insert_items(self, arrival: Arrival, time: int) -> None:
-        """Put each item of a message into the lane of its client."""
+        """Insert each item of a message into the lane of its client."""
         stream, key, payload = arrival.stream, arrival.key, arrival.payload
         self._number += 1
         found = self._read_items(stream, key, payload)
@@ -127,7 +127,7 @@ class Ingest:
                 self._put(lane, Item(time, self._number, payload, key, place, share, before))
 
     def _before(self, lane: Lane, time: int) -> Before | None:
-        """The newest sample in the buffer up to a time, unless it is stale then."""
+        """The newest sample in the buffer up to a time; None if it is stale at that time."""
         newest = lane.newest
         if newest is not None and newest.time > time:
             newest = next((sample for sample in reversed(lane.samples) if sample.time <= time), None)
@@ -170,7 +170,7 @@ class Ingest:
             self.lanes += lanes
 
     def _lane(self, stream: str, key: str, time: int, payload: bytes) -> Lane | None:
-        """The lane that takes a sample; None, and not counted among those taken in, where there is none for it."""
+        """The lane for a sample; None if there is none, and the sample then does not count as taken in."""
         if stream in self._message_clients:
             lane = self._lane_of_message(stream, key, time, payload)
         else:
@@ -182,13 +182,13 @@ class Ingest:
         return lane
 
     def sender_of(self, arrival: Arrival) -> str | None:
-        """Who sent the arrival: its client, of a message with items its key; None as in `clients_of`."""
+        """The sender of the arrival: its client; for a message with items its key; None as in `clients_of`."""
         if arrival.stream in self._of_items:
             return _BY_CLIENT + arrival.key
         return self._client_of(arrival)
 
     def clients_of(self, arrival: Arrival) -> Collection[str]:
-        """Whose the arrival is; none, and counted, where neither its key nor its message names a valid client."""
+        """The clients of the arrival; none, and counted, if neither its key nor its message names a valid client."""
         if arrival.stream in self._of_items:
             return self._read_items(arrival.stream, arrival.key, arrival.payload)
         client = self._client_of(arrival)
@@ -201,19 +201,20 @@ class Ingest:
         return lane.client if lane is not None else self._read(arrival.stream, arrival.key)
 
     def step_back(self, to: int) -> None:
-        """Time goes on from `to`, which is earlier; nanoseconds."""
+        """Time continues from `to` (nanoseconds), which is earlier."""
         self._newest = to
 
     def lose(self, lost: Collection[str]) -> None:
-        """These clients are lost. The next sample of one makes it known again; its last samples are still there then.
+        """These clients are lost. The next sample of one makes it known again; its last samples are still available
+        then.
 
-        (A latched sample would not come again, since its sender may not know that it was away.)
+        (A latched sample would not be sent again, since its sender may not have noticed the loss.)
         """
         for lanes in self._lanes.values():
             for key in [key for key, lane in lanes.items() if lane.client in lost]:
                 del lanes[key]
         for client in lost if self._of_items else ():
-            self._buffer.forget(client, self._of_items)  # an item that comes under that name is another object
+            self._buffer.forget(client, self._of_items)  # a later item of that name is another object
         self._lost.update(dict.fromkeys(lost))
         while len(self._lost) > MAXIMUM_LOST:
             client = next(iter(self._lost))
@@ -221,7 +222,7 @@ class Ingest:
             self._buffer.forget(client)
 
     def _token(self, key: str, payload: bytes, time: int) -> None:
-        """Something happened to a client's liveliness token."""
+        """Handle a change of a client's liveliness token."""
         try:
             token = Token(payload)
         except ValueError:
@@ -231,7 +232,7 @@ class Ingest:
         if token is not Token.DECLARED:
             client = tokens.withdraw(key, lost=token is Token.DROPPED)
             if client is not None:
-                self._clients.still_heard(client, time)  # from here on the timeout counts
+                self._clients.still_heard(client, time)  # the timeout counts from here
             return
         whose = self._read_key(LIVELINESS, key)
         if whose is None:
@@ -245,7 +246,7 @@ class Ingest:
             self._clients.heard(whose[0], time)
 
     def _route(self, stream: str, key: str, time: int) -> Lane | None:
-        """The lane for a key that has none at hand: a new key, or one of a client that was lost."""
+        """The lane for a key that is not cached: a new key, or one of a client that was lost."""
         if stream == LIVELINESS:
             return None
         client = self._read(stream, key)
@@ -260,7 +261,7 @@ class Ingest:
         return self._lanes[stream].get(name) or self._new_lane(stream, name, client, time)
 
     def _new_lane(self, stream: str, key: str, client: str, time: int) -> Lane | None:
-        """A lane to remember under the key; None, and counted, where there are too many clients."""
+        """A lane to cache under the key; None, and counted, if there are too many clients."""
         of_items = stream in self._of_items
         maximum = MAXIMUM_OBJECTS if of_items else MAXIMUM_CLIENTS
         if client not in self._clients and len(self._clients) >= maximum:
@@ -275,7 +276,7 @@ class Ingest:
         return lane
 
     def _read_items(self, stream: str, key: str, payload: bytes) -> dict[str, int]:
-        """The clients of a message's items, and their places in the list."""
+        """The clients of a message's items, and their indices in the list."""
         whose = self._read_key(stream, key)
         if whose is None:
             self._unnamed(stream, key)
@@ -284,7 +285,7 @@ class Ingest:
 
     def _read(self, stream: str, key: str) -> str | None:
         whose = self._read_key(stream, key) if stream in self._lane_makers else None
-        if whose is None:  # also what still came in on a stream that the Detector no longer has
+        if whose is None:  # including messages of a stream that the Detector no longer has
             self._unnamed(stream, key)
             return None
         return whose[0]

@@ -1,7 +1,7 @@
-"""Messages that are lists of objects: a stream's `items` names the list, and each item is a sample of its own.
+"""Messages that are lists of objects: a stream's `items` names the list, and each item is a separate sample.
 
-The samples share the message's payload. A message is decoded when it enters the buffer, for the names of its clients,
-and soon afterwards again, when rules read it: so the newest messages are cached.
+The samples share the message's payload. A message is decoded when it enters the buffer, to find its clients, and again
+soon afterwards, when rules read it. Therefore the newest messages are cached.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from wayside.expressions import Expression, Path
 from wayside.rules import CompiledStream
 
 _MAXIMUM_BYTES = 4 * 2**20
-"""Of the payloads of cached messages; the oldest go first."""
+"""Maximum size of the payloads of cached messages; the oldest are removed first."""
 
 
 class Listed(NamedTuple):
@@ -40,7 +40,7 @@ class Items:
         return stream in self._lists
 
     def read(self, stream: str, payload: bytes) -> Listed:
-        """A message, and its list. Raises DecodeError, and EvaluationError where there is no list."""
+        """A message and its list. Raises DecodeError, and EvaluationError if there is no list."""
         listed = self._cached.get((stream, payload))
         if listed is None:
             message = self._decoders[stream].decode(payload)
@@ -58,7 +58,7 @@ class Items:
 
 
 def below(value: Any, path: Path) -> Any:
-    """What the path leads to below a value; MISSING: nothing."""
+    """The value at the path below a value; MISSING: there is none."""
     for step in path:
         if isinstance(value, dict):
             value = value.get(step, MISSING)
@@ -70,10 +70,10 @@ def below(value: Any, path: Path) -> Any:
 
 
 def _list(expression: Expression, path: Path | None, message: Any) -> list[Any]:
-    """The list. A plain path is followed here: CEL copies what it yields."""
+    """The list. A plain path is followed here, because CEL copies its results."""
     found = MISSING if path is None else below(message, path[1:])
     if isinstance(found, list):
         return found
     evaluated = expression.evaluate({"msg": message})
-    assert isinstance(evaluated, list)  # noqa: S101  of no other kind was it compiled
+    assert isinstance(evaluated, list)  # noqa: S101  it was compiled for this type
     return evaluated

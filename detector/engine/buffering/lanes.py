@@ -23,18 +23,18 @@ class LaneMaker:
         self._of_items = stream.items is not None
 
     def lane(self, client: str) -> Lane:
-        """A lane of the client, without samples."""
+        """A new, empty lane of the client."""
         if self._topic is None:
             return (ItemLane if self._of_items else Lane)(client, self._stream, *self._limits)
         return LatchedLane(client, self._stream, *self._limits, topic=self._topic)
 
     def limit(self, lane: Lane) -> None:
-        """A lane that there is already keeps to the Detector as it is now."""
+        """Apply the current limits to an existing lane."""
         lane.limit(*self._limits)
 
 
 def lane_makers(detector: Detector, decoders: Mapping[str, Decoder]) -> dict[str, LaneMaker]:
-    """One for each stream of the Detector; `decoders` has theirs."""
+    """One for each stream of the Detector; `decoders` has one for each as well."""
     topics = latched_topics(detector, decoders)
     return {
         stream.name: LaneMaker(stream, detector.spec.buffer_duration_ns(stream), topics.get(stream.name))
@@ -43,7 +43,7 @@ def lane_makers(detector: Detector, decoders: Mapping[str, Decoder]) -> dict[str
 
 
 def latched_topics(detector: Detector, decoders: Mapping[str, Decoder]) -> dict[str, Topic]:
-    """For each latched stream of the Detector, what its samples speak of."""
+    """For each latched stream of the Detector, the function that returns the topic of a sample."""
     return {
         stream.name: by_key_and_frames(decoders[stream.name]) if stream.carries_transforms else by_key
         for stream in detector.spec.streams

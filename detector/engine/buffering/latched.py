@@ -1,7 +1,7 @@
 """Lanes of latched streams: the last sample stays valid, however old, until it is replaced.
 
-What a sample speaks of is its key; of transforms (a /tf_static that several publishers share) the key and the frames.
-The newest sample about each is kept beyond the duration; caps push it out last of all.
+The topic of a sample is its key; for transforms (a /tf_static that several publishers share) the key and the frames.
+The newest sample of each topic is kept beyond the duration; caps evict it last of all.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from detector.engine.buffering.buffer import NEVER, Lane, bytes_of
 from detector.engine.samples.sample import DecodeError, Decoder, Sample
 
 Topic = Callable[[str, bytes], Hashable]
-"""What a sample with that key and payload speaks of: a newer one about the same takes its place."""
+"""The topic of a sample with that key and payload: a newer sample of the same topic replaces it."""
 
 
 def by_key(key: str, payload: bytes) -> Hashable:
-    """A sample speaks of its key."""
+    """The topic is the key."""
     return key
 
 
 def by_key_and_frames(decoder: Decoder) -> Topic:
-    """Transforms speak of their child frames; what cannot be read, of its key."""
+    """The topic of transforms is the key and their child frames; of payloads that cannot be read, the key."""
 
     def topic(key: str, payload: bytes) -> Hashable:
         try:
@@ -36,7 +36,7 @@ def by_key_and_frames(decoder: Decoder) -> Topic:
 
 
 class LatchedLane(Lane):
-    """The samples of one client on one latched stream. Not made for speed: such streams are rare and slow."""
+    """The samples of one client on one latched stream. Not optimised: such streams are rare and slow."""
 
     __slots__ = ("_topic", "_topics")
 
@@ -58,7 +58,7 @@ class LatchedLane(Lane):
         """The topics of samples, computed on first use; equal samples have equal topics."""
 
     def _decide(self) -> None:
-        """Every sample comes through `insert`."""
+        """Every sample goes through `insert`."""
         self.capped = True
 
     def drop_oldest(self) -> int:
@@ -67,7 +67,7 @@ class LatchedLane(Lane):
         return super().drop_oldest()
 
     def expire(self, now: int) -> int:
-        """Forget what is older than the duration and was replaced since; returns the bytes freed."""
+        """Drop replaced samples that are older than the duration; returns the bytes freed."""
         horizon = now - self.duration
         if not self.samples or self.samples[0].time > horizon:
             return 0
@@ -75,7 +75,7 @@ class LatchedLane(Lane):
         return self._keep([s for s in self.samples if s.time > horizon or newest[self._about(s)] is s])
 
     def newest_first(self, after: int | None, until: int, now: int | None = None) -> Iterator[Sample]:
-        """See Lane; leaves out what is older than the duration and was replaced since."""
+        """See Lane; excludes replaced samples that are older than the duration."""
         horizon = (until if now is None else now) - self.duration
         replaced: set[Hashable] = set()
         for sample in reversed(self.samples):
@@ -87,18 +87,18 @@ class LatchedLane(Lane):
             replaced.add(about)
 
     def step_back(self, to: int) -> None:
-        """Time continues from `to`: samples stay valid, none of them newer than that."""
+        """Time continues at `to`: samples stay valid, with times no newer than that."""
         self._keep([_not_after(sample, to) for sample in self.samples])
         self._pushed_out = NEVER
 
     def _about(self, sample: Sample) -> Hashable:
-        """What the sample speaks of."""
+        """The topic of the sample."""
         if sample not in self._topics:
             self._topics[sample] = self._topic(sample.key, sample.payload)
         return self._topics[sample]
 
     def _keep(self, samples: list[Sample]) -> int:
-        """Hold these and no others; returns the bytes freed."""
+        """Keep only these samples; returns the bytes freed."""
         before = self.bytes
         self.samples = deque(samples)
         self._topics = {sample: self._about(sample) for sample in samples}

@@ -1,4 +1,4 @@
-"""What expressions over one sample see of it: payloads are decoded on first use, and stamps are read."""
+"""The values that expressions over one sample read: payloads are decoded on first use, and stamps are read."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from wayside.rules import CompiledStream
 _MISSING: Any = object()
 
 _RECEIVED = "sample.received"
-"""A stream's `stamp` where the receive time is the sender's: in JSON lines, `t`."""
+"""A stream's `stamp` if the receive time is used as the sender's: `t` of JSON lines."""
 
 _SECOND = 10**9
 """An integer: Python divides integers to the nearest double, where a double of nanoseconds would be 256 ns off."""
 
 
 class KeyReader(Protocol):
-    """Tells whose a sample is."""
+    """Finds the client of a sample."""
 
     def __call__(self, stream: str, key: str) -> tuple[str, Mapping[str, str]] | None:
-        """The client and the captured chunks; None where the key names no valid client."""
+        """The client and the captured chunks; None if the key names no valid client."""
 
 
 class Messages:
@@ -47,24 +47,24 @@ class Messages:
         self._decoded: dict[tuple[str, Sample], Any] = {}
         self._stamps: dict[tuple[str, Sample], int | None] = {}
         self._stamps_before: dict[tuple[str, Sample], int | None] = {}
-        """Those of the last tick at which stamps were read: plugins look at the same samples tick by tick."""
+        """The stamps read in the previous tick that read any: plugins read the same samples tick after tick."""
         self._last_stamp: tuple[tuple[str, int, bytes], int | None] | None = None
 
     def forget(self) -> None:
-        """Drop what was decoded: the tick is over."""
+        """Release what was decoded: the tick is over."""
         self._decoded.clear()
         if self._stamps:
             self._stamps_before, self._stamps = self._stamps, {}
 
     def content(self, stream: str, sample: Sample) -> Any:
-        """What the client sent: the item of a stream with `items`, else the message; UNKNOWN as in `message`."""
+        """The client's data: for a stream with `items` the item, otherwise the message; UNKNOWN as in `message`."""
         message = self.message(stream, sample)
         if message is UNKNOWN or not isinstance(sample, Item):
             return message
         return self.items.read(stream, sample.payload).items[sample.place]
 
     def _before(self, stream: str, before: Before | None) -> Any:
-        """What the client sent before; UNKNOWN: nothing, or it cannot be read, which is counted already."""
+        """The client's previous data; UNKNOWN: there is none, or it cannot be read, which was counted before."""
         if before is None:
             return UNKNOWN
         if before.place >= 0:
@@ -75,9 +75,9 @@ class Messages:
             return UNKNOWN
 
     def message(self, stream: str, sample: Sample) -> Any:
-        """The decoded message of a sample, or UNKNOWN where it cannot be read; that is counted."""
+        """The decoded message of a sample, or UNKNOWN if it cannot be read; that is counted."""
         if isinstance(sample, Item):
-            return self.items.read(stream, sample.payload).message  # it could be read as it came
+            return self.items.read(stream, sample.payload).message  # it was readable on receipt
         at = (stream, sample)
         message = self._decoded.get(at, _MISSING)
         if message is _MISSING:
@@ -98,7 +98,7 @@ class Messages:
     def values(
         self, stream: str, sample: Sample, names: frozenset[str], parameters: Mapping[str, Any]
     ) -> dict[str, Any] | None:
-        """What an expression over one sample sees; None where the sample cannot be read."""
+        """The variables of an expression over one sample; None if the sample cannot be read."""
         values: dict[str, Any] = {"parameters": parameters}
         if "msg" in names:
             message = self.message(stream, sample)
@@ -127,7 +127,7 @@ class Messages:
         return values
 
     def stamp(self, stream: str, sample: Sample) -> int | None:
-        """The stamp of a sample in the buffer: see `time`. It is read once while each tick looks at the sample."""
+        """The stamp of a sample in the buffer: see `time`. It is cached while each tick reads the sample."""
         at = (stream, sample)
         stamp: int | None = self._stamps.get(at, _MISSING)
         if stamp is _MISSING:
@@ -138,9 +138,9 @@ class Messages:
         return stamp
 
     def time(self, stream: str, key: str, received: int, payload: bytes) -> int | None:
-        """A sample's time with clock Data, in nanoseconds: its stamp, or the receive time where it carries none.
+        """A sample's time with clock Data, in nanoseconds: its stamp, or the receive time if it has none.
 
-        None where it cannot be read; that is counted.
+        None if it cannot be read; that is counted.
         """
         try:
             stamp = self._stamp(stream, payload, received)
@@ -151,7 +151,7 @@ class Messages:
         return received if stamp is None else stamp
 
     def _stamp_of(self, stream: str, sample: Sample) -> int | None:
-        """The same as `_stamp`; that of a message with items is read once for all that come one after the other."""
+        """The same as `_stamp`; the stamp of a message with items is read once for all consecutive items."""
         if not isinstance(sample, Item):
             return self._stamp(stream, sample.payload, sample.received)
         about = stream, sample.received, sample.payload
@@ -160,7 +160,7 @@ class Messages:
         return self._last_stamp[1]
 
     def _stamp(self, stream: str, payload: bytes, received: int) -> int | None:
-        """The sender's time in nanoseconds, where the message carries one."""
+        """The sender's time in nanoseconds, if the message has one."""
         decoder, expression = self._decoders[stream], self._streams[stream].stamp
         if expression is None:
             near = self._near.get(stream)
@@ -177,7 +177,7 @@ class Messages:
 
 
 def _nanoseconds(seconds: object) -> int:
-    """A stamp in seconds, to the microsecond: a double holds no more of a time since the epoch."""
+    """A stamp in seconds, to the microsecond: a double has no greater precision for a time since the epoch."""
     if not isinstance(seconds, int | float) or not 0 <= seconds < 1e11:
         raise ValueError(f"stamp {seconds!r} is not a time in seconds since the epoch")
     return round(seconds * 1e6) * 1000

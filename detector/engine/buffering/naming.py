@@ -1,4 +1,4 @@
-"""The clients of messages that name them: a stream's `client` is a template over the message, or over its items.
+"""The clients named in messages: a stream's `client` is a template over the message, or over its items.
 
 Such messages are decoded as they enter the buffer, on the thread that evaluates, never on the one that receives.
 """
@@ -16,17 +16,17 @@ from wayside.expressions import CompiledTemplate, EvaluationError, Interpolation
 from wayside.rules import CompiledStream
 
 CLIENT_NAME = re.compile(r"(?!\.*$)[A-Za-z0-9._:-]{1,63}")
-"""What a client's name is made of. Dots alone are none: they would be a way out of a folder or of a URL's path."""
+"""Valid names of clients. Names of only dots are invalid: they would escape from a folder or a URL's path."""
 
 MAXIMUM_ITEMS = 2048
 """Maximum number of items of one message; further ones are dropped and counted."""
 
 _MAXIMUM_NAMES = 65_536
-"""Maximum number of cached names; beyond, the cache starts again."""
+"""Maximum number of cached names; beyond it, the cache is emptied."""
 
 
 class MessageClients:
-    """Reads the names of clients out of messages."""
+    """Reads the names of clients from messages."""
 
     def __init__(
         self,
@@ -45,7 +45,7 @@ class MessageClients:
         return stream in self._namers
 
     def client(self, stream: str, key: str, captures: Mapping[str, str], payload: bytes) -> str | None:
-        """The client's name; None, and counted, where the message cannot be read or yields no valid name."""
+        """The client's name; None, and counted, if the message cannot be read or yields no valid name."""
         try:
             message = self._decoders[stream].decode(payload)
         except DecodeError as error:
@@ -54,9 +54,10 @@ class MessageClients:
         return self._name(stream, key, {"msg": message, "key": captures})
 
     def of_items(self, stream: str, key: str, captures: Mapping[str, str], payload: bytes) -> dict[str, int]:
-        """The clients of a message's items, and the place of each; what is no list, or has no name, is counted.
+        """The clients of a message's items, and the index of each; items that are no list or have no valid name are
+        counted.
 
-        A client has one item of a message: the first of its name.
+        A client has one item per message: the first with its name.
         """
         try:
             message, items = self._items.read(stream, payload)
@@ -78,7 +79,7 @@ class MessageClients:
         return found
 
     def _name(self, stream: str, key: str, values: Mapping[str, Any]) -> str | None:
-        """A name; None, and counted, where these values yield none that is valid."""
+        """A name; None, and counted, if these values yield no valid one."""
         try:
             name = self._namers[stream].name(values)
         except InterpolationError as error:
@@ -97,7 +98,7 @@ class MessageClients:
 
 
 class _Namer:
-    """Renders a `client` template: equal values of the fields that it reads have one name."""
+    """Renders a `client` template and caches the name by the values of the fields that it reads."""
 
     def __init__(self, template: CompiledTemplate) -> None:
         self._template = template
@@ -105,10 +106,10 @@ class _Namer:
         self._names: dict[tuple[Any, ...], str] = {}
 
     def name(self, values: Mapping[str, Any]) -> str | None:
-        """The name, which need not be a valid one. Raises InterpolationError."""
+        """The name, which may be invalid. Raises InterpolationError."""
         read = tuple([below(values, path) for path in self._paths])
         plain = all(map(_is_plain, read))
-        kinds = (*read, *map(type, read))  # 1.0 and true are equal, but not one name
+        kinds = (*read, *map(type, read))  # 1.0 and true are equal, but render as different names
         if plain and (name := self._names.get(kinds)) is not None:
             return name
         rendered = self._template.render(values, integers=True)
@@ -121,5 +122,5 @@ class _Namer:
 
 
 def _is_plain(value: Any) -> bool:
-    """Whether equal values of this type are rendered alike: 0.0 and -0.0 are not, and NaN equals nothing."""
+    """Whether equal values of this type render the same: 0.0 and -0.0 do not, and NaN equals nothing."""
     return type(value) in (str, bool) or (type(value) is float and value != 0 and value == value)  # noqa: PLR0124

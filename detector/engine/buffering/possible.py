@@ -1,4 +1,4 @@
-"""Which clients can have samples of which streams: what can never come is not counted as missing."""
+"""Which clients can have samples of which streams: impossible ones are not counted as missing."""
 
 from __future__ import annotations
 
@@ -9,24 +9,24 @@ from wayside.keys import KeyPattern
 
 
 class Possible:
-    """Says of a stream and a client whether a sample can ever come, by the stream's key and `client`."""
+    """Whether a client can ever have samples of a stream, by the stream's key and `client`."""
 
     def __init__(self, streams: Iterable[Stream]) -> None:
         self._limits = {stream.name: limit for stream in streams if (limit := _limit(stream)) is not None}
 
     @property
     def limited(self) -> bool:
-        """Whether there is a stream that not every client can have."""
+        """Whether any stream is limited to some clients."""
         return bool(self._limits)
 
     def __call__(self, stream: str, client: str) -> bool:
-        """Whether the client can have samples of the stream; of what is no stream of the Detector, it can."""
+        """Whether the client can have samples of the stream; true for names that are no stream of the Detector."""
         limit = self._limits.get(stream)
         return limit is None or limit(client)
 
 
 def _limit(stream: Stream) -> Callable[[str], bool] | None:
-    """Whose samples can come; None: anybody's."""
+    """The clients that can have samples; None: all."""
     if stream.client is None:
         pattern = KeyPattern.parse(stream.key)
         return None if "${client:*}" in stream.key else lambda client: pattern.can_capture("client", client)

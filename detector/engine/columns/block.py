@@ -1,6 +1,6 @@
-"""A block: some ticks and some clients, and what rules see at each point of them.
+"""A block: some ticks and some clients, and the values that rules read at each point of them.
 
-A point is a tick and a client; in all arrays of a block, clients come first and ticks change fastest.
+A point is a tick and a client. In all arrays of a block, clients are the first axis and ticks change fastest.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _SUBJECTS = 100_000
 
 
 class Context(NamedTuple):
-    """What rules look at."""
+    """The inputs of rules."""
 
     tables: Tables
     clients: Clients
@@ -56,9 +56,9 @@ class Track:
         row: int,
         past: Past,
     ) -> None:
-        """`place`: by condition, the text that errors add about its inputs. `row`: the track's place in its group.
+        """`place`: by condition, the text about its inputs that errors contain. `row`: the track's index in its group.
 
-        `past` has the earlier values of the rule's signals over others.
+        `past` has the earlier values of the rule's signals over other signals.
         """
         self.rule = rule
         self.element = element
@@ -67,11 +67,11 @@ class Track:
         self.row = row
         self.past = past
         self.signals: dict[str, int] = {}
-        """Places of the rule's signals in the group, by name, in the order of the rule."""
+        """Indices of the rule's signals in the group, by name, in the order of the rule."""
         self._subjects: dict[str, Subject] = {}
 
     def subject(self, client: str) -> Subject:
-        """The subject that the client, or the fleet, is."""
+        """The subject of the client, or of the fleet."""
         subject = self._subjects.get(client)
         if subject is None:
             if len(self._subjects) > _SUBJECTS:
@@ -81,12 +81,12 @@ class Track:
 
 
 class Block:
-    """What the rules of a group see at some ticks, of some clients."""
+    """The values that the rules of a group read at some ticks, for some clients."""
 
     def __init__(
         self, context: Context, ticks: Sequence[int], clients: Sequence[str], numbers: Integers | None = None
     ) -> None:
-        """`numbers` are the clients', where the caller knows them."""
+        """`numbers` are those of the clients, if the caller knows them."""
         self.ticks = ticks
         self.times: Integers = np.array(ticks, np.int64)
         self.clients = clients
@@ -95,38 +95,38 @@ class Block:
         self.numbers: Integers = numbers
         self.signals: list[Column] = []
         self.fresh: dict[str, Truths] = {}
-        """By stream: whether it is, at each point; shape (clients, ticks)."""
+        """By stream: whether it is fresh, at each point; shape (clients, ticks)."""
         self.latest: dict[str, Integers] = {}
         """By stream: the time of the newest sample, or NEVER."""
         self.present: Truths | None = None
-        """Which points there are; None: all. Shape (clients, ticks)."""
+        """Which points exist; None: all. Shape (clients, ticks)."""
         self.looked: Truths | None = None
-        """Which rule looks at which client; None: all at all. Shape (tracks, clients)."""
+        """Which rule evaluates which client; None: each rule all clients. Shape (tracks, clients)."""
         self.measured: dict[tuple[int, str], Column] = {}
-        """By track and signal over the open episode, the values that it is over."""
+        """By track and signal over the open episode, the values that the signal aggregates."""
         self.verdicts: Mapping[str, Verdict] = {}
         """By field, where conditions are true and where false; shape (tracks, points)."""
         self._context = context
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Clients and ticks."""
+        """Number of clients and of ticks."""
         return len(self.clients), len(self.ticks)
 
     def points(self, row: int) -> Truths | None:
-        """The points that a track looks at, flat; None: all."""
+        """The points that a track evaluates, flat; None: all."""
         if self.looked is None:
             return None if self.present is None else self.present.ravel()
         looked = np.repeat(self.looked[row], len(self.ticks))
         return looked if self.present is None else looked & self.present.ravel()
 
     def count(self, row: int, points: Truths) -> int:
-        """How many of the points a track looks at."""
+        """How many of the points a track evaluates."""
         own = self.points(row)
         return int(points.sum()) if own is None else int((points & own).sum())
 
     def variables(self, track: Track, point: int) -> dict[str, Any]:
-        """What expressions see at a point, as in `scopes`."""
+        """The variables of expressions at a point, as in `scopes`."""
         view = self.view(track, point)
         view.update(track.element.variables)
         return view
@@ -143,10 +143,10 @@ class Block:
         }
 
     def values(self, track: Track, point: int) -> dict[str, Any]:
-        """The rule's signals at a point, those that are known."""
+        """The known values of the rule's signals at a point."""
         found: dict[str, Any] = {}
         for name, at in track.signals.items():
-            if at >= len(self.signals):  # over others that are just being looked at
+            if at >= len(self.signals):  # signals over others that are being computed now
                 continue
             column = self.signals[at]
             if column.tags is None:
@@ -156,12 +156,12 @@ class Block:
         return found
 
     def measured_at(self, row: int, point: int) -> dict[str, Any]:
-        """What a track's signals over the open episode are over at a point, those that are known."""
+        """The known values at a point that a track's signals over the open episode aggregate."""
         texts = self._context.tables.texts
         found = {name: value_at(column, point, texts) for (of, name), column in self.measured.items() if of == row}
         return {name: value for name, value in found.items() if value is not UNKNOWN}
 
     def last(self, points: Integers) -> int:
-        """Of some points the one that comes last: by tick, then by client."""
+        """The latest of some points: by tick, then by client."""
         ticks = points % len(self.ticks)
         return int(points[np.flatnonzero(ticks == ticks.max())[-1]])

@@ -1,6 +1,6 @@
-"""Conditions about clients, of rules that are evaluated together, as one program over the points of a block.
+"""Conditions about clients, for rules that are evaluated together, as one program over the points of a block.
 
-What the columns cannot take or decide is left to CEL, once for each run of ticks in which its inputs do not change.
+CEL evaluates the rest, which the columns cannot represent or decide: once for each run of ticks with the same inputs.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from wayside.expressions.columns.values import Tag
 from wayside.rules import CompiledRule
 
 _OF_CLIENTS = frozenset({"client", "labels", "parameters"})
-"""Variables that differ from client to client."""
+"""Variables that differ between clients."""
 
 _REMEMBERED = 100_000
 """Maximum number of clients whose last result of CEL is cached."""
@@ -36,13 +36,13 @@ class ClientCondition(NamedTuple):
     field: str
     expression: Expression
     node: int | None
-    """Its truth in the program; None: it is CEL's."""
+    """Its truth in the program; None: CEL evaluates it."""
     signals: tuple[int, ...]
-    """The signals that it reads, by their places in the group."""
+    """Indices in the group of the signals that it reads."""
     streams: bool
-    """Whether it reads which streams are fresh."""
+    """Whether it reads the freshness of streams."""
     by_client: bool
-    """Whether it reads what differs from client to client."""
+    """Whether it reads variables that differ between clients."""
 
 
 class Conditions:
@@ -51,7 +51,7 @@ class Conditions:
     def __init__(
         self, context: Context, tracks: Sequence[Track], chosen: Callable[[CompiledRule], Mapping[str, Expression]]
     ) -> None:
-        """`chosen` are a rule's conditions, by what errors call them. The tracks know the places of their signals."""
+        """`chosen` are a rule's conditions, by their names in errors. The tracks know the indices of their signals."""
         self._context = context
         self._tracks = tracks
         self._chosen = chosen
@@ -117,7 +117,7 @@ class Conditions:
     # CEL
 
     def _ask_cel(self, block: Block, row: int, condition: ClientCondition, true: Truths, false: Truths) -> None:
-        """Evaluate a condition by CEL, at the points where anything changes that it reads."""
+        """Evaluate a condition by CEL, at the points where any of its inputs changes."""
         count = len(block.ticks)
         changed = np.zeros(block.shape, bool)
         changed[:, 0] = True
@@ -153,7 +153,7 @@ class Conditions:
         false: Truths,
         times: int = 1,
     ) -> None:
-        """Evaluate a condition by CEL at a point, and take the result for `times` points from there on."""
+        """Evaluate a condition by CEL at a point, and use the result for the next `times` points."""
         track, client = self._tracks[row], block.clients[point // len(block.ticks)]
         cache = self._cache.setdefault((row, condition.field), {})
         key = self._inputs(block, condition, point)
@@ -171,7 +171,7 @@ class Conditions:
             self._note(block, row, condition, point, note, times)
 
     def _inputs(self, block: Block, condition: ClientCondition, point: int) -> Hashable | None:
-        """A key that differs whenever the inputs of a condition do; None: evaluate it each time."""
+        """A key that differs whenever the inputs of a condition differ; None: evaluate it each time."""
         inputs: list[Hashable] = []
         for at in condition.signals:
             column = block.signals[at]
@@ -187,7 +187,8 @@ class Conditions:
     def _note_unknown(
         self, block: Block, row: int, condition: ClientCondition, unknown: Truths, tags: NDArray[np.uint8] | None
     ) -> None:
-        """Count a condition's unknown results. Points that look alike have one reason, which CEL gives for the last."""
+        """Count a condition's unknown results. Points with the same tags share one reason, which CEL gives for the
+        last."""
         own = block.points(row)
         points = np.flatnonzero(unknown if own is None else unknown & own)
         if not len(points):

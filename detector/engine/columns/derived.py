@@ -1,4 +1,4 @@
-"""Signals over what conditions see, in columns: expressions over the points of a block, and windows over their past."""
+"""Signals over other signals, in columns: expressions over the points of a block, and windows over their past."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ class Derived(NamedTuple):
 
     signal: CompiledDerived
     column: Column
-    """Of a statistic of the open episode, the values that it is over."""
+    """For a statistic of the open episode, the values that it aggregates."""
 
 
 class DerivedColumns:
-    """The signals of one track over what its conditions see."""
+    """The signals over other signals of one track."""
 
     def __init__(self, track: Track, leaf: Callable[[Path], Hashable | Constant | None], context: Context) -> None:
         self._track = track
@@ -39,7 +39,7 @@ class DerivedColumns:
         ]
 
     def look(self, rows: Rows, now: Evaluations) -> Iterator[Derived]:
-        """Each signal at the rows, which are these evaluations. Its rows read those before it."""
+        """Compute each signal at the rows, which are these evaluations. The signal's windows contain earlier rows."""
         track = self._track
         for signal, formula in self._formulas:
             column = formula.column(rows)
@@ -49,10 +49,10 @@ class DerivedColumns:
 
 
 class ClientDerived:
-    """These signals of rules about clients."""
+    """The signals over other signals of rules about clients."""
 
     def __init__(self, context: Context, tracks: list[Track], first: int) -> None:
-        """They have the places from `first` on among the signals of a block, and the tracks know these then."""
+        """Their indices among the signals of a block start at `first`; this call adds them to the tracks."""
         self._context = context
         for track in tracks:
             for signal in track.rule.derived:

@@ -1,4 +1,4 @@
-"""Signals over the episodes of other rules, in columns. Episodes are few: only clients that have some cost a look."""
+"""Signals over the episodes of other rules, in columns. Episodes are few: only clients with episodes are evaluated."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from wayside.rules import CompiledSignal
 
 
 def of_episodes(context: Context, block: Block, track: Track, signal: CompiledSignal) -> Column:
-    """The signal at each point. Counts what is unknown or fails."""
+    """The signal at each point. Counts unknown values and failures."""
     counters, ticks = track.counters, block.ticks
     looked = block.points(track.row)
     points = np.ones(block.shape, bool) if looked is None else looked.reshape(block.shape)

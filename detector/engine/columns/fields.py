@@ -1,4 +1,4 @@
-"""Reads the fields of samples that expressions name: of messages, and of their items."""
+"""Reads the fields that expressions name from messages and from their items."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ class Found(NamedTuple):
     columns: list[Column]
     """By path."""
     errors: dict[int, DecodeError]
-    """The samples that cannot be read, by their places."""
+    """The samples that cannot be read, by their indices."""
     odd: frozenset[int]
-    """The places of the samples of which an expression needs the whole: see `Fields.odd`."""
+    """The indices of the samples that an expression needs as a whole: see `Fields.odd`."""
 
 
 class SampleFields:
     """Reads the same fields of many samples of a stream."""
 
     def __init__(self, stream: str, decoder: Decoder, items: Items, paths: Sequence[Path]) -> None:
-        """`paths` begin with one of the variables OF_A_SAMPLE, and are longer than that."""
+        """`paths` begin with one of the variables in OF_A_SAMPLE, and have at least one more part."""
         self._stream = stream
         self._items = items
         self._paths = paths
@@ -68,7 +68,7 @@ class SampleFields:
             found["item"] = [column_of(values, texts) for values in self._walked(items, self._of["item"], odd)]
         if self._of["before"]:
             before = [sample.before if isinstance(sample, Linked | Item) else None for sample in samples]
-            odd.update(at for at, each in enumerate(before) if each is None)  # CEL says that nothing is known of it
+            odd.update(at for at, each in enumerate(before) if each is None)  # CEL defines that it is unknown
             if shared:
                 items = [None if each is None else (each.payload, each.place) for each in before]
                 columns = self._walked(items, self._of["before"], odd)
@@ -79,7 +79,7 @@ class SampleFields:
         return Found([next(ready[str(path[0])]) for path in self._paths], errors, frozenset(odd))
 
     def _read_before(self, before: Sequence[Before | None], odd: set[int]) -> list[list[Any]]:
-        """The fields of the messages before, where there are some that can be read."""
+        """The fields of the previous messages, if there are some and they can be read."""
         there = [at for at, each in enumerate(before) if each is not None]
         fields = self._before([each.payload for each in before if each is not None])
         odd.update(there[at] for at in (*fields.odd, *fields.errors))
@@ -92,7 +92,7 @@ class SampleFields:
         return columns
 
     def _shared(self, samples: Sequence[Sample], texts: Texts, odd: set[int]) -> list[Column]:
-        """The fields of messages that several samples share, each read once. All could be read as they came."""
+        """The fields of messages that several samples share, each read once. All of them were readable on receipt."""
         places: dict[bytes, int] = {}
         which = np.array([places.setdefault(sample.payload, len(places)) for sample in samples], np.int64)
         fields = self._messages([*places])
@@ -102,7 +102,7 @@ class SampleFields:
     def _walked(
         self, items: Sequence[tuple[bytes, int] | None], paths: Sequence[Path], odd: set[int]
     ) -> list[list[Any]]:
-        """The fields of items, given by their messages and their places in these."""
+        """The fields of items, given by their messages and their indices in them."""
         lists: dict[bytes, list[Any]] = {}
         values: list[Any] = []
         for item in items:
@@ -123,7 +123,7 @@ def _reader(decoder: Decoder, paths: Sequence[Path]) -> FieldReader:
 
 
 def walked(values: Sequence[Any], path: Path, odd: set[int]) -> list[Any]:
-    """What the path leads to below each value, or MISSING; adds the places of values as in `Fields.odd`."""
+    """The value at the path below each value, or MISSING; adds the indices of values as in `Fields.odd`."""
     found = list(values)
     for step in path:
         found = [
@@ -162,7 +162,7 @@ def whole(decoder: Decoder, paths: Sequence[Path]) -> FieldReader:
 
 
 def _taken(column: Column, at: np.ndarray[Any, np.dtype[np.int64]]) -> Column:
-    """The column's values at these places."""
+    """The column's values at these indices."""
     return Column(
         column.values[at],
         None if column.tags is None else column.tags[at],

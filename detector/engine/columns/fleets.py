@@ -1,7 +1,7 @@
 """Rules about the fleet in columns: which clients are members, and conditions over all of them.
 
-Loops over the members are folds: a predicate at each point, reduced over the clients of a tick. Conditions with loops
-of other kinds, and ticks that the columns cannot decide, are left to CEL.
+Loops over the members become folds: a predicate at each point, reduced over the clients of a tick. CEL evaluates
+conditions with other loops, and ticks that the columns cannot decide.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _MEMBERS = "members"
 
 
 def fits_fleet(rule: CompiledRule) -> bool:
-    """Whether a rule about the fleet whose signals fit can be evaluated in columns."""
+    """Whether a rule about the fleet can be evaluated in columns; its signals are known to fit."""
     budgeted = rule.maximum_per_hour is not None and len(rule.elements) > 1
     return isinstance(rule.subject, FleetSubject) and not budgeted and not rule.derived
 
@@ -44,20 +44,21 @@ class FleetCondition(NamedTuple):
 
     expression: Expression
     node: int | None
-    """Its truth over the ticks; None: it is CEL's."""
+    """Its truth over the ticks; None: CEL evaluates it."""
     folds: Mapping[str, tuple[How, int | None]]
-    """By leaf, how it is folded, and its predicate's truth over the points; None: all members count."""
+    """By leaf, how it is folded, and the truth of its predicate over the points; None: all members count."""
 
 
 class FleetBlock:
-    """What rules see of the fleet at some ticks. It looks like a `Block` with one client, the fleet."""
+    """The values of the fleet that rules read at some ticks. It has the interface of a `Block` with one client, the
+    fleet."""
 
     clients = (FLEET,)
     numbers: Integers = np.zeros(1, np.int64)
     present = None
 
     def __init__(self, block: Block, members: Truths) -> None:
-        """`members`: which clients are, by track and point; shape (tracks, clients, ticks)."""
+        """`members`: which clients are members, by track and point; shape (tracks, clients, ticks)."""
         self.ticks = block.ticks
         self.times = block.times
         self.of_clients = block
@@ -66,7 +67,7 @@ class FleetBlock:
         """By track and field, where conditions are true and false; shape (ticks,)."""
 
     def variables(self, track: Track, point: int) -> dict[str, Any]:
-        """What expressions see at a tick, as in `scopes`."""
+        """The variables of expressions at a tick, as in `scopes`."""
         block, count = self.of_clients, len(self.ticks)
         chosen = np.flatnonzero(self.members[track.row, :, point]).tolist()
         return {
@@ -106,7 +107,7 @@ class FleetGroup:
         self._outer = Program(self._of_ticks, [each.node for each in conditions if each.node is not None], texts)
 
     def number(self, subject: Subject) -> int:
-        """The number of a subject among those of its rule and element: there is one."""
+        """The number of a subject among the subjects of its rule and element: there is only one."""
         return 0
 
     def _condition(self, track: Track, field: str, expression: Expression) -> FleetCondition:
@@ -140,15 +141,15 @@ class FleetGroup:
         return (track.row, field, path[0]) if path[0] in folds else self._own(track, path)
 
     def _own(self, track: Track, path: Path) -> Constant | None:
-        """The rule's parameters and the element."""
+        """A leaf that is a parameter of the rule, or the element."""
         return constant({"parameters": track.rule.parameters.own, **track.element.variables}, path)
 
     def evaluate(
         self, ticks: Sequence[int], clients: Sequence[str], floor: int | None, looked: Truths | None = None
     ) -> tuple[FleetBlock, Codes]:
-        """The rules' observations at the ticks: uint8, shape (tracks, 1, ticks). They look at all clients.
+        """The rules' observations at the ticks: uint8, shape (tracks, 1, ticks). They read all clients.
 
-        Windows do not reach back to `floor` or beyond. Counts what was unknown or failed.
+        Windows start after `floor`. Counts unknown values and failures.
         """
         assert looked is None  # noqa: S101  such rules are not evaluated with samples
         block = Block(self._context, ticks, clients)
@@ -232,7 +233,8 @@ class FleetGroup:
         return found
 
     def _kinds(self, fleet: FleetBlock, row: int, *, exact: bool) -> Integers:
-        """A number for each tick. Equal ones see the same; if not `exact`, something of the same kinds."""
+        """A number for each tick. Ticks with equal numbers have the same inputs, or, if not `exact`, inputs of the same
+        types."""
         block, members = fleet.of_clients, fleet.members[row]
         count = len(fleet.ticks)
         rows: list[NDArray[np.int64]] = [members.astype(np.int64)]
@@ -254,7 +256,8 @@ class FleetGroup:
         return found
 
     def _ask(self, fleet: FleetBlock, row: int, field: str, kinds: Integers, verdict: Verdict) -> None:
-        """Evaluate a condition by CEL, once for the ticks of each kind; those of a negative kind are decided."""
+        """Evaluate a condition by CEL, once for the ticks of each kind; ticks of a negative kind are already
+        decided."""
         track, expression = self.tracks[row], self._of[row][field].expression
         place = f"{field} of {track.subject(FLEET).text}{track.place.get(field, '')}"
         last = {kind: at for at, kind in enumerate(kinds.tolist()) if kind >= 0}
@@ -267,7 +270,7 @@ class FleetGroup:
 
 
 _PLACE = "members,"
-"""Errors are about "members, of car1"."""
+"""For errors such as "members, of car1"."""
 
 
 def _members(rule: CompiledRule) -> Mapping[str, Expression]:
@@ -280,7 +283,7 @@ def _conditions(rule: CompiledRule) -> Mapping[str, Expression]:
 
 
 def _reads_streams(rule: CompiledRule) -> bool:
-    """Whether any expression of the rule may read which streams are fresh."""
+    """Whether any expression of the rule may read the freshness of streams."""
     templates = [
         *(deploy.parameters for deploy in rule.deploys),
         *(template for action in rule.actions for template in action.templates.values()),

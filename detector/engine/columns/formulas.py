@@ -1,4 +1,4 @@
-"""Conditions over rows of any kind, such as pairs: in columns where they can be, by CEL elsewhere."""
+"""Conditions over rows of any kind, such as pairs: in columns if possible, otherwise by CEL."""
 
 from __future__ import annotations
 
@@ -20,21 +20,22 @@ from wayside.expressions.columns.values import Column, Tag, Texts, column_of
 
 
 class Rows(NamedTuple):
-    """What conditions are evaluated over."""
+    """The rows over which conditions are evaluated."""
 
     size: int
     column: Callable[[Any], Column]
     """The column of a leaf."""
     variables: Callable[[int], Mapping[str, Any]]
-    """What CEL sees at a row."""
+    """The variables of CEL at a row."""
     note: Callable[[str, int, Reason, str, int], None]
-    """Told the field of a condition, a row, why the result is unknown there, and how many rows are like it."""
+    """Receives the field of a condition, a row, the reason why the result is unknown there, and the number of rows like
+    it."""
     alike: bool
-    """Whether rows whose leaves have the same tags are counted together; else each row by itself."""
+    """Whether rows whose leaves have the same tags are counted together; otherwise each row separately."""
 
 
 class Formulas:
-    """Conditions by field; an absent one holds everywhere."""
+    """Conditions by field; an absent condition is true everywhere."""
 
     def __init__(
         self,
@@ -98,7 +99,7 @@ class Formula:
     def __init__(
         self, name: str, expression: Expression, leaf: Callable[[Path], Hashable | Constant | None], texts: Texts
     ) -> None:
-        """Errors are about `name`."""
+        """`name` is the name in errors."""
         self._name, self._expression, self._texts = name, expression, texts
         graph = Graph()
         self._node = graph.add(expression, leaf)
@@ -106,7 +107,7 @@ class Formula:
         self._program = Program(graph, [] if self._node is None else [self._node], texts)
 
     def column(self, rows: Rows) -> Column:
-        """The value of each row. Counts those that are unknown."""
+        """The value of each row. Counts unknown values."""
         if self._node is None or not rows.size:
             empty = Column(np.zeros(rows.size), np.zeros(rows.size, np.uint8), None)
             return self._asked(rows, np.arange(rows.size), empty) if rows.size else empty
@@ -126,7 +127,7 @@ class Formula:
         return column if foreign is None else self._asked(rows, np.flatnonzero(foreign), column)
 
     def _asked(self, rows: Rows, at: NDArray[np.intp], column: Column) -> Column:
-        """The column with what CEL gives for some rows."""
+        """The column, with the values from CEL for some rows."""
         found: list[object] = []
         for row in at.tolist():
             value, why = self._expression.explained(rows.variables(row))
@@ -146,7 +147,8 @@ class Formula:
 def _note_unknown(
     field: str, expression: Expression, rows: Rows, at: NDArray[np.intp], tags: NDArray[np.uint8] | None
 ) -> None:
-    """Rows that look alike have one reason, which CEL gives for the last of them; `tags` are those of the leaves."""
+    """Rows with the same tags share one reason, which CEL gives for the last of them; `tags` are those of the
+    leaves."""
     if not len(at):
         return
     which, counts = np.arange(len(at)), np.ones(len(at), np.int64)

@@ -22,7 +22,7 @@ from wayside.rules import ClientSubject, CompiledRule, CompiledSignal
 
 
 def fits_clients(rule: CompiledRule) -> bool:
-    """Whether a rule about clients whose signals fit can be evaluated in columns."""
+    """Whether a rule about clients can be evaluated in columns; its signals are known to fit."""
     budgeted = rule.maximum_per_hour is not None and len(rule.elements) > 1
     return isinstance(rule.subject, ClientSubject) and not budgeted
 
@@ -45,7 +45,7 @@ def fit_signals(rule: CompiledRule, tables: Tables) -> bool:
 
 
 def signals_of(rule: CompiledRule) -> Iterator[CompiledSignal]:
-    """All of a rule's signals, those of its elements as well."""
+    """All of a rule's signals, including those of its elements."""
     yield from rule.signals
     for element in rule.elements:
         yield from element.signals
@@ -72,8 +72,8 @@ class ClientGroup:
     ) -> tuple[Block, Codes]:
         """The rules' observations at the points: uint8, shape (tracks, clients, ticks).
 
-        Windows do not reach back to `floor` or beyond. Counts what was unknown or failed at the points that a rule
-        looks at: `looked`, shape (tracks, clients), or all.
+        Windows start after `floor`. Counts unknown values and failures at the points that a rule evaluates: `looked`,
+        shape (tracks, clients), or all.
         """
         block = Block(self._context, ticks, clients)
         block.present = present(block, self._context.clients)
@@ -100,17 +100,17 @@ class ClientGroup:
         return codes
 
     def _where_any(self, field: str, verdict: Verdict, otherwise: Verdict) -> Verdict:
-        """A condition's verdict, and another for the rules that have none."""
+        """A condition's verdict; `otherwise` for the rules without the condition."""
         has = self._conditions.has(field)
         return Verdict(np.where(has, verdict.true, otherwise.true), np.where(has, verdict.false, otherwise.false))
 
     @property
     def room(self) -> int:
-        """Numbers of subjects of a rule are smaller."""
+        """An upper bound of the numbers of a rule's subjects."""
         return len(self._context.tables.names)
 
     def number(self, subject: Subject) -> int:
-        """The number of a subject among those of its rule and element."""
+        """The number of a subject among the subjects of its rule and element."""
         return self._context.tables.number(subject.clients[0])
 
 
@@ -121,7 +121,7 @@ def _conditions(rule: CompiledRule) -> Mapping[str, Expression]:
 
 
 def present(block: Block, clients: Clients) -> Truths | None:
-    """Which clients are known at which ticks: within a block, some may come. None: all at all."""
+    """Which clients are known at which ticks: some may appear within a block. None: all clients at all ticks."""
     if clients.newest <= block.ticks[0]:
         return None
     since = np.array([clients.since(client) for client in block.clients], np.int64)

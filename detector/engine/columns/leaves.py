@@ -1,4 +1,4 @@
-"""What expressions read of clients, as columns: signals, labels, parameters and names."""
+"""The values of clients that expressions read, as columns: signals, labels, parameters and names."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ class ClientLeaves:
     """The leaves of programs over the clients of a block."""
 
     def __init__(self, context: Context, tracks: Sequence[Track]) -> None:
-        """The tracks know the places of their signals."""
+        """The tracks know the indices of their signals."""
         self._context = context
         self._rules = {track.rule.name: track.rule for track in tracks}
 
     def leaf(self, track: Track, path: Path) -> Hashable | Constant | None:
-        """The leaf of a path in an expression about one client; None: there is no such column."""
+        """The leaf of a path in an expression about one client; None: no column represents it."""
         if str(path[0]) in track.element.variables:
             return constant(track.element.variables, path)
         return self.of_client(track, path)
 
     def of_client(self, track: Track, path: Path) -> Hashable | Constant | None:
-        """The same for a path below the client itself, which knows no element."""
+        """The same for a path below the client itself, without the element."""
         name = str(path[0])
         if name in track.signals:
             return ("signal", track.signals[name]) if len(path) == 1 else None
@@ -46,7 +46,7 @@ class ClientLeaves:
         return None
 
     def column(self, block: Block, leaf: Any) -> Column:
-        """What a leaf is for each client; signals: at each point."""
+        """The value of a leaf for each client; of signals: at each point."""
         if leaf[0] == "signal":
             column: Column = block.signals[leaf[1]]
             return column
@@ -57,7 +57,7 @@ class ClientLeaves:
         return column_of([*self._values(block, leaf)], texts)
 
     def at_points(self, block: Block, leaf: Any) -> Column:
-        """What a leaf is at each point of a block."""
+        """The value of a leaf at each point of a block."""
         column = self.column(block, leaf)
         if leaf[0] == "signal":
             return column
@@ -81,7 +81,7 @@ class ClientLeaves:
 
 
 def stacked(columns: Sequence[Column], size: int) -> tuple[Doubles, NDArray[np.uint8] | None]:
-    """The values and tags of columns of this size, as programs take them; no tags: all are numbers."""
+    """The values and tags of columns of this size, in the form that programs take; no tags: all are numbers."""
     values = np.empty((len(columns), size))
     for at, column in enumerate(columns):
         values[at] = column.values

@@ -1,4 +1,4 @@
-"""Signals that name the client whose samples they are over: computed for it alone, and the same for all others."""
+"""Signals that name the client whose samples they aggregate: computed for that client only, the same for all others."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from wayside.expressions.columns.values import Column, Tag
 
 
 class Computed(Protocol):
-    """What computes the signals of one client."""
+    """Computes the signals of one client."""
 
     def look(self, block: Block, floor: int | None) -> None:
-        """Compute all signals of a block, which has that client alone."""
+        """Compute all signals of a block that contains only this client."""
 
     def place(self, row: int, name: str) -> int:
-        """The place of a track's signal among them."""
+        """The index of a track's signal among them."""
 
 
 class NamedSignals:
@@ -26,22 +26,22 @@ class NamedSignals:
     def __init__(self, client: str) -> None:
         self.client = client
         self.columns: Computed | None = None
-        """Set when all signals were placed."""
+        """Set when all signals have an index."""
         self._places: list[tuple[int, Track, str]] = []
 
     def add(self, at: int, track: Track, name: str) -> None:
-        """A track has such a signal, which has this place in the group."""
+        """Add such a signal of a track, with its index in the group."""
         self._places.append((at, track, name))
 
     def look(self, context: Context, block: Block, floor: int | None) -> dict[int, Column]:
-        """The signals at all points of a block, by their places; unknown while the client is not known."""
+        """The signals at all points of a block, by their indices; unknown while the client is not known."""
         known = np.array([context.clients.knows(self.client, tick) for tick in block.ticks], bool)
         own = Block(context, block.ticks, (self.client,)) if known.any() else None
         if own is not None:
             assert self.columns is not None  # noqa: S101  all signals were placed
             own.present = known[None, :]
             self.columns.look(own, floor)
-        # Which ticks without clients are in a block depends on the cut.
+        # Which ticks without clients are in a block depends on how blocks are cut.
         read = np.full(len(known), bool(block.clients)) if block.present is None else block.present.any(axis=0)
         found: dict[int, Column] = {}
         for at, track, name in self._places:
@@ -54,7 +54,7 @@ class NamedSignals:
 
 
 def _repeated(column: Column, known: np.ndarray[tuple[int], np.dtype[np.bool_]], times: int) -> Column:
-    """The column for each of that many clients, where it is known."""
+    """The column for each of these clients, where it is known."""
     tags = np.full(len(known), Tag.NUMBER, np.uint8) if column.tags is None else column.tags
     return Column(
         np.tile(column.values, times),

@@ -33,18 +33,18 @@ class Crowd(NamedTuple):
     """The points of clients whose place is known: see `Search`."""
     distances: Callable[[Integers, Integers], Doubles]
     first: Truths
-    """Who can be the first of a pair; its place is known."""
+    """Which clients can be the first of a pair; their place is known."""
     second: Truths
 
 
 def nearby(crowd: Crowd, subject: PairSubject) -> Nearby:
-    """The pairs within reach; if there are more than the subject takes, the nearest, then by names."""
+    """The pairs within reach; if they exceed the subject's maximum, the nearest ones, then by names."""
     first, second = np.flatnonzero(crowd.first), np.flatnonzero(crowd.second)
     if len(first) * len(second) <= FEW:
         i, j = np.repeat(first, len(second)), np.tile(second, len(first))
         found = None
     else:
-        # Not at the top: it takes half a second to import, which a detector of few clients does not owe.
+        # Not at the top: the import takes half a second, which a detector with few clients can save.
         from scipy.spatial import cKDTree  # noqa: PLC0415
 
         radius, same = reach(subject.within), np.array_equal(first, second)
@@ -74,7 +74,7 @@ def nearby(crowd: Crowd, subject: PairSubject) -> Nearby:
 
 
 def _crowded(crowd: Crowd, subject: PairSubject, first: Integers, second: Integers) -> Nearby:
-    """Far more pairs than the subject takes: they are not made."""
+    """Far more pairs than the subject's maximum: avoids creating them all."""
     names = crowd.names
     index = {names[at]: at for at in np.union1d(first, second).tolist()}
 

@@ -1,4 +1,4 @@
-"""A rule about pairs at one tick, in columns: from places to an observation of each pair that matters."""
+"""A rule about pairs at one tick, in columns: from places to an observation of each relevant pair."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _ROLES = ("a", "b")
 
 
 def fits_pairs(rule: CompiledRule, context: Context) -> bool:
-    """Whether a rule about pairs whose signals fit can be evaluated in columns."""
+    """Whether a rule about pairs can be evaluated in columns; its signals are known to fit."""
     return (
         isinstance(rule.subject, PairSubject)
         and context.exact
@@ -53,21 +53,21 @@ class PairBlock:
     """The clients, in order of their names, at the tick."""
     places: Places
     seen: Block
-    """The clients whose signals are known, and where they are in it."""
+    """The clients whose signals are known, and their indices."""
     at: Integers
     first: Integers
     second: Integers
-    """The pairs' clients, by their indices in the block."""
+    """The clients of the pairs, by their indices in the block."""
     distance: Doubles
     placed: Truths
     closing: Doubles | None = None
     closing_known: Truths | None = None
     codes: Codes = field(default_factory=lambda: np.zeros(0, np.uint8))
-    """Of each pair its observation (see SubjectState.run)."""
+    """The observation of each pair (see SubjectState.run)."""
     derived: dict[str, Column] = field(default_factory=dict)
-    """Of each pair, the signals over what conditions see."""
+    """The signals over other signals, of each pair."""
     measured: dict[str, Column] = field(default_factory=dict)
-    """By signal over the open episode, the values that it is over."""
+    """By signal over the open episode, the values that it aggregates."""
     verdicts: Mapping[str, Verdict] = field(default_factory=dict)
     """By field, where conditions are true and where false."""
 
@@ -98,12 +98,12 @@ class PairColumns:
         self._conditions = Formulas(conditions, self._leaf, texts)
         self._derived = DerivedColumns(track, self._leaf, context) if rule.derived else None
         self._numbers: tuple[Sequence[str], int, Integers] = ((), -1, np.zeros(0, np.int64))
-        """Clients, the version of their numbers for signals over others, and these."""
+        """Clients, the version of their numbers for signals over others, and the numbers."""
 
     def evaluate(self, block: Block, floor: int | None, more: tuple[Integers, Integers]) -> PairBlock:
-        """Look at the pairs within reach and at `more`, at the block's only tick; its clients are in order.
+        """Evaluate the pairs within reach and `more`, at the block's only tick; its clients are in order.
 
-        `more` are indices of clients. No look goes back to `floor` or beyond. Counts what is unknown or fails.
+        `more` are indices of clients. Windows start after `floor`. Counts unknown values and failures.
         """
         clients = block.clients
         places, newest = self._where_abouts.now(block)
@@ -151,7 +151,7 @@ class PairColumns:
             columns[each.signal.name] = each.column
 
     def measured(self, these: PairBlock, row: int) -> dict[str, Any]:
-        """What signals over the open episode are over, at one pair; those that are known."""
+        """The known values of one pair that signals over the open episode aggregate."""
         return self._known(these.measured, row)
 
     def _known(self, columns: Mapping[str, Column], row: int) -> dict[str, Any]:
@@ -159,7 +159,7 @@ class PairColumns:
         return {name: value for name, value in found.items() if value is not UNKNOWN}
 
     def variables(self, these: PairBlock, row: int) -> dict[str, Any]:
-        """What expressions see of a pair, as in `scopes`."""
+        """The variables of expressions about a pair, as in `scopes`."""
         found: dict[str, Any] = {
             "a": self._member(these, int(these.first[row])),
             "b": self._member(these, int(these.second[row])),
@@ -193,7 +193,7 @@ class PairColumns:
         return nearby(crowd, self._subject)
 
     def _measure_closing(self, these: PairBlock, newest: Integers, floor: int | None) -> None:
-        """By how much distances shrank in the last second for which both have sent places: see `Views`."""
+        """By how much the distances shrank in the last second for which both clients sent places: see `Views`."""
         at = np.flatnonzero(these.placed)
         one, other = these.first[at], these.second[at]
         now, abouts = int(these.block.times[0]), self._where_abouts
@@ -239,7 +239,7 @@ class PairColumns:
         return self._roles[role].evaluate(rows).get("where", everybody)
 
     def _rows(self, these: PairBlock, expressions: Mapping[str, Expression | None]) -> Rows:
-        """The pairs; `expressions` are those that are evaluated over them, by what errors call them."""
+        """The pairs as rows; `expressions` are the ones evaluated over them, by their names in errors."""
 
         def note(field: str, row: int, reason: Reason, message: str, times: int) -> None:
             a, b = self._names(these, row)
@@ -333,7 +333,7 @@ def _where(values: Doubles, known: Truths) -> Column:
 
 
 def _reads_streams(rule: CompiledRule) -> bool:
-    """Whether any expression of the rule may read which streams are fresh."""
+    """Whether any expression of the rule may read the freshness of streams."""
     subject = rule.subject
     assert isinstance(subject, PairSubject)  # noqa: S101  the rule fits
     roles = {path for each in (subject.a, subject.b) if each is not None for path in each.paths}

@@ -1,6 +1,6 @@
-"""The values that signals over signals had at earlier evaluations, so that windows reach back beyond a block.
+"""The values of signals at earlier evaluations, so that windows of signals over signals reach back beyond a block.
 
-Values are kept by subject for as long as the window reaches. How many evaluations come together changes no result.
+Values are kept by subject for the length of the window. The number of evaluations taken together changes no result.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _CLIENT = (1 << _SHIFT) - 1
 
 
 class Evaluations(NamedTuple):
-    """Evaluations of subjects: those of one subject are in order of time."""
+    """Evaluations of subjects; those of one subject are in time order."""
 
     keys: Integers
     """The subjects, see `Past.key`."""
@@ -40,7 +40,7 @@ class _Kept(NamedTuple):
     values: Doubles
     tags: Bytes
     others: NDArray[Any] | None
-    """Texts are among them: codes may not last."""
+    """Set if there are texts among them: their codes may not last."""
 
 
 _NOTHING = _Kept(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0), np.zeros(0, np.uint8), None)
@@ -72,17 +72,17 @@ class Past:
         return key
 
     def pairs(self, first: Integers, second: Integers) -> Integers:
-        """The keys of pairs of numbers of clients."""
+        """The keys of pairs of client numbers."""
         return first << _SHIFT | second
 
     def clear(self) -> None:
-        """Windows reset: no value counts any more."""
+        """Windows reset: forget all values."""
         self._kept.clear()
         self._numbers.clear()
         self.version += 1
 
     def lose(self, clients: Collection[str]) -> None:
-        """These clients are lost: should they return, earlier values are not theirs."""
+        """These clients are lost: if they return, earlier values do not count."""
         gone = np.array([number for client in clients if (number := self._numbers.pop(client, None)) is not None])
         if not len(gone):
             return
@@ -100,7 +100,8 @@ class Past:
         texts: Texts,
         counters: RuleCounters,
     ) -> Column:
-        """The signal at these evaluations, of which the column has the values that it is over. Counts misfits."""
+        """The signal at these evaluations; the column has the values that it aggregates. Counts values of the wrong
+        kind."""
         if not signal.keeps:
             return column
         rows = _joined(self._kept.get((signal.name, element), _NOTHING), now, column, texts)
@@ -130,7 +131,7 @@ def _of(kept: _Kept, rows: NDArray[np.bool_]) -> _Kept:
 
 
 def _joined(kept: _Kept, now: Evaluations, column: Column, texts: Texts) -> _Kept:
-    """What was kept, and the new values among it."""
+    """The earlier values, merged with the new ones."""
     order = np.argsort(now.keys, kind="stable")
     keys = now.keys[order]
     tags = np.full(len(keys), Tag.NUMBER, np.uint8) if column.tags is None else column.tags[order]
@@ -157,7 +158,7 @@ def _joined(kept: _Kept, now: Evaluations, column: Column, texts: Texts) -> _Kep
 
 
 def _ranges(rows: _Kept, now: Evaluations, signal: CompiledDerived) -> tuple[Integers, Integers]:
-    """The rows that the window of each evaluation has: from which on, and up to which."""
+    """The window of each evaluation as a range of rows."""
     moments = np.unique(rows.times)
     changes = np.ones(len(rows.keys), bool)
     changes[1:] = rows.keys[1:] != rows.keys[:-1]
@@ -172,7 +173,7 @@ def _ranges(rows: _Kept, now: Evaluations, signal: CompiledDerived) -> tuple[Int
 
 
 def _with_texts(column: Column, texts: Texts) -> Column:
-    """Texts that were kept as they are have codes again."""
+    """Give codes to texts that were kept without."""
     if column.tags is None or column.others is None:
         return column
     for row in np.flatnonzero(column.tags == Tag.OTHER).tolist():

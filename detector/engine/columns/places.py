@@ -1,4 +1,4 @@
-"""Where clients are, in columns: see `detector.engine.scoping.positions`, which decides what is strange."""
+"""The places of clients, in columns: see `detector.engine.scoping.positions`, which defines invalid ones."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ class Places(NamedTuple):
     axes: Doubles
     """Shape (axes, n); metres or degrees."""
     known: Truths
-    """Which of them are known; the others have any numbers."""
+    """Which of them are known; the values of the others are arbitrary."""
 
     def of(self, at: Integers) -> Places:
-        """The places of these, in this order."""
+        """Select the places at these indices, in this order."""
         return Places(np.take(self.axes, at, axis=1), self.known[at])
 
     def place(self, at: int) -> Place:
@@ -37,7 +37,7 @@ class Whereabouts:
     """Looks up a position of many clients in the table of its stream."""
 
     def __init__(self, position: CompiledPosition, context: Context, counters: RuleCounters, ages: SampleAges) -> None:
-        """`ages` are those of the rule's signals, where they are watched."""
+        """`ages` are those of the rule's signals, if they are measured."""
         reader = context.tables.add(position.stream)
         uses = [reader.use(Reading(each, position.parameters, None), None) for each in position.axes.values()]
         self._columns = [use.value for use in uses if use.value is not None]
@@ -48,9 +48,10 @@ class Whereabouts:
         self._ages = ages
 
     def now(self, block: Block) -> tuple[Places, Integers]:
-        """Where the block's clients are at its only tick, by their newest samples, whose rows come with them.
+        """The places of the block's clients at its only tick, from their newest samples; also the rows of these
+        samples.
 
-        Of a client without any the row means nothing, and its place is unknown.
+        If a client has no sample, its row is meaningless and its place unknown.
         """
         table, numbers, stream = self._table, block.numbers, self._position.stream
         high = table.find(block.times, numbers)[:, 0]
@@ -71,14 +72,14 @@ class Whereabouts:
         return Places(axes, known), rows
 
     def times(self, rows: Integers) -> Integers:
-        """When these samples came."""
+        """The times of the samples in these rows."""
         times: Integers = self._table.times[rows]
         return times
 
     def then(self, block: Block, newest: Integers, at: Integers, times: Integers, floor: int | None) -> Places:
-        """Where clients, given by their places in the block, were at these times; `newest` is what `now` gave.
+        """The places of clients, given by their indices in the block, at these times; `newest` is the result of `now`.
 
-        No look goes back to `floor` or beyond.
+        Windows start after `floor`.
         """
         table, numbers = self._table, block.numbers[at]
         rows = table.find_each(times, numbers) - 1
@@ -92,7 +93,7 @@ class Whereabouts:
         limit = self._context.positions.limit(self._position)
         if limit is not None:
             there &= times - came <= limit
-        # Each sample is looked at once, and each client that has none is counted once.
+        # Each sample is read once, and each client without one is counted once.
         _, first, inverse = np.unique(np.where(there, rows, -1 - at), return_index=True, return_inverse=True)
         self._counters.unknowns += int((~there[first]).sum())
         axes, known = np.zeros((len(self._columns), len(first))), np.zeros(len(first), bool)
@@ -101,7 +102,7 @@ class Whereabouts:
         return Places(axes, known).of(inverse)
 
     def distances(self, one: Places, other: Places) -> Doubles:
-        """Metres between the places of the same index, as `positions.distance` computes it; where both are known."""
+        """Metres between the places with the same index, computed as by `positions.distance`; both must be known."""
         both = np.flatnonzero(one.known & other.known)
         found = np.zeros(len(one.known))
         if self._position.geographic:
@@ -114,7 +115,7 @@ class Whereabouts:
         return np.sqrt(found)
 
     def points(self, places: Places, at: Integers) -> Doubles:
-        """Shape (n, 2 or 3): the known places of these clients as a search takes them."""
+        """Shape (n, 2 or 3): the known places of these clients in the form that a search takes."""
         if self._position.geographic:
             return np.array([point(self._position, tuple(each)) for each in places.axes[:, at].T.tolist()])
         return places.axes[:, at].T

@@ -1,7 +1,7 @@
-"""What rules read of each sample of a stream, as columns of its table: read when first needed, and once.
+"""The values that rules read from each sample of a stream, as columns of its table: read once, on first use.
 
-The fields of all expressions are read together. What the columns of an expression cannot decide, and every expression
-that they cannot take, is left to CEL, row by row.
+The fields of all expressions are read together. CEL evaluates the rest row by row: values that the columns cannot
+decide, and expressions that they cannot represent.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _CONSTANTS = (bool, float, str)
 
 
 class Reading(NamedTuple):
-    """An expression over one sample, as a rule has it."""
+    """An expression over one sample, as written in a rule."""
 
     expression: Expression
     parameters: Parameters
@@ -47,7 +47,7 @@ class Failure(NamedTuple):
 
 
 class Used(NamedTuple):
-    """What a signal takes from a table: the columns of its `value` and its `where`; None: it has none."""
+    """The columns of a table that a signal uses: those of its `value` and its `where`; None: it has none."""
 
     value: int | None
     where: int | None
@@ -65,7 +65,7 @@ class Reader:
         counters: Counters,
         names: Sequence[str],
     ) -> None:
-        """`names` has the clients' names by their numbers."""
+        """`names` are the clients' names, by their numbers."""
         self._stream = stream
         self._decoder = decoder
         self._texts = texts
@@ -75,18 +75,18 @@ class Reader:
         self._graph = Graph()
         self._index: dict[Hashable, int] = {}
         self._readings: list[Reading] = []
-        """By column; of equal ones, the first."""
+        """By column; the first of equal ones."""
         self._nodes: list[int | None] = []
         self._used: dict[Used, None] = {}
         self._paths: list[Path] = []
         self._fields_at: dict[int, int] = {}
-        """Of the nodes that are a field as it is, its place among the paths."""
+        """For nodes that are a plain field, its index among the paths."""
         self._program: Program | None = None
         self._fields: SampleFields | None = None
 
     @property
     def count(self) -> int:
-        """How many columns there are."""
+        """Number of columns."""
         return len(self._readings)
 
     def use(self, value: Reading | None, where: Reading | None) -> Used:
@@ -96,7 +96,7 @@ class Reader:
         return used
 
     def read(self, table: Table, rows: Integers) -> Mapping[Used, Sequence[Failure]]:
-        """Fill these rows of the table, which are not filled yet. Returns what has no value, for each use."""
+        """Fill these rows of the table, which are not filled yet. Returns the rows without a value, for each use."""
         if self._program is None:
             self._prepare()
         samples: list[Sample] = table.samples[rows].tolist()
@@ -110,7 +110,7 @@ class Reader:
         return {used: found for used in self._used if (found := [*self._failures(batch, used, done)])}
 
     def failures(self, table: Table, rows: Integers, used: Used) -> Iterator[Failure]:
-        """Which of these rows, all filled, have no value for a use, and why."""
+        """Which of these filled rows have no value for a use, and why."""
         for at in (used.where, used.value):
             if at is None:
                 continue
@@ -151,7 +151,7 @@ class Reader:
         self._fields = SampleFields(self._stream, self._decoder, self._messages.items, self._paths)
 
     def _leaves(self, samples: Sequence[Sample]) -> _Leaves:
-        """The fields of the samples, and what the program makes of them."""
+        """The fields of the samples, and the program's results."""
         assert self._program is not None  # noqa: S101  the caller prepared it
         assert self._fields is not None  # noqa: S101
         if not self._paths:
@@ -169,7 +169,7 @@ class Reader:
         return _Leaves(columns, results, fields.errors, fields.odd)
 
     def _evaluated(self, batch: _Batch, at: int, node: int | None) -> tuple[Column, dict[int, tuple[Reason, str]]]:
-        """A column's values for the batch, and why CEL has none, by row."""
+        """A column's values for the batch, and by row the reason why CEL has none."""
         count, leaves = len(batch.samples), batch.leaves
         failed: dict[int, tuple[Reason, str]] = {}
         if node is None or leaves.results is None:
@@ -177,7 +177,7 @@ class Reader:
         odd = set(leaves.odd)
         if node in self._fields_at:
             column = leaves.columns[self._fields_at[node]]
-            if column.others is not None and column.tags is not None:  # as CEL gives lists and maps
+            if column.others is not None and column.tags is not None:  # in the form of CEL's lists and maps
                 odd.update(np.flatnonzero(column.tags == Tag.OTHER).tolist())
         else:
             column = leaves.results.column(node)
@@ -204,7 +204,7 @@ class Reader:
         return column_of(values, self._texts)
 
     def _ask(self, at: int, batch: _Batch, row: int) -> tuple[Value | Unknown, tuple[Reason, str] | None]:
-        """The value of a row by CEL, and why it has none; None where the sample cannot be read."""
+        """The value of a row by CEL, and the reason if it has none; None if the sample cannot be read."""
         reading, sample = self._readings[at], batch.samples[row]
         parameters = reading.parameters.of(self._names[batch.clients[row]])
         if "msg" in reading.expression.names and row in batch.leaves.errors:
@@ -223,7 +223,8 @@ class Reader:
         used: Used,
         done: Mapping[int, tuple[Column, Mapping[int, tuple[Reason, str]]]],
     ) -> Iterator[Failure]:
-        """The samples for which a use has no value: those without a `where`, and of those that it takes, the rest."""
+        """The samples without a value for a use: first those whose `where` has none, then those selected whose `value`
+        has none."""
         taken: NDArray[np.bool_] | None = None
         for at in (used.where, used.value):
             if at is None:
@@ -242,7 +243,7 @@ class Reader:
     def _explained(
         self, batch: _Batch, at: int, rows: Sequence[int], failed: Mapping[int, tuple[Reason, str]]
     ) -> Iterator[Failure]:
-        """Rows that look alike to the columns have one explanation, which CEL gives for the first."""
+        """Rows that look the same to the columns share one explanation, which CEL gives for the first."""
         known: dict[Hashable, tuple[Reason | None, str]] = {}
         counts: dict[tuple[int, Reason | None, str], int] = {}
         kinds = [None if each.tags is None else each.tags for each in batch.leaves.columns]
@@ -273,7 +274,7 @@ class _Leaves(NamedTuple):
 
 
 class _Batch(NamedTuple):
-    """The samples that are read at one go."""
+    """Samples that are read together."""
 
     samples: Sequence[Sample]
     clients: Integers
@@ -281,7 +282,7 @@ class _Batch(NamedTuple):
 
 
 def _leaf(path: Path, reading: Reading) -> Hashable | Constant | None:
-    """What a path of an expression over one sample is in columns: a field, or the same for all samples."""
+    """The column of a path in an expression over one sample: a field, or a constant for all samples."""
     name, below = path[0], path[1:]
     if name in OF_A_SAMPLE:
         return path if below else None
@@ -292,7 +293,7 @@ def _leaf(path: Path, reading: Reading) -> Hashable | Constant | None:
 
 
 def constant(variables: Mapping[str, Any], path: Path) -> Constant | None:
-    """What a path leads to, if it is a number, a text or a boolean."""
+    """The value at a path, if it is a number, a text or a boolean."""
     value: Any = variables
     for step in path:
         if not isinstance(value, Mapping) or step not in value:

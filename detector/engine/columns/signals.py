@@ -1,4 +1,4 @@
-"""The signals of rules that are evaluated together, in columns: equal ones are computed once."""
+"""The signals of rules that are evaluated together, in columns; equal signals are computed once."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from wayside.expressions.columns.values import Column, Tag, value_at
 from wayside.rules import CompiledSignal
 
 _ALWAYS_KNOWN: Final = frozenset({Aggregate.COUNT, Aggregate.ANY})
-"""Aggregates that a client with a stale stream has as well."""
+"""Aggregates that are known for a stale stream as well."""
 
 
 class Key(NamedTuple):
-    """What a signal is, whatever it is called: equal ones are computed once."""
+    """The definition of a signal without its name: equal ones are computed once."""
 
     stream: str
     used: Used
@@ -39,28 +39,30 @@ class SignalColumns:
     def __init__(
         self, context: Context, tracks: Sequence[Track], *, shared: bool = True, client: str | None = None
     ) -> None:
-        """`shared`: samples without a value are counted when they are read; else when a window first holds them.
+        """`shared`: samples without a value are counted when they are read; otherwise when a window first contains
+        them.
 
-        The first is for rules that look at all clients, the second for those that look at some. `client`: compute the
-        signals that name this client, of this client alone; None: all signals.
+        The first is for rules that evaluate all clients, the second for those that evaluate some. `client`: compute
+        only the signals that name this client, for this client; None: all signals.
         """
         self._client = client
         self._named: dict[str, NamedSignals] = {}
-        """By client, the signals that name it."""
+        """The signals that name a client, by client."""
         self._context = context
         self._tracks = tracks
         self._keys: dict[Key, int] = {}
         self._places: dict[tuple[int, str], int] = {}
-        """Of the signals that are computed here, by track and name."""
+        """The indices of the signals that are computed here, by track and name."""
         self._users: list[list[tuple[int, CompiledSignal]]] = []
-        """By signal: which tracks have it, and under which name."""
+        """By signal: the tracks that use it, each with its name there."""
         self._over_rules: list[tuple[int, Track, CompiledSignal]] = []
-        """Signals over the episodes of other rules, each with its place."""
+        """Signals over the episodes of other rules, each with its index."""
         self._marks: dict[str, int] = {}
-        """By stream, where the rows begin that no window of ours has seen: one of its table's marks."""
+        """By stream, the first row that no window has contained yet: one of its table's marks."""
         self._shared = shared
         self._new: dict[int, int] = {}
-        """By signal, where the rows begin that were in no window of it: one of its table's marks; unless shared."""
+        """By signal, the first row that no window of it has contained yet: one of its table's marks; only if not
+        shared."""
         self._version = -1
         self.ages = SampleAges()
         self._all_streams = False
@@ -73,21 +75,21 @@ class SignalColumns:
                 elif signal.client == client:
                     self._place(row, placed)
         self._by_stream: dict[str, list[tuple[int, Key]]] = {}
-        """The signals and their places, by the stream that they read."""
+        """The signals and their indices, by the stream that they read."""
         for key, at in self._keys.items():
             self._by_stream.setdefault(key.stream, []).append((at, key))
         for name, named in self._named.items():
             named.columns = SignalColumns(context, tracks, shared=shared, client=name)
         self._nested = _nested(self._keys)
-        """The signals that differ in the length of their windows alone, from the shortest on."""
+        """The signals that differ only in the length of their windows, from the shortest."""
 
     @property
     def count(self) -> int:
-        """How many there are."""
+        """Number of signals."""
         return len(self._users)
 
     def watch_all_streams(self) -> None:
-        """Know of every stream whether it is fresh: some rule reads it."""
+        """Compute the freshness of every stream: some rule reads it."""
         self._all_streams = True
         for stream in self._context.stale_after:
             self._context.tables.add(stream)
@@ -152,13 +154,13 @@ class SignalColumns:
         block.signals = [found[at] for at in range(len(self._users))]
 
     def place(self, row: int, name: str) -> int:
-        """The place of a track's signal that is computed here."""
+        """The index of a track's signal that is computed here."""
         return self._places[row, name]
 
     def _ranges(
         self, block: Block, stream: str, overs: Iterable[int | None], floor: int | None
     ) -> tuple[Integers, dict[int | None, Integers]]:
-        """Up to which row each point sees, and from which row on for each length of window."""
+        """The end of each point's windows as a row, and the first row for each length of window."""
         table, duration = self._context.tables.table(stream), self._context.tables.duration(stream)
         lengths = [*overs]
         after = [block.times]
@@ -176,7 +178,7 @@ class SignalColumns:
             low = found[:, at * count : (at + 1) * count]
             lows[over] = np.minimum(low, np.maximum(high - 1, first)) if over is None else low
         some = high > first
-        dropped = table.dropped[block.numbers][:, None]  # a cap may have pushed out all that there was
+        dropped = table.dropped[block.numbers][:, None]  # a cap may have evicted all rows
         before = np.where(dropped <= block.times, dropped, NEVER)
         latest = np.where(some, table.times[np.where(some, high - 1, 0)], before) if len(table.times) else before
         block.latest[stream] = latest
@@ -191,7 +193,7 @@ class SignalColumns:
         table, reader = tables.table(stream), tables.readers[stream]
         if not reader.count or not len(table.keys):
             return
-        if block.present is not None:  # nobody looks at a client where it is not known
+        if block.present is not None:  # no rule evaluates a client where it is not known
             windows = [(key, np.where(block.present, low, high)) for key, low in windows]
         rows: list[Integers] = []
         whole = [low for key, low in windows if _needs_all(key)]
@@ -217,7 +219,7 @@ class SignalColumns:
             tables.note_failures(stream, reader.read(table, wanted))
 
     def _note_new(self, block: Block, at: int, key: Key, high: Integers, low: Integers) -> None:
-        """Count what samples have no value that are new in a window; high and low are those of the last tick."""
+        """Count samples without a value that are new in a window; high and low are those of the last tick."""
         tables = self._context.tables
         table = tables.table(key.stream)
         if key.used == Used(None, None) or not len(table.keys):
@@ -256,7 +258,7 @@ class SignalColumns:
         lows: Mapping[int | None, Integers],
         ready: Column | None = None,
     ) -> Column:
-        """A signal at all points; `ready`: its windows, where they are computed already."""
+        """A signal at all points; `ready`: its windows, if they are computed already."""
         if key.aggregate is Aggregate.AGE:
             return self._age(block, key)
         table, low = self._context.tables.table(key.stream), lows[key.over]
@@ -299,7 +301,7 @@ class SignalColumns:
         return Column(((block.times - begin) / 1e9).ravel(), None, None)
 
     def _note_misfits(self, block: Block, at: int, key: Key, rows: Ranges, counts: Integers, odd: Truths) -> None:
-        """Values of the wrong kind are errors, at each evaluation that meets them."""
+        """Count values of the wrong kind as errors, at each evaluation whose window contains them."""
         fresh = block.fresh[key.stream].ravel() if key.aggregate not in _ALWAYS_KNOWN else np.ones(len(counts), bool)
         counts = np.where(fresh, counts, 0)
         if block.present is not None:
@@ -330,7 +332,7 @@ class SignalColumns:
                 self._tracks[row].counters.unknowns += block.count(row, unknown)
 
     def _watch(self, block: Block, stream: str, high: Integers, keys: Sequence[tuple[int, Key]]) -> None:
-        """Note how old the newest samples are, where somebody wants to know."""
+        """Note the ages of the newest samples, if ages are measured."""
         watching = [
             ages
             for at, key in keys
@@ -360,14 +362,14 @@ def _nested(keys: Mapping[Key, int]) -> Mapping[str, Sequence[Sequence[tuple[int
 
 
 def _needs_all(key: Key) -> bool:
-    """Whether a signal looks at all samples of its windows."""
+    """Whether a signal needs all samples of its windows."""
     if key.used.where is not None:
         return True
     return key.used.value is not None and key.aggregate not in OF_A_SAMPLE
 
 
 def _row(aggregate: Aggregate, low: Integers, high: Integers) -> tuple[Integers, Truths]:
-    """The one row of each range that counts, and where there is one."""
+    """The one row of each range that determines the result, and which ranges have one."""
     if aggregate is Aggregate.FIRST:
         return low, high > low
     back = 1 if aggregate is Aggregate.LAST else 2

@@ -1,8 +1,8 @@
 """The samples of one stream as a table: a segment of rows for each client, in order of time.
 
 All segments lie in one flat array. The key of a row is its client and its time in one integer, and the keys ascend over
-the whole array: so one binary search finds the windows of all clients at all ticks. A segment has room for more rows
-behind it; when that is full, the table is packed again with the rows that are still needed.
+the whole array: so a single binary search finds the windows of all clients at all ticks. A segment has room for more
+rows behind it; when it is full, the table is repacked with the rows that are still needed.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ MAXIMUM_CLIENTS = 2**17 - 1
 """Numbers of clients are below this: 17 bits of a key."""
 
 LONGEST = 2**44
-"""Nanoseconds (almost five hours) that a window may be long: a table reaches back twice as far."""
+"""Maximum length of a window in nanoseconds (almost five hours): a table reaches back twice as far."""
 
 _SHIFT = 46
 _REACH = 2**46
@@ -43,7 +43,7 @@ class StoredColumn:
         self.tags = np.zeros(rows, np.uint8)
         self.others: NDArray[Any] | None = None
         self.odd = False
-        """Whether there was ever a row that is no number."""
+        """Whether any row has ever been other than a number."""
 
 
 class Table:
@@ -54,27 +54,27 @@ class Table:
         self.times: Integers = np.zeros(0, np.int64)
         self.samples: NDArray[Any] = np.empty(0, object)
         self.filled: Truths = np.zeros(0, bool)
-        """Of which rows the columns were read."""
+        """Which rows have their columns filled."""
         self.columns: list[StoredColumn] = []
         self.marks: list[Integers] = []
-        """Places in the segments that others remember, by client; they move with the rows."""
+        """Marks: indices in the segments, by client, that move with the rows."""
         self.start: Integers = np.zeros(0, np.int64)
         self.room: Integers = np.zeros(0, np.int64)
         self.first: Integers = np.zeros(0, np.int64)
-        """Of each client, its first row."""
+        """The first row of each client."""
         self.end: Integers = np.zeros(0, np.int64)
-        """Of each client, the place after its last row."""
+        """The index after the last row of each client."""
         self.dropped: Integers = np.zeros(0, np.int64)
-        """Of each client, the greatest time of all rows that were dropped, or NEVER."""
+        """The greatest time of all rows that were dropped, of each client, or NEVER."""
         self._base: int | None = None
 
     @property
     def clients(self) -> int:
-        """How many clients there is a place for."""
+        """Number of clients that the table has room for."""
         return len(self.end)
 
     def grow(self, clients: int) -> None:
-        """Have a place for at least this number of clients."""
+        """Make room for at least this number of clients."""
         more = clients - len(self.end)
         if more > 0:
             size = len(self.keys)
@@ -86,12 +86,12 @@ class Table:
             self.marks[:] = [np.append(mark, np.full(more, size)) for mark in self.marks]
 
     def mark(self) -> int:
-        """A new mark: for each client, the place of its first row. Returns its index in `marks`."""
+        """Add a mark at the first row of each client. Returns its index in `marks`."""
         self.marks.append(self.first.copy())
         return len(self.marks) - 1
 
     def append(self, clients: NDArray[np.integer[Any]], times: Integers, samples: Sequence[Sample]) -> None:
-        """Add rows, in the order in which they came; a late one takes its place by its time."""
+        """Add rows, in the order of their arrival; a late one is inserted by its time."""
         if not len(samples):
             return
         order = np.argsort(clients, kind="stable")
@@ -118,7 +118,7 @@ class Table:
                 self._sort(client)
 
     def find(self, times: Integers, clients: Integers) -> Integers:
-        """The place after the last row up to each time. Shapes: (T,), (C,) to (C, T)."""
+        """The index after the last row up to each time. Shapes: (T,), (C,) to (C, T)."""
         if self._base is None:
             return np.repeat(self.end[clients][:, None], len(times), axis=1)
         behind = np.clip(times - self._base, -1, _REACH - 1)
@@ -127,26 +127,26 @@ class Table:
         return np.clip(found, self.first[clients][:, None], self.end[clients][:, None])
 
     def find_each(self, times: Integers, clients: Integers) -> Integers:
-        """The place after the last row of each client up to its time. Shapes: (n,), (n,) to (n,)."""
+        """The index after the last row of each client up to its time. Shapes: (n,), (n,) to (n,)."""
         if self._base is None:
             return self.end[clients]
         keys = (clients << _SHIFT) + np.clip(times - self._base, -1, _REACH - 1)
         return np.clip(np.searchsorted(self.keys, keys, side="right"), self.first[clients], self.end[clients])
 
     def clients_of(self, rows: Integers) -> Integers:
-        """Whose rows these are."""
+        """The clients of these rows."""
         clients: Integers = self.keys[rows] >> _SHIFT
         return clients
 
     def expire(self, horizon: int) -> None:
-        """Forget rows up to the horizon (nanoseconds), but never the last one of a client."""
+        """Drop rows up to the horizon (nanoseconds), but never the last row of a client."""
         if not len(self.end):
             return
         before = self.find(np.array([horizon]), np.arange(len(self.end)))[:, 0]
         self.drop(np.minimum(before, np.maximum(self.end - 1, self.first)) - self.first)
 
     def drop(self, counts: Integers) -> None:
-        """Forget that many of each client's first rows."""
+        """Drop this number of each client's first rows."""
         if (counts > 0).any():
             rows = rows_between(self.first, self.first + counts)
             some = np.flatnonzero(counts > 0)
@@ -160,7 +160,7 @@ class Table:
             self.marks[:] = [np.maximum(mark, self.first) for mark in self.marks]
 
     def set_columns(self, count: int) -> None:
-        """Have this many columns, all of them to be read again."""
+        """Set the number of columns and mark all of them as not filled."""
         self.columns = [StoredColumn(len(self.keys)) for _ in range(count)]
         self.filled[:] = False
         self.marks[:] = [self.first.copy() for _ in self.marks]
@@ -170,7 +170,7 @@ class Table:
         return (clients.astype(np.int64) << _SHIFT) + np.clip(times - self._base, 0, _REACH - 2)
 
     def _sort(self, client: int) -> None:
-        """Put a client's rows in order: of equal times, as they came."""
+        """Sort a client's rows by time; rows of equal time keep their order of arrival."""
         begin, end = int(self.first[client]), int(self.end[client])
         order = begin + np.argsort(self.times[begin:end], kind="stable")
         arrays = [self.times, self.keys, self.samples, self.filled]
@@ -182,7 +182,7 @@ class Table:
             mark[client] = begin
 
     def _pack(self, counts: Integers, base: int) -> None:
-        """Move the rows that are still needed to new arrays, with room for `counts` new ones and more."""
+        """Move the rows that are still needed to new arrays, with room for at least `counts` new ones."""
         self._base = base
         live = self.end - self.first
         need = live + counts
@@ -192,7 +192,7 @@ class Table:
         size = int(room.sum())
         times = np.zeros(size, np.int64)
         times[target] = self.times[source]
-        # What is not used yet of a segment has the greatest key of its client, so that keys ascend.
+        # The unused rest of a segment has the greatest key of its client, so that keys ascend.
         keys = np.repeat((np.arange(1, len(room) + 1) << _SHIFT) - 1, room)
         keys[target] = self._keys(np.repeat(np.arange(len(live)), live), times[target])
         samples, filled = np.empty(size, object), np.zeros(size, bool)
@@ -211,7 +211,7 @@ class Table:
 
 
 def rows_between(begin: Integers, end: Integers) -> Integers:
-    """All places of the ranges [begin, end), one range after the other; empty where end is not after begin."""
+    """All indices of the ranges [begin, end), one range after the other; a range is empty if end is not after begin."""
     counts = np.maximum(end - begin, 0)
     ends = np.cumsum(counts)
     total = int(ends[-1]) if len(ends) else 0

@@ -1,7 +1,7 @@
-"""The tables of all streams that rules read, kept in step with the buffer.
+"""The tables of all streams that rules read, synchronised with the buffer.
 
-What enters the buffer is added before rules are evaluated. What the buffer pushes out early, by a cap or with a client
-that is forgotten, leaves the tables as well.
+Samples that enter the buffer are added before rules are evaluated. Samples that the buffer evicts early, by a cap or
+with a client that is forgotten, are dropped from the tables as well.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from wayside.expressions.columns.values import Texts
 from wayside.rules import CompiledSignal
 
 _MAXIMUM_TEXTS = 1_000_000
-"""Maximum number of different texts; beyond, tables are rebuilt: texts are never forgotten one by one."""
+"""Maximum number of distinct texts; beyond it, tables are rebuilt, because texts are never forgotten one by one."""
 
 _SPARE_COLUMNS = 16
-"""Number of columns of removed rules that do no harm."""
+"""Number of unused columns that are tolerated."""
 
 
 class Tables:
@@ -43,24 +43,24 @@ class Tables:
         self._evictions = buffer.evictions
         self._stale = True
         self._asked: set[tuple[str, Hashable]] = set()
-        """The names of the marks that were requested since the rules were set."""
+        """The marks requested since the rules were set, by stream and owner."""
         self._marks: dict[tuple[str, Hashable], int] = {}
         self.users: dict[tuple[str, Used], list[tuple[RuleCounters, CompiledSignal]]] = {}
-        """Who uses which columns of a stream."""
+        """The users of a stream's columns."""
         self.version = 0
-        """Changes when tables are rebuilt: earlier places and numbers are invalid then."""
+        """Changes when tables are rebuilt, which invalidates earlier indices and numbers."""
 
     def configure(
         self, detector: Detector, decoders: Mapping[str, Decoder], messages: Messages, counters: Counters
     ) -> None:
-        """Follow the Detector. Tables are created on first use."""
+        """Switch to this Detector. Tables are created on first use."""
         self._detector, self._decoders, self._messages, self._counters = detector, decoders, messages, counters
         self._tables, self.readers = {}, {}
         self._durations = {stream.name: detector.spec.buffer_duration_ns(stream) for stream in detector.spec.streams}
         self.forget()
 
     def follow(self, other: Tables) -> None:
-        """Take over what the other ones follow."""
+        """Use the Detector of the other tables."""
         self.configure(other._detector, other._decoders, other._messages, other._counters)
 
     def forget_users(self) -> None:
@@ -80,7 +80,7 @@ class Tables:
         self._stale = True
 
     def add(self, stream: str) -> Reader:
-        """Have a table of the stream from now on; returns what reads its columns."""
+        """Keep a table of the stream from now on; returns the reader of its columns."""
         if stream not in self._tables:
             self._tables[stream] = Table()
             self.readers[stream] = Reader(
@@ -94,7 +94,7 @@ class Tables:
         return self._tables[stream]
 
     def mark(self, stream: str, owner: Hashable) -> int:
-        """The owner's mark in the stream's table: the same one each time, until tables are rebuilt."""
+        """The owner's mark in the stream's table: the same one at each call, until tables are rebuilt."""
         self._asked.add((stream, owner))
         if (stream, owner) not in self._marks:
             self._marks[stream, owner] = self._tables[stream].mark()
@@ -112,18 +112,18 @@ class Tables:
 
     @property
     def full(self) -> bool:
-        """Whether numbers or texts run out: make new tables then."""
+        """Whether the numbers of clients or texts are used up: the caller then makes new tables."""
         return len(self.names) >= MAXIMUM_CLIENTS - 1 or len(self.texts) > _MAXIMUM_TEXTS
 
     @property
     def wasteful(self) -> bool:
-        """Whether most columns are read for rules that are gone: make new tables then."""
+        """Whether most columns are unused: the caller then makes new tables."""
         used = {(stream, at) for stream, each in self.users for at in each if at is not None}
         return sum(reader.count for reader in self.readers.values()) > 2 * len(used) + _SPARE_COLUMNS
 
     @property
     def streams(self) -> Sequence[Stream]:
-        """The Detector's."""
+        """The Detector's streams."""
         return self._detector.spec.streams
 
     @property
@@ -137,12 +137,12 @@ class Tables:
         return not stream.latched and not capped and self._durations[stream.name] <= LONGEST
 
     def duration(self, stream: str) -> int:
-        """How long the stream's samples are kept, in nanoseconds."""
+        """The retention of the stream's samples, in nanoseconds."""
         return self._durations[stream]
 
     @property
     def behind(self) -> bool:
-        """Whether the buffer has dropped samples that are still here."""
+        """Whether the buffer has dropped samples that are still in the tables."""
         return self._stale or self._evictions != self._buffer.evictions
 
     def settle(self, samples: list[Sample], lanes: list[Lane]) -> None:
@@ -159,19 +159,19 @@ class Tables:
             self._follow_evictions()
 
     def expire(self, now: int) -> None:
-        """Forget what the buffer keeps no longer; nanoseconds."""
+        """Drop the rows that have expired in the buffer; nanoseconds."""
         if not self._stale:
             for stream, table in self._tables.items():
                 table.expire(now - self._durations[stream])
 
     def note_failures(self, stream: str, failures: Mapping[Used, Sequence[Failure]]) -> None:
-        """Count what samples have no value, for every rule that has the signal."""
+        """Count samples without a value, for every rule that has the signal."""
         for used, found in failures.items():
             for counters, signal in self.users.get((stream, used), ()):
                 self.note(counters, signal, found)
 
     def note(self, counters: RuleCounters, signal: CompiledSignal, failures: Sequence[Failure]) -> None:
-        """Count what samples have no value for a signal."""
+        """Count samples without a value for a signal."""
         for failure in failures:
             if signal.client is not None and signal.client != self.names[failure.client]:
                 continue
@@ -224,7 +224,7 @@ class Tables:
         self.version += 1
 
     def _follow_evictions(self) -> None:
-        """Drop the rows that the buffer has no longer."""
+        """Drop the rows whose samples the buffer has evicted."""
         self._evictions = self._buffer.evictions
         for stream, table in self._tables.items():
             kept: Integers = np.zeros(table.clients, np.int64)

@@ -1,4 +1,4 @@
-"""What conditions yield: verdicts, and of those the observations that bring episodes forward."""
+"""The results of conditions: verdicts, and the observations derived from them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Codes = NDArray[np.uint8]
 
 
 class Verdict(NamedTuple):
-    """Where a condition is true and where it is false; unknown where it is neither."""
+    """Where a condition is true and where it is false; it is unknown at all other points."""
 
     true: Truths
     false: Truths
@@ -25,7 +25,7 @@ def observed(when: Verdict, until: Verdict, scope: Verdict | None = None, start:
     """The observations of arrays of points of any shape.
 
     `scope`: whether a point is in the rule's scope; outside, open episodes end. `start`: whether an episode may start
-    at all. None: everywhere.
+    at all. None: true everywhere.
     """
     may, not_ = when.true & until.false, when.false | until.true
     for each in (scope, start):

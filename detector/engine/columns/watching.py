@@ -1,4 +1,4 @@
-"""How old the samples are that rules use: see `detector.engine.counters.ages`, for a whole block."""
+"""The ages of the samples that rules use, for a whole block: see `detector.engine.counters.ages`."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ _POWERS = 10 ** np.arange(19, dtype=np.int64)
 
 
 class Points(Protocol):
-    """Where rules are evaluated."""
+    """The points at which rules are evaluated."""
 
     @property
     def times(self) -> Integers:
-        """The ticks."""
+        """The ticks of the points."""
 
     @property
     def numbers(self) -> Integers:
@@ -29,7 +29,7 @@ class Points(Protocol):
 
     @property
     def clients(self) -> Sequence[str]:
-        """Their clients."""
+        """The names of their clients."""
 
 
 class SampleAges:
@@ -50,9 +50,10 @@ class SampleAges:
         latest: Integers,
         where: Truths,
     ) -> None:
-        """Values were computed of the rows before `high` at these points; each rule is named once for each value.
+        """Note that values were computed from the rows before `high` at these points; `rules` has each rule once per
+        value.
 
-        `latest` has the time of the newest sample at each point, which a cap may have pushed out.
+        `latest` has the time of the newest sample at each point, which a cap may have evicted.
         """
         if not where.any():
             return
@@ -63,7 +64,7 @@ class SampleAges:
         before = np.maximum.accumulate(np.concatenate((first[:, None], seen[:, :-1]), axis=1), axis=1)
         new = where & (latest != before)
         if new.any():
-            begin = points.times - points.times % HOUSEKEEPING - duration  # what is older has left the buffer
+            begin = points.times - points.times % HOUSEKEEPING - duration  # older samples have expired in the buffer
             several = (high - table.first[points.numbers][:, None] >= 2) & (
                 table.times[np.maximum(high - 2, 0)] > begin
             )

@@ -1,7 +1,7 @@
-"""Aggregates over ranges of rows: what a signal is at many points at once.
+"""Aggregates over ranges of rows: the values of a signal at many points at once.
 
-The results are those of `detector.engine.signals.aggregates`, to the last digit; what cannot be computed for all ranges
-at once goes through these very functions, once for each range that differs from the one before.
+The results equal those of `detector.engine.signals.aggregates` to the last digit. Aggregates that cannot be computed
+for all ranges at once are computed by those functions, once for each range that differs from the previous one.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ _ONE_BY_ONE: Final = frozenset(
         Aggregate.RATE, Aggregate.STD_DEV, Aggregate.QUANTILE, Aggregate.SLOPE, Aggregate.MIN_TIME, Aggregate.MAX_TIME,
     }
 )  # fmt: skip
-"""Aggregates of numbers that are computed for each range by itself."""
+"""Aggregates of numbers that are computed for each range separately."""
 
 _HUGE = 1e290
-"""Sums of numbers up to here do not overflow."""
+"""Sums of numbers up to this value do not overflow."""
 
 _GRIDS = 4
 
 
 class Ranges:
-    """Rows of a table, with the ranges of them that windows are. Shapes: rows (N,), ranges any."""
+    """Rows of a table, and the ranges of them that form the windows. Shapes: rows (N,), ranges any."""
 
     __slots__ = ("begin", "high", "low", "others", "tags", "times", "values")
 
@@ -46,7 +46,7 @@ class Ranges:
         self, values: Numbers, tags: Tags | None, others: NDArray[Any] | None, times: Integers, low: Integers,
         high: Integers,
     ) -> None:  # fmt: skip
-        """`tags` None: all rows are numbers. Only the rows that some range has are kept."""
+        """`tags` None: all rows are numbers. Only the rows that occur in some range are kept."""
         begin = int(low.min(initial=len(values)))
         end = max(int(high.max(initial=0)), begin)
         self.values, self.times = values[begin:end], times[begin:end]
@@ -54,10 +54,10 @@ class Ranges:
         self.others = None if others is None else others[begin:end]
         self.low, self.high = low - begin, high - begin
         self.begin = begin
-        """The first row of the table that is among these."""
+        """The table's index of the first of these rows."""
 
     def picked(self, keep: NDArray[np.bool_]) -> None:
-        """Keep only these rows, and adapt the ranges."""
+        """Keep only these rows, and adjust the ranges."""
         before = np.concatenate(([0], np.cumsum(keep)))
         self.low, self.high = before[self.low], before[self.high]
         self.values, self.times = self.values[keep], self.times[keep]
@@ -66,9 +66,9 @@ class Ranges:
 
 
 def extremes(aggregate: Aggregate, values: Numbers, lows: Sequence[Integers], high: Integers) -> list[Column]:
-    """The aggregate Min or Max of windows of several lengths that end at the same rows, from the shortest on.
+    """The aggregate Min or Max of windows of several lengths that end at the same rows, from the shortest.
 
-    All rows are numbers. Each row is looked at once, not once for each length. Shapes: values (N,), lows and high any.
+    All rows are numbers. Each row is read once, not once per length. Shapes: values (N,), lows and high any.
     """
     begin = int(lows[-1].min(initial=len(values)))
     end = max(int(high.max(initial=0)), begin)
@@ -76,10 +76,10 @@ def extremes(aggregate: Aggregate, values: Numbers, lows: Sequence[Integers], hi
     borders = np.stack([*(low.ravel() for low in reversed(lows)), high.ravel()], axis=1) - begin
     least = np.minimum if aggregate is Aggregate.MIN else np.maximum
     parts = least.reduceat(longer, borders.ravel()).reshape(borders.shape)[:, :-1]
-    # A part without rows: reduceat gives the row at which it would begin.
+    # For an empty part, reduceat returns the row at which it would begin.
     nothing = np.inf if aggregate is Aggregate.MIN else -np.inf
     parts = np.where(borders[:, 1:] > borders[:, :-1], parts, nothing)
-    found = least.accumulate(parts[:, ::-1], axis=1) + 0.0  # which of two zeros wins is no matter: no -0.0
+    found = least.accumulate(parts[:, ::-1], axis=1) + 0.0  # the sign of zero does not matter: no -0.0
     columns = []
     for at, low in enumerate(lows):
         some = (high > low).ravel() & ~np.isnan(found[:, at])
@@ -92,9 +92,9 @@ def extremes(aggregate: Aggregate, values: Numbers, lows: Sequence[Integers], hi
 
 
 def aggregated_ranges(aggregate: Aggregate, rows: Ranges, texts: Texts, quantile: float | None = None) -> Column:
-    """The aggregate of each range, flat. Values that the aggregate does not take are left out: see `misfits`.
+    """The aggregate of each range, flat. Values that the aggregate cannot use are left out: see `misfits`.
 
-    `quantile` is of the aggregate Quantile.
+    `quantile` is the parameter of the aggregate Quantile.
     """
     low, high = rows.low.ravel(), rows.high.ravel()
     count = high - low
@@ -140,7 +140,7 @@ def aggregated_ranges(aggregate: Aggregate, rows: Ranges, texts: Texts, quantile
 
 
 def misfits(aggregate: Aggregate, rows: Ranges) -> tuple[Integers, NDArray[np.bool_]] | None:
-    """How many values of each range (flat) the aggregate does not take, and which rows these are; None: none."""
+    """The number of values in each range (flat) that the aggregate cannot use, and which rows these are; None: none."""
     if aggregate not in NUMERIC and aggregate not in (Aggregate.ANY, Aggregate.ALL):
         return None
     if rows.tags is None:
@@ -190,7 +190,7 @@ def _truth(aggregate: Aggregate, values: Numbers, low: Integers, high: Integers)
 
 
 def _each(aggregate: Aggregate, rows: Ranges, texts: Texts, quantile: float | None = None) -> Column:
-    """By the function for one window, once for each range that differs from the one before."""
+    """Compute each range by the function for one window, once for each range that differs from the previous one."""
     found: list[Any] = []
     before: tuple[int, int] | None = None
     result: Any = UNKNOWN
@@ -209,7 +209,7 @@ def _each(aggregate: Aggregate, rows: Ranges, texts: Texts, quantile: float | No
 
 
 def _column(found: Sequence[Any]) -> Column:
-    """Of numbers, lists and unknowns."""
+    """A column of numbers, lists and unknowns."""
     values, tags = np.zeros(len(found)), np.zeros(len(found), np.uint8)
     others: NDArray[Any] | None = None
     for at, each in enumerate(found):
@@ -222,22 +222,23 @@ def _column(found: Sequence[Any]) -> Column:
 
 
 def _has_integers(rows: Ranges) -> bool:
-    """Whether there are numbers that are no doubles."""
+    """Whether some numbers are integers rather than doubles."""
     assert rows.others is not None  # noqa: S101  the caller looked
     return any(isinstance(each, int) for each in rows.others[rows.tags == Tag.OTHER])
 
 
 def _pairs(low: Integers, high: Integers) -> Integers:
-    """As `reduceat` takes ranges: every second of its results is one's."""
+    """Interleave the bounds as `reduceat` needs them: every second of its results is a window's."""
     pairs = np.empty(2 * len(low), np.int64)
     pairs[0::2], pairs[1::2] = low, high
     return pairs
 
 
 def _sums(values: Numbers, low: Integers, high: Integers) -> Numbers | None:
-    """The sum of each range, exact and then rounded once; None where one may overflow or is not finite.
+    """The sum of each range, computed exactly and rounded once; None if one may overflow or is not finite.
 
-    The numbers are split on grids so coarse that sums of their parts are exact. `values` has one more at its end.
+    The numbers are split on grids so coarse that sums of the parts are exact. `values` has one additional element at
+    its end.
     """
     most = int(np.max(high - low, initial=1))
     top = float(np.max(np.abs(values), initial=0.0))
@@ -266,7 +267,7 @@ def _sums(values: Numbers, low: Integers, high: Integers) -> Numbers | None:
     if len(parts) == 1:
         return parts[0]
     if len(parts) == 2:
-        total: Numbers = parts[0] + parts[1]  # both are exact: one rounding
+        total: Numbers = parts[0] + parts[1]  # both are exact: rounded once
         return total
     return np.array([math.fsum(each) for each in zip(*(part.tolist() for part in parts), strict=True)])
 
@@ -277,4 +278,4 @@ NUMERIC: Final = frozenset(
         Aggregate.QUANTILE, Aggregate.SLOPE, Aggregate.MIN_TIME, Aggregate.MAX_TIME,
     }
 )  # fmt: skip
-"""The aggregates that take numbers only."""
+"""The aggregates that take only numbers."""

@@ -1,6 +1,6 @@
-"""What the actions of rules receive, in order: an episode begins, its samples, it ends, nothing more follows.
+"""The messages that the actions of rules receive, in order: an episode begins, its samples, its end, completion.
 
-The engine notes what happens; the shell takes it and passes it on, to actions that may be as slow as they like.
+The engine only queues these messages. The shell takes them and passes them to the actions, which may be slow.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from wayside.rules import CompiledAction, CompiledRule, CompiledWindow
 
 _WATCHED = 100
 _WATCHED_FOR = 10 * 10**9
-"""Maximum number of complete excerpts that are watched for late samples, and for how many nanoseconds."""
+"""Complete excerpts are watched for late samples: at most this number, for this time in nanoseconds."""
 
 REPLACED = "the action was changed or removed"
 
@@ -40,7 +40,7 @@ class Begun:
 
     run: Run
     event: Event
-    """Of the start."""
+    """The start event."""
     rendered: Rendered
     resumed: bool
     """The episode was open before the detector started, or before the rule had this action."""
@@ -60,42 +60,42 @@ class Over:
 
     run: Run
     event: Event
-    """Of the end."""
+    """The end event."""
 
 
 @dataclass(frozen=True, slots=True)
 class Completed:
-    """There is nothing more to come of the run."""
+    """No more messages of the run follow."""
 
     run: Run
     cut: str = ""
-    """Why the window ended before its time; empty where it did not."""
+    """Why the window ended early; empty if it did not."""
 
 
 Consequence = Begun | Sampled | Over | Completed
 
 
 class Consequences:
-    """The runs of all actions other than deploy."""
+    """The runs of all actions except deploy."""
 
     def __init__(self, buffer: Buffer) -> None:
         self.wanted = False
-        """Whether anybody takes what is noted; else nothing is, as in a replay."""
+        """Whether anybody takes the messages; otherwise none are queued, as in a replay."""
         self._excerpts = Excerpts(buffer)
         self._running: dict[Run, Excerpt | None] = {}
-        """With the excerpt, where the action has a window."""
+        """With the excerpt, if the action has a window."""
         self._requested: dict[Run, Event] = {}
-        """The runs that were requested from outside, with the message that began each."""
+        """The runs that were requested from outside, with the event that began each."""
         self._noted: list[Consequence] = []
         self._complete_ones: deque[Excerpt] = deque()
-        """Excerpts that are complete and still watched, for what comes too late for them."""
+        """Excerpts that are complete and still watched for late samples."""
         self.watch_late = False
         """Whether samples may come late, as with clock Data."""
         self.too_late = 0
-        """Samples that came when the window to which they belong was complete."""
+        """Number of samples that came after their window was complete."""
 
     def note(self, rule: CompiledRule, event: Event) -> None:
-        """An episode of the rule started or ended just now, or before the rule changed."""
+        """Queue the start or end of an episode, before or after a change of its rule."""
         if event.started:
             self.begin(rule.actions, rule, event, resumed=False)
             return
@@ -103,7 +103,7 @@ class Consequences:
             self._end(run, event)
 
     def begin(self, actions: Iterable[CompiledAction], rule: CompiledRule, event: Event, *, resumed: bool) -> None:
-        """These actions of the rule have the episode from now on."""
+        """These actions of the rule receive the episode from now on."""
         if rule.dry_run or not self.wanted:
             return
         for action in actions:
@@ -119,7 +119,7 @@ class Consequences:
     def request(
         self, run: Run, event: Event, window: CompiledWindow, clients: frozenset[str] | None, begin: int, until: int
     ) -> None:
-        """Begin a run that was requested from outside and belongs to no episode of a rule. Times are nanoseconds.
+        """Begin a run that was requested from outside and belongs to no rule's episode. Times are nanoseconds.
 
         `event` describes it; `clients` None: all. It ends at `until` at the latest.
         """
@@ -130,13 +130,13 @@ class Consequences:
         self._requested[run] = event
 
     def release(self, run: Run, until: int) -> None:
-        """Nobody needs what comes after `until` for that run; one that is over already stays so."""
+        """End the run's window at `until`; a run that is already over is left unchanged."""
         excerpt = self._running.get(run)
         if excerpt is not None and excerpt.until is not None:
             excerpt.until = min(excerpt.until, until)
 
     def change(self, before: CompiledRule, rule: CompiledRule, open_starts: Iterable[Event]) -> None:
-        """The rule has other actions than before, and these episodes go on."""
+        """The rule has other actions than before, and these episodes continue."""
         known, wanted = set(before.actions), set(rule.actions)
         if (known, before.dry_run) == (wanted, rule.dry_run):
             return
@@ -148,7 +148,7 @@ class Consequences:
             self.begin(new, rule, event, resumed=True)
 
     def take(self, now: int) -> list[Consequence]:
-        """The messages for the actions, up to the time `now` that the engine has reached; nanoseconds."""
+        """The messages for the actions up to the engine's time `now`; nanoseconds."""
         if self._running:
             self._excerpts.distribute()
             for run, excerpt in list(self._running.items()):
@@ -171,7 +171,7 @@ class Consequences:
             self._excerpts.stop(self._complete_ones.popleft())
 
     def cut(self, now: int, why: str) -> list[Consequence]:
-        """The same, and the end of all runs: the detector stops."""
+        """The same, and the end of all runs, because the detector stops."""
         noted = self.take(now)
         for run in list(self._running):
             self._complete(run, why)
@@ -179,13 +179,13 @@ class Consequences:
 
     @property
     def running(self) -> Mapping[Run, Excerpt | None]:
-        """The runs of which more may come."""
+        """The runs that are not complete yet."""
         return self._running
 
     def _end(self, run: Run, event: Event) -> None:
         excerpt = self._running[run]
         if excerpt is not None and excerpt.until is not None:
-            return  # it has ended already, and its window goes on
+            return  # it has ended already; its window is still open
         self._noted.append(Over(run, event))
         if excerpt is None or event.end_time is None:
             self._complete(run, "")

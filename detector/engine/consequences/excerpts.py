@@ -2,9 +2,9 @@
 
     ──(begin … onset … start … end … until]──▶ time
 
-What is in the buffer when an excerpt begins belongs to it; from then on its lanes keep a list of what is put into them,
-also of what comes late or is pushed out again. A sample is given out when time has reached it: only then it is certain
-that the episode had not ended before.
+Samples in the buffer at the beginning of an excerpt belong to it. From then on its lanes record each sample inserted
+into them, including late ones and ones that are evicted later. A sample is released only once time has reached it: only
+then it is certain that the episode had not ended before.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ class EpisodeSample(NamedTuple):
     client: str
     stream: str
     key: str
-    """The full key it came on, without a leading slash."""
+    """The full key of the message, without a leading slash."""
     time: int
-    """Its place on the detector's time axis, in nanoseconds since the epoch."""
+    """Its time on the detector's time axis, in nanoseconds since the epoch."""
     received: int
     """Nanoseconds since the epoch; the stamp as well with clock Data."""
     payload: bytes
-    """As it came, undecoded; of a stream with `items` the whole message, once for all its clients."""
+    """The payload as received, undecoded; for a stream with `items` the whole message, once for all its clients."""
 
 
 _TIME = attrgetter("time")
@@ -50,12 +50,12 @@ class Excerpt:
     until: int | None = None
     """Samples up to this time belong to it; None while the episode is open."""
     waiting: list[tuple[Lane, Sample]] = field(default_factory=list)
-    """Samples that time has not reached yet, or that nobody has taken."""
+    """Samples that time has not reached yet, or that have not been taken."""
     lanes: list[Lane] = field(default_factory=list)
-    """Where its samples come from."""
+    """The lanes of its samples."""
 
     def wants(self, lane: Lane) -> bool:
-        """Whether the lane's samples are of the window's streams and clients."""
+        """Whether the lane belongs to the window's streams and clients."""
         if lane.stream in self.window.shared:
             return True
         if lane.stream not in self.window.streams and lane.stream not in self.window.latched:
@@ -63,11 +63,12 @@ class Excerpt:
         return self.clients is None or lane.client in self.clients
 
     def take(self, now: int) -> list[EpisodeSample]:
-        """What time has reached, in order of time; what lies outside of the window is forgotten."""
+        """The samples that time has reached, in time order; samples outside of the window are discarded."""
         reached = now if self.until is None else min(now, self.until)
         taken: list[EpisodeSample] = []
         listed: dict[tuple[str, int], EpisodeSample] = {}
-        """The messages of which items belong to it, by stream and number: each is one sample, of the first client."""
+        """Messages with items that belong to the window, by stream and number: each is one sample, attributed to the
+        first client."""
         waiting: list[tuple[Lane, Sample]] = []
         for lane, sample in self.waiting:
             time = sample.time
@@ -88,7 +89,7 @@ class Excerpt:
 
 
 class Excerpts:
-    """All excerpts that are being cut from a buffer."""
+    """All open excerpts of a buffer."""
 
     def __init__(self, buffer: Buffer) -> None:
         self._buffer = buffer
@@ -97,7 +98,7 @@ class Excerpts:
         buffer.on_added = self._added
 
     def begin(self, window: CompiledWindow, clients: frozenset[str] | None, begin: int) -> Excerpt:
-        """Cut another one: what is in the buffer belongs to it, and what comes from now on."""
+        """Begin another excerpt: it contains the samples in the buffer, and those that arrive from now on."""
         self.distribute()
         excerpt = Excerpt(window, clients, begin)
         self._excerpts.append(excerpt)
@@ -108,7 +109,7 @@ class Excerpts:
         return excerpt
 
     def stop(self, excerpt: Excerpt) -> None:
-        """There is nothing more to come of it."""
+        """No more samples follow for this excerpt."""
         self._excerpts.remove(excerpt)
         for lane in excerpt.lanes:
             self._watchers[lane].remove(excerpt)
@@ -117,13 +118,13 @@ class Excerpts:
                 lane.record(None)
 
     def _candidates(self, excerpt: Excerpt) -> Iterable[Lane]:
-        """The lanes that it may want: there may be many clients, and an episode is about one or two of them."""
+        """The lanes that may belong to it: there may be many clients, and an episode is about one or two of them."""
         if excerpt.clients is None or excerpt.window.shared:
             return self._buffer
         return self._buffer.of(sorted(excerpt.clients))
 
     def _added(self, lane: Lane) -> None:
-        """A lane is new in the buffer."""
+        """Add a lane that is new in the buffer."""
         for excerpt in self._excerpts:
             if excerpt.wants(lane):
                 self._watch(lane, excerpt)
@@ -136,13 +137,13 @@ class Excerpts:
         excerpt.lanes.append(lane)
 
     def distribute(self) -> None:
-        """Give each excerpt what came since the last time."""
+        """Give each excerpt the samples that arrived since the last call."""
         for lane, came in self._came():
             for excerpt in self._watchers[lane]:
                 excerpt.waiting.extend((lane, sample) for sample in came)
 
     def _came(self) -> Iterator[tuple[Lane, list[Sample]]]:
-        """What was put into the lanes since the last look."""
+        """The samples inserted into the lanes since the last call."""
         for lane in self._watchers:
             came = lane.came
             if came:

@@ -1,4 +1,4 @@
-"""What was counted: every drop, unknown and error, by its cause."""
+"""Counters of every drop, unknown and error, by cause."""
 
 from __future__ import annotations
 
@@ -11,53 +11,54 @@ from wayside.expressions import Reason
 _MAXIMUM_NOTES = 1000
 
 _EARLY = 3600 * 1_000_000_000
-"""Nanoseconds: a recording whose receive times are smaller counts from 0, and a stamp of 0 is a time."""
+"""Nanoseconds: a recording with smaller receive times counts from 0, so a stamp of 0 is a valid time there."""
 
 _MAXIMUM_REASONS = 16
-"""Maximum number of different reasons for each rule: some name values, which are unbounded."""
+"""Maximum number of distinct reasons per rule: some contain values, which are unbounded."""
 
 OTHERS = "for other reasons"
-"""What counts the reasons beyond these."""
+"""The label under which further reasons are counted."""
 
 
 @dataclass(slots=True)
 class RuleCounters:
-    """What happened in the evaluation of one rule."""
+    """Counters of the evaluation of one rule."""
 
     evaluations: int = 0
     skipped: int = 0
-    """Times at which it was due and left out, the machine being too slow."""
+    """Evaluations that were due but skipped because the machine was too slow."""
     suppressed: int = 0
-    """Episodes left out, one of their clients having had maxEpisodesPerHour."""
+    """Episodes suppressed because a client had reached maxEpisodesPerHour."""
     started: int = 0
     ended: int = 0
     unknowns: int = 0
-    """Values that were not there when an expression needed them."""
+    """Values that were absent when an expression needed them."""
     absences: Counter[str] = field(default_factory=Counter)
-    """Reasons for unknown results, with their counts; a bounded number of them."""
+    """Number of unknown results by reason; the number of reasons is bounded."""
     errors: int = 0
-    """Expressions that failed on values that were there."""
+    """Expressions that failed on values that were present."""
     last_error: str = ""
     misplaced: int = 0
     """Evaluations of a client whose newest sample has no position: absent, not a number, infinite."""
     last_misplaced: str = ""
     ticks: int = 0
-    """Times at which the rule was evaluated, for all its subjects."""
+    """Number of ticks at which the rule was evaluated, each for all its subjects."""
     last_tick: int = 0
     """The newest of these times, in nanoseconds on the engine's time axis."""
     time_ns: int = 0
-    """Spent on evaluating it, by the engine's stopwatch."""
+    """Time spent on its evaluation, by the engine's stopwatch."""
 
     crowded_pairs: int = 0
-    """Pairs within reach that were not looked at, there being more than `maxPairs`; each at each evaluation."""
+    """Pairs within reach that exceeded `maxPairs` and were skipped; counted at each evaluation."""
 
     unfollowed: int = 0
-    """Parameters that should follow and kept their last value, being unknown or failing; each at each evaluation."""
+    """Parameters with `follow` that kept their last value because the new one was unknown or failed; counted at each
+    evaluation."""
     last_unfollowed: str = ""
     ages: Ages | None = None
-    """How old the samples were that it used; None while nobody wants to know."""
+    """The age of the samples that it used; None if not measured."""
     notes: list[str] | None = None
-    """While somebody wants to know, what expressions missed or failed on; at most a thousand."""
+    """If set, collects what expressions missed or failed on; at most a thousand entries."""
 
     def note(self, reason: Reason, message: str, place: str = "", times: int = 1) -> None:
         """Count an expression's unknown results; `place` names the client and stream in the text of an error."""
@@ -85,7 +86,7 @@ class RuleCounters:
 
 @dataclass(slots=True)
 class Counters:
-    """What happened in the engine."""
+    """Counters of the engine."""
 
     samples: Counter[str] = field(default_factory=Counter)
     """Samples taken into the buffer, by stream."""
@@ -95,18 +96,18 @@ class Counters:
     unnamed: Counter[str] = field(default_factory=Counter)
     """Samples dropped since neither their key nor their message names a valid client, by stream."""
     last_unnamed: dict[str, str] = field(default_factory=dict)
-    """The key of the last one, and the value in its message that is not a name, by stream."""
+    """The key of the last one, and the invalid name in its message, by stream."""
     unstamped: Counter[str] = field(default_factory=Counter)
-    """With clock Data, samples without a stamp, by stream: their receive time counts."""
+    """With clock Data, samples without a stamp, by stream: their receive time is used instead."""
     zeros: Counter[str] = field(default_factory=Counter)
-    """With clock Data, samples whose stamp is 0, by stream: a header that nobody filled in."""
+    """With clock Data, samples whose stamp is 0, by stream: the sender did not fill in the header."""
     delays: dict[str, int] = field(default_factory=dict)
-    """With clock Data, by stream: how far stamps were behind the receive times at least, in nanoseconds."""
+    """With clock Data, the smallest delay between stamp and receive time, by stream; nanoseconds."""
     crowded: Counter[str] = field(default_factory=Counter)
-    """Samples dropped since too many clients were known already, by stream."""
+    """Samples dropped because too many clients were known already, by stream."""
     rules: dict[str, RuleCounters] = field(default_factory=dict)
     watch_ages: bool = False
-    """Whether it is noted, of rules from now on, how old the samples are that they use."""
+    """Whether the age of used samples is measured for rules set from now on."""
 
     def rule(self, name: str) -> RuleCounters:
         """The counters of a rule."""
@@ -115,7 +116,7 @@ class Counters:
         return self.rules[name]
 
     def stamped(self, stream: str, received: int, stamp: int | None) -> None:
-        """Note how a sample's stamp compares with its receive time; nanoseconds, None: it carries none."""
+        """Compare a sample's stamp with its receive time; nanoseconds, None: the sample has no stamp."""
         if stamp is None:
             self.unstamped[stream] += 1
             stamp = received

@@ -1,4 +1,4 @@
-"""How old the samples are that a rule uses, and how often they usually come. Watched in replays alone."""
+"""The age of the samples that a rule uses, and the usual period between samples. Measured in replays only."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 OLD = 3
-"""Usual periods: a sample that is older shows that its sender fell silent."""
+"""In usual periods: an older sample shows that its sender fell silent."""
 
 _MANY, _SHARE = 10, 0.1
-"""Uses of old samples are reported from this number and share on; a client that leaves always gives a few."""
+"""Uses of old samples are reported from this number and this share on: a client that leaves always causes a few."""
 
 
 class AgedSample(Protocol):
@@ -23,33 +23,33 @@ class AgedSample(Protocol):
 
 
 class AgedLane(Protocol):
-    """The samples of one client on one stream, in order of time."""
+    """The samples of one client on one stream, in time order."""
 
     @property
     def client(self) -> str:
-        """Whose they are."""
+        """The client that sent them."""
 
     @property
     def stream(self) -> str:
-        """Which stream they came on."""
+        """The stream that they belong to."""
 
     @property
     def latest(self) -> int:
-        """The time of the newest, in nanoseconds."""
+        """The time of the newest sample, in nanoseconds."""
 
     @property
     def samples(self) -> Sequence[AgedSample]:
-        """Those that are still there."""
+        """The samples that are still in the buffer."""
 
 
 @dataclass(slots=True)
 class Use:
-    """What one rule used of one stream."""
+    """The samples of one stream that one rule used."""
 
     ages: Counter[int] = field(default_factory=Counter)
     periods: Counter[int] = field(default_factory=Counter)
     newest: dict[str, int] = field(default_factory=dict)
-    """By client, the time of the newest sample that was used; nanoseconds."""
+    """Per client, the time of the newest sample that was used; nanoseconds."""
 
     @property
     def period(self) -> int | None:
@@ -63,12 +63,12 @@ class Use:
 
     @property
     def count(self) -> int:
-        """How often a sample was used."""
+        """Number of uses of samples."""
         return self.ages.total()
 
     @property
     def old(self) -> int:
-        """How often one was that is older than three periods; 0 where that is seldom."""
+        """Number of uses of samples older than three periods; 0 if these are rare."""
         period = self.period
         if period is None:
             return 0
@@ -77,13 +77,13 @@ class Use:
 
 
 class Ages:
-    """What a rule used, by stream."""
+    """The samples that a rule used, by stream."""
 
     def __init__(self) -> None:
         self.uses: dict[str, Use] = {}
 
     def used(self, lane: AgedLane, now: int) -> None:
-        """A value was computed of the lane's newest sample and those before it, at the tick `now` (ns)."""
+        """Note that a value was computed from the lane's newest sample and earlier ones, at the tick `now` (ns)."""
         use = self.uses.setdefault(lane.stream, Use())
         use.ages[_rounded(now - lane.latest)] += 1
         before = use.newest.get(lane.client)

@@ -1,1 +1,1 @@
-"""What a rule's condition makes of a subject: episodes, their events and the demands of their actions."""
+"""Episodes: from a rule's condition for a subject to events and the demands of actions."""

@@ -1,4 +1,4 @@
-"""The maximum number of episodes per client and hour, where a rule has one."""
+"""The maximum number of episodes per client and hour, for rules that set one."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ HOUR = 3_600 * 10**9
 """Nanoseconds."""
 
 _FLEET = ""
-"""In place of a client, for a subject that names none: no client has such a name."""
+"""Stands in for a client where a subject names none: no client has an empty name."""
 
 
 class Budget:
-    """Counts the starts of the last hour by client. A pair's episode is one of both its clients."""
+    """Counts the starts of the last hour by client. An episode of a pair counts for both clients."""
 
     def __init__(self) -> None:
         self._starts: dict[str, deque[int]] = {}
 
     def takes(self, clients: Sequence[str], now: int, limit: int) -> bool:
-        """Whether each of the clients had fewer than `limit` starts in (now - 1 h, now]; if so, this one is counted."""
+        """Whether each of the clients had fewer than `limit` starts in (now - 1 h, now]; if so, count this one."""
         names = clients or (_FLEET,)
         for name in names:
             starts = self._starts.get(name)

@@ -21,7 +21,7 @@ from wayside.rules import CompiledDeploy, CompiledRule
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Whose episodes these are."""
+    """The holder, rule and subject of episodes."""
 
     detector: str
     holder: str
@@ -38,17 +38,17 @@ class Episode:
     start: int
     values: Mapping[str, Any]
     variables: Mapping[str, Any] | None
-    """What the conditions saw at the start; None until the next evaluation where the episode was restored, or started
-    while the rule had no actions."""
+    """The variables of the conditions at the start; None until the next evaluation if the episode was restored, or
+    started while the rule had no actions."""
     demands: dict[str, Demand] = field(default_factory=dict)
-    """By action; an action whose parameters cannot be rendered yet has none."""
+    """By action; an action without an entry cannot be rendered yet."""
     outdated: set[str] = field(default_factory=set)
-    """Actions that changed since: their demands hold until they can be rendered again."""
+    """Actions that changed since the start: their demands stay valid until they can be rendered again."""
     statistics: Statistics | None = None
-    """None where the rule has no signals over the episode."""
+    """None if the rule has no signals over the episode."""
 
     def started(self, rule: CompiledRule, identity: Identity) -> Event:
-        """The event of its start, with what is rendered for the rule's actions as they are now."""
+        """The start event, with the texts rendered for the rule's current actions."""
         rendered = {action.name: render(action, self.variables) for action in rule.actions} if rule.actions else {}
         return self._event(rule, identity, None, None, self.values, rendered)
 
@@ -61,7 +61,7 @@ class Episode:
         values: Mapping[str, Any],
         variables: Mapping[str, Any],
     ) -> Event:
-        """The event of its end; `values` and `variables` are those of the last evaluation.
+        """The end event; `values` and `variables` are those of the last evaluation.
 
         Templates that read statistics of the episode are rendered again.
         """
@@ -74,7 +74,7 @@ class Episode:
         return self._event(rule, identity, now, reason, values, rendered)
 
     def kept(self, rule: CompiledRule) -> OpenEpisode:
-        """As it is kept beyond a restart."""
+        """The episode in the form that survives a restart."""
         return OpenEpisode(
             rule.name, self.subject, self.id, self.onset, self.start, self.values, rule.classification, rule.digest,
             None if self.statistics is None else self.statistics.to_document(),
@@ -85,15 +85,15 @@ class Episode:
         return not self.outdated and len(self.demands) >= len(rule.deploys)
 
     def change(self, changed: Collection[str], gone: Collection[str]) -> None:
-        """The rule's deploy actions changed: demands of those that are gone go at once, the others hold for now."""
+        """The rule's deploy actions changed: demands of removed actions end at once, the others stay valid for now."""
         for action in gone:
             self.demands.pop(action, None)
         self.outdated = (self.outdated | set(changed)) - set(gone)
 
     def render(self, rule: CompiledRule, identity: Identity, counters: RuleCounters) -> int:
-        """Render demands that are missing or outdated; those that fail are tried again at the next tick.
+        """Render demands that are missing or outdated; failed ones are retried at the next tick.
 
-        Returns how many demands changed.
+        Returns the number of demands that changed.
         """
         changes = 0
         for deploy in rule.deploys if self.variables is not None else ():
@@ -110,7 +110,7 @@ class Episode:
         return changes
 
     def follow(self, rule: CompiledRule, variables: Mapping[str, Any], counters: RuleCounters) -> int:
-        """Evaluate the parameters of actions with `follow` again. Returns how many demands changed."""
+        """Evaluate the parameters of actions with `follow` again. Returns the number of demands that changed."""
         changes = 0
         for deploy in rule.deploys:
             demand = self.demands.get(deploy.action)

@@ -1,7 +1,7 @@
 """Demands: the applications that deploy actions of open episodes request, and their form as ApplicationTasks.
 
-A demand is held while its episode is open. It has a name that follows from what it is, so that a detector which
-restarts finds its own tasks again, and never makes two of one.
+A demand is held while its episode is open. Its name is derived from its contents, so that a restarted detector finds
+its own tasks again and never creates a second task for one demand.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Demand:
     template: str
     priority: int
     parameters: Mapping[str, JsonValue]
-    """Evaluated; the only part that may change while the episode is open."""
+    """Evaluated parameters; only these may change while the episode is open."""
     detector: str
     holder: str
     namespace: str
@@ -48,7 +48,7 @@ class Demand:
     subjects: tuple[str, ...]
     """The clients that the episode is about."""
     episode: str
-    """The episode's id."""
+    """The id of the episode."""
     onset_time: int
     """Nanoseconds since the epoch."""
     start_time: int
@@ -57,7 +57,7 @@ class Demand:
     values: Mapping[str, JsonValue]
     """The rule's variables at the start."""
     rule_digest: str
-    """Of the rule's semantics under which the episode started."""
+    """Digest of the rule's semantics under which the episode started."""
     operation: Operation = Operation.DEPLOY
 
     @property
@@ -90,15 +90,15 @@ def holder_label(holder: str) -> str:
 def to_task(demand: Demand, end_time: int | None = None) -> ApplicationTask:
     """The demand as an object for the API server or a file.
 
-    Absent and null are one in a resource, so null parameters and values are left out, and so are NaN and infinities
-    (JSON has none). Of the event's values, those that exceed the bounds of free data are left out.
+    A resource does not distinguish absent from null, so null parameters and values are left out, and so are NaN and
+    infinities, which JSON does not have. Of the event's values, those that exceed the bounds of free data are left out.
 
     Args:
-        demand: what is wanted.
+        demand: the demand.
         end_time: when the episode ended, in nanoseconds since the epoch; None while it is open.
 
     Raises:
-        ValueError: a part of it does not fit into an ApplicationTask, e.g. a subject that is too long.
+        ValueError: a part does not fit into an ApplicationTask, e.g. a subject that is too long.
     """
     return ApplicationTask(
         metadata=Metadata(
@@ -131,7 +131,7 @@ def to_task(demand: Demand, end_time: int | None = None) -> ApplicationTask:
 
 
 def from_task(task: ApplicationTask) -> Demand | None:
-    """The demand that a task stands for; None where no detector emitted it (no holder or no event)."""
+    """The demand of a task; None if no detector emitted the task (no holder or no event)."""
     spec = task.spec
     if spec.event is None or spec.requester.holder is None or spec.requester.detector_name is None:
         return None
@@ -158,5 +158,5 @@ def from_task(task: ApplicationTask) -> Demand | None:
 
 
 def _digest(*parts: str) -> str:
-    """An identifier of the parts, length-prefixed so that no two lists agree."""
+    """A digest of the parts, length-prefixed so that different lists never collide."""
     return identifier(b"".join(len(data).to_bytes(8, "big") + data for data in map(str.encode, parts)))

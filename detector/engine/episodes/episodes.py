@@ -67,12 +67,12 @@ _UNTIL, _OUT_OF_SCOPE, _UNKNOWN = map(Ended, (Reason.UNTIL, Reason.OUT_OF_SCOPE,
 FALSE, UNSURE, TRUE = 0, 1, 2
 """Whether an episode may start: the lower two bits of an observation that is one byte."""
 UNTIL_UNSURE, UNTIL, OUTSIDE = 4, 8, 12
-"""What may end one: the two bits above. 0: nothing."""
+"""The condition that may end an episode: the next two bits. 0: none."""
 UNSEEN = 255
-"""In place of an observation: there was none yet, so any is a change."""
+"""Stands in for an observation before the first one, so any observation is a change."""
 
 NO_WAKE = 2**63 - 1
-"""In place of a time to wake: nothing happens before the observation changes. Nanoseconds, beyond all times."""
+"""Stands in for a time to wake: nothing happens before the observation changes. Nanoseconds, later than all times."""
 
 
 Ran = tuple[int, Started | Ended | None, int | None]
@@ -82,7 +82,7 @@ one; what happened; and when something will happen although nothing changes, in 
 
 @dataclass(slots=True)
 class SubjectState:
-    """Where a subject stands. Times are nanoseconds."""
+    """The state of a subject. Times are nanoseconds."""
 
     is_open: bool = False
     onset: int | None = None
@@ -94,7 +94,8 @@ class SubjectState:
         return not self.is_open and self.onset is None and self.rests_until <= now
 
     def wake(self, now: int, timing: Timing) -> int | None:
-        """When one of its times is over, so that something may happen without a sample; nanoseconds, after `now`."""
+        """The next time, after `now`, at which a timer expires, so that something may happen without a sample;
+        nanoseconds."""
         times = []
         if self.is_open:
             if self.unknown_since is not None:
@@ -108,21 +109,21 @@ class SubjectState:
         return min((time for time in times if time > now), default=None)
 
     def gap(self) -> None:
-        """Time went on without us: what was pending is forgotten, an open episode holds."""
+        """Time moved on without ticks: discard a pending episode, keep an open one."""
         self.onset = None
         self.unknown_since = None
 
     def end(self, now: int, timing: Timing) -> None:
-        """Close the episode; the subject rests."""
+        """Close the episode; the cooldown begins."""
         self.is_open = False
         self.onset = None
         self.unknown_since = None
         self.rests_until = now + timing.cooldown
 
     def run(self, ticks: Sequence[int], first: int, last: int, timing: Timing, code: int) -> Ran:
-        """The same as `step` at each of ticks[first:last], at which the observation is the same, up to what happens.
+        """The same as calling `step` at each of ticks[first:last] with the same observation, up to the first change.
 
-        Nothing more happens at the ticks after that.
+        Nothing more happens at the later ticks.
         """
         start, stop = code & 3, code & 12
         if self.is_open:
@@ -169,7 +170,7 @@ class SubjectState:
         return at, ended, None
 
     def step(self, now: int, timing: Timing, seen: Observation) -> Started | Ended | None:
-        """Go on to the tick `now`; returns what happened."""
+        """Advance to the tick `now`; returns what happened."""
         return self._open_step(now, timing, seen) if self.is_open else self._idle_step(now, timing, seen)
 
     def _open_step(self, now: int, timing: Timing, seen: Observation) -> Ended | None:

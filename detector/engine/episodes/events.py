@@ -19,7 +19,7 @@ ENDED = "dev.wayside.event.ended"
 
 
 class Event(msgspec.Struct, frozen=True, gc=False):
-    """An episode started, or ended where there is a reason. Times are nanoseconds since the epoch."""
+    """The start of an episode, or its end if there is a reason. Times are nanoseconds since the epoch."""
 
     holder: str
     rule: str
@@ -33,26 +33,26 @@ class Event(msgspec.Struct, frozen=True, gc=False):
     values: Mapping[str, JsonValue]
     classification: Mapping[str, JsonValue] | None
     models: Mapping[str, str] = msgspec.field(default_factory=dict)
-    """The sha256 of the models that the rule's signals are computed by, by signal."""
+    """By signal, the sha256 of the model that computes it."""
     element: str | None = None
-    """The element of `each` that the rule was evaluated for."""
+    """The element of `each` for which the rule was evaluated."""
 
     dry_run: bool = False
     """No action of the rule runs."""
 
     rendered: Mapping[str, Rendered] = msgspec.field(default_factory=dict)
-    """What is rendered for the actions, by their names: at the start, and at the end what reads statistics of the
-    episode. It is for them alone."""
+    """The texts rendered for the actions, by their names: at the start; at the end those that read statistics of the
+    episode. Not published."""
 
     traceparent: str | None = None
-    """Where the episode stands in a trace; None where traces are off. The engine knows nothing of it."""
+    """The trace context of the episode; None if traces are off. The engine does not set it."""
 
     recording: str | None = None
-    """The recording that it is from, where several were replayed. The engine knows nothing of it."""
+    """The recording that it comes from, if several were replayed. The engine does not set it."""
 
     @property
     def started(self) -> bool:
-        """Whether the episode started; else it ended."""
+        """Whether the episode started; otherwise it ended."""
         return self.reason is None
 
     @property
@@ -70,9 +70,9 @@ class Event(msgspec.Struct, frozen=True, gc=False):
 
         Raises:
             ValueError: a time is outside the years 1 to 9999.
-            TypeError: JSON does not have one of the values.
+            TypeError: a value has no form in JSON.
         """
-        # The text is put together by hand: an encoder takes several times as long.
+        # The text is built by hand: an encoder takes several times as long.
         kind, what = (STARTED, "started") if self.reason is None else (ENDED, "ended")
         rule, episode, start = quote(self.rule), quote(self.episode), format_time(self.start_time)
         time = start if self.end_time is None else format_time(self.end_time)

@@ -1,4 +1,4 @@
-"""Parameters that follow: of an action with `follow`, they are evaluated again at each evaluation of the episode."""
+"""Parameters of actions with `follow`: evaluated again at each evaluation of the episode."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ def followed(
     variables: Mapping[str, Any],
     counters: RuleCounters,
 ) -> dict[str, JsonValue]:
-    """The action's parameters as they are now.
+    """The current parameters of the action.
 
-    Each stands for itself: one that is unknown or fails keeps the value that it has in `before`, and is counted. One
-    that is null is left out, as at the start.
+    Each parameter is evaluated separately: one that is unknown or fails keeps its value in `before`, and is counted.
+    Null ones are left out, as at the start.
     """
     now: dict[str, JsonValue] = {}
     for name, template in deploy.each_parameter.items():

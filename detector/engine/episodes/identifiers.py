@@ -1,4 +1,4 @@
-"""Short identifiers that follow from what they stand for: 16 lowercase letters and digits of its SHA-256."""
+"""Short identifiers derived from contents: 16 lowercase letters and digits of the SHA-256."""
 
 from __future__ import annotations
 
@@ -21,5 +21,5 @@ def identifier(data: bytes) -> str:
 
 
 def episode_id(holder: str, rule: str, subject: str, start: int) -> str:
-    """The identifier of the episode that starts at a time, in nanoseconds since the epoch."""
+    """The identifier of the episode that starts at this time, in nanoseconds since the epoch."""
     return identifier(f"{holder}\0{rule}\0{subject}\0{start}".encode())

@@ -1,4 +1,4 @@
-"""Open episodes as they are kept beyond a restart, and recorded where one takes them up again."""
+"""Open episodes in the form that survives a restart, and the demands they are restored from."""
 
 from __future__ import annotations
 
@@ -23,19 +23,20 @@ class OpenEpisode:
     rule: str
     subject: Subject
     episode: str
-    """The episode's id."""
+    """The id of the episode."""
     onset_time: int
     start_time: int
     values: Mapping[str, JsonValue]
-    """What its rule saw at the start."""
+    """The rule's values at the start."""
     classification: Mapping[str, JsonValue] | None
     rule_digest: str
-    """Of the rule's semantics under which it started."""
+    """Digest of the rule's semantics under which it started."""
     statistics: Mapping[str, Any] | None = None
-    """What its signals over the episode are so far, see `Statistics.to_document`; None: it has none, or lost them."""
+    """The current statistics of its signals over the episode, see `Statistics.to_document`; None: it has none, or lost
+    them."""
 
     def to_document(self) -> dict[str, Any]:
-        """The episode as JSON carries it."""
+        """The episode as a JSON document."""
         return {
             "rule": self.rule,
             "subject": self.subject.text,
@@ -50,7 +51,7 @@ class OpenEpisode:
 
 
 def from_document(document: Mapping[str, Any]) -> OpenEpisode:
-    """The episode of what `to_document` made.
+    """The episode from a document that `to_document` made.
 
     Raises:
         ValueError: the document does not describe an episode; the text names the wrong field.
@@ -79,7 +80,7 @@ def from_document(document: Mapping[str, Any]) -> OpenEpisode:
 
 
 def episode_of(demand: Demand) -> OpenEpisode:
-    """The episode that a demand is of. Its subject's text differs from the demand's where that one is none."""
+    """The episode of a demand. Without an element, the subject's text may differ from the demand's."""
     try:
         _, element = parse_subject(demand.subject)
     except ValueError:
@@ -97,7 +98,7 @@ def episode_of(demand: Demand) -> OpenEpisode:
 
 
 def ended_while_away(episode: OpenEpisode, holder: str, now: int) -> Event:
-    """The end of an episode whose rule changed or went while the detector was not running."""
+    """The end of an episode whose rule changed or was removed while the detector was not running."""
     return Event(
         holder=holder,
         rule=episode.rule,

@@ -1,4 +1,4 @@
-"""Values as JSON carries them: without null, NaN and infinities in maps, and with lists in place of tuples."""
+"""Values in the form of JSON: without null, NaN and infinities in maps, and with lists in place of tuples."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from typing import Any
 from wayside.api.base import JsonValue
 
 to_text = json.JSONEncoder(separators=(",", ":"), ensure_ascii=False, allow_nan=False).encode
-"""JSON on one line. Raises ValueError for NaN and infinities, TypeError for what JSON does not have."""
+"""JSON on one line. Raises ValueError for NaN and infinities, TypeError for other types than JSON's."""
 
 quote = encode_basestring
-"""A text as JSON has it, with quotes. The same as `to_text`, without its set-up."""
+"""A text as a quoted JSON string. The same as `to_text`, without its set-up."""
 
 _UNCHANGED = frozenset({bool, float, int, str})
-"""Exact types that JSON carries as they are; finite numbers only."""
+"""Exact types that JSON represents unchanged; finite numbers only."""
 
 
 def plain(values: Mapping[str, JsonValue]) -> dict[str, JsonValue]:
-    """The values as JSON can carry them: nulls, NaN and infinities are left out, tuples become lists."""
+    """The values in the form of JSON: nulls, NaN and infinities are left out, tuples become lists."""
     return {
         key: value if type(value) in _UNCHANGED else _plain(value)
         for key, value in values.items()
@@ -30,10 +30,10 @@ def plain(values: Mapping[str, JsonValue]) -> dict[str, JsonValue]:
 
 
 def plain_text(values: Mapping[str, JsonValue]) -> str:
-    """The same text as `to_text(plain(values))`. Most values are single numbers and texts: those need no encoder.
+    """The same text as `to_text(plain(values))`. Most values are single numbers and texts, which need no encoder.
 
     Raises:
-        TypeError: JSON does not have such a value.
+        TypeError: a value has another type than JSON's.
     """
     parts = []
     for key, value in values.items():
@@ -50,7 +50,7 @@ def plain_text(values: Mapping[str, JsonValue]) -> str:
 
 def _plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
-        # An item's place has a meaning, so here null stays.
+        # The position of an item has a meaning, so null stays in lists.
         return [None if _is_null(item) else item if type(item) in _UNCHANGED else _plain(item) for item in value]
     if isinstance(value, Mapping):
         return {

@@ -13,14 +13,14 @@ from wayside.rules import CompiledAction
 
 @dataclass(frozen=True, slots=True)
 class Rendered:
-    """An action's templates by name: what became of them, and why of others nothing did."""
+    """An action's templates by name: the rendered texts, and for the others the reason why rendering failed."""
 
     values: Mapping[str, JsonValue] = field(default_factory=dict)
     problems: Mapping[str, str] = field(default_factory=dict)
 
 
 def render(action: CompiledAction, variables: Mapping[str, Any] | None) -> Rendered:
-    """Each template by itself; `variables` is None where the episode was taken up after a restart."""
+    """Render each template separately; `variables` is None if the episode was restored after a restart."""
     values: dict[str, JsonValue] = {}
     problems: dict[str, str] = {}
     for name, template in action.templates.items():
@@ -32,5 +32,5 @@ def render(action: CompiledAction, variables: Mapping[str, Any] | None) -> Rende
         except InterpolationError as error:
             problems[name] = str(error)
         else:
-            values |= rendered if isinstance(rendered, dict) else {}  # null drops what it is of
+            values |= rendered if isinstance(rendered, dict) else {}  # a null key or value is dropped
     return Rendered(values, problems)

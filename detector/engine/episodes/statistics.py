@@ -1,7 +1,7 @@
-"""Statistics of an open episode: what its signals over the episode are, from its start to the last evaluation.
+"""Statistics of an open episode: the values of its signals over the episode, from its start to the last evaluation.
 
-They are exact sums, extremes and counts, so neither the length of an episode nor the number of evaluations that come
-together changes what they take or what they are.
+They are exact sums, extremes and counts. Their size and their values therefore depend neither on the length of an
+episode nor on the number of evaluations that are taken together.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ _OF_ONE = frozenset({Aggregate.FIRST, Aggregate.LAST})
 
 @dataclass(slots=True)
 class Statistic:
-    """One of them. What it does not use stays as it is."""
+    """One statistic. Fields that its aggregate does not use keep their defaults."""
 
     count: int = 0
-    """Evaluations of Count, and numbers or booleans of the others."""
+    """Number of evaluations for Count, of numbers or booleans for the others."""
     value: Value | Unknown = UNKNOWN
     """The extreme; or the first or the last value; or whether all or any are true."""
     time: int = 0
-    """Of the extreme; nanoseconds."""
+    """The time of the extreme; nanoseconds."""
     total: Fraction = Fraction()
-    """Of the finite numbers."""
+    """The sum of the finite numbers."""
     infinite: float = 0.0
-    """The sum of the infinite ones."""
+    """The sum of the infinite numbers."""
 
     def take(self, aggregate: Aggregate, time: int, value: Value | Unknown) -> bool:
         """Take a value into account; False where the aggregate cannot use it."""
@@ -74,7 +74,7 @@ class Statistic:
         self.count += 1
 
     def result(self, aggregate: Aggregate) -> Value | Unknown:
-        """What it is by now."""
+        """The current result."""
         match aggregate:
             case Aggregate.COUNT:
                 return float(self.count)
@@ -95,7 +95,7 @@ class Statistic:
             return math.copysign(math.inf, self.total)
 
     def to_document(self) -> dict[str, Any]:
-        """As JSON carries it."""
+        """The statistic as a JSON document."""
         value, infinite = self.value, str(self.infinite)
         if isinstance(value, Unknown):
             kept: dict[str, Any] = {}
@@ -109,27 +109,28 @@ class Statistics:
     """The statistics of one open episode."""
 
     def __init__(self, signals: Sequence[CompiledDerived], start: int) -> None:
-        """`start` is the episode's, in nanoseconds."""
+        """`start` is the start of the episode, in nanoseconds."""
         self._signals = signals
         self._start = start
         self.until = start - 1
-        """The last evaluation that was taken; nanoseconds."""
+        """The last evaluation that was taken into account; nanoseconds."""
         self._of = {signal.name: Statistic() for signal in signals if signal.of is not None}
 
     @classmethod
     def of(cls, rule: CompiledRule, start: int) -> Statistics | None:
-        """Those of an episode of the rule; None where it has no signals over episodes."""
+        """The statistics of an episode of the rule; None if it has no signals over episodes."""
         signals = [signal for signal in rule.derived if signal.episode]
         return cls(signals, start) if signals else None
 
     def up_to(self, now: int, values: Mapping[str, Value], counters: RuleCounters) -> dict[str, Value]:
-        """The statistics that are known after an evaluation with these values, which may be taken already."""
+        """The known statistics after an evaluation with these values, which may be taken into account already."""
         if self.until < now:
             self.take(now, values, counters)
         return self.values(now)
 
     def take(self, time: int, values: Mapping[str, Value], counters: RuleCounters) -> None:
-        """Take the values of an evaluation; those that are unknown are left out. Counts what cannot be used."""
+        """Take the values of an evaluation into account; unknown ones are left out. Counts values that cannot be
+        used."""
         self.until = time
         for signal in self._signals:
             if signal.of is not None:
@@ -140,7 +141,7 @@ class Statistics:
                     counters.last_error = f"signal {signal.name}: {message}"
 
     def values(self, now: int) -> dict[str, Value]:
-        """The statistics that are known."""
+        """The known statistics."""
         return dict(self._values(now))
 
     def _values(self, now: int) -> Iterator[tuple[str, Value]]:
@@ -151,11 +152,11 @@ class Statistics:
                 yield signal.name, value
 
     def to_document(self) -> dict[str, Any]:
-        """As JSON carries them beyond a restart."""
+        """The statistics as a JSON document that survives a restart."""
         return {"until": self.until, "signals": {name: each.to_document() for name, each in self._of.items()}}
 
     def restore(self, document: Mapping[str, Any]) -> None:
-        """Go on from what `to_document` made; missing or malformed statistics restart."""
+        """Continue from a document that `to_document` made; missing or malformed statistics restart."""
         try:
             until = int(document["until"])
             restored = {name: _statistic(each) for name, each in document["signals"].items()}

@@ -1,4 +1,4 @@
-"""Subjects: whom an episode is about."""
+"""Subjects: the clients that an episode is about."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from wayside.names import subject_text
 from wayside.rules import ClientSubject, CompiledRule, FleetSubject, PairSubject
 
 FLEET: Final = ""
-"""In place of a client's name: the fleet. No client has such a name."""
+"""Stands in for a client's name: the fleet. No client has an empty name."""
 
 
 class Subject(NamedTuple):
     """Clients, and the element of `each` where the rule has one."""
 
     clients: tuple[str, ...]
-    """One client, the two of a pair (a, then b), or none where it is the fleet."""
+    """One client, the two of a pair (a, then b), or none for the fleet."""
     element: str | None = None
 
     @property
     def text(self) -> str:
-        """As in events' keys: `car1`, `car1+car2~north`, `~fleet`."""
+        """The text in events' keys: `car1`, `car1+car2~north`, `~fleet`."""
         return _text(self.clients, self.element)
 
 

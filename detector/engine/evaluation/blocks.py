@@ -1,7 +1,7 @@
-"""Rules in columns: which of them are evaluated together, and the ticks that wait for that.
+"""Rules in columns: which rules are evaluated together, and the ticks that wait for evaluation.
 
-The rules that are due at the same ticks are a group. Ticks are collected as long as nothing happens between them that
-an evaluation could see or change; how many are evaluated together never changes a result.
+Rules that are due at the same ticks form a group. Ticks are collected as long as nothing happens between them that an
+evaluation could see or change. The number of ticks evaluated together never changes a result.
 """
 
 from __future__ import annotations
@@ -29,30 +29,31 @@ _place = attrgetter("time", "order", "event.subject")
 
 
 class Blocks:
-    """All rules in columns."""
+    """All rules that are evaluated in columns."""
 
     def __init__(self, context: Context, floor: Callable[[], int | None], observer: Observer | None = None) -> None:
-        """`floor`: windows do not reach back to this time or beyond; nanoseconds."""
+        """`floor`: windows start after this time; nanoseconds."""
         self._observer = observer
         self._context = context
         self._floor = floor
         self._depths: list[list[RuleGroup | PairGroup]] = []
-        """First the groups whose rules look at no episodes of others, then those that look at episodes of these, …"""
+        """Groups by depth: first those whose rules read no episodes of other rules, then those that read episodes of
+        these, …"""
         self._groups: list[RuleGroup | PairGroup] = []
         self._ahead: list[Happened] = []
-        """What happened at ticks that others still wait for."""
+        """Events at ticks for which other groups have not been evaluated yet."""
         self._on_sample: dict[str, RuleGroup] = {}
         self.with_samples: Mapping[str, Sequence[RuleRun]] = {}
-        """By stream, the rules that are evaluated with its samples."""
+        """By stream, the rules that are evaluated on each sample of it."""
         self.hurries = False
-        """Whether there are groups for `run_ahead`."""
+        """Whether any group needs `run_ahead`."""
         self.names: frozenset[str] = frozenset()
-        """The rules that are evaluated here."""
+        """The names of the rules that are evaluated here."""
 
     def set_rules(
         self, runs: Mapping[str, RuleRun], paused: Collection[str], thinning: Callable[[RuleRun], int]
     ) -> None:
-        """These rules are evaluated from now on; `thinning`: one in this number of a rule's evaluations takes place."""
+        """Evaluate these rules from now on; `thinning`: only one in this number of a rule's evaluations takes place."""
         orders = {name: order for order, name in enumerate(runs)}
         depths: dict[str, int] = {}
         together: dict[tuple[int, type[ClientGroup | FleetGroup], int, int], list[RuleRun]] = {}
@@ -98,7 +99,8 @@ class Blocks:
                 run.disturbed = True
 
     def _depth(self, rule: CompiledRule, depths: Mapping[str, int]) -> int | None:
-        """How far the rule is above those that look at no other; None: one that it looks at is not evaluated here."""
+        """The rule's depth: one more than that of the rules it reads; None: a rule that it reads is not evaluated
+        here."""
         named = {signal.rule for signal in signals_of(rule) if signal.rule is not None}
         evaluated = {each for each in named if self._context.starts.is_evaluated(episode_stream(each))}
         if not evaluated <= depths.keys():
@@ -110,14 +112,14 @@ class Blocks:
         return [group for group in self._groups if time % group.period == 0]
 
     def skip(self, time: int) -> None:
-        """Count the evaluations that are left out at a tick."""
+        """Count the evaluations that are skipped at a tick."""
         for group in self._groups:
             if group.period != group.every and time % group.every == 0 and time % group.period:
                 for run in group.runs:
                     run.counters.skipped += 1
 
     def wait(self, time: int, groups: Iterable[RuleGroup | PairGroup]) -> bool:
-        """Evaluate the groups at this tick later. Returns whether enough points wait to evaluate them now."""
+        """Queue this tick of the groups. Returns whether enough points are queued to evaluate them now."""
         clients = len(self._context.clients)
         full = False
         ahead = self._depths[0] if self._depths else ()
@@ -129,17 +131,17 @@ class Blocks:
 
     @property
     def waiting(self) -> bool:
-        """Whether there are ticks that are not evaluated yet."""
+        """Whether any queued tick is not evaluated yet."""
         return bool(self._ahead) or any(group.waiting for group in self._groups)
 
     @property
     def since(self) -> int:
-        """The first tick that is not evaluated yet; there is one."""
+        """The first queued tick; the queue must not be empty."""
         first = [group.waiting[0] for group in self._groups if group.waiting]
         return min([*first, *(each.time for each in self._ahead[:1])])
 
     def run_ahead(self, stopwatch: Callable[[], int]) -> None:
-        """Evaluate the groups that take one tick at a time, while the others wait. `run` returns their events."""
+        """Evaluate the groups that take one tick at a time; the others wait. `run` returns their events."""
         clients = [*self._context.clients]
         for group in self._depths[0]:
             if group.waiting and not group.may_wait:
@@ -149,7 +151,7 @@ class Blocks:
                 )
 
     def run(self, stopwatch: Callable[[], int]) -> list[Happened]:
-        """Evaluate all ticks that wait; what happened, in order."""
+        """Evaluate all queued ticks; returns what happened, in order."""
         happened, self._ahead = self._ahead, []
         clients = [*self._context.clients]
         for groups in self._depths:
@@ -173,7 +175,7 @@ class Blocks:
     def run_with_samples(
         self, stream: str, time: int, only: Mapping[str, Only], stopwatch: Callable[[], int]
     ) -> list[Happened]:
-        """Evaluate the rules that are evaluated with the samples of a stream, by rule for these subjects."""
+        """Evaluate the rules that are triggered by the samples of a stream; `only` has the subjects of each rule."""
         group = self._on_sample[stream]
         present = sorted({client for each in only.values() for client in each.present(self._context.clients)})
         return self._noted(_timed(group, (time,), stopwatch, group.evaluate((time,), present, self._floor(), only)))
@@ -182,7 +184,7 @@ class Blocks:
 def _timed(
     group: RuleGroup | PairGroup, ticks: Sequence[int], stopwatch: Callable[[], int], happened: Iterator[Happened]
 ) -> list[Happened]:
-    """All that happened; the time that it took is shared out among the rules."""
+    """All that happened; the time spent is divided among the rules."""
     begin = stopwatch()
     found = [*happened]
     spent = (stopwatch() - begin) // max(len(group.runs), 1)

@@ -1,4 +1,4 @@
-"""Signals over what conditions see, for rules that are evaluated one by one."""
+"""Signals over other signals, for rules that are evaluated one by one."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ from wayside.rules import CompiledRule
 def with_derived(
     rule: CompiledRule, past: Past, now: int, candidates: Iterable[Candidate], counters: RuleCounters
 ) -> Iterator[Candidate]:
-    """The subjects with these signals among their variables, and with what statistics of episodes are over."""
+    """The subjects with these signals among their variables, and with the values that statistics of episodes
+    aggregate."""
     by_element: dict[str | None, list[Candidate]] = {}
     for candidate in candidates:
         by_element.setdefault(candidate.subject.element, []).append(candidate)

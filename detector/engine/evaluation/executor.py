@@ -1,6 +1,6 @@
-"""The steps of a timeline are carried out here: samples go into the buffer, rules are evaluated at ticks.
+"""Carries out the steps of a timeline: inserts samples into the buffer, and evaluates rules at ticks.
 
-Ticks wait to be evaluated together as long as nothing happens between them that an evaluation could see or change.
+Ticks are queued and evaluated together as long as nothing happens between them that an evaluation could see or change.
 """
 
 from __future__ import annotations
@@ -54,17 +54,17 @@ class Executor:
         self._runs: Mapping[str, RuleRun] = {}
         self._blocks = Blocks(known.context, lambda: known.floor)
         self._order: dict[str, int] = {}
-        """The rules' places in the order of evaluation."""
+        """The position of each rule in the order of evaluation."""
         self._others: list[CompiledRule] = []
         """Rules that are not evaluated in blocks."""
         self._alone: set[str] = set()
-        """Rules of which somebody looks at each evaluation by itself."""
+        """Rules with an observer that needs each evaluation separately."""
         self._losing: set[str] = set()
-        """Rules that have not ended the episodes of lost clients yet."""
+        """Rules whose episodes of lost clients have not been ended yet."""
         self._last_wait = now()
-        """The last tick that waits to be evaluated."""
+        """The last queued tick."""
         self._unsorted: int | None = None
-        """From where on the journal is not in order yet; None: it is."""
+        """From this index on, the journal is not sorted yet; None: it is sorted."""
 
     @property
     def in_columns(self) -> frozenset[str]:
@@ -84,7 +84,8 @@ class Executor:
         self._others = [run.rule for run in self._runs.values() if run.rule.enabled]
 
     def plan(self) -> None:
-        """Decide which rules are evaluated in columns, and which together, after rules or thinning changed."""
+        """After a change of rules or thinning: decide which rules are evaluated in columns, and which of them
+        together."""
         if self._known.tables.full:
             self._known.new_tables()
         self._make_blocks()
@@ -106,7 +107,7 @@ class Executor:
         self._blocks.set_rules(self._runs, self._schedule.paused, lambda run: thinning(run.rule))
 
     def run(self, steps: Iterable[Step]) -> list[Event]:
-        """Carry out these steps; what happened, in order."""
+        """Carry out these steps; returns what happened, in order."""
         if {name for name, run in self._runs.items() if run.alone} != self._alone:
             self.plan()
         events: list[Event] = []
@@ -135,7 +136,7 @@ class Executor:
         return in_order and last - self._blocks.since <= LONGEST and self._known.buffer.takes(size)
 
     def _evaluate_waiting(self) -> list[Event]:
-        """Evaluate the ticks that wait."""
+        """Evaluate the queued ticks."""
         if not self._blocks.waiting:
             return []
         self._known.settle()
@@ -150,7 +151,7 @@ class Executor:
         return events
 
     def _in_columns(self) -> list[Happened]:
-        """Evaluate what waits, and put in order what happened."""
+        """Evaluate the queued ticks, and sort what happened."""
         journal = self._instruments.journal
         noted = self._unsorted if self._unsorted is not None else len(journal or ())
         self._unsorted = None
@@ -165,9 +166,9 @@ class Executor:
         if self._known.tables.full:
             events += self._evaluate_waiting()
             self.plan()
-        if regular:  # else it is there for a single sample or subject, and must cost no look at all the others
+        if regular:  # otherwise it is there for a single sample or subject, and must not scan all the others
             if self._known.clients.may_lose(time):
-                events += self._evaluate_waiting()  # who is lost now was known at the ticks before
+                events += self._evaluate_waiting()  # clients that are lost now were known at the earlier ticks
                 self._keep_house(time)
             elif time % HOUSEKEEPING == 0:
                 self._keep_house(time)
@@ -189,7 +190,8 @@ class Executor:
         return events
 
     def _is_alone(self, tick: Tick, groups: Sequence[RuleGroup | PairGroup]) -> bool:
-        """Whether the tick cannot wait: for rules that are not in columns, or have to look who was lost."""
+        """Whether the tick must be evaluated at once: for rules that are not in columns, or that must check for lost
+        clients."""
         if self._losing and any(run.rule.name in self._losing for group in groups for run in group.runs):
             return True
         return any(
@@ -231,14 +233,14 @@ class Executor:
     def _with_samples(
         self, time: int, regular: bool, sampled: Mapping[str, frozenset[str]]
     ) -> Mapping[str, list[Event]]:
-        """What happens to the rules in columns that are evaluated with samples, by rule."""
+        """What happens to the rules in columns that samples trigger, by rule."""
         happened: dict[str, list[Event]] = {}
         for stream, runs in self._blocks.with_samples.items():
             chosen: dict[str, Only] = {}
             for run in runs:
                 name = run.rule.name
                 happened[name] = self._lost(name, time) if regular else []
-                only, thinned = self._schedule.whom(run.rule, time, sampled)
+                only, thinned = self._schedule.selection(run.rule, time, sampled)
                 run.counters.skipped += thinned
                 if only.clients or only.subjects:
                     chosen[name] = only
@@ -257,20 +259,20 @@ class Executor:
         return [subject for subject in subjects if only.takes(subject)]
 
     def _seen(self, events: list[Event]) -> list[Event]:
-        """The events, once rules that look at episodes of others can see them."""
+        """Return the events, after making them visible to rules that read episodes of other rules."""
         for event in events:
             self._starts.note(event)
         return events
 
     def noted(self, run: RuleRun, events: Iterable[Event]) -> list[Event]:
-        """The events, once other rules and the rule's actions know of them."""
+        """Return the events, after reporting them to other rules and to the rule's actions."""
         happened = self._seen([*events])
         for event in happened:
             self._consequences.note(run.rule, event)
         return happened
 
     def _turn(self, run: RuleRun, time: int, sampled: Mapping[str, frozenset[str]], regular: bool) -> list[Event]:
-        """What happens to a rule at a tick; `regular`: it is one of some rule's periods, or of housekeeping."""
+        """What happens to a rule at a tick; `regular`: the tick belongs to a rule's period or to housekeeping."""
         rule = run.rule
         if rule.every_ns is not None:
             if time % rule.every_ns:
@@ -282,7 +284,7 @@ class Executor:
         events = run.lose(time, self._clients) if regular else []
         if rule.on_sample is None:
             return events
-        only, thinned = self._schedule.whom(rule, time, sampled)
+        only, thinned = self._schedule.selection(rule, time, sampled)
         run.counters.skipped += thinned
         if only.clients or only.subjects:
             events += self._evaluated(run, time, only)
@@ -310,13 +312,13 @@ class Executor:
             self._schedule.wake(run.rule.name, subject, at)
 
     def wake_all(self, time: int) -> None:
-        """Rules or time changed."""
+        """Rules or time changed: evaluate every subject at the next tick."""
         for run in self._runs.values():
             if run.rule.on_sample is not None:
                 self._wake(run, time, run.subjects)
 
     def gap(self, time: int, backwards: bool) -> None:
-        """Time goes on from here without the ticks between; `backwards`: it may be earlier. Nanoseconds."""
+        """Continue at this time without the ticks between; `backwards`: it may be earlier. Nanoseconds."""
         if backwards:
             self._starts.step_back(time)
         self._known.gap(time, backwards)

@@ -1,4 +1,4 @@
-"""Rules about clients or the fleet that are due at the same ticks: from their observations to their episodes."""
+"""Rules about clients or the fleet that are due at the same ticks: brings observations into episodes."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ from wayside.rules import ClientSubject
 
 
 class SubjectChanges(NamedTuple):
-    """When a subject has to be looked at, by the block's ticks, and its observations then."""
+    """The ticks of the block at which a subject must be evaluated, and its observations there."""
 
     row: int
     """The subject's track."""
     at: int
-    """Its place among the block's clients."""
+    """The client's index in the block."""
     ticks: list[int]
     codes: list[int]
 
 
 class RuleGroup:
-    """The rules that are due at the same ticks, and what was last seen of their subjects."""
+    """The rules that are due at the same ticks, and the last observation of each subject."""
 
     def __init__(
         self,
@@ -47,12 +47,13 @@ class RuleGroup:
         period: int,
         columns: type[ClientGroup | FleetGroup] = ClientGroup,
     ) -> None:
-        """`every` is the rules' period, `period` that at which they are evaluated: longer where some are left out."""
+        """`every` is the period of the rules, `period` the one at which they are evaluated: longer if evaluations are
+        thinned."""
         self.every = every
         self.period = period
         self.runs = runs
         self.waiting: list[int] = []
-        """Ticks that are not evaluated yet."""
+        """Queued ticks."""
         elements = [(run, element) for run in runs for element in run.rule.elements]
         self.columns = columns(
             [Track(run.rule, each, run.counters, run.read, row, run.past) for row, (run, each) in enumerate(elements)],
@@ -60,9 +61,9 @@ class RuleGroup:
         )
         self.observer: Observer | None = None
         self.may_wait = True
-        """Whether several ticks are evaluated together."""
+        """Whether several ticks can be evaluated together."""
         self.width = len(self.columns.tracks)
-        """How many columns there are for each client."""
+        """Number of columns per client."""
         self._of = [run for run in runs for _ in run.rule.elements]
         """The rule of each track."""
         self._budgeted = [run for run in runs if run.rule.maximum_per_hour is not None]
@@ -70,19 +71,20 @@ class RuleGroup:
         """Whether some rule has statistics of its episodes."""
         self._deploying = [(row, run) for row, run in enumerate(self._of) if run.has_deploys]
         self._plain = [isinstance(run.rule.subject, ClientSubject) and not run.rule.has_actions for run in self._of]
-        """Rules of which only signals go into events, and nothing is rendered."""
+        """Rules whose events contain only signals, and that render nothing."""
         self._orders = [orders[run.rule.name] for run in self._of]
         self._context = context
         self._version = -1
         self._last: Codes = np.zeros((0, 0), np.uint8)
         self._wakes: Integers = np.zeros((0, 0), np.int64)
         self._watched: Truths = np.zeros((0, 0), bool)
-        """Which subjects have a state of their own. These have a row for each track, a column for each client."""
+        """Which subjects have a state. This array and the next ones have a row per track and a column per client."""
 
     def evaluate(
         self, ticks: Sequence[int], clients: Sequence[str], floor: int | None, only: Mapping[str, Only] | None = None
     ) -> Iterator[Happened]:
-        """What happens at these ticks. `only`: by rule, the subjects that it looks at; others are looked at in vain."""
+        """Evaluate these ticks; returns what happened. `only`: by rule, the subjects to evaluate; the others are
+        skipped."""
         if not clients and self.columns.needs_clients:
             return
         looked = None if only is None else self._looked(clients, only)
@@ -108,7 +110,7 @@ class RuleGroup:
             run.tidy_starts(last)
 
     def _looked(self, clients: Sequence[str], only: Mapping[str, Only]) -> Truths:
-        """Which track looks at which client."""
+        """Which track evaluates which client."""
         looked = np.zeros((len(self._of), len(clients)), bool)
         for row, (run, track) in enumerate(zip(self._of, self.columns.tracks, strict=True)):
             chosen = only.get(run.rule.name)
@@ -117,7 +119,7 @@ class RuleGroup:
         return looked
 
     def _follow(self) -> None:
-        """Know all clients, and the states that changed otherwise."""
+        """Add new clients, and the states that changed elsewhere."""
         tables = self._context.tables
         if self._version != tables.version:
             self._version = tables.version
@@ -126,7 +128,7 @@ class RuleGroup:
             self._watched = np.zeros(nobody, bool)
             for run in self.runs:
                 run.disturbed = True
-        # Before there is room for all clients: of a subject that was restored, no sample may have come yet.
+        # This comes before there is room for all clients: a restored subject may not have received a sample yet.
         watched = {
             row: [self.columns.number(each) for each in run.subjects if each.element == track.element.name]
             for row, (run, track) in enumerate(zip(self._of, self.columns.tracks, strict=True))
@@ -146,7 +148,7 @@ class RuleGroup:
             run.disturbed = False
 
     def _changed(self, block: Block | FleetBlock, codes: Codes, looked: Truths | None) -> Iterator[SubjectChanges]:
-        """Of each subject, where it matters, the ticks at which the observation changes or something is due."""
+        """Of each subject that matters, the ticks at which its observation changes or a timer expires."""
         numbers, last = block.numbers, int(block.times[-1])
         changed = np.empty(codes.shape, bool)
         np.not_equal(codes[:, :, 0], self._last[:, numbers], out=changed[:, :, 0])
@@ -183,7 +185,8 @@ class RuleGroup:
     def _step(
         self, block: Block | FleetBlock, changes: SubjectChanges, number: int, states: list[tuple[int, int, bool, int]]
     ) -> list[Happened]:
-        """Bring one subject's state forward over all ticks of the block; adds whether it has one, and when to look."""
+        """Advance one subject's state over all ticks of the block; notes whether it keeps a state, and when to evaluate
+        it again."""
         row, at = changes.row, changes.at
         run, track = self._of[row], self.columns.tracks[row]
         subject = track.subject(block.clients[at])
@@ -224,7 +227,7 @@ class RuleGroup:
         return Candidate(subject, seen, in_scope=True, near=True, measured=block.measured_at(track.row, point))
 
     def _measure(self, block: Block) -> None:
-        """Take the rest of the block into the statistics of the open episodes."""
+        """Add the rest of the block to the statistics of the open episodes."""
         at = {client: place for place, client in enumerate(block.clients)}
         for row, (run, track) in enumerate(zip(self._of, self.columns.tracks, strict=True)):
             for subject in run.measured:
@@ -232,7 +235,7 @@ class RuleGroup:
                     self._measure_until(block, row, at[subject.clients[0]], subject, len(block.ticks))
 
     def _measure_until(self, block: Block | FleetBlock, row: int, at: int, subject: Subject, end: int) -> None:
-        """Take the block's ticks before `end` into the statistics of the subject's episode, if it has any."""
+        """Add the block's ticks before `end` to the statistics of the subject's episode, if it has one."""
         run = self._of[row]
         statistics = run.statistics(subject)
         if statistics is None or not isinstance(block, Block):

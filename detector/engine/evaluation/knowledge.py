@@ -1,6 +1,6 @@
-"""What the engine knows of its clients: their samples, how these are read, and what is computed from them.
+"""What the engine knows of its clients: their samples, how to read them, and the values computed from them.
 
-It follows the Detector. Time comes in with each call; rules and episodes are not its business.
+It follows changes of the Detector. Each call gives the time; rules and episodes are kept elsewhere.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from wayside.rules import compile_stream
 _SAMPLE = frozenset({"sample"})
 
 _DEFINED = (Encoding.CDR, Encoding.UPER)
-"""Encodings that are read by definitions."""
+"""Encodings that need message definitions."""
 
 
 class Knowledge:
@@ -50,7 +50,7 @@ class Knowledge:
         *,
         exact: bool = True,
     ) -> None:
-        """`starts` are the episode starts that signals over rules look at. `exact`: see `timeline.ORDER`.
+        """`starts` are the episode starts that signals over rules read. `exact`: see `timeline.ORDER`.
 
         Raises:
             RuleError: an expression of one of the Detector's streams does not compile.
@@ -63,14 +63,14 @@ class Knowledge:
         self._exact = exact
         self._rows_forgotten = start
         self._floor: int | None = None
-        """Windows do not reach back further than the last gap; nanoseconds."""
+        """Windows start after the last gap; nanoseconds."""
         self._configure(detector, decoders, read_key, start)
 
     def follow(self, detector: Detector, decoders: Mapping[str, Decoder], read_key: KeyReader, now: int) -> None:
-        """Go on with a changed Detector. Samples of streams that are read as before stay.
+        """Switch to a changed Detector. Samples of streams that are read as before are kept.
 
         Raises:
-            RuleError: an expression of one of its streams does not compile; nothing has changed then.
+            RuleError: an expression of one of its streams does not compile; the state is then unchanged.
         """
         before = self.detector.spec
         self._configure(detector, decoders, read_key, now)
@@ -123,11 +123,11 @@ class Knowledge:
             self.signals,
             self._exact,
         )
-        """What rules in columns look at; a new one with each change of the Detector."""
+        """The inputs of rules in columns; replaced with each change of the Detector."""
 
     @property
     def floor(self) -> int | None:
-        """Windows do not reach back to this time or beyond; nanoseconds."""
+        """Windows start after this time; nanoseconds."""
         return self._floor
 
     def settle(self) -> None:
@@ -138,23 +138,23 @@ class Knowledge:
         ingest.noting = not self.tables.empty
 
     def forget_rows(self, now: int) -> None:
-        """Forget what the tables need no longer, once a second: all ticks up to `now` (nanoseconds) have run."""
+        """Drop table rows that are no longer needed, once a second: all ticks up to `now` (nanoseconds) have run."""
         if not 0 <= now - self._rows_forgotten < HOUSEKEEPING:
             self._rows_forgotten = now
             self.tables.expire(now - now % HOUSEKEEPING)
 
     def new_tables(self) -> None:
-        """Begin with new tables: rules that are evaluated in columns have to be set again."""
+        """Create new tables: rules that are evaluated in columns must be set again."""
         tables = self.tables
         self.tables = Tables(self.buffer)
         self.tables.follow(tables)
         self.context = self.context._replace(tables=self.tables)
 
     def age(self, time: int) -> list[str]:
-        """Forget old samples, at whole seconds, and lost clients; returns who is lost."""
-        if time % HOUSEKEEPING == 0:  # not with the ticks of a rule: what the caps push out would depend on rules
+        """Forget lost clients and, at whole seconds, old samples; returns the lost clients."""
+        if time % HOUSEKEEPING == 0:  # not at rule ticks: evictions must not depend on rules
             if self.tables.behind:
-                self.settle()  # while the buffer still has what the ticks that wait look at
+                self.settle()  # while the buffer still has what the queued ticks read
             self.buffer.expire(time)
         lost = self.clients.lose(time) if self.clients.may_lose(time) else []
         if lost:
@@ -163,7 +163,7 @@ class Knowledge:
         return lost
 
     def gap(self, time: int, backwards: bool) -> None:
-        """Time went on from here without us, or (backwards) restarts: windows do not reach back further."""
+        """Time moved on to here without ticks, or (backwards) restarts: later windows start after it."""
         if backwards:
             self.buffer.step_back(time)
             self.ingest.step_back(time)
@@ -174,16 +174,16 @@ class Knowledge:
         self.clients.gap(time)
 
     def looked(self, now: int) -> None:
-        """The tick is over: what was decoded for it is not needed any more."""
+        """The tick is over: release what was decoded for it."""
         self.messages.forget()
         self.transforms.forget(now)
 
     def stamp_of(self, arrival: Arrival) -> int | None:
-        """The arrival's time with clock Data; None where it cannot be read, which is counted."""
+        """The arrival's time with clock Data; None if it cannot be read, which is counted."""
         return self.messages.time(arrival.stream, arrival.key, arrival.received, arrival.payload)
 
     def sampled(self, arrivals: Sequence[Arrival]) -> Mapping[str, frozenset[str]]:
-        """By stream, the known clients of which these samples are."""
+        """By stream, the known clients that sent these samples."""
         found: dict[str, set[str]] = {}
         for arrival in arrivals:
             for client in self.ingest.clients_of(arrival):
@@ -192,13 +192,13 @@ class Knowledge:
         return {stream: frozenset(clients) for stream, clients in found.items()}
 
     def latency(self, sample: Sample, stream: str) -> float | None:
-        """Seconds from the sample's stamp to its receipt; None where it carries no stamp. Counts nothing."""
+        """Seconds from the sample's stamp to its receipt; None if it has no stamp. Counts nothing."""
         values = self.messages.values(stream, sample, _SAMPLE, {})
         latency = None if values is None else values["sample"].get("latency")
         return latency if isinstance(latency, float) else None
 
     def views(self, run: RuleRun, time: int) -> Views:
-        """What a rule sees at a time."""
+        """The values that a rule can read at a time."""
         return Views(
             run.rule,
             time,
@@ -212,13 +212,13 @@ class Knowledge:
         )
 
     def queries(self, now: int) -> BufferQueries:
-        """What is in the buffer."""
+        """Read access to the buffer."""
         return BufferQueries(
             now, self._floor, self.buffer, self.clients, self.messages, self._stale_after, self.transforms
         )
 
     def forget_rules(self, kept: Collection[str]) -> None:
-        """Forget the signals of all rules but these."""
+        """Forget the signals of all rules except these."""
         self.signals.forget(lambda rule, client: rule in kept)
 
 
@@ -231,7 +231,7 @@ def _transform_streams(detector: Detector) -> list[TransformStream]:
 
 
 def _reads_like(stream: Stream, before: Stream | None) -> bool:
-    """Whether samples taken in before can be read as ones of the stream."""
+    """Whether samples taken in earlier can be read as samples of the stream."""
     return before is not None and _reading(stream) == _reading(before)
 
 

@@ -1,4 +1,4 @@
-"""What looks on at an engine. It decides nothing, and nothing is computed for it."""
+"""Observers of an engine. They influence no result, and nothing is computed only for them."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from detector.engine.episodes.demands import DemandChange
 
 
 class Observer(Protocol):
-    """Receives each block as it was evaluated in columns. It copies what it keeps."""
+    """Receives each block that was evaluated in columns, and copies what it keeps."""
 
     def clients(self, tracks: Sequence[Track], block: Block, codes: Codes, looked: Truths | None) -> None:
         """Rules about clients: the observations have shape (tracks, clients, ticks), `looked` (tracks, clients).
 
-        The block has the signals and, by field, where conditions are true and false (`verdicts`), one row a track.
+        The block has the signals and, by field, where conditions are true and false (`verdicts`), one row per track.
         """
 
     def fleet(self, tracks: Sequence[Track], block: FleetBlock) -> None:
@@ -32,10 +32,10 @@ class Observer(Protocol):
 
 @dataclass
 class Instruments:
-    """What looks on; all are off at first."""
+    """The observers; all are off by default."""
 
     stopwatch: Callable[[], int] = int
-    """Returns nanoseconds of any clock that runs; the counters use it."""
+    """Returns nanoseconds of any running clock, for the counters."""
     journal: list[DemandChange] | None = None
-    """What became of demands, in order."""
+    """Changes of demands, in order."""
     observer: Observer | None = None

@@ -1,4 +1,4 @@
-"""A rule about pairs in columns: its pairs' states, brought forward only where an observation changes."""
+"""A rule about pairs in columns: advances the states of its pairs only where an observation changes."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ _SHIFT = 32
 
 
 class Watched(NamedTuple):
-    """The pairs with a state of their own, in any order."""
+    """The pairs that have a state, in any order."""
 
     keys: Integers
-    """The numbers of both clients in one integer."""
+    """The numbers of both clients, combined in one integer."""
     last: NDArray[np.uint8]
-    """The observation before."""
+    """The previous observation."""
     wakes: Integers
-    """When to look again although nothing changes; nanoseconds."""
+    """When to evaluate the pair again although nothing changes; nanoseconds."""
     in_progress: Truths
-    """Whether an episode is open or pending; the others rest."""
+    """Whether an episode is open or pending; otherwise the pair is in its cooldown."""
     matters: NDArray[np.uint8]
     """The bits of an observation that count: those that end an open episode, else those that start one."""
 
     def of(self, at: Integers | Truths) -> Watched:
-        """These of them."""
+        """Select these."""
         return Watched(self.keys[at], self.last[at], self.wakes[at], self.in_progress[at], self.matters[at])
 
 
@@ -52,13 +52,13 @@ _STARTS, _ENDS = 3, 12
 
 
 class PairGroup:
-    """One rule about pairs. It is driven like a `RuleGroup`."""
+    """One rule about pairs, with the same interface as `RuleGroup`."""
 
     width = 1
     may_wait = False  # samples that cannot be read are counted at each tick that reads them
 
     def __init__(self, run: RuleRun, order: int, context: Context, every: int, period: int) -> None:
-        """`order` is the rule's place among the rules; for the rest see `RuleGroup`."""
+        """`order` is the rule's position among the rules; for the other arguments see `RuleGroup`."""
         self.every = every
         self.period = period
         self.runs: Sequence[RuleRun] = (run,)
@@ -74,13 +74,13 @@ class PairGroup:
         self._version = -1
         self._clients: Sequence[str] = ()
         self._numbers: Integers = np.zeros(0, np.int64)
-        """Those of the clients, at this version of the tables."""
+        """The clients' numbers in this version of the tables."""
         self._numbered = -1
 
     def evaluate(
         self, ticks: Sequence[int], clients: Sequence[str], floor: int | None, only: Mapping[str, Only] | None = None
     ) -> Iterator[Happened]:
-        """What happens at these ticks; such a rule looks at all pairs."""
+        """Evaluate these ticks; returns what happened. Such a rule evaluates all pairs."""
         assert only is None  # noqa: S101  it is not evaluated with samples
         for tick in ticks:
             yield from self._tick(tick, clients, floor)
@@ -98,7 +98,7 @@ class PairGroup:
         these = self._columns.evaluate(block, floor, (first[look], second[look]))
         if self.observer is not None:
             self.observer.pairs(self._track, these)
-        # Where each watched pair is among those that were looked at; -1: it was not.
+        # Where each watched pair is among the evaluated ones; -1: it was not evaluated.
         pairs = these.first * count + these.second
         rows = np.searchsorted(pairs, first * count + second)
         rows[rows == len(pairs)] = 0
@@ -121,7 +121,7 @@ class PairGroup:
         self._watched = _joined(watched.of(~stale & ~over), kept)
 
     def _measure(self, tick: int, these: PairBlock, index: Integers) -> None:
-        """Take the tick into the statistics of the open episodes; `index`: where clients are in the block."""
+        """Add the tick to the statistics of the open episodes; `index`: the clients' indices in the block."""
         tables, count = self._context.tables, len(these.block.clients)
         pairs = these.first * count + these.second
         for subject, statistics in self._run.measured.items():
@@ -141,7 +141,7 @@ class PairGroup:
         return Block(self._context, (tick,), clients, self._numbers)
 
     def _follow(self) -> None:
-        """Know the states that changed otherwise."""
+        """Pick up states that changed elsewhere."""
         run, tables = self._run, self._context.tables
         if self._version == tables.version and not run.disturbed:
             return
@@ -176,7 +176,7 @@ class PairGroup:
         return np.array(needed, bool)
 
     def _step(self, tick: int, these: PairBlock, row: int, kept: list[Entry]) -> Iterator[Happened]:
-        """Bring one pair's state forward, and add it to those that are kept where it is still needed."""
+        """Advance one pair's state, and add it to the kept ones if it is still needed."""
         run, key, code = self._run, self._key(these, row), int(these.codes[row])
         subject = self._subject(key)
         state = run.state(subject) or run.new_state(subject)

@@ -1,4 +1,4 @@
-"""The evaluation of one rule: its subjects' states, tick by tick, and the episodes that are open."""
+"""The evaluation of one rule: the states of its subjects, tick by tick, and its open episodes."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class OnDemandResult:
     when: bool | None
     """None: unknown."""
     values: Mapping[str, JsonValue]
-    """Signals, as in an event; what is unknown is left out."""
+    """Signals, as in an event; unknown ones are left out."""
     episode: str | None
     """The open episode, after this evaluation."""
     start_time: int | None
@@ -55,28 +55,29 @@ class RuleRun:
         self._timing = Timing(rule.for_ns, rule.cooldown_ns, rule.unknown_timeout_ns)
         self._follows = any(deploy.follow for deploy in rule.deploys)
         self.past = Past()
-        """What signals over others look back on."""
+        """Earlier values for signals over other signals."""
         self.witness: Callable[[Evaluated], None] | None = None
-        """Called with each evaluation while it is set. It decides nothing."""
+        """If set, called with each evaluation. It influences no result."""
         self.version = 0
         """Changes whenever the demands do."""
         self._states: dict[Subject, SubjectState] = {}
         self._open: dict[Subject, Episode] = {}
         self._muted: set[Subject] = set()
-        """Subjects in an episode beyond the budget: it goes on, without events."""
+        """Subjects with an episode beyond the budget: the episode continues, without events."""
         self._budget = Budget()
         self._answers: list[OnDemandResult] | None = None
         self.looked_at: list[Subject] = []
         """The subjects of the last evaluation."""
         self.disturbed = True
-        """Whether states changed otherwise than by `run`, so that every subject has to be looked at again."""
+        """Whether states changed outside `run`, so that every subject must be evaluated again."""
         self.journal: list[DemandChange] | None = None
-        """What became of demands, in order of time; None while nobody reads it."""
+        """Changes of demands, in time order; None while nobody reads them."""
 
     def tick(
         self, now: int, views: Views, clients: Clients, plugins: PluginSignals, only: Only | None = None
     ) -> list[Event]:
-        """Evaluate the rule, for all subjects or those given; returns what started and ended, in order of subjects."""
+        """Evaluate the rule for all subjects, or for `only` these; returns what started and ended, in order of
+        subjects."""
         self.disturbed = True
         events = [] if only is not None else [*self._lost(now, clients)]
         self.looked_at = []
@@ -93,7 +94,7 @@ class RuleRun:
         return sorted(events, key=lambda event: event.subject)
 
     def lose(self, now: int, clients: Clients) -> list[Event]:
-        """For a rule without a period: end the episodes of clients that are lost, and forget what is over."""
+        """For a rule without a period: end the episodes of lost clients, and forget states that have expired."""
         self.disturbed = True
         events = [*self._lost(now, clients)]
         self.tidy(now)
@@ -102,56 +103,56 @@ class RuleRun:
     def answer(
         self, now: int, views: Views, clients: Clients, plugins: PluginSignals
     ) -> tuple[list[Event], list[OnDemandResult]]:
-        """Evaluate the rule for all subjects; returns events, and the result for each, in order of the subjects."""
+        """Evaluate the rule for all subjects; returns the events, and the result for each subject in order."""
         self._answers = []
         events = self.tick(now, views, clients, plugins)
         answers, self._answers = self._answers, None
         return events, sorted(answers, key=lambda answer: answer.subject)
 
     def forget_pending(self) -> None:
-        """The rule is paused: open episodes hold, what was pending is forgotten."""
+        """The rule is paused: keep open episodes, discard pending ones."""
         self.disturbed = True
         for state in self._states.values():
             state.gap()
 
     @property
     def read(self) -> Mapping[str, str]:
-        """By condition, the text that errors add about what it reads."""
+        """By condition, the text about its inputs that errors contain."""
         return self._read
 
     @property
     def alone(self) -> bool:
-        """Whether somebody looks at each evaluation by itself."""
+        """Whether an observer needs each evaluation separately."""
         return self.witness is not None or self.counters.notes is not None
 
     @property
     def subjects(self) -> Iterable[Subject]:
-        """Those with a state of their own."""
+        """The subjects that have a state."""
         return self._states
 
     def wakes(self, now: int, subjects: Iterable[Subject]) -> Iterator[tuple[Subject, int | None]]:
-        """When each of the subjects must be looked at; nanoseconds after `now`, None: at no time."""
+        """When each of the subjects must be evaluated again; nanoseconds after `now`, None: never."""
         for subject in subjects:
             state = self._states.get(subject)
             yield subject, None if state is None else state.wake(now, self._timing)
 
     def tidy(self, now: int) -> None:
-        """Forget subjects that are as if they were new, and starts that are over an hour old."""
+        """Forget subjects whose state equals a new one, and starts that are over an hour old."""
         self._states = {subject: state for subject, state in self._states.items() if not state.idle_at(now)}
         self._budget.expire(now)
 
     @property
     def open_episodes(self) -> int:
-        """How many episodes are open."""
+        """Number of open episodes."""
         return len(self._open)
 
     @property
     def pending(self) -> int:
-        """Subjects whose condition holds, but not yet as long as `for`."""
+        """Subjects whose condition holds, but for less than `for`."""
         return sum(state.onset is not None for state in self._states.values())
 
     def gap(self, time: int) -> None:
-        """Time went on (or back) without ticks: open episodes hold, what was pending is forgotten; windows reset."""
+        """Time moved on (or back) without ticks: keep open episodes, discard pending ones, reset windows."""
         self.disturbed = True
         self.past.clear()
         for state in self._states.values():
@@ -159,7 +160,7 @@ class RuleRun:
             state.rests_until = min(state.rests_until, time + self._timing.cooldown)
 
     def can_restore(self, episode: OpenEpisode) -> bool:
-        """Whether the episode is one of this rule, as it is now."""
+        """Whether the episode belongs to this rule in its current version."""
         return (
             self.rule.enabled
             and self.rule.digest == episode.rule_digest
@@ -168,10 +169,10 @@ class RuleRun:
         )
 
     def restore(self, episode: OpenEpisode, demands: Sequence[Demand]) -> Event:
-        """Take up an episode that was open before a restart, with the demands of its actions.
+        """Restore an episode that was open before a restart, with the demands of its actions.
 
-        Returns the event of its start. Where an action has changed, its demand holds until it is
-        rendered again, at the next evaluation.
+        Returns its start event. If an action has changed, its demand stays valid until it is rendered again, at the
+        next evaluation.
         """
         self.disturbed = True
         deploys = {deploy.action: deploy.fixed for deploy in self.rule.deploys}
@@ -196,9 +197,9 @@ class RuleRun:
         return (episode.kept(self.rule) for episode in self._open.values())
 
     def change_actions(self, rule: CompiledRule) -> None:
-        """Go on with a rule that differs in nothing that decides which episodes there are.
+        """Switch to a rule with the same conditions but other actions.
 
-        The demands of actions that are gone go at once, those of changed ones hold until they are rendered again.
+        Demands of removed actions end at once; those of changed actions stay valid until they are rendered again.
         """
         changed = {deploy.action for deploy in {*rule.deploys} ^ {*self.rule.deploys}}
         gone = changed - {deploy.action for deploy in rule.deploys}
@@ -211,7 +212,7 @@ class RuleRun:
             self._render(episode)
 
     def end_all(self, now: int, reason: Reason) -> Iterator[Event]:
-        """End every open episode, in order of the subjects, and forget what was pending."""
+        """End every open episode, in order of the subjects, and discard pending ones."""
         self.disturbed = True
         for subject in sorted(self._open, key=lambda each: each.text):
             yield self._cut_off(now, self._open.pop(subject), reason)
@@ -251,7 +252,7 @@ class RuleRun:
 
     @property
     def measured(self) -> Mapping[Subject, Statistics]:
-        """The statistics of the open episodes; none where the rule has no signals over episodes."""
+        """The statistics of the open episodes; empty if the rule has no signals over episodes."""
         return {subject: each.statistics for subject, each in self._open.items() if each.statistics is not None}
 
     def statistics(self, subject: Subject) -> Statistics | None:
@@ -283,11 +284,11 @@ class RuleRun:
             self._answers.append(self._answer(candidate, when))
 
     def state(self, subject: Subject) -> SubjectState | None:
-        """The subject's state, if it has one of its own."""
+        """The subject's state, if it has one."""
         return self._states.get(subject)
 
     def new_state(self, subject: Subject) -> SubjectState:
-        """A state of its own for the subject, as of one that was never looked at."""
+        """A new state for the subject."""
         state = self._states[subject] = SubjectState()
         return state
 
@@ -310,12 +311,13 @@ class RuleRun:
         return self._timing
 
     def needs_every_tick(self, subject: Subject) -> bool:
-        """Whether an evaluation matters although the subject's observation is the same: demands may change by it."""
+        """Whether the subject needs an evaluation although its observation is the same, because its demands may
+        change."""
         episode = self._open.get(subject)
         return episode is not None and (self._follows or not episode.is_complete(self.rule))
 
     def happened(self, now: int, what: Started | Ended, candidate: Candidate) -> Event | None:
-        """An episode of the subject started or ended; None: it has no event."""
+        """An episode of the subject started or ended; returns its event, None if it has none."""
         subject = candidate.subject
         if isinstance(what, Ended):
             if subject in self._muted:
@@ -332,7 +334,7 @@ class RuleRun:
         return None
 
     def stays(self, now: int, candidate: Candidate) -> None:
-        """Nothing started or ended: what the demands of an open episode follow may have changed."""
+        """Nothing started or ended, but parameters with `follow` of an open episode may have changed."""
         episode = self._open.get(candidate.subject)
         if episode is None:
             return
@@ -345,7 +347,7 @@ class RuleRun:
         self._note_demands(now, episode, before)
 
     def _note_demands(self, now: int, episode: Episode, before: Mapping[str, Demand], end: int | None = None) -> None:
-        """Note which demands differ from those before; or, where they end, all of them."""
+        """Note which demands differ from `before`; if they end, all of them."""
         if self.journal is None or self.rule.dry_run:
             return
         for action, demand in episode.demands.items():
@@ -395,5 +397,5 @@ class RuleRun:
 
 
 def same_semantics(run: RuleRun, rule: CompiledRule) -> bool:
-    """Whether open episodes go on under the new rule."""
+    """Whether open episodes continue under the new rule."""
     return run.rule.digest == rule.digest and run.rule.enabled == rule.enabled

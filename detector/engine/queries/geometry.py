@@ -11,11 +11,12 @@ Quaternion = tuple[float, float, float, float]
 IDENTITY: Quaternion = (0.0, 0.0, 0.0, 1.0)
 
 _NEARLY_EQUAL = 1e-6
-"""Radians below which slerp divides by next to nothing: there, the straight line is as good."""
+"""Angle in radians below which slerp would divide by almost zero: linear interpolation is precise enough there."""
 
 
 class Pose(NamedTuple):
-    """A place and an orientation; also the transform that takes what is seen from there into the frame it is in."""
+    """A position and an orientation; also the transform from the frame of this pose into the frame that it is given
+    in."""
 
     position: Vector
     """Metres."""
@@ -27,11 +28,11 @@ class Pose(NamedTuple):
         return _added(self.position, rotated(self.orientation, point))
 
     def after(self, other: Pose) -> Pose:
-        """First `other`, then this one."""
+        """The composition: first `other`, then this one."""
         return Pose(self.apply(other.position), product(self.orientation, other.orientation))
 
     def inverse(self) -> Pose:
-        """The way back."""
+        """The inverse transform."""
         x, y, z, w = self.orientation
         back = (-x, -y, -z, w)
         px, py, pz = rotated(back, self.position)
@@ -47,7 +48,7 @@ NO_MOTION = Pose((0.0, 0.0, 0.0), IDENTITY)
 
 
 def unit(quaternion: Quaternion) -> Quaternion | None:
-    """The quaternion at unit length; None where it is zero or not finite, and so is no orientation."""
+    """The quaternion at unit length; None if it is zero or not finite, and therefore no orientation."""
     length = math.hypot(*quaternion)
     if not 1e-6 < length < math.inf:
         return None
@@ -56,7 +57,7 @@ def unit(quaternion: Quaternion) -> Quaternion | None:
 
 
 def product(a: Quaternion, b: Quaternion) -> Quaternion:
-    """First b, then a."""
+    """The composition: first b, then a."""
     ax, ay, az, aw = a
     bx, by, bz, bw = b
     return (
@@ -68,7 +69,7 @@ def product(a: Quaternion, b: Quaternion) -> Quaternion:
 
 
 def rotated(quaternion: Quaternion, vector: Vector) -> Vector:
-    """The vector turned by a quaternion of unit length."""
+    """The vector, rotated by a quaternion of unit length."""
     x, y, z, w = quaternion
     vx, vy, vz = vector
     tx, ty, tz = 2 * (y * vz - z * vy), 2 * (z * vx - x * vz), 2 * (x * vy - y * vx)
@@ -78,7 +79,7 @@ def rotated(quaternion: Quaternion, vector: Vector) -> Vector:
 def slerp(a: Quaternion, b: Quaternion, share: float) -> Quaternion:
     """On the shorter great circle from a (share 0) to b (1), at constant angular speed (Shoemake 1985)."""
     cosine = sum(p * q for p, q in zip(a, b, strict=True))
-    sign = -1.0 if cosine < 0 else 1.0  # q and -q are the same orientation: take the one that is nearer
+    sign = -1.0 if cosine < 0 else 1.0  # q and -q are the same orientation: use the nearer one
     # An arccosine would lose half of the digits of a small angle.
     angle = 2 * math.atan2(
         math.hypot(*(p - sign * q for p, q in zip(a, b, strict=True))),

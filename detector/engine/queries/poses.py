@@ -13,7 +13,7 @@ class PoseError(ValueError):
 
 
 def pose_in(message: Any, at: str = "") -> Pose:
-    """The pose at a path such as `pose.pose`; without one, where ROS messages have it.
+    """The pose at a path such as `pose.pose`; without a path, at the places where ROS messages have it.
 
     A map with position (or translation) and orientation (or rotation); without an orientation it points along x. Raises
     PoseError.

@@ -1,9 +1,8 @@
 """The contents of the buffer at a tick, for plugins: decoded samples by client, stream, time and frame.
 
-A view at a tick shows the samples up to its time and none later, and never changes anything. `newest`, `last` and
-`between` go by the time at which a sample came in (the engine's time axis, see docs/concepts.md); whatever compares
-data with data (`nearest`, `pose`, `tuples`, `transform`) goes by the senders' stamps. All times are nanoseconds since
-the epoch.
+A view at a tick contains the samples up to its time, and never changes anything. `newest`, `last` and `between` use the
+time at which a sample came in (the engine's time axis, see docs/concepts.md). Methods that compare data with data
+(`nearest`, `pose`, `tuples`, `transform`) use the senders' stamps. All times are nanoseconds since the epoch.
 """
 
 from __future__ import annotations
@@ -33,23 +32,23 @@ class QueryError(ValueError):
 
 
 class DecodedSample(NamedTuple):
-    """One sample as a plugin sees it."""
+    """One sample in the form that plugins receive."""
 
     client: str
     stream: str
     key: str
-    """The full Zenoh key it came on."""
+    """The full Zenoh key of the message."""
     time: int
-    """Its place on the engine's time axis, in nanoseconds since the epoch."""
+    """Its time on the engine's time axis, in nanoseconds since the epoch."""
     stamp: int
-    """The sender's time in nanoseconds since the epoch; the receive time where the message carries none."""
+    """The sender's time in nanoseconds since the epoch; the receive time if the message has none."""
     message: Any
-    """Maps, lists, strings, booleans, None, bytes and doubles, as expressions see it; of a stream with items, the
-    client's item."""
+    """Maps, lists, strings, booleans, None, bytes and doubles, as in expressions; for a stream with items, the client's
+    item."""
 
 
 class Queries(Protocol):
-    """The buffer at one tick. `client=None` means all clients; samples that cannot be decoded are left out, counted.
+    """The buffer at one tick. `client=None` means all clients; samples that cannot be decoded are left out and counted.
 
     All raise QueryError for a stream that the Detector does not have.
     """
@@ -65,7 +64,7 @@ class Queries(Protocol):
         """The client's streams that are not stale."""
 
     def newest(self, client: str | None, stream: str, *, frame: str | None = None) -> DecodedSample | None:
-        """The sample that came last; with `frame`, of those whose header.frame_id it is."""
+        """The sample with the newest time; with `frame`, only of those with this header.frame_id."""
 
     def last(self, client: str | None, stream: str, count: int, *, frame: str | None = None) -> list[DecodedSample]:
         """The newest `count` samples, oldest first."""
@@ -73,39 +72,41 @@ class Queries(Protocol):
     def between(
         self, client: str | None, stream: str, after: int, until: int, *, frame: str | None = None
     ) -> list[DecodedSample]:
-        """The samples of (after, until], oldest first; like windows, not from before a gap in time."""
+        """The samples of (after, until], oldest first; like windows, none from before a gap in time."""
 
     def nearest(self, client: str | None, stream: str, stamp: int, *, frame: str | None = None) -> DecodedSample | None:
         """The sample whose stamp is nearest; of two equally near, the earlier one."""
 
     def pose(self, client: str, stream: str, stamp: int, *, at: str = "") -> Pose | None:
-        """Where the client was at that time, between the samples before and after (position linear, orientation slerp).
+        """The client's pose at that time, interpolated between the samples before and after (position linear,
+        orientation slerp).
 
-        None where there are no samples on both sides; at the very stamp of a sample, one is enough. `at` is the path to
+        None if there are no samples on both sides; at exactly the stamp of a sample, one is enough. `at` is the path to
         the pose in the message; without it, pose, pose.pose or transform.
 
         Raises:
-            PoseError: the messages hold no pose there.
+            PoseError: the messages have no pose at that path.
         """
 
     def tuples(self, client: str, streams: Sequence[str], slop: int) -> list[tuple[DecodedSample, ...]]:
         """Samples of several streams that belong together, oldest first; `slop` is in nanoseconds.
 
-        The first stream is the reference; how they are found stands in engine/queries/tuples.py.
+        The first stream is the reference; engine/queries/tuples.py explains the matching.
         """
 
     def transform(self, client: str, target: str, source: str, stamp: int | None = None) -> Pose:
-        """The pose of frame `source` in frame `target`: it takes points given in source into target.
+        """The pose of frame `source` in frame `target`: it transforms points given in source into target.
 
-        `stamp` None: the newest time for which all the transforms between them are known.
+        `stamp` None: the newest time for which all transforms between them are known.
 
         Raises:
-            TransformError: an unknown frame, frames that are not connected, or a time beyond the transforms' stamps.
+            TransformError: a frame is unknown, the frames are not connected, or the time is beyond the transforms'
+            stamps.
         """
 
 
 class BufferQueries:
-    """The queries, answered from the engine's buffer; there is a new one for each tick."""
+    """The queries over the engine's buffer; there is a new object for each tick."""
 
     def __init__(
         self,
@@ -212,7 +213,7 @@ class BufferQueries:
     def _newest_first(
         self, client: str | None, stream: str, after: int | None, until: int, frame: str | None
     ) -> Iterator[DecodedSample]:
-        """Of several clients, merged by time; of equal times, the client with the greater name first."""
+        """For several clients, merged by time; of equal times, the client with the greater name first."""
         names = self._names(client)
         lanes = [lane for name in names if (lane := self._lane(name, stream)) is not None]
         if len(lanes) == 1:
@@ -229,7 +230,7 @@ class BufferQueries:
                 yield decoded
 
     def _stamped(self, client: str, stream: str) -> list[tuple[int, int, Sample]]:
-        """The lane's samples with their stamps, in order of these, then of their times; computed once a tick."""
+        """The lane's samples with their stamps, sorted by stamp, then by time; computed once a tick."""
         known = self._by_stamp.get((client, stream))
         if known is None:
             lane = self._lane(client, stream)
@@ -264,7 +265,7 @@ class BufferQueries:
 
 
 def frame_of(message: Any) -> str | None:
-    """header.frame_id, where the message has one."""
+    """header.frame_id, if the message has one."""
     header = message.get("header") if isinstance(message, dict) else None
     frame = header.get("frame_id") if isinstance(header, dict) else None
     return frame if isinstance(frame, str) else None

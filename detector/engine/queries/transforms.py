@@ -1,8 +1,8 @@
 """The transform tree of each client, from the tf2_msgs/msg/TFMessage samples in the buffer.
 
-A transform says where a child frame is in its parent frame at its stamp; between two of them it is interpolated, before
-the first and after the last it is not known. Where a frame changes its parent, the last transform holds until then. On
-a latched stream (/tf_static) a transform holds at all times, and the one stamped last counts.
+A transform gives the pose of a child frame in its parent frame at its stamp. Between two transforms it is interpolated;
+before the first and after the last it is unknown. When a frame changes its parent, the last transform stays valid until
+then. On a latched stream (/tf_static) a transform is valid at all times, and the one with the newest stamp is used.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ class TransformStream:
 
     name: str
     static: bool
-    """Whether its transforms hold at all times."""
+    """Whether its transforms are valid at all times."""
     prefix: str
-    """What frames' names begin with and lose; `${client}` in it stands for the client's name."""
+    """The prefix that is removed from the names of frames; `${client}` in it stands for the client's name."""
 
 
 class Link(NamedTuple):
-    """Where a frame is in its parent."""
+    """The pose of a frame in its parent."""
 
     stamp: int
     parent: str
@@ -55,7 +55,7 @@ _Parsed = dict[str, list[Link]]
 
 
 class Transforms:
-    """Looks up transforms between frames. Samples are read once, on first use."""
+    """Looks up transforms between frames. Samples are parsed once, on first use."""
 
     def __init__(
         self, streams: Sequence[TransformStream], buffer: Buffer, messages: Messages, counters: Counters
@@ -65,14 +65,15 @@ class Transforms:
         self._messages = messages
         self._counters = counters
         self._parsed: dict[tuple[str, str], dict[Sample, _Parsed]] = {}
-        """By client and stream; no more than what is in the buffer."""
+        """By client and stream; only of samples in the buffer."""
         self._used: dict[tuple[str, str], int] = {}
         """When these were last used; nanoseconds."""
         self._trees: dict[str, _Tree] = {}
-        """Of this tick."""
+        """The trees of the current tick."""
 
     def forget(self, now: int) -> None:
-        """The tick is over. Entries that were not used lately go: they may hold samples that the buffer has dropped."""
+        """The tick is over. Drop entries that were not used lately: they may hold samples that the buffer has
+        dropped."""
         self._trees.clear()
         for place in [place for place, used in self._used.items() if not 0 <= now - used <= _REMEMBERED]:
             del self._used[place], self._parsed[place]
@@ -158,12 +159,12 @@ class _Tree:
         return back.inverse().after(there)
 
     def _newest_common(self, target: str, source: str) -> int:
-        """The newest time at which all moving transforms on the way are known; the tick where none moves."""
+        """The newest time at which all moving transforms on the path are known; the tick if none moves."""
         ups, downs = self._path(target, source, self._now)
         return min((links[-1].stamp for frame in (*ups, *downs) if (links := self._of(frame)[1])), default=self._now)
 
     def _path(self, target: str, source: str, stamp: int) -> tuple[list[str], list[str]]:
-        """The frames from source, and from target, up to below their closest common ancestor."""
+        """The frames from source, and from target, to just below their closest common ancestor."""
         ups, downs = self._upwards(source, stamp), self._upwards(target, stamp)
         common = next((frame for frame in ups if frame in downs), None)
         if common is not None:
@@ -193,10 +194,10 @@ class _Tree:
         return links[max(bisect_right(links, stamp, key=_stamp_of) - 1, 0)].parent
 
     def _pose(self, frame: str, stamp: int) -> Pose:
-        """Where the frame is in its parent at that time."""
+        """The pose of the frame in its parent at that time."""
         fixed, links = self._of(frame)
         if not links:
-            assert fixed is not None  # noqa: S101  only frames with a parent come here
+            assert fixed is not None  # noqa: S101  only frames with a parent get here
             return fixed.pose
         after = bisect_right(links, stamp, key=_stamp_of)
         if after == 0 or (after == len(links) and links[-1].stamp < stamp):
@@ -214,7 +215,7 @@ class _Tree:
         return before.pose.towards(following.pose, (stamp - before.stamp) / (following.stamp - before.stamp))
 
     def _of(self, frame: str) -> tuple[Link | None, list[Link]]:
-        """The frame's transform that always holds, and those of its stamps, in order of these."""
+        """The frame's static transform, and its moving ones sorted by stamp."""
         known = self._links.get(frame)
         if known is None:
             fixed = [link for parsed in self._fixed if frame in parsed for link in parsed[frame]]

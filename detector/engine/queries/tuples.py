@@ -1,4 +1,4 @@
-"""Which samples of several streams belong together: those of about the same stamp.
+"""Matches samples of several streams that have about the same stamp.
 
 The first stream is the reference. A tuple is one sample of each stream such that
 
@@ -6,8 +6,8 @@ The first stream is the reference. A tuple is one sample of each stream such tha
    own stream to each of them (of two equally near ones, that with the smaller stamp; of equal stamps, the first),
 2. the stamps of all of them lie within `slop` of each other.
 
-So a sample is in one tuple at most, and which tuples there are depends neither on the order of arrival nor on where the
-search begins.
+So a sample is in at most one tuple, and the result depends neither on the order of arrival nor on where the search
+begins.
 """
 
 from __future__ import annotations
@@ -20,8 +20,9 @@ def matched(stamps: Sequence[Sequence[int]], slop: int) -> list[tuple[int, ...]]
     """The tuples, as indices into each stream's stamps, in order of the reference.
 
     Args:
-        stamps: of each stream its samples' stamps in ascending order; nanoseconds. The first is the reference.
-        slop: how far apart the stamps of a tuple may be, in nanoseconds.
+        stamps: for each stream the stamps of its samples in ascending order; nanoseconds. The first stream is the
+            reference.
+        slop: maximum distance between the stamps of a tuple, in nanoseconds.
     """
     reference, *others = stamps
     found = []
@@ -42,9 +43,9 @@ def matched(stamps: Sequence[Sequence[int]], slop: int) -> list[tuple[int, ...]]
 
 
 def nearest(stamps: Sequence[int], time: int) -> int:
-    """The index of the stamp nearest to `time`; of two equally near the smaller one, of equal ones the first.
+    """The index of the stamp nearest to `time`; of two equally near ones the smaller, of equal ones the first.
 
-    `stamps` ascend and there is at least one.
+    `stamps` is ascending and not empty.
     """
     after = bisect_left(stamps, time)
     if after == 0:

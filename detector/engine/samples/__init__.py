@@ -1,1 +1,1 @@
-"""What comes in: samples and tokens, and the one place where they get their receive time."""
+"""The input: samples and tokens, and the one place where they get their receive time."""

@@ -1,10 +1,9 @@
 """The one place where samples get their receive time.
 
-The thread that receives a message stamps and queues it without a lock: a lock would cost more than all the rest. So
-two threads may queue out of order by a few microseconds, and a thread may pause between stamping and queueing. `drain`
-therefore settles the times: they never go back, and all are later than what was drained before and than the last
-`until`. So no sample ever belongs to a time whose tick has run, and samples of equal time are drained together, in
-their order.
+The thread that receives a message stamps and queues it without a lock: a lock would cost more than all the rest. Two
+threads may therefore queue out of order by a few microseconds, and a thread may pause between stamping and queueing.
+`drain` settles the times: they never go back, and all are later than what was drained before and than the last `until`.
+No sample ever belongs to a time whose tick has run, and samples of equal time are drained together, in their order.
 """
 
 from __future__ import annotations
@@ -18,39 +17,39 @@ from msgspec.structs import replace
 from detector.engine.samples.sample import SAMPLE_OVERHEAD, Arrival
 
 _PAUSE = 0.01
-"""Seconds between two looks whether there is room."""
+"""Seconds between two checks for room."""
 
 _RECEIVED = operator.attrgetter("received")
 
 
 class Intake:
-    """A bounded queue of arrivals. When it is full, what comes is dropped and counted."""
+    """A bounded queue of arrivals. When it is full, new messages are dropped and counted."""
 
     __slots__ = ("_last", "_lock", "_maximum_bytes", "_now", "_queue", "_room", "dropped", "on_urgent", "urgent")
 
     def __init__(self, now: Callable[[], int], *, maximum_bytes: int = 512 * 2**20) -> None:
-        """`now` gives nanoseconds since the epoch; `maximum_bytes` bounds what waits, overhead included.
+        """`now` returns nanoseconds since the epoch; `maximum_bytes` bounds the queued messages, including overhead.
 
-        The bound is kept to within what the threads queue at one go.
+        It can be exceeded by the messages that the threads queue at the same moment.
         """
         self._now = now
         self._maximum_bytes = maximum_bytes
         self._lock = threading.Lock()
         self._queue: list[Arrival] = []
-        """Stays the same list: appending to it and cutting off its beginning are each one step of the interpreter."""
+        """Always the same list: appending to it and deleting its beginning are atomic in the interpreter."""
         self._room = maximum_bytes
         self._last = 0
         self.dropped = 0
         self.urgent: frozenset[str] = frozenset()
         """Streams whose messages should be drained at once."""
         self.on_urgent: Callable[[], None] = lambda: None
-        """Called after messages of such a stream were queued, on the thread that queued them."""
+        """Called after messages of such a stream were queued, by the thread that queued them."""
 
     def putter(self, *streams: str) -> Callable[[Sequence[tuple[str, bytes]]], None]:
         """A function that takes messages: the key and the payload of each. Thread-safe; never waits.
 
-        Each message gets the time at which it is queued. With several streams, each of them gets the message, at that
-        one time and in the order of `streams`.
+        Each message gets the time at which it is queued. With several streams, each of them gets the message, with the
+        same time and in the order of `streams`.
         """
         now, extend = self._now, self._queue.extend
 
@@ -75,7 +74,7 @@ class Intake:
         return put
 
     def patient_putter(self, stream: str, patience: float = 1.0) -> Callable[[Sequence[tuple[str, bytes]]], None]:
-        """The same for what is rare and should not be dropped: it waits for room, at most `patience` seconds."""
+        """The same for rare messages that should not be dropped: it waits for room, at most `patience` seconds."""
         put = self.putter(stream)
         pause = threading.Event()
 
@@ -89,7 +88,7 @@ class Intake:
         return patient
 
     def drain(self, until: int) -> list[Arrival]:
-        """What was queued, in order. What is drained later is later than all of it, and than `until`."""
+        """The queued messages, in order. Later ones will be later than all of these, and than `until`."""
         arrivals = self._queue[:]
         del self._queue[: len(arrivals)]
         self._room = self._maximum_bytes
@@ -106,7 +105,7 @@ class Intake:
         return self._last
 
     def step_back(self, to: int) -> None:
-        """The wall clock went back: what is drained from now on may be received as early as just after `to`."""
+        """The wall clock went back: messages drained from now on may have a receive time just after `to`."""
         self._last = to
 
     def _drop(self, count: int) -> None:
@@ -115,13 +114,13 @@ class Intake:
 
 
 def _in_order(arrivals: list[Arrival], last: int) -> bool:
-    """Whether the times are later than `last` and never go back, as is nearly always so."""
+    """Whether the times are later than `last` and never go back, which is almost always true."""
     times = list(map(_RECEIVED, arrivals))
-    return times[0] > last and times == sorted(times)  # sorting what is in order is the fastest way to see that it is
+    return times[0] > last and times == sorted(times)  # sorting a sorted list is the fastest check
 
 
 def _settled(arrivals: list[Arrival], last: int) -> list[Arrival]:
-    """The same with times that are later than `last` and never go back."""
+    """The same arrivals, with times that are later than `last` and never go back."""
     settled = []
     time = last + 1
     for arrival in arrivals:

@@ -1,7 +1,7 @@
 """Liveliness tokens: a client declares a token while it is there, and the network reports when the token is gone.
 
-What happens to tokens comes through the intake like samples, on a stream name of its own, so it is recorded and
-replayed in order with them. The payload is what happened to the token of that key.
+Changes of tokens go through the intake like samples, on a separate stream name, so they are recorded and replayed in
+order with the samples. The payload is the change of the token with that key.
 """
 
 from __future__ import annotations
@@ -9,35 +9,35 @@ from __future__ import annotations
 from enum import Enum
 
 LIVELINESS = "~liveliness"
-"""The stream name of what happens to tokens; no Detector's stream can be called so."""
+"""The stream name of token changes; no stream of a Detector can have this name."""
 
 MAXIMUM_TOKENS = 200_000
 """Maximum number of known tokens; further ones are ignored and counted."""
 
 
 class Token(Enum):
-    """What happened to a token: the payload of its arrival."""
+    """A change of a token: the payload of its arrival."""
 
     DECLARED = b"declared"
     DROPPED = b"dropped"
     """The client withdrew it, or its session ended: the client is lost."""
     UNSURE = b"unsure"
-    """We cannot see it any more, since our own connection is gone: the client may be there still."""
+    """It is no longer visible because our own connection is gone: the client may still be there."""
 
 
 class Tokens:
-    """Which tokens there are, and whose they are."""
+    """The known tokens and their clients."""
 
     def __init__(self) -> None:
         self._clients: dict[str, str] = {}
-        """By key, whose token it is."""
+        """By key, the client of the token."""
         self._counts: dict[str, int] = {}
         self._dropped: set[str] = set()
         self.changed = False
-        """Whether any token came or went since the last tick."""
+        """Whether any token was added or removed since the last tick."""
 
     def declare(self, key: str, client: str) -> bool:
-        """A token is there; False where there are too many."""
+        """Add a token; False if there are too many."""
         self.changed = True
         if key not in self._clients:
             if len(self._clients) >= MAXIMUM_TOKENS:
@@ -48,7 +48,7 @@ class Tokens:
         return True
 
     def withdraw(self, key: str, *, lost: bool) -> str | None:
-        """A token is gone; returns the client that has none left now, if there is one. `lost`: it is lost by that."""
+        """Remove a token; returns the client if this was its last token. `lost`: the client is lost by that."""
         self.changed = True
         client = self._clients.pop(key, None)
         if client is None:
@@ -66,16 +66,16 @@ class Tokens:
         return client in self._counts
 
     def dropped(self, client: str) -> bool:
-        """Whether the client's last token was dropped since the last tick, and no new one came."""
+        """Whether the client's last token was dropped since the last tick, without a new one."""
         return client in self._dropped
 
     def forget_dropped(self) -> None:
-        """The tick took note."""
+        """The tick has handled the dropped tokens."""
         self.changed = False
         self._dropped.clear()
 
     def forget(self) -> list[str]:
-        """Forget all tokens, since the Detector watches others; returns whose they were."""
+        """Forget all tokens, because the Detector watches others; returns their clients."""
         self.changed = True
         clients = list(self._counts)
         self._clients.clear()

@@ -1,1 +1,1 @@
-"""Whom a rule is evaluated for, and what its expressions see of each subject."""
+"""The subjects that a rule is evaluated for, and the variables of its expressions for each subject."""

@@ -1,8 +1,7 @@
-"""Which pairs of clients are within reach of each other: of all of them the nearest, up to a number.
+"""Which pairs of clients are within reach of each other: the nearest ones, up to a maximum number.
 
-A few clients are compared each with each. For more, a tree answers how many pairs there are before any is made: a
-thousand clients at one spot are half a million pairs, and making them only to leave most of them out would stall
-everything else.
+For a few clients, all pairs are compared. For more, a tree counts the pairs before any is created: a thousand clients
+at one spot form half a million pairs, and creating them only to drop most would stall everything else.
 """
 
 from __future__ import annotations
@@ -20,41 +19,41 @@ if TYPE_CHECKING:
 Pair = tuple[str, str]
 
 Distance = Callable[[str, str], float]
-"""Between two clients, in metres, as expressions see it."""
+"""Between two clients, in metres, as in expressions."""
 
 FEW = 1024
 """Maximum number of pairs for which comparing all is faster than building trees."""
 
 _ROUNDING = 1 + 1e-9
 _SLACK = 1e-6
-"""The trees search a little farther than the limit, by a factor and in metres, so that rounding hides no pair;
+"""The trees search slightly beyond the limit, by this factor and this number of metres, so that rounding hides no pair;
 `distance` decides. Points on the Earth are 6,400 km from the origin, so they are exact to a nanometre only."""
 
 ROOM = 4
-"""Up to this multiple of the wanted number of pairs is made, to be sorted exactly."""
+"""Up to this multiple of the requested number of pairs is created, to be sorted exactly."""
 
 _HALVINGS = 40
 
 
 class Near(NamedTuple):
-    """What was found."""
+    """The result of a search."""
 
     pairs: list[Pair]
     left_out: int
-    """How many pairs within reach were left out: the maximum number was too small. With many clients it may count
-    a pair that is beyond reach by a micrometre or a billionth."""
+    """How many pairs within reach were left out because of the maximum number. With many clients it may include pairs
+    that are out of reach by a micrometre or a billionth."""
 
 
 class Search(NamedTuple):
-    """Whom to search, and how."""
+    """The clients to search among."""
 
     points: Mapping[str, Point]
-    """Where clients are; straight distances are never longer than `distance`."""
+    """The clients' places; straight distances are never longer than `distance`."""
     distance: Distance
     first: Collection[str] | None
-    """Who can be the first of a pair; None: the first is the one with the smaller name."""
+    """The possible first clients of a pair; None: the first is the one with the smaller name."""
     second: Collection[str] | None
-    """Who can be the second, where `first` is given."""
+    """The possible second clients, if `first` is given."""
 
 
 def reach(within: float) -> float:
@@ -86,7 +85,7 @@ def _nearest(search: Search, pairs: Iterator[Pair], within: float, maximum: int)
 
 
 def _by_trees(search: Search, first: list[str], second: list[str], within: float, maximum: int) -> Near:
-    # Not at the top: it takes half a second to import, which a detector of few clients does not owe.
+    # Not at the top: the import takes half a second, which a detector with few clients can save.
     from scipy.spatial import cKDTree  # noqa: PLC0415
 
     one = cKDTree(np.array([search.points[name] for name in first]))
@@ -115,14 +114,14 @@ def _by_trees(search: Search, first: list[str], second: list[str], within: float
     if count(high) <= maximum * ROOM:
         pairs = _nearest(search, _all(one, other, first, second, high), within, maximum).pairs
     else:
-        # Very many are equally far from each other: those that are nearer, and then by names until it is enough.
+        # Very many are equally far apart: take the nearer ones, then by names up to the maximum.
         nearer = _nearest(search, _all(one, other, first, second, low), within, maximum).pairs if low else []
         pairs = _filled(search, nearer, _between(one, other, first, second, high), within, maximum)
     return Near(pairs, found - len(pairs))
 
 
 def _all(one: cKDTree, other: cKDTree, first: list[str], second: list[str], radius: float) -> Iterator[Pair]:
-    """The pairs of both, found at once."""
+    """The pairs between both, found at once."""
     if one is other:
         for i, j in one.query_pairs(radius, output_type="ndarray").tolist():
             yield first[i], first[j]
@@ -134,7 +133,7 @@ def _all(one: cKDTree, other: cKDTree, first: list[str], second: list[str], radi
 
 
 def _between(one: cKDTree, other: cKDTree, first: list[str], second: list[str], radius: float) -> Iterator[Pair]:
-    """The pairs of both, by names; made one client at a time."""
+    """The pairs between both, by names; created one client at a time."""
     for index, name in enumerate(first):
         for near in sorted(other.query_ball_point(one.data[index], radius)):
             yield name, second[near]

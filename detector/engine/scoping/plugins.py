@@ -1,8 +1,8 @@
 """Signals that plugins compute: the calls of the engine, and how it uses the results.
 
-A plugin's value is computed at each evaluation, for the rule's subject, from the buffer as it is at the tick. Where and
-how a plugin runs is its host's business (detector/plugins); the engine only calls, in a fixed order, and takes a value,
-nothing, or a failure for an answer.
+A plugin's value is computed at each evaluation, for the rule's subject, from the buffer at that tick. Its host
+(detector/plugins) decides where and how a plugin runs. The engine only calls it, in a fixed order, and receives a
+value, nothing, or a failure.
 """
 
 from __future__ import annotations
@@ -23,15 +23,16 @@ class PluginCall(NamedTuple):
     rule: str
     signal: str
     subject: str
-    """As in events: `car1+car2~north`."""
+    """The text in events: `car1+car2~north`."""
     clients: tuple[str, ...]
     """The client, the two of a pair in order, or the fleet's members at this tick."""
     element: str | None
-    """The element of `each`, where the rule has one."""
+    """The element of `each`, if the rule has one."""
 
 
 class PluginFailedError(Exception):
-    """A plugin gave no value: it failed (Reason.ERROR), or it does not run (Reason.ABSENT); the text says why."""
+    """A plugin returned no value: it failed (Reason.ERROR), or it is not running (Reason.ABSENT); the text names the
+    reason."""
 
     def __init__(self, reason: Reason, message: str) -> None:
         super().__init__(message)
@@ -39,23 +40,23 @@ class PluginFailedError(Exception):
 
 
 class PluginHost(Protocol):
-    """Runs the plugins of all rules. Called by the one thread that drives the engine."""
+    """Runs the plugins of all rules. Called only by the thread that drives the engine."""
 
     def configure(self, rules: Sequence[CompiledRule], kept: Collection[str]) -> None:
-        """These rules are evaluated from now on; those that are not among `kept` begin without any state."""
+        """Evaluate these rules from now on; those that are not in `kept` start without state."""
 
     def value(self, call: PluginCall, queries: Queries) -> Value:
-        """The signal's value, None where it has none. Raises PluginFailedError."""
+        """The signal's value, None if it has none. Raises PluginFailedError."""
 
     def keep(self, rule: str, subjects: Collection[str]) -> None:
-        """The rule was evaluated for these subjects: the state of all others goes."""
+        """The rule was evaluated for these subjects: drop the state of all others."""
 
     def reset(self) -> None:
-        """Time jumped: all state goes, since windows reset."""
+        """Time jumped: drop all state, because windows reset."""
 
 
 class NoPlugins:
-    """The host of an engine that is given none."""
+    """The host of an engine without plugins."""
 
     def configure(self, rules: Sequence[CompiledRule], kept: Collection[str]) -> None:
         """Nothing to prepare."""
@@ -72,22 +73,22 @@ class NoPlugins:
 
 
 class PluginSignals:
-    """Adds the values of plugins to what the conditions of a rule see."""
+    """Adds the values of plugins to the variables of a rule's conditions."""
 
     def __init__(self, host: PluginHost, queries: Callable[[], Queries]) -> None:
-        """`queries` gives the buffer at the tick."""
+        """`queries` returns the view of the buffer at the tick."""
         self._host = host
         self._queries = queries
         self._subjects: dict[str, dict[str, tuple[str, ...]]] = {}
-        """By rule and subject its clients, of what may have state."""
+        """By rule, the subjects that may have state, each with its clients."""
 
     def configure(self, rules: Sequence[CompiledRule], kept: Collection[str]) -> None:
-        """These rules are evaluated from now on; those that are not among `kept` start without state."""
+        """Evaluate these rules from now on; those that are not in `kept` start without state."""
         self._subjects = {rule: subjects for rule, subjects in self._subjects.items() if rule in kept}
         self._host.configure(rules, kept)
 
     def lose(self, clients: Collection[str]) -> None:
-        """These clients are lost: the state of their subjects goes, also of rules that are evaluated with samples."""
+        """These clients are lost: drop the state of their subjects, also for rules that samples trigger."""
         for rule, subjects in self._subjects.items():
             left = {subject: of for subject, of in subjects.items() if not any(client in clients for client in of)}
             if len(left) < len(subjects):
@@ -104,7 +105,7 @@ class PluginSignals:
     ) -> Iterator[Candidate]:
         """The candidates with the values of the rule's plugin signals among their variables.
 
-        `every_subject`: there are no other subjects, so that the state kept for others can go.
+        `every_subject`: there are no other subjects, so state kept for others is dropped.
         """
         if not rule.plugins:
             yield from candidates

@@ -1,4 +1,4 @@
-"""Where clients are: by the newest sample of a stream, in metres of one frame or on the Earth."""
+"""The positions of clients: from the newest sample of a stream, in metres of one frame or on the Earth."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ Place = tuple[float, ...]
 """Metres (x, y, z); or degrees (latitude, longitude)."""
 
 Point = tuple[float, float, float]
-"""Metres, straight: what a search works on."""
+"""Metres in a straight frame: the input of a search."""
 
 FARTHEST = 1e12
-"""No frame reaches this far, in metres; from 1e154 on the squares of distances are no numbers any more."""
+"""Maximum coordinate in metres; from 1e154 on, the squares of distances overflow."""
 
 LIMITS: Mapping[str, float] = {"latitude": 90.0, "longitude": 360.0}
-"""Degrees; some write longitudes from 0 to 360."""
+"""Degrees; some sources write longitudes from 0 to 360."""
 
 
 class Positions:
@@ -39,9 +39,9 @@ class Positions:
         possible: Possible,
         floor: int | None,
     ) -> None:
-        """`floor`: no look goes back to this time or beyond, in nanoseconds.
+        """`floor`: samples up to this time are ignored, in nanoseconds.
 
-        A client that can never have a position (see `possible`) does not count as one with an unknown position.
+        A client that can never have a position (see `possible`) is not counted as one with an unknown position.
         """
         self._buffer = buffer
         self._messages = messages
@@ -50,11 +50,11 @@ class Positions:
         self._floor = floor
 
     def gap(self, time: int) -> None:
-        """Samples before `time` no longer give positions."""
+        """Samples before `time` give no positions any more."""
         self._floor = time
 
     def now(self, position: CompiledPosition, client: str, now: int, counters: RuleCounters) -> Place | None:
-        """Where the client is, by the newest sample; None where that is not known or makes no sense."""
+        """The client's place from its newest sample; None if it is unknown or invalid."""
         lane = self._buffer.lane(client, position.stream)
         sample = None if lane is None else lane.newest
         if sample is None or not is_fresh(client, position.stream, self.limit(position), self._buffer, now):
@@ -67,7 +67,7 @@ class Positions:
     def common_time(self, position: CompiledPosition, clients: Iterable[str], now: int) -> int:
         """The newest time at which the positions of all these clients are known, in nanoseconds.
 
-        That is `now` where positions have no age: the last one holds. All have a place now.
+        This is `now` for positions without a maximum age: the last one stays valid. All clients have a place now.
         """
         if self.limit(position) is None:
             return now
@@ -75,7 +75,7 @@ class Positions:
         return min(lane.newest.time for lane in lanes if lane is not None and lane.newest is not None)
 
     def sample(self, position: CompiledPosition, client: str, then: int, now: int) -> Sample | None:
-        """The newest sample up to a past time; None where there is none, or it was too old then."""
+        """The newest sample up to a past time; None if there is none, or if it was too old then."""
         lane, limit = self._buffer.lane(client, position.stream), self.limit(position)
         sample = None if lane is None else next(lane.newest_first(self._floor, then, now), None)
         return None if sample is None or (limit is not None and then - sample.time > limit) else sample
@@ -83,14 +83,14 @@ class Positions:
     def of(
         self, position: CompiledPosition, client: str, sample: Sample | None, counters: RuleCounters
     ) -> Place | None:
-        """Where the client was by a sample; None like `now`."""
+        """The client's place in a sample; None as in `now`."""
         if sample is None:
             counters.unknowns += 1
             return None
         return self._place(position, client, sample, counters)
 
     def limit(self, position: CompiledPosition) -> int | None:
-        """Of samples older than this the position is unknown, in nanoseconds; None: of none."""
+        """The maximum age of samples for a known position, in nanoseconds; None: unlimited."""
         stale, oldest = self._stale_after[position.stream], position.max_age_ns
         return oldest if stale is None or (oldest is not None and oldest < stale) else stale
 
@@ -128,16 +128,16 @@ class Positions:
 
 
 def described(position: CompiledPosition, place: Place) -> dict[str, float]:
-    """What expressions see of a place: x, y and z in metres, or latitude and longitude in degrees."""
+    """The members of a place in expressions: x, y and z in metres, or latitude and longitude in degrees."""
     found = dict(zip(position.axes, place, strict=True))
     return found if position.geographic else {**found, "z": found.get("z", 0.0)}
 
 
 def distance(position: CompiledPosition, one: Place, other: Place) -> float:
-    """Metres, straight in a flat frame, along the surface on the Earth.
+    """Metres: straight in a flat frame, along the surface on the Earth.
 
-    The same number whichever of the two comes first. In a flat frame √(dx² + dy² + dz²), rounded after each operation,
-    so that each computation in this order gives the same number.
+    The result does not depend on the order of the two. In a flat frame it is √(dx² + dy² + dz²), rounded after each
+    operation, so every computation in this order gives the same number.
     """
     if position.geographic:
         return geodesy.surface_distance(*min(one, other), *max(one, other))
@@ -148,12 +148,12 @@ def distance(position: CompiledPosition, one: Place, other: Place) -> float:
 
 
 def distance_of_order_1(position: CompiledPosition, one: Place, other: Place) -> float:
-    """What it was for detectors of order 1 (see `timeline.ORDER`): it differs in the last digits."""
+    """The distance for detectors of order 1 (see `timeline.ORDER`): it differs in the last digits."""
     return geodesy.surface_distance(*one, *other) if position.geographic else math.dist(one, other)
 
 
 def point(position: CompiledPosition, place: Place) -> Point:
-    """The place as a search takes it: no two points are farther apart than `distance`."""
+    """The place in the form that a search takes: no two points are farther apart than `distance`."""
     if position.geographic:
         return geodesy.cartesian(*place)
     x, y, *rest = place

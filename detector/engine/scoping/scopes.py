@@ -1,4 +1,4 @@
-"""Scopes: which subjects a rule is evaluated for at a tick, and what its expressions see of them."""
+"""Scopes: which subjects a rule is evaluated for at a tick, and the variables of its expressions for each."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from wayside.rules import ClientSubject, CompiledElement, CompiledRule, Compiled
 _NONE: frozenset[Path] = frozenset()
 
 CLOSING_NS = 1_000_000_000
-"""Over so long the closing speed is measured, in nanoseconds."""
+"""The period over which the closing speed is measured, in nanoseconds."""
 
 
 class Candidate(NamedTuple):
@@ -30,19 +30,19 @@ class Candidate(NamedTuple):
 
     subject: Subject
     variables: Mapping[str, Any]
-    """What the conditions see; what is unknown is left out."""
+    """The variables of the conditions; unknown ones are left out."""
     in_scope: Truth
     """Whether `where` and the roles of a pair hold; false ends an open episode."""
     near: Truth
-    """Whether an episode may start; unknown for a pair of which one's position is."""
+    """Whether an episode may start; unknown for a pair if one position is unknown."""
     never: frozenset[Path] = frozenset()
     """The beginnings of the paths to signals that its clients can never have."""
     measured: Mapping[str, Any] = {}
-    """By signal over the open episode, the value that it takes at this evaluation; what is unknown is left out."""
+    """By signal over the open episode, the value at this evaluation; unknown ones are left out."""
 
 
 class Evaluated(NamedTuple):
-    """What the evaluation of a rule saw of one subject, after it has decided. Times are nanoseconds."""
+    """The inputs and the result of a rule's evaluation for one subject. Times are nanoseconds."""
 
     now: int
     candidate: Candidate
@@ -85,7 +85,7 @@ class Views:
         self._by_sample: dict[tuple[str, Sample | None], Place | None] = {}
 
     def of(self, client: str, element: CompiledElement) -> dict[str, Any]:
-        """client, labels, streams and the known signals, those that read the element among them."""
+        """client, labels, streams and the known signals, including those that read the element."""
         if client not in self._views:
             self.prepare((client,))
         if not element.signals:
@@ -96,7 +96,7 @@ class Views:
         return self._of_elements[at]
 
     def prepare(self, clients: Iterable[str]) -> None:
-        """Look at these clients together: models are run once for all of them."""
+        """Prepare these clients together: models run once for all of them."""
         new = {client: self._looked_at(client) for client in clients if client not in self._views}
         self._views.update(new)
         if self._rule.models and new:
@@ -120,17 +120,17 @@ class Views:
         return {name: value for name, value in computed.items() if value is not UNKNOWN}
 
     def place(self, subject: PairSubject, client: str) -> Place | None:
-        """Where the client is, if that is known."""
+        """The client's place, if known."""
         return self._positions.now(subject.position, client, self._now, self._counters)
 
     def distance(self, subject: PairSubject, one: Place, other: Place) -> float:
-        """Metres between two places: the one number for conditions, reach and events."""
+        """Metres between two places: the same number for conditions, reach and events."""
         return (distance if self._exact else distance_of_order_1)(subject.position, one, other)
 
     def closing_speed(self, subject: PairSubject, a: str, b: str, distance: float) -> float | None:
-        """By how much the distance shrank in the last second for which both have sent places, in m/s.
+        """By how much the distance shrank in the last second for which both clients sent places, in m/s.
 
-        `distance` is that of now. None while one of the places is unknown. A zero has no sign.
+        `distance` is the current one. None while one of the places is unknown. A zero has no sign.
         """
         end = self._closing_end(subject, a, b)
         after = distance if end == self._now else self._distance_at(subject, a, b, end)
@@ -141,7 +141,7 @@ class Views:
         return speed if self._exact or speed else -0.0
 
     def _closing_end(self, subject: PairSubject, a: str, b: str) -> int:
-        """When the second ends over which the closing speed is measured."""
+        """The end of the second over which the closing speed is measured."""
         order_1 = not self._exact
         return self._now if order_1 else self._positions.common_time(subject.position, (a, b), self._now)
 
@@ -150,7 +150,7 @@ class Views:
         return None if one is None or other is None else self.distance(subject, one, other)
 
     def _place_at(self, subject: PairSubject, client: str, then: int) -> Place | None:
-        """Where the client was, if that is known; looked up once a tick for each time, and each sample read once."""
+        """The client's place, if known; looked up once a tick for each time, and each sample read once."""
         at = (client, then)
         if at not in self._earlier:
             sample = self._positions.sample(subject.position, client, then, self._now)
@@ -161,14 +161,14 @@ class Views:
         return self._earlier[at]
 
     def truth(self, expression: Expression | None, variables: Mapping[str, Any], place: str) -> Truth:
-        """The truth of a condition; one that is absent holds. `place` names field and subject, for errors."""
+        """The truth of a condition; an absent one is true. `place` names field and subject, for errors."""
         if expression is None:
             return True
         never = self.never(str(variables["client"])) if "client" in variables else frozenset()
         return condition(expression, variables, place, never, self._counters)
 
     def never(self, client: str, *role: str) -> frozenset[Path]:
-        """The beginnings of the paths to signals that the client can never have; behind a pair's role, where given."""
+        """The beginnings of the paths to signals that the client can never have, after a pair's role if given."""
         possible = self._signals.possible
         if not possible.limited:
             return _NONE
@@ -206,9 +206,9 @@ def evaluated(
 def candidates(
     rule: CompiledRule, views: Views, clients: Clients, pending: Iterable[Subject], only: Only | None = None
 ) -> Iterator[Candidate]:
-    """The subjects to look at: all that may start an episode, and those that have one or are about to.
+    """The subjects to evaluate: all that may start an episode, and those with an open or pending one.
 
-    `only`: of these, none but the subjects that it takes.
+    `only`: restricts them to the subjects that it contains.
     """
     if not isinstance(rule.subject, PairSubject):
         views.prepare(clients if only is None or isinstance(rule.subject, FleetSubject) else only.present(clients))
@@ -244,7 +244,7 @@ def candidates(
 
 
 def _with(views: Views, client: str, element: CompiledElement) -> dict[str, Any]:
-    """What one client is seen as, and the element."""
+    """The variables about one client, and the element."""
     view = views.of(client, element)
     return {**view, **element.variables} if element.variables else view
 
@@ -297,7 +297,7 @@ def _pairs(
 
 
 def _role(where: Expression | None, element: CompiledElement, views: Views, clients: Clients) -> dict[str, Truth]:
-    """Of each client, whether it can have the role."""
+    """By client, whether it can have the role."""
     if where is None:
         return dict.fromkeys(clients, True)
     return {
@@ -306,7 +306,7 @@ def _role(where: Expression | None, element: CompiledElement, views: Views, clie
 
 
 def _possible(role: Mapping[str, Truth]) -> list[str]:
-    """Who has the role, or may have it."""
+    """The clients that have the role, or may have it."""
     return [client for client, truth in role.items() if truth is not False]
 
 

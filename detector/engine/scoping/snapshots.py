@@ -1,4 +1,4 @@
-"""The values that go into an event: what a rule saw of its subject."""
+"""The values in an event: those that a rule read for its subject."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _MEMBERS = 100
 
 
 def snapshot(rule: CompiledRule, candidate: Candidate) -> dict[str, Any]:
-    """Signals, positions, distance and closing speed, where known; of a fleet its first members and their number."""
+    """Signals, positions, distance and closing speed, if known; of a fleet its first members and their number."""
     variables = candidate.variables
     values = _of_the_scope(rule, variables)
     for others in (rule.plugins, rule.derived):
@@ -30,11 +30,11 @@ def snapshot(rule: CompiledRule, candidate: Candidate) -> dict[str, Any]:
 
 
 def signals_read(rule: CompiledRule, expression: Expression | None) -> str:
-    """The signals that an expression reads, with their streams, for people."""
+    """The signals that an expression reads, with their streams, for error messages."""
     steps: set[object] = set()
     if expression is not None:
         steps.update(step for path in expression.paths for step in path)
-        if isinstance(rule.subject, FleetSubject):  # it reads the clients' signals by names of its own for them
+        if isinstance(rule.subject, FleetSubject):  # it reads the clients' signals by other names
             steps.update(_NAME.findall(expression.source))
     found = [f"{each.name} of stream {each.stream}" for each in rule.signals if each.name in steps and not each.rule]
     return f" ({', '.join(found)})" if found else ""
@@ -75,7 +75,7 @@ def _signals_of(rule: CompiledRule, view: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _without_bytes(value: Any) -> Any:
-    """Replace bytes, which a CEL expression may yield, by null: neither an event nor a task can carry them."""
+    """Replace bytes, which a CEL expression may return, by null: neither an event nor a task can contain them."""
     if isinstance(value, bytes):
         return None
     if isinstance(value, list):

@@ -1,1 +1,1 @@
-"""The values that conditions are over: aggregates of samples, episodes of other rules, models."""
+"""The inputs of conditions: aggregates of samples, episodes of other rules, models."""

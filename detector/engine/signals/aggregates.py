@@ -1,12 +1,12 @@
-"""Aggregates: how the values of a window become one, or unknown.
+"""Aggregates: reduce the values of a window to one value, or to unknown.
 
-All take the values in order of time, the oldest first, without those that are unknown. Those that calculate take
-numbers only. Sums and differences are exact before they are rounded once, so that neither the order of a sum nor a
-counter of nanoseconds near 1e18 costs digits; beyond the range of a double they are infinite, as in IEEE 754.
+All take the known values in time order, the oldest first. Those that calculate take only numbers. Sums and differences
+are exact and rounded once, so neither the order of a sum nor a counter of nanoseconds near 1e18 costs digits; beyond
+the range of a double they are infinite, as in IEEE 754.
 
 Rate and Delta are (last - first)/(time between) and last - first (see docs/rules.md). StdDev is the population's
-(divided by n, so that of one value is 0). Slope is that of the line of least squares, per second.
-Quantile interpolates linearly between the two values that are next to it.
+(divided by n, so it is 0 for one value). Slope is the slope of the least-squares line, per second. Quantile
+interpolates linearly between the two adjacent values.
 """
 
 from __future__ import annotations
@@ -23,18 +23,19 @@ Number = float | int
 """A double, or an integer beyond 2^53."""
 
 Timed = tuple[int, Number]
-"""A number and its sample's time in nanoseconds."""
+"""A number and the time of its sample in nanoseconds."""
 
 _SECOND = 10**9
 
 
 def is_number(value: object) -> bool:
-    """Whether aggregates calculate with the value: true and false are no numbers."""
+    """Whether aggregates calculate with the value; booleans are not numbers."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def calculated(aggregate: Aggregate, window: Sequence[Timed], quantile: float | None = None) -> Number | Unknown:
-    """An aggregate that takes numbers; unknown with too few samples, or where it is NaN. `quantile` is of Quantile."""
+    """An aggregate of numbers; unknown with too few samples, or if it is NaN. `quantile` is the parameter of
+    Quantile."""
     if not window:
         return UNKNOWN
     result = _CALCULATED[aggregate](window) if quantile is None else _quantile(window, quantile)
@@ -42,9 +43,9 @@ def calculated(aggregate: Aggregate, window: Sequence[Timed], quantile: float | 
 
 
 def distinct(values: Sequence[Value]) -> list[Value] | Unknown:
-    """The different values, in order of their first appearance; unknown where there is none.
+    """The distinct values, in order of their first appearance; unknown if there are none.
 
-    Equal are values of one type that hold the same, lists and maps included: 1 is not true, and not "1".
+    Values are equal if they have the same type and contents, lists and maps included: 1 is not true, and not "1".
     """
     found: dict[object, Value] = {}
     for value in values:
@@ -53,12 +54,12 @@ def distinct(values: Sequence[Value]) -> list[Value] | Unknown:
 
 
 def _minimum(window: Sequence[Timed]) -> Number:
-    """A zero without a sign: 0.0 and -0.0 are equal, so which of them were the least would depend on their order."""
+    """A zero loses its sign: 0.0 and -0.0 are equal, so the result would depend on their order."""
     return min(number for _, number in window) or 0.0
 
 
 def _maximum(window: Sequence[Timed]) -> Number:
-    """A zero without a sign, as of the minimum."""
+    """A zero loses its sign, as in the minimum."""
     return max(number for _, number in window) or 0.0
 
 
@@ -68,12 +69,12 @@ def _minimum_time(window: Sequence[Timed]) -> Number:
 
 
 def _maximum_time(window: Sequence[Timed]) -> Number:
-    """Of equal numbers, the time of the first."""
+    """The first of the samples with the maximum."""
     return max(window, key=lambda each: each[1])[0] / _SECOND
 
 
 def _sum(window: Sequence[Timed]) -> Number:
-    """Infinite where one of the numbers is, NaN where they are infinite both ways."""
+    """Infinite if one of the numbers is, NaN if there are infinities of both signs."""
     return _over([number for _, number in window], 1)
 
 
@@ -82,7 +83,7 @@ def _mean(window: Sequence[Timed]) -> Number:
 
 
 def _over(numbers: Sequence[Number], divisor: int) -> float:
-    """The sum of the numbers over the divisor; what only the sum is too large for is no matter."""
+    """The sum of the numbers over the divisor, even if the sum itself overflows."""
     infinite = [number for number in numbers if math.isinf(number)]
     if infinite:
         return float(sum(infinite))
@@ -95,18 +96,18 @@ def _over(numbers: Sequence[Number], divisor: int) -> float:
 
 
 def _deviation(window: Sequence[Timed]) -> Number:
-    """Exact before the root is taken."""
+    """Exact before the root."""
     if any(math.isinf(number) for _, number in window):
         return math.nan
     values, common = _whole(window)
     count = len(values)
     square = count * sum(value * value for value in values) - sum(values) ** 2
-    bits = max(0, 64 - square.bit_length() // 2)  # so that the root in whole numbers has more digits than a double
+    bits = max(0, 64 - square.bit_length() // 2)  # so that the integer root has more digits than a double
     return _double(Fraction(math.isqrt(square << 2 * bits), common * count << bits))
 
 
 def _slope(window: Sequence[Timed]) -> Number | Unknown:
-    """Exact before it is rounded."""
+    """Exact before rounding."""
     first, count = window[0][0], len(window)
     if first == window[-1][0]:
         return UNKNOWN
@@ -122,7 +123,7 @@ def _slope(window: Sequence[Timed]) -> Number | Unknown:
 
 
 def _whole(window: Sequence[Timed]) -> tuple[list[int], int]:
-    """The numbers as whole ones over a common denominator; none is infinite."""
+    """The numbers as integers over a common denominator; none is infinite."""
     ratios = [number.as_integer_ratio() for _, number in window]
     common = max(below for _, below in ratios)  # all are powers of two
     return [above * (common // below) for above, below in ratios], common
@@ -146,7 +147,7 @@ def _delta(window: Sequence[Timed]) -> Number | Unknown:
 
 
 def _rate(window: Sequence[Timed]) -> Number | Unknown:
-    """Per second. Unknown where the samples are of one time, which only stamps can be."""
+    """Per second. Unknown if all samples have the same time, which is only possible for stamps."""
     if len(window) < 2 or window[-1][0] == window[0][0]:
         return UNKNOWN
     first, last = window[0][1], window[-1][1]
@@ -163,7 +164,7 @@ def _difference(last: Number, first: Number) -> float:
 
 
 def _double(exact: Fraction) -> float:
-    """Rounded once; infinite beyond what a double holds."""
+    """Rounded once; infinite beyond the range of a double."""
     try:
         return float(exact)
     except OverflowError:
@@ -171,14 +172,14 @@ def _double(exact: Fraction) -> float:
 
 
 def _identity(value: Value) -> object:
-    """What makes the value this one, as a key of a dictionary."""
+    """The identity of a value, as a dictionary key."""
     if isinstance(value, list):
         return (list, *map(_identity, value))
     if isinstance(value, dict):
         return (dict, *sorted(((str(key), _identity(part)) for key, part in value.items()), key=lambda each: each[0]))
     if isinstance(value, bool | str | bytes) or value is None:
         return (type(value), value)
-    return (float, value)  # a double and an integer that are the same number are one
+    return (float, value)  # a double and an integer of equal value are the same number
 
 
 _CALCULATED: Final[Mapping[Aggregate, Callable[[Sequence[Timed]], Number | Unknown]]] = {

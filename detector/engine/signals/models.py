@@ -1,7 +1,7 @@
-"""Signals that models compute: for all clients of a tick at once, from what the rule's other signals and streams hold.
+"""Signals that models compute: for all clients of a tick at once, from the rule's other signals and streams.
 
-A client of which an input is unknown is left out, and its signal is unknown. So is that of all clients of the batch
-where the model fails, which is counted as an error for each.
+If an input of a client is unknown, the client is left out and its signal is unknown. If the model fails, the signals of
+all clients in the batch are unknown, and an error is counted for each.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from wayside.rules import CompiledModel, CompiledRule
 def add_models(
     rule: CompiledRule, views: Mapping[str, dict[str, Any]], now: int, signals: Signals, counters: RuleCounters
 ) -> None:
-    """Put the rule's model signals into the views, which are by client and hold the other signals that are known."""
+    """Add the rule's model signals to the views, which are by client and contain the other known signals."""
     for model in rule.models:
         rows: dict[str, dict[str, Any]] = {}
         for client, view in views.items():
@@ -55,7 +55,7 @@ def _row(
     signals: Signals,
     counters: RuleCounters,
 ) -> dict[str, Any] | None:
-    """The client's inputs by name; None where one is unknown."""
+    """The client's inputs by name; None if one is unknown."""
     row: dict[str, Any] = {}
     for given in model.source.inputs:
         value = (
@@ -74,7 +74,7 @@ def _row(
 def _numbers(
     model: CompiledModel, values: Sequence[Any], names: Sequence[str], counters: RuleCounters
 ) -> list[float] | None:
-    """The values as doubles; None where one is unknown, or no number."""
+    """The values as doubles; None if one is unknown or not a number."""
     numbers = []
     for name, value in zip(names, values, strict=True):
         if value is None or isinstance(value, Unknown):
@@ -95,7 +95,7 @@ def _window(
     signals: Signals,
     counters: RuleCounters,
 ) -> Any:
-    """A row for each step, a column for each signal, oldest first."""
+    """A row per step, a column per signal, oldest first."""
     window = given.window
     assert window is not None  # noqa: S101  the caller looked
     columns = []

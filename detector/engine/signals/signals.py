@@ -19,7 +19,7 @@ from wayside.rules import CompiledSignal
 
 
 class Signals:
-    """Computes the signals of clients at a tick; values of samples are kept while they are looked at."""
+    """Computes the signals of clients at a tick; values of samples are cached while they are in use."""
 
     def __init__(
         self,
@@ -31,9 +31,9 @@ class Signals:
         possible: Possible,
         floor: int | None = None,
     ) -> None:
-        """`starts` has the samples of signals over rules; windows do not reach back to `floor` (ns) or beyond.
+        """`starts` has the samples of signals over rules; windows start after `floor` (ns).
 
-        A signal that a client can never have (see `possible`) is unknown and not counted.
+        A signal that a client can never have (see `possible`) is unknown, and this is not counted.
         """
         self._buffer = buffer
         self._clients = clients
@@ -43,17 +43,17 @@ class Signals:
         self.possible = possible
         self._extracted: dict[tuple[str, str, str], dict[Sample, Value | Unknown | None]] = {}
         self._picked: dict[tuple[str, str, str], int] = {}
-        """When the last sample came that an Age's `where` picks."""
+        """The time of the last sample selected by the `where` of an Age."""
         self._floor = floor
 
     def gap(self, time: int) -> None:
-        """Reset windows: what lies before `time` no longer counts in them."""
+        """Reset windows: samples before `time` no longer count."""
         self._floor = time
         self._extracted.clear()
         self._picked = {key: last for key, last in self._picked.items() if last <= time}
 
     def forget(self, keep: Callable[[str, str], bool]) -> None:
-        """Drop the state of rules and clients that are gone; `keep` returns whether (rule, client) is needed."""
+        """Drop the state of removed rules and lost clients; `keep` returns whether (rule, client) is needed."""
         for kept in (self._extracted, self._picked):
             for key in [key for key in kept if not keep(key[0], key[2])]:
                 del kept[key]
@@ -101,7 +101,7 @@ class Signals:
     def window(
         self, rule: str, signal: CompiledSignal, client: str, now: int, counters: RuleCounters, *, at_most: int | None
     ) -> list[tuple[int, Value | Unknown]]:
-        """Times and values of the signal's samples, newest first; none where the stream is stale."""
+        """Times and values of the signal's samples, newest first; empty if the stream is stale."""
         client = signal.client or client
         lane = self._buffer.lane(client, signal.stream)
         if lane is None or not self._is_fresh(client, signal.stream, now):
@@ -110,7 +110,7 @@ class Signals:
         return [(sample.time, value) for sample, value in window]
 
     def newest_payload(self, stream: str, client: str, now: int) -> bytes | None:
-        """The bytes of the newest sample; None where there is none, or the stream is stale."""
+        """The bytes of the newest sample; None if there is none, or if the stream is stale."""
         lane = self._buffer.lane(client, stream)
         if lane is None or not self._is_fresh(client, stream, now):
             return None
@@ -118,7 +118,7 @@ class Signals:
         return None if sample is None else sample.payload
 
     def _is_fresh(self, client: str, stream: str, now: int) -> bool:
-        # The starts of a rule's episodes are in no list of streams: they do not go stale.
+        # The starts of a rule's episodes belong to no stream of the Detector: they never become stale.
         return stream not in self._stale_after or is_fresh(client, stream, self._stale_after[stream], self._buffer, now)
 
     def _no_value(self, counters: RuleCounters) -> Unknown:
@@ -128,14 +128,14 @@ class Signals:
     def _age(
         self, rule: str, signal: CompiledSignal, lane: Lane | None, client: str, now: int, counters: RuleCounters
     ) -> float:
-        """Seconds since the last sample (that `where` picks); while there was none, since the client is known."""
+        """Seconds since the last sample (selected by `where`); before the first, since the client became known."""
         latest = NEVER if lane is None else lane.latest
-        if lane is not None and latest > now:  # starts of episodes are there for all ticks of a block
+        if lane is not None and latest > now:  # starts of episodes are already there for all ticks of a block
             latest = next((sample.time for sample in lane.newest_first(None, now)), NEVER)
         if lane is not None and signal.where is not None:
             key = (rule, signal.place, client)
             picked = self._window(rule, signal, lane, client, now, counters, at_most=1)
-            # Kept beyond the buffer: what has left it was still the last one.
+            # Kept longer than in the buffer: an expired sample was still the last one.
             latest = self._picked[key] = picked[0][0].time if picked else self._picked.get(key, NEVER)
         return (now - (self._clients.since(client) if latest == NEVER else latest)) / 1e9
 
@@ -151,9 +151,9 @@ class Signals:
         at_most: int | None = None,
         oldest_first: bool = False,
     ) -> list[tuple[Sample, Value | Unknown]]:
-        """The samples in the window with their values, newest first, without those that `where` leaves out.
+        """The samples in the window that `where` selects, with their values, newest first.
 
-        It looks for `at_most` of them, from the newest or from the oldest on.
+        At most `at_most` of them, from the newest or from the oldest.
         """
         key = (rule, signal.place, client)
         known = self._extracted.get(key, {})
@@ -161,9 +161,9 @@ class Signals:
         values: list[tuple[Sample, Value | Unknown]] = []
         samples: Iterable[Sample] = self._in_window(signal, lane, now)
         if oldest_first:
-            samples = reversed(list(samples))  # so that only the oldest is decoded, not all that came since
+            samples = reversed(list(samples))  # so that only the oldest is decoded, not all later ones
         for sample in samples:
-            # By the sample itself: its value follows from what it holds, so two that are equal have the same.
+            # Keyed by the sample: equal samples have equal values.
             value = known[sample] if sample in known else self._extract(signal, lane, sample, counters)
             looked_at[sample] = value
             if value is not None:
@@ -182,7 +182,7 @@ class Signals:
     def _extract(
         self, signal: CompiledSignal, lane: Lane, sample: Sample, counters: RuleCounters
     ) -> Value | Unknown | None:
-        """The sample's value; None where `where` is not true for it."""
+        """The sample's value; None if `where` is not true for it."""
         if signal.where is not None and self._evaluate(signal.where, signal, lane, sample, counters) is not True:
             return None
         return True if signal.value is None else self._evaluate(signal.value, signal, lane, sample, counters)
@@ -203,22 +203,22 @@ class Signals:
 
 
 def _place(signal: CompiledSignal, client: str) -> str:
-    """Where an error is, for people."""
+    """The place of an error, for its message."""
     source = f"stream {signal.stream}" if signal.rule is None else f"rule {signal.rule}"
     return f"signal {signal.name} of {client}, {source}"
 
 
 _ENOUGH: Final = {Aggregate.LAST: 1, Aggregate.PREVIOUS: 2, Aggregate.FIRST: 1}
-"""How many samples an aggregate looks at, where not at all."""
+"""Maximum number of samples that an aggregate needs, if not all."""
 
 _ALWAYS_KNOWN: Final[Mapping[Aggregate, Value]] = {Aggregate.COUNT: 0.0, Aggregate.ANY: False}
-"""The aggregates that a client without samples, or with a stale stream, has as well: what they are of nothing."""
+"""The aggregates that are known without samples, or for a stale stream, with their values for an empty window."""
 
 
 def aggregated(
     signal: CompiledSignal, client: str, window: Sequence[tuple[Sample, Value | Unknown]], counters: RuleCounters
 ) -> Value | Unknown:
-    """The window's value; the window is given from the newest on."""
+    """The aggregate of the window, which is given newest first."""
     aggregate = signal.aggregate
     match aggregate:
         case Aggregate.COUNT:
@@ -248,7 +248,7 @@ def _fitting(
     wanted: str,
     counters: RuleCounters,
 ) -> list[tuple[int, Value]]:
-    """The values of the kind that the aggregate takes; the others are left out, and counted as errors."""
+    """The values of the types that the aggregate takes; the others are left out, and counted as errors."""
     fitting = []
     for time, value in known:
         if fits(value):

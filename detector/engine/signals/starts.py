@@ -1,8 +1,8 @@
-"""The episodes of rules as other rules see them: each start and end is a sample, and open episodes are known.
+"""The episodes of rules in the form that other rules read: each start and end is a sample, and open episodes are known.
 
-A start is kept for each of the episode's clients; that of an episode of the whole fleet, which names none, for
-everybody. Starts live in a buffer of their own, with a cap of its own: they are no data of a client, so they neither
-keep it from timing out nor push its samples out.
+A start is stored for each of the episode's clients; the start of an episode of the whole fleet, which names none, for
+everybody. Starts have a separate buffer with a separate cap. They are not data from a client, so they neither keep it
+from timing out nor displace its samples.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from detector.engine.samples.sample import Sample, Stamped
 from wayside.rules import CompiledRule, episode_stream
 
 MAXIMUM_BYTES = 64 * 2**20
-"""Of all starts that are kept; beyond, the oldest go and are counted as evicted."""
+"""Maximum size of all starts; beyond it, the oldest are evicted and counted."""
 
 ALWAYS: Final = 2**63 - 1
-"""After all times: an episode is open."""
+"""Later than all times: the end of an open episode."""
 
 
 class Starts:
@@ -31,19 +31,19 @@ class Starts:
     def __init__(self) -> None:
         self.buffer = Buffer(MAXIMUM_BYTES)
         self._durations: dict[str, int] = {}
-        """Of the rules that are named, by what their starts are called: how long starts are kept, in nanoseconds."""
+        """For the rules that are named, by stream name of their starts: how long starts are kept, in nanoseconds."""
         self._evaluated: set[str] = set()
         self._open: dict[str, dict[str, dict[str, int]]] = {}
-        """Since when episodes are open, by what starts are called, client and episode; nanoseconds."""
+        """When open episodes started, by stream name of the starts, client and episode; nanoseconds."""
         self._ended: dict[str, dict[str, list[tuple[int, int]]]] = {}
-        """From when to when episodes were open that ended since `settle`, by what starts are called and client."""
+        """Start and end of the episodes that ended since `settle`, by stream name of the starts and client."""
         self._number = 0
         self._expired = NEVER
         self.is_known: Callable[[str], bool] = lambda client: True
-        """Whether the client is known: one that was lost keeps no end."""
+        """Whether the client is known: for a lost client no end is stored."""
 
     def configure(self, rules: Iterable[CompiledRule], least: int) -> set[str]:
-        """These rules are evaluated from now on; starts are kept as long as any signal looks back, or `least` (ns).
+        """Evaluate these rules from now on; starts are kept as long as any signal reaches back, or `least` (ns).
 
         Returns the rules that are newly named: report their open episodes with `started`.
         """
@@ -69,7 +69,7 @@ class Starts:
         return new
 
     def forget(self, rule: str) -> None:
-        """The rule means something else now, or is gone: its past starts are not its own."""
+        """The rule has changed its meaning or was removed: its past starts no longer count."""
         stream, ends = episode_stream(rule), episode_stream(rule, ends=True)
         self.buffer.keep([each for each in self._durations if each not in (stream, ends)])
         self._open.pop(stream, None)
@@ -91,7 +91,7 @@ class Starts:
             self._put(episode_stream(event.rule, ends=True), event.end_time, event, clients)
 
     def started(self, event: Event, since: int = NEVER) -> None:
-        """An episode started, now or, where it was restored, before; `since`: when rules can first see that."""
+        """An episode started, now or, if it was restored, earlier; `since`: when rules can first see it."""
         stream = episode_stream(event.rule)
         if stream not in self._durations:
             return
@@ -101,7 +101,7 @@ class Starts:
         self._put(stream, event.start_time, event, clients)
 
     def _put(self, stream: str, time: int, event: Event, clients: Iterable[str]) -> None:
-        """Keep a start or an end for these clients, where any rule looks at it."""
+        """Store a start or an end for these clients, if any rule reads it."""
         if stream not in self._durations:
             return
         payload = _payload(event)
@@ -114,14 +114,14 @@ class Starts:
             self.buffer.grew(lane.insert(sample))
 
     def settle(self, now: int) -> None:
-        """All ticks up to `now` were evaluated, in nanoseconds: forget what later ones do not look at."""
+        """All ticks up to `now` were evaluated, in nanoseconds: forget what later ones do not read."""
         self._ended.clear()
         if not 0 <= now - self._expired < HOUSEKEEPING:
             self._expired = now
             self.buffer.expire(now)
 
     def step_back(self, time: int) -> None:
-        """Time goes on from here, which is earlier. What is open stays so."""
+        """Time continues here, earlier than before. Open episodes stay open."""
         self.buffer.step_back(time)
         self._ended.clear()
         for of_clients in self._open.values():
@@ -130,36 +130,36 @@ class Starts:
 
     @property
     def needed(self) -> bool:
-        """Whether any rule looks at episodes of another."""
+        """Whether any rule reads the episodes of another."""
         return bool(self._durations)
 
     def is_evaluated(self, stream: str) -> bool:
-        """Whether the rule whose starts these are is there and enabled; else nothing is known of its episodes."""
+        """Whether the rule of these starts exists and is enabled; otherwise its episodes are unknown."""
         return stream in self._evaluated
 
     def is_open(self, client: str, stream: str, now: int) -> bool:
-        """Whether an episode is open at a time that the client is a subject of; nanoseconds."""
+        """Whether an episode with the client among its subjects is open at this time; nanoseconds."""
         return any(begin <= now < end for begin, end in self.spans(client, stream))
 
     def spans(self, client: str, stream: str) -> list[tuple[int, int]]:
-        """From when to when episodes were or are open that the client is a subject of; some of those that ended."""
+        """Start and end of episodes with the client among their subjects: open ones, and some that ended."""
         open_episodes, ended = self._open.get(stream, {}), self._ended.get(stream, {})
         found = [(since, ALWAYS) for whose in (client, FLEET) for since in open_episodes.get(whose, {}).values()]
         return found + [span for whose in (client, FLEET) for span in ended.get(whose, ())]
 
     def lane(self, client: str, stream: str) -> Lane | None:
-        """The starts of the episodes that the client is a subject of."""
+        """The starts of the episodes with the client among their subjects."""
         return self.buffer.lane(client, stream) or self.buffer.lane(FLEET, stream)
 
     def lose(self, clients: Iterable[str]) -> None:
-        """These clients are lost; should they return, past starts are not theirs. (What is open ends by an event.)"""
+        """These clients are lost; if they return, past starts do not count. (Open episodes end by an event.)"""
         for client in clients:
             self.buffer.forget(client)
 
     def values(
         self, stream: str, sample: Sample, names: frozenset[str], parameters: Mapping[str, Any]
     ) -> dict[str, Any]:
-        """What an expression over one start sees."""
+        """The variables of an expression over one start."""
         values: dict[str, Any] = {"key": {}, "parameters": parameters}
         if "msg" in names:
             values["msg"] = json.loads(sample.payload, parse_int=float)

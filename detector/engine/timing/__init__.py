@@ -1,1 +1,1 @@
-"""When something happens: the time axis, the ticks, and who is looked at when."""
+"""Time: the time axis, the ticks, and which subjects are evaluated when."""

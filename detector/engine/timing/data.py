@@ -1,7 +1,8 @@
 """Clock Data: a sample's time is the sender's stamp, and the samples advance the time.
 
-Tick t runs once a stamp of at least t + lateness, and later than t, was seen. So samples of equal stamps that come in
-order are all there by then, also with a lateness of zero. At the end, the ticks up to the newest stamp run.
+Tick t runs once a stamp was seen that is at least t + lateness, and later than t. Samples of equal stamps that arrive
+in order are therefore all there by then, even with a lateness of zero. At the end, the ticks up to the newest stamp
+run.
 """
 
 from __future__ import annotations
@@ -18,30 +19,30 @@ from detector.engine.timing.ticks import Ticks
 
 @dataclass(slots=True)
 class _Row:
-    """Samples in a row that agree with each other, but not with the time."""
+    """Consecutive samples whose stamps agree with each other, but not with the time axis."""
 
     client: str
     first: int
     last: int
     received: int
     several: bool = False
-    """Whether they are of more than one client."""
+    """Whether they come from more than one client."""
 
 
 class DataTimeline:
     """Clock Data: time is the senders' stamps.
 
-    A sample waits until the tick that comes after it, and then enters in the order of the stamps: so the order in which
-    samples arrive does not matter as long as `lateness` covers it. One that is later than that enters at once.
+    A sample waits until the next tick after it, and then enters in the order of the stamps: the order in which samples
+    arrive does not matter as long as `lateness` covers it. A sample that is later than that enters at once.
 
-    A stamp more than `max_ahead` ahead of where the newest one would be by now (the receive times show how long nothing
-    came), or so far behind that the buffer has no room for it, is dropped and counted. Time that really jumped (a pause
-    in a recording, a simulation that began again) shows in what follows: when samples in a row agree on another time,
-    that time holds from then on. Two are enough, if they are of two clients or there is only one; one client among
-    several must keep it up for `alone_after` while nobody contradicts.
+    A stamp is dropped and counted if it is more than `max_ahead` ahead of the time expected by now (receive times show
+    how long nothing arrived), or so far behind that the buffer has no room for it. If time really jumped (a pause in a
+    recording, a simulation that restarted), the following samples show it: when consecutive samples agree on another
+    time, that time is adopted. Two are enough if they come from two clients or if there is only one client; one client
+    among several must persist for `alone_after` without contradiction.
 
-    A sample of a latched stream may be old: it never advances the time, and takes its place at its stamp, or at the
-    newest one where that is later.
+    A sample of a latched stream may be old: it never advances the time, and is placed at its stamp, or at the newest
+    stamp if its own is later.
     """
 
     def __init__(
@@ -59,16 +60,16 @@ class DataTimeline:
         latched: frozenset[str] = frozenset(),
         exact: bool = True,
     ) -> None:
-        """Times are in nanoseconds; `start` stands for now until the first stamp is seen.
+        """Times are in nanoseconds; `start` is the time until the first stamp is seen.
 
-        `maximum_bytes` bounds the payloads that wait; what comes when they are full is dropped and counted. `stamp_of`
-        and `client_of` give None where they cannot tell; the sample is then left out, and they count it. `latched` are
-        the names of the latched streams. `exact`: see `timeline.ORDER`; False is order 1.
+        `maximum_bytes` bounds the waiting payloads; samples that arrive when they are full are dropped and counted.
+        `stamp_of` and `client_of` return None for samples that they cannot read; they count these, and the sample is
+        left out. `latched` are the names of the latched streams. `exact`: see `timeline.ORDER`; False is order 1.
         """
         self._ticks = ticks
         self._lateness = lateness
         self._behind = max(lateness, 1) if exact else lateness
-        """Up to so far behind the newest stamp, ticks run."""
+        """How far ticks stay behind the newest stamp."""
         self._max_ahead = max_ahead
         self.alone_after = alone_after
         self.maximum_bytes = maximum_bytes
@@ -82,13 +83,13 @@ class DataTimeline:
         self._waiting_bytes = 0
         self._triggers: frozenset[str] = frozenset()
         self._trigger_stamps: list[int] = []
-        """A heap: of what waits, the stamps of samples that are evaluated at their own times."""
+        """A heap: the stamps of waiting samples that are evaluated at their own times."""
         self._number = 0
         self._some_client: str | None = None
         self._several_clients = False
         self._row: _Row | None = None
         self._early: list[tuple[int, Arrival]] = []
-        """Latched samples that came before there was a time, with their stamps."""
+        """Latched samples that arrived before the first stamp, with their stamps."""
         self.latched = latched
         self.max_behind = max_behind
         self.now = start
@@ -96,11 +97,11 @@ class DataTimeline:
         self.dropped_late = 0
         self.dropped_full = 0
         self.last = ""
-        """Whose stamp was dropped last for its time, and how far off it was."""
+        """The sample last dropped because of its time, and how far off it was."""
         self.jumps = 0
 
     def steps(self, arrivals: Sequence[Arrival], until: int) -> Iterator[Step]:
-        """All steps that follow from the arrivals; `until`, a time of the wall clock, is not used here."""
+        """All steps that result from the arrivals; `until`, a time of the wall clock, is not used here."""
         for arrival in arrivals:
             if arrival.stream == LIVELINESS:
                 yield from self._token(arrival)
@@ -120,7 +121,7 @@ class DataTimeline:
             elif newest - self.max_behind <= stamp <= newest + self._reach(arrival, self._newest_received):
                 self._row = None
                 if not self._ticked and newest - self._lateness <= stamp <= self.now:
-                    yield self._begin(stamp, backwards=False)  # the first to arrive was not the first
+                    yield self._begin(stamp, backwards=False)  # the first sample to arrive was not the earliest
                 newest = max(newest, stamp)
             elif self._jumped(arrival, client, stamp, newest):
                 self.jumps += 1
@@ -138,14 +139,14 @@ class DataTimeline:
             yield from self._run_up_to(newest - self._behind)
 
     def finish(self) -> Iterator[Step]:
-        """Nothing more comes: the ticks up to the newest stamp, and all that waits."""
+        """No more samples follow: the ticks up to the newest stamp, and all waiting samples."""
         if self._newest is not None:
             yield from self._run_up_to(self._newest)
             yield from self.rest()
             self.now = max(self.now, self._newest)
 
     def _run_up_to(self, limit: int) -> Iterator[Step]:
-        """The ticks up to there, those for samples included."""
+        """The ticks up to there, including those of samples."""
         while True:
             tick = self._ticks.after(self.now)
             trigger = self._next_trigger()
@@ -162,7 +163,7 @@ class DataTimeline:
             yield Tick(tick, sampled)
 
     def _next_trigger(self) -> int | None:
-        """The earliest stamp of what waits that is evaluated at its own time."""
+        """The earliest stamp of a waiting sample that is evaluated at its own time."""
         if self._triggers is not self._ticks.triggers:  # the rules changed
             self._triggers = self._ticks.triggers
             self._trigger_stamps = [stamp for stamp, _, each in self._waiting if each.stream in self._triggers]
@@ -172,15 +173,15 @@ class DataTimeline:
         return self._trigger_stamps[0] if self._trigger_stamps else None
 
     def gap(self, time: int) -> Iterator[Step]:
-        """Steps and stalls of the wall clock do not touch the time of the data."""
+        """Steps and stalls of the wall clock do not affect the time of the data."""
         yield from ()
 
     def rest(self) -> Iterator[Step]:
-        """All that waits, at once: no tick of this axis comes any more."""
+        """All waiting samples, at once: this axis has no more ticks."""
         yield from self._release(None)
 
     def _token(self, arrival: Arrival) -> Iterator[Step]:
-        """What happens to a token carries no stamp: it comes after all samples with the newest stamp so far."""
+        """A change of a token has no stamp: it follows all samples with the newest stamp so far."""
         newest = self.now if self._newest is None else self._newest
         if newest <= self.now or self._waiting_bytes >= self.maximum_bytes:
             yield Insert((arrival,), (self.now,))
@@ -188,7 +189,7 @@ class DataTimeline:
             self._wait(arrival, newest)
 
     def _hold(self, arrival: Arrival, stamp: int) -> Iterator[Step]:
-        """A sample of a latched stream."""
+        """Queue a sample of a latched stream."""
         if self._newest is None:
             self._early.append((stamp, arrival))
         elif (place := min(stamp, self._newest)) <= self.now:
@@ -215,7 +216,7 @@ class DataTimeline:
             heapq.heappush(self._trigger_stamps, stamp)
 
     def _release(self, until: int | None) -> Iterator[Insert]:
-        """What waits with a stamp up to `until` (None: all), in order."""
+        """The waiting samples with a stamp up to `until` (None: all), in order."""
         arrivals, times = [], []
         while self._waiting and (until is None or self._waiting[0][0] <= until):
             stamp, _, arrival = heapq.heappop(self._waiting)
@@ -232,11 +233,11 @@ class DataTimeline:
             self._several_clients = True
 
     def _reach(self, arrival: Arrival, since: int) -> int:
-        """How far ahead of a stamp that was received then the arrival's may be."""
+        """How far the arrival may be ahead of a stamp that was received at `since`."""
         return self._max_ahead + max(0, arrival.received - since)
 
     def _jumped(self, arrival: Arrival, client: str, stamp: int, newest: int) -> bool:
-        """Whether this sample, which does not fit, shows that time jumped; else it is dropped."""
+        """Whether this sample, which does not fit, shows that time jumped; otherwise it is dropped."""
         row = self._row
         if row is not None and -self._max_ahead <= stamp - row.last <= self._reach(arrival, row.received):
             row.several = row.several or client != row.client

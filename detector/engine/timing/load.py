@@ -1,8 +1,8 @@
-"""When the machine is too slow: which rules are evaluated less often, in which order. Pure; the level is given.
+"""Overload: which rules are evaluated less often, and in which order. Pure; the caller gives the level.
 
-Each class of rules with one priority, from the lowest on, is thinned out in three steps: every second evaluation, every
-fourth, every eighth. The next class begins when the one below it is at its last step. At level 0 no
-evaluation is left out.
+Each class of rules with the same priority, from the lowest, is thinned in three steps: every second evaluation, every
+fourth, every eighth. The next class begins when the one below it has reached its last step. At level 0 no evaluation is
+skipped.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ STEPS = (1, 2, 4, 8)
 
 
 def highest_level(priorities: Collection[int]) -> int:
-    """The level beyond which nothing more can be left out."""
+    """The level at which thinning reaches its maximum."""
     return len(set(priorities)) * (len(STEPS) - 1)
 
 
 def thinning(level: int, priorities: Collection[int]) -> Mapping[int, int]:
-    """Of how many evaluations one takes place, by the rules' priority."""
+    """By priority of the rules: one in this number of evaluations takes place."""
     found = {}
     for priority in sorted(set(priorities)):
         step = min(level, len(STEPS) - 1)

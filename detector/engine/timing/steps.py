@@ -28,7 +28,7 @@ class Tick:
 
 @dataclass(frozen=True, slots=True)
 class Gap:
-    """Time went on (or back) to `time` without ticks."""
+    """Time continues at `time`, later or earlier, without ticks between."""
 
     time: int
     backwards: bool

@@ -1,4 +1,4 @@
-"""When there is a tick beside those for samples: at the rules' periods, and when a single subject must wake."""
+"""When there is a tick apart from those for samples: at the rules' periods, and when a single subject must wake."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from detector.engine.buffering.buffer import HOUSEKEEPING
 
 
 class Ticks:
-    """When to evaluate beside the samples: at whole multiples of the rules' periods, and when a subject must wake."""
+    """Times of ticks apart from samples: whole multiples of the rules' periods, and the wakes of subjects."""
 
     def __init__(self) -> None:
         self._periods: tuple[int, ...] = (HOUSEKEEPING,)
         self._wakes: list[int] = []
-        """A heap; what is over is dropped when it is met."""
+        """A heap; past entries are dropped when they are met."""
         self.triggers: frozenset[str] = frozenset()
         """The streams whose samples are evaluated at their own times."""
 
@@ -27,7 +27,7 @@ class Ticks:
         self.triggers = frozenset(streams)
 
     def wake_at(self, time: int) -> None:
-        """There is a tick at this time, if it is still to come."""
+        """Schedule a tick at this time, if it is still in the future."""
         heapq.heappush(self._wakes, time)
 
     def after(self, time: int) -> int:
@@ -38,5 +38,5 @@ class Ticks:
         return min(regular, self._wakes[0]) if self._wakes else regular
 
     def is_regular(self, time: int) -> bool:
-        """Whether the tick is there for a period, not just for a sample or a wake."""
+        """Whether the tick belongs to a period, not only to a sample or a wake."""
         return any(time % period == 0 for period in self._periods)

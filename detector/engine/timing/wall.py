@@ -1,6 +1,6 @@
-"""Clock Wall: a sample's time is its receive time, and the shell advances the time.
+"""Clock Wall: a sample's time is its receive time, and the caller advances the time.
 
-A tick sees the samples up to its time, those of exactly its time included, and none later.
+A tick sees the samples up to and including its time, and no later ones.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ class WallTimeline:
         self._ticks = ticks
         self._exact = exact
         self.now = start
-        """Up to here all ticks have run."""
+        """All ticks up to this time have run."""
 
     def steps(self, arrivals: Sequence[Arrival], until: int) -> Iterator[Step]:
         """All that happens up to `until`, or up to the last arrival if that is later.
 
-        The arrivals are in order of time, and whatever comes in a later call is later than these and than `until`: so
-        the ticks up to there can run, and each sees all samples up to its time.
+        The arrivals are in time order, and those of a later call are later than these and than `until`. Therefore the
+        ticks up to there can run, and each sees all samples up to its time.
         """
         first, count = 0, len(arrivals)
         if count:
@@ -53,19 +53,19 @@ class WallTimeline:
         self.now = max(self.now, until)
 
     def _due(self, arrivals: Sequence[Arrival]) -> deque[Arrival]:
-        """The arrivals that are evaluated at their own times; not those of a stall, before which time does not go."""
+        """The arrivals that are evaluated at their own times; not those of a stall, because time never goes back."""
         triggers, past = self._ticks.triggers, self.now if self._exact else 0
         if not triggers:
             return deque()
         return deque(each for each in arrivals if each.stream in triggers and each.received > past)
 
     def gap(self, time: int) -> Iterator[Step]:
-        """The shell found that time stood still or jumped: go on from `time` without the ticks between."""
+        """The clock stood still or jumped: continue at `time` without the ticks between."""
         backwards, self.now = time < self.now, time
         yield Gap(time, backwards)
 
     def rest(self) -> Iterator[Step]:
-        """Nothing waits here."""
+        """Nothing is waiting here."""
         yield from ()
 
     def finish(self) -> Iterator[Step]:

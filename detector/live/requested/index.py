@@ -1,8 +1,8 @@
-"""The index of requested recordings: what a request leads to, and its response. Pure.
+"""The index of requested recordings: the effect of a request, and its response. Pure.
 
-A recording is known by the id that its requester chose, so that a request that is sent twice does nothing twice.
-Recordings that are over stay in the index for a while: a later request returns their result, and a start that arrives
-after its own stop begins nothing.
+A recording is identified by the id that its requester chose, so a repeated request has no further effect. Finished
+recordings stay in the index for a while: a later request returns their result, and a start that arrives after its own
+stop begins nothing.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ BY_ITSELF = "ended by its maximumDuration"
 
 @dataclass(slots=True)
 class RequestedRecording:
-    """One recording. Times are nanoseconds since the epoch, of the detector's time axis."""
+    """One recording. Times are nanoseconds since the epoch, on the detector's time axis."""
 
     id: str
     state: Progress
@@ -61,9 +61,9 @@ class RecordingIndex:
     def start(
         self, request: RecordingRequest, allowed: OnRequest | None, streams: Collection[str], now: int
     ) -> tuple[RecordingReport, RequestedRecording | None]:
-        """What to answer; and the recording that is to begin, if one is.
+        """The response, and the recording to begin, if any.
 
-        `allowed` is None if requests are not permitted; `streams` are those that the detector has.
+        `allowed` is None if requests are not permitted; `streams` are those of the detector.
         """
         identity = request.id or ""
         known = self._entries.get(identity)
@@ -81,7 +81,7 @@ class RecordingIndex:
         return entry.report(), entry
 
     def stop(self, request: RecordingRequest, now: int) -> tuple[RecordingReport, RequestedRecording | None]:
-        """What to answer; and the recording whose `until` has come closer, if one has."""
+        """The response, and the recording whose `until` was shortened, if any."""
         identity = request.id or ""
         entry = self._entries.get(identity)
         if entry is None:
@@ -97,7 +97,7 @@ class RecordingIndex:
         return entry.report(), entry
 
     def status(self, identity: str | None) -> RecordingReport | list[RecordingReport]:
-        """What is known of one recording, or of all."""
+        """The state of one recording, or of all."""
         if identity is None:
             return [entry.report() for entry in self._entries.values() if entry.since is not None]
         entry = self._entries.get(identity)
@@ -116,7 +116,7 @@ class RecordingIndex:
             entry.message = BY_ITSELF
 
     def withdraw(self, identity: str) -> None:
-        """It could not be begun after all."""
+        """Remove a recording that could not be started."""
         self._entries.pop(identity, None)
 
     def _refusal(self, request: RecordingRequest, allowed: OnRequest | None, streams: Collection[str]) -> str:

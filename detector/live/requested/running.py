@@ -1,4 +1,4 @@
-"""How a recording on request runs: by the record action of a generated rule, with an episode of its own."""
+"""Runs a recording on request: by the record action of a generated rule, with a separate episode."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ REQUESTED = Which("_requested", "record")
 
 
 def with_requested(rules: Sequence[EventRule], detector: Detector) -> list[EventRule]:
-    """The rules whose actions are at work: with that of the recordings on request, where the Detector allows them."""
+    """The rules whose actions run, including the rule for recordings on request if the Detector allows these."""
     recordings = detector.spec.recordings
     if recordings is None or recordings.on_request is None:
         return list(rules)
@@ -39,7 +39,7 @@ def with_requested(rules: Sequence[EventRule], detector: Detector) -> list[Event
 
 
 def run_of(identity: str) -> Run:
-    """The run of a recording; its episode is a short name for the id, which may be long."""
+    """The run of a recording; its episode is a short name derived from the id, which may be long."""
     return Run(REQUESTED.rule, REQUESTED.action, identifier(identity.encode()))
 
 
@@ -52,9 +52,7 @@ def begin(
     cause: dict[str, Any],
     now: int,
 ) -> None:
-    """Pass the samples of the recording on from now on. `cause` is the event of the requester; nothing in it is
-    trusted.
-    """
+    """Begin to pass on the samples of the recording. `cause` is the requester's event; nothing in it is trusted."""
     subject, subjects = _about(cause)
     data = cause.get("data")
     classification = data.get("classification") if isinstance(data, dict) else None

@@ -1,4 +1,4 @@
-"""Answers recording requests: the index decides, the thread of the evaluation carries it out."""
+"""Handles recording requests: the index decides, the evaluation thread carries it out."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Requested:
         self._lock = threading.Lock()
         self._index = RecordingIndex()
         self._runs: dict[str, str] = {}
-        """The ids by episode, of those that are not over."""
+        """The ids by episode, of unfinished recordings."""
 
     def answer(self, payload: bytes) -> bytes:
         """The response to a request, as JSON. Raises ValueError, with a message for the requester."""
@@ -88,7 +88,8 @@ class Requested:
         return report
 
     def _begin(self, entry: RequestedRecording, request: RecordingRequest) -> None:
-        """On the evaluation's thread. One that was stopped in the meantime is so short that its end is known."""
+        """Runs on the evaluation thread. A recording that was stopped in the meantime is so short that its end is
+        known."""
         engine = self._engine
         begin(
             engine.consequences,
@@ -101,7 +102,7 @@ class Requested:
         )
 
     def _release(self, identity: str, until: int | None) -> None:
-        """On the evaluation's thread; None: now."""
+        """Runs on the evaluation thread; None: now."""
         self._engine.consequences.release(run_of(identity), self._engine.now if until is None else until)
 
     def _in_time(self, future: Future[Any]) -> None:

@@ -170,7 +170,7 @@
     return made;
   }
 
-  /** Conditions, booleans and texts: a bar whose colour says what it is. */
+  /** Conditions, booleans and texts: a bar whose colour shows the value. */
   function drawStates(rows, subject, range) {
     const source = { left: [], right: [], row: [], paint: [], text: [] };
     const add = (row, from, to, paint, text) => {
@@ -244,7 +244,7 @@
     const place = at("map");
     if (!data.ways.length) {
       at("no-map").hidden = false;
-      at("no-map").textContent = "No rule says where clients are: positions come from a pairs scope.";
+      at("no-map").textContent = "No rule defines the positions of clients: they come from a pairs scope.";
       return;
     }
     const made = figure({ height: Math.min(520, Math.max(320, place.clientWidth * 0.6)), match_aspect: true,

@@ -13,11 +13,11 @@ from wayside.api.stream import Encoding, Stream
 
 
 def codec_for(stream: Stream, *, types: RosTypes | None = None, asn1: OwnDefinitions | None = None) -> Decoder:
-    """What reads the stream's payloads.
+    """The decoder of the stream's payloads.
 
-    `types` are the ROS 2 message types that are known, by default the standard ones; `asn1` are definitions of ETSI ITS
-    messages that the Detector brings. Raises UnknownTypeError, which names the stream's field and what is close, and
-    DefinitionError where the definitions of ETSI ITS messages are not there.
+    `types` are the known ROS 2 message types, by default the standard ones; `asn1` are the Detector's definitions of
+    ETSI ITS messages. Raises UnknownTypeError, which names the stream's field and similar types, and DefinitionError if
+    the definitions of ETSI ITS messages are missing.
     """
     match stream.encoding:
         case Encoding.JSON:

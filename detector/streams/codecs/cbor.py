@@ -1,8 +1,9 @@
-"""CBOR (RFC 8949): read by cbor2, then made plain as JSON would be.
+"""CBOR (RFC 8949): read by cbor2, then converted to plain values as in JSON.
 
-What JSON has no word for: byte strings stay bytes, undefined and simple values without a meaning are null, and numbers
-as keys of maps become text. Of tags the content counts: a time stays the text or number that it is. Big integers and
-fractions are numbers. References inside a message (tags 28 and 29) are refused: they could make it endless.
+Values without a form in JSON: byte strings stay bytes, undefined and unassigned simple values become null, and numbers
+as keys of maps become text. Tags are replaced by their content: a time stays the text or number that it is. Big
+integers and fractions are numbers. References inside a message (tags 28 and 29) are rejected: they could make it
+endless.
 """
 
 from __future__ import annotations
@@ -18,12 +19,12 @@ from detector.engine.samples.sample import DecodeError
 from detector.streams.codecs.doubles import number
 
 MAX_DEPTH = 64
-"""How deeply maps, lists and tags may be nested: no real message comes near, and a hostile one must not exhaust the
+"""Maximum nesting of maps, lists and tags: no real message comes near it, and a hostile one must not exhaust the
 stack."""
 
 
 class CborDecoder:
-    """Reads CBOR of any shape; only the stream knows which field is its stamp."""
+    """Reads CBOR of any shape; the stream's configuration names its stamp."""
 
     def decode(self, payload: bytes) -> Any:
         """The value. Raises DecodeError for anything but one CBOR data item, nested at most MAX_DEPTH deep."""
@@ -39,7 +40,7 @@ class CborDecoder:
         raise DecodeError("not CBOR: there are bytes after the data item")
 
     def stamp(self, payload: bytes) -> int | None:
-        """None: the stream defines which field is the stamp."""
+        """None: the stream's configuration names the field of the stamp."""
         return None
 
 
@@ -48,7 +49,7 @@ class _ReferenceError(ValueError):
 
 
 def _plain(value: Any) -> Any:
-    """The value without what is CBOR's own; cbor2 has bounded how deep it is."""
+    """The value without CBOR's own types; cbor2 has bounded its depth."""
     kind = type(value)
     if kind is float or kind is str or kind is bool or value is None or kind is bytes:
         return value
@@ -58,7 +59,7 @@ def _plain(value: Any) -> Any:
         return {key if type(key) is str else _key(key): _plain(item) for key, item in value.items()}
     if kind is list or kind is tuple:
         return [_plain(item) for item in value]
-    return None  # undefined, or a simple value without a meaning
+    return None  # undefined, or an unassigned simple value
 
 
 def _key(key: Any) -> str:
@@ -90,7 +91,7 @@ def _binary(value: Any, immutable: bool) -> Any:
 
 
 def _fraction(value: Any) -> tuple[int, int]:
-    """Exponent and mantissa. Raises ValueError where they are not two integers of at most 64 bits."""
+    """Exponent and mantissa. Raises ValueError unless they are two integers of at most 64 bits."""
     match value:
         case [int(exponent), int(mantissa)] if max(abs(exponent), abs(mantissa)) < 2**64:
             return exponent, mantissa
@@ -115,4 +116,4 @@ _TAGS: Mapping[int, Callable[[Any, bool], Any]] = {
     28: _reference,
     29: _reference,
 }
-"""What is done with tags of which cbor2 would make Python objects; big integers (2 and 3) stay its own."""
+"""The conversions of tags that cbor2 would convert to Python objects; big integers (2 and 3) are left to it."""

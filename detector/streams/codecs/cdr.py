@@ -1,4 +1,4 @@
-"""CDR: ROS 2 messages, read by rosbags, then made plain by a converter that is built once per type."""
+"""CDR: ROS 2 messages, read by rosbags, then converted to plain values by a function that is built once per type."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from detector.streams.codecs.paths import Path
 from detector.streams.codecs.ros import RosTypes, UnknownTypeError, standard
 
 _STAMPS = {b"\x00\x01": struct.Struct("<iI").unpack_from, b"\x00\x00": struct.Struct(">iI").unpack_from}
-"""How to read seconds and nanoseconds, by the encapsulation's representation."""
+"""Reads seconds and nanoseconds, by the encapsulation's representation."""
 _LARGE = 4096
-"""From here on, reading through a view costs less than the copy that rosbags would make behind the encapsulation."""
+"""From this size, reading through a view costs less than the copy that rosbags would make after the encapsulation."""
 
 
 class CdrDecoder:
@@ -45,8 +45,8 @@ class CdrDecoder:
     def decode(self, payload: bytes) -> Any:
         """The message as a map; arrays of octets (uint8, char, byte) are bytes, all others lists.
 
-        Raises DecodeError where the bytes are no message of the type. rosbags checks every length against what is
-        there before it allocates, and turns what goes wrong (too short, no UTF-8, no terminator) into SerdeError.
+        Raises DecodeError if the bytes are not a message of the type. rosbags checks every length against the available
+        bytes before it allocates, and raises SerdeError for errors (too short, no UTF-8, no terminator).
         """
         try:
             message = self._read(payload if len(payload) < _LARGE else memoryview(payload), self.type_name)
@@ -55,9 +55,9 @@ class CdrDecoder:
         return self._convert(message)
 
     def stamp(self, payload: bytes) -> int | None:
-        """header.stamp in nanoseconds, without decoding the rest where it comes first; None for a type without header.
+        """header.stamp in nanoseconds, without decoding the rest if it comes first; None for a type without header.
 
-        Raises DecodeError where the bytes are too short or hold no time since 1970.
+        Raises DecodeError if the bytes are too short or contain no time since 1970.
         """
         if not self._stamp_first:
             return self._stamp_inside(payload) if self._has_header else None
@@ -67,11 +67,11 @@ class CdrDecoder:
         return self._time(*unpack(payload, 4))
 
     def field_reader(self, paths: Sequence[Path]) -> FieldReader | None:
-        """A reader of just these paths; None for types with wide texts, empty arrays or an unusual size."""
+        """A reader of only these paths; None for types with wide texts, empty arrays or an unusual size."""
         return cdr_fields(self._types, self.type_name, paths, self.decode)
 
     def _stamp_inside(self, payload: bytes) -> int:
-        """header.stamp where other fields come before the header."""
+        """header.stamp if other fields precede the header."""
         stamp = self.decode(payload)["header"]["stamp"]
         return self._time(int(stamp["sec"]), int(stamp["nanosec"]))
 
@@ -83,7 +83,7 @@ class CdrDecoder:
 
 @lru_cache(maxsize=4096)
 def _converter(types: RosTypes, type_name: str) -> Convert:
-    """Makes a message of the type a map."""
+    """The conversion of a message of the type to a map."""
     definition = types.store.get_msgdef(type_name)
     fields = [
         (name, attribute, desc)
@@ -109,7 +109,7 @@ def _converter(types: RosTypes, type_name: str) -> Convert:
 
 
 def _field(types: RosTypes, desc: FieldDesc) -> Convert | None:
-    """Makes a field's value plain; None where it already is."""
+    """The conversion of a field's value to a plain one; None if it is plain already."""
     kind, detail = desc
     if kind is Nodetype.NAME:
         return _converter(types, str(detail))

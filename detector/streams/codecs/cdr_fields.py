@@ -1,7 +1,7 @@
 """CDR: reads a few fields, by a function whose source is generated for the type and the paths (see `cdr_walk`).
 
-It finds what rosbags finds, and makes every check that rosbags makes, also of what it skips. A payload that fails one
-is decoded whole, so that the decoder reports what is wrong.
+It finds what rosbags finds, and makes all its checks, including those of skipped fields. A payload that fails a check
+is decoded as a whole, so that the decoder reports the error.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from detector.streams.codecs.paths import Path, complete, shortest, spread
 from detector.streams.codecs.ros import RosTypes
 
 _Walker = Callable[[Sequence[bytes], Callable[[int], None]], list[list[Any] | None]]
-"""Reads payloads, and calls back with the place of each that it cannot read. Returns the values of the others by path;
-None for a path that leads to nothing."""
+"""Reads payloads, and calls back with the index of each that it cannot read. Returns the values of the others by path;
+None for a path that does not exist."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,13 +42,13 @@ _BIG: Final = _Order(b"\x00\x00", 0, ">")
 
 
 _REFUSED = (struct.error, IndexError, ValueError, OverflowError)
-"""What generated code raises for payloads that cannot be read."""
+"""Exceptions of generated code for payloads that cannot be read."""
 
 
 def cdr_fields(
     types: RosTypes, type_name: str, paths: Sequence[Path], decode: Callable[[bytes], Any]
 ) -> FieldReader | None:
-    """Reads the paths of messages of a known type; None where only `decode` can read it.
+    """A reader of the paths in messages of a known type; None if only `decode` can read it.
 
     `decode` reads a whole payload.
     """
@@ -60,7 +60,8 @@ def cdr_fields(
 
     def read_fields(payloads: Sequence[bytes]) -> Fields:
         columns, left = _read(little, payloads)
-        # One stream rarely has both byte orders: that of most payloads is read, the others are decoded whole.
+        # A stream rarely has both byte orders: payloads with the most common one are read, the others are decoded as a
+        # whole.
         if 2 * sum(payloads[place][:2] == _BIG.representation for place in left) > len(payloads):
             columns, left = _read(big, payloads)
         return spread(complete(payloads, columns, whole, left, decode), whole, paths)
@@ -69,7 +70,7 @@ def cdr_fields(
 
 
 def _read(walk: _Walker, payloads: Sequence[bytes]) -> tuple[list[list[Any]], list[int]]:
-    """The columns of what can be read, and the places of the other payloads."""
+    """The columns of the readable payloads, and the indices of the others."""
     left: list[int] = []
     columns = walk(payloads, left.append)
     present = len(payloads) - len(left)
@@ -82,14 +83,14 @@ def _walkers(types: RosTypes, type_name: str, paths: tuple[Path, ...]) -> tuple[
 
 
 def _readable(types: RosTypes, type_name: str, path: Path) -> Path:
-    """How far the path leads through messages: below, it is looked up in the value."""
+    """The part of the path that leads through messages: the rest is looked up in the value."""
     at: str | None = type_name
     for length, step in enumerate(path):
         if at is None:
             return path[:length]
         desc = None if step == PADDING else dict(types.fields(at)).get(str(step)) if type(step) is str else None
         if desc is None:
-            return path[: length + 1]  # to nothing
+            return path[: length + 1]  # it does not exist
         at = str(desc[1]) if desc[0] is Nodetype.NAME else None
     return path
 
@@ -119,7 +120,7 @@ def _walker(types: RosTypes, type_name: str, paths: Sequence[Path], order: _Orde
     ]
     space = {**code.bound, "refused": _REFUSED, "texts": _Texts(), "frombuffer": np.frombuffer}
     try:
-        # The source holds nothing from outside but quoted names of fields.
+        # The only external text in the source are quoted names of fields.
         exec(compile("\n".join(source), f"<fields of {type_name}>", "exec"), space)  # noqa: S102
     except (SyntaxError, RecursionError, MemoryError) as error:
         raise UnwalkableError(f"{type_name} is too large") from error
@@ -150,7 +151,8 @@ def _tree(paths: Sequence[Path]) -> Tree:
 
 
 class _Texts(dict[bytes, str]):
-    """Texts by their bytes with the terminator. Raises ValueError for what rosbags refuses: most texts come again."""
+    """A cache of texts by their bytes with the terminator: most texts repeat. Raises ValueError for those that rosbags
+    rejects."""
 
     _MOST, _LONGEST = 4096, 256
 

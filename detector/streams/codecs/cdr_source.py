@@ -1,7 +1,7 @@
-"""CDR: source that is generated piece by piece, and knows where in the message it has come to.
+"""CDR: generates source piece by piece, and tracks its position in the message.
 
-Behind a text or a sequence the position is only known when the code runs. Even then its remainder is often known, so
-that an alignment needs no code. Numbers between two such places are read at once.
+After a text or a sequence the position is only known when the code runs. Even then its remainder is often known, so
+that an alignment needs no code. Numbers between two such places are read together.
 """
 
 from __future__ import annotations
@@ -13,19 +13,19 @@ from dataclasses import dataclass, field
 from typing import Any
 
 _MOST_LOOPS = 10
-"""How many loops may stand in each other: Python bounds them."""
+"""Maximum number of nested loops: Python bounds them."""
 
 
 class UnwalkableError(ValueError):
-    """A type that no function can be generated for."""
+    """No function can be generated for this type."""
 
 
 @dataclass
 class CdrSource:
-    """Lines that read a payload `p`; the position is `base + constant`, of which `base` is a variable."""
+    """Lines that read a payload `p`; the position is `base + constant`, where `base` is a variable."""
 
     sign: str
-    """Of the byte order, as struct and numpy have it."""
+    """The sign of the byte order in struct and numpy."""
     modulus: int = 8
     remainder: int = 0
     """Of the distance to the end of the encapsulation, divided by the modulus."""
@@ -34,7 +34,7 @@ class CdrSource:
 
     lines: list[str] = field(default_factory=list)
     bound: dict[str, Any] = field(default_factory=dict)
-    """What the lines refer to."""
+    """The objects that the lines refer to."""
     names: int = 0
     indent: str = ""
     pending: list[tuple[int, str, str]] = field(default_factory=list)
@@ -57,7 +57,7 @@ class CdrSource:
         return f"v{self.names}"
 
     def line(self, text: str) -> None:
-        """Adds a line, behind those that read the numbers before it."""
+        """Adds a line, after those that read the numbers before it."""
         self.flush()
         self.lines.append(self.indent + text)
 
@@ -68,7 +68,7 @@ class CdrSource:
         return name
 
     def read(self, form: str, size: int) -> str:
-        """Reads a number; the name of its value."""
+        """Reads a number; returns the name of its value."""
         name = self.name()
         self.pending.append((self.constant, form, name))
         self.advance(size)
@@ -95,7 +95,7 @@ class CdrSource:
         self.remainder = (self.remainder + size) % self.modulus
 
     def rebase(self, source: str, modulus: int, constant: int = 0) -> None:
-        """Go on at a computed position, which is a multiple of the modulus from the end of the encapsulation."""
+        """Continue at a computed position, which is a multiple of the modulus from the end of the encapsulation."""
         name = self.name()
         self.line(f"{name} = {source}")
         self.base, self.constant, self.modulus, self.remainder = name, constant, modulus, 0
@@ -105,7 +105,7 @@ class CdrSource:
         return math.gcd(self.modulus, self.remainder)
 
     def align(self, size: int) -> None:
-        """Go on to the next multiple of the size."""
+        """Advance to the next multiple of the size."""
         if self.modulus % size == 0:
             self.advance(-self.remainder % size)
         elif size == 8:  # the encapsulation has 4 bytes
@@ -114,7 +114,7 @@ class CdrSource:
             self.rebase(f"({self.at(size - 1)}) & -{size}", size)
 
     def loop(self, count: str, body: Callable[[], None]) -> None:
-        """Repeats what `body` adds. Raises UnwalkableError."""
+        """Repeats the lines that `body` adds. Raises UnwalkableError."""
         if len(self.indent) >= _MOST_LOOPS:
             raise UnwalkableError("sequences are nested too deeply")
         self.rebase(self.at(), 1)

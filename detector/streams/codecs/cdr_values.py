@@ -1,4 +1,4 @@
-"""CDR: the numbers, texts and arrays of ROS 2 messages, made plain."""
+"""CDR: converts the numbers, texts and arrays of ROS 2 messages to plain values."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from detector.streams.codecs.doubles import EXACT, number
 Convert = Callable[[Any], Any]
 
 PADDING = "structure_needs_at_least_one_member"
-"""What an empty message holds on the wire; no field of it."""
+"""The content of an empty message on the wire; not one of its fields."""
 
 
 def scalar(kind: str) -> Convert | None:
-    """What makes a value of this ROS type plain; None where it already is."""
+    """The conversion of a value of this ROS type to a plain one; None if it is plain already."""
     return _SCALARS.get(kind, float)
 
 
 def array(kind: str) -> Convert | None:
-    """What makes an array of this ROS type plain, as numpy has it; None where it already is."""
+    """The conversion of a numpy array of this ROS type to a plain value; None if it is plain already."""
     return _ARRAYS.get(kind, _small_integers)
 
 
 def _octet(value: int) -> float:
-    return float(value & 0xFF)  # rosbags reads a byte as signed, ROS means an octet
+    return float(value & 0xFF)  # rosbags reads a byte as signed; in ROS it is an octet
 
 
 def _floats(values: np.ndarray[Any, Any]) -> list[float]:
@@ -60,7 +60,7 @@ _SCALARS: dict[str, Convert | None] = {
 }
 _ARRAYS: dict[str, Convert | None] = {
     "string": None,
-    "bool": _floats,  # tolist() also makes numpy's booleans plain
+    "bool": _floats,  # tolist() also converts numpy's booleans
     "float32": _floats,
     "float64": _floats,
     "uint8": _octets,

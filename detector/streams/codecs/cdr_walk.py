@@ -1,6 +1,6 @@
-"""CDR: generates the source that walks through messages of a type and reads the wanted fields.
+"""CDR: generates the source that walks through messages of a type and reads the requested fields.
 
-rosbags reads a field wherever its own rules of alignment lead it; the same rules hold here.
+It follows rosbags' rules of alignment exactly, so it finds fields at the same positions.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from detector.streams.codecs.paths import Path
 from detector.streams.codecs.ros import RosTypes
 
 Tree = Mapping[str, "Tree | bool"]
-"""What is wanted of a message's fields; True: all of it."""
+"""The requested fields of a message; True: the whole value."""
 
 _FORMATS: Final = {
     "bool": "?",
@@ -42,14 +42,14 @@ _FORMATS: Final = {
 _OCTETS: Final = frozenset(("uint8", "char", "byte"))
 
 _UNROLLED = 32
-"""Arrays of up to this number of messages are read one by one, larger ones in a loop."""
+"""Arrays of up to this number of messages are unrolled, larger ones are read in a loop."""
 _MOST_FIELDS = 20_000
-"""What a generated function may look at: messages that hold each other many times over would make it endless."""
+"""Maximum number of fields in a generated function: deeply repeated messages would make it endless."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Value:
-    """A value that the source has read, and what makes it plain."""
+    """A value that the source has read, and its conversion to a plain value."""
 
     expression: str
     convert: Callable[[Any], Any] | None = None
@@ -57,16 +57,16 @@ class _Value:
 
 @dataclass
 class Walk:
-    """Adds to the source what walks through messages. It refers to `texts`, which checks and reads texts."""
+    """Adds source that walks through messages. It refers to `texts`, which checks and reads texts."""
 
     types: RosTypes
     source: CdrSource
     found: dict[Path, _Value] = field(default_factory=dict)
-    """What was wanted, by its path."""
+    """The requested values, by path."""
     fields: int = 0
 
     def message(self, type_name: str, wanted: Tree | bool, path: Path = ()) -> str:
-        """Walks through a message; the source of its value where all of it is wanted."""
+        """Walks through a message; returns the source of its value if the whole message is requested."""
         parts: list[str] = []
         fields = self.types.fields(type_name)
         for place, (name, desc) in enumerate(fields):
@@ -96,7 +96,7 @@ class Walk:
         return f"{self.source.bind(convert)}({value.expression})"
 
     def _field(self, desc: FieldDesc, wanted: Tree | bool, path: Path = ()) -> _Value:
-        """Walks through a field; its value counts where all of it is wanted."""
+        """Walks through a field; its value is kept if the whole field is requested."""
         kind, detail = desc
         if kind is Nodetype.NAME:
             return _Value(self.message(str(detail), wanted, path))
@@ -110,7 +110,7 @@ class Walk:
             raise UnwalkableError("arrays of arrays")
         if kind is Nodetype.ARRAY:
             if count == 0:
-                raise UnwalkableError("an array of nothing")  # rosbags' alignment depends on what stands around it
+                raise UnwalkableError("an array of nothing")  # rosbags' alignment depends on the surrounding fields
             if of_messages:
                 return self._array_of_messages(str(element[1]), count, whole)
             return self._array(str(element[1][0]), count, whole)
@@ -124,13 +124,13 @@ class Walk:
             return _Value(self._text(wanted))
         size = _size(kind)
         if wanted:
-            # A byte is read as an octet right away.
+            # A byte is read as an octet directly.
             return _Value(self.source.read(_FORMATS[kind], size), float if kind == "byte" else scalar(kind))
         self.source.advance(size)
         return _Value("")
 
     def _text(self, wanted: bool) -> str:
-        """A text; the name of its value."""
+        """A text; returns the name of its value."""
         length = self.source.read("I", 4)
         self.source.flush()
         begin = self.source.at()
@@ -174,7 +174,7 @@ class Walk:
         return _Value(value)
 
     def _numbers(self, kind: str, count: str, begin: str) -> str:
-        """Reads an array of numbers; the name of its value."""
+        """Reads an array of numbers; returns the name of its value."""
         name = self.source.name()
         if kind in _OCTETS:
             self.source.line(f"{name} = p[{begin}:{begin} + {count}]")
@@ -230,7 +230,7 @@ class Walk:
         return _Value(values or "")
 
     def _fixed_size(self, type_name: str, alignment: int) -> int | None:
-        """The size of messages of the type where it is always the same, given how they are aligned; else None."""
+        """The size of messages of the type if it is constant for this alignment; else None."""
         source = CdrSource(self.source.sign, modulus=alignment)
         alone = Walk(self.types, source, fields=self.fields)
         alone.message(type_name, False)
@@ -238,7 +238,7 @@ class Walk:
         return None if source.lines or source.pending else source.constant
 
     def _collected(self, wanted: bool) -> str | None:
-        """A list for values that are wanted."""
+        """A list for requested values."""
         if not wanted:
             return None
         name = self.source.name()
@@ -250,7 +250,7 @@ class Walk:
             self.source.line(f"{values}.append({value})")
 
     def _alignment(self, desc: FieldDesc) -> int:
-        """How rosbags aligns a field."""
+        """rosbags' alignment of a field."""
         kind, detail = desc
         if kind is Nodetype.NAME:
             return self._alignment(self.types.fields(str(detail))[0][1])
@@ -261,7 +261,7 @@ class Walk:
         return 4 if detail[0] == "string" else _size(str(detail[0]))
 
     def _alignment_behind(self, desc: FieldDesc) -> int:
-        """What rosbags takes the position behind a field to be a multiple of."""
+        """The alignment that rosbags assumes for the position after a field."""
         kind, detail = desc
         if kind is Nodetype.NAME:
             return self._alignment_behind(self.types.fields(str(detail))[-1][1])
@@ -272,7 +272,7 @@ class Walk:
 
 
 def _size(kind: str) -> int:
-    """Of a number, in bytes."""
+    """The size of a number, in bytes."""
     if kind not in _FORMATS:
         raise UnwalkableError(f"{kind} is not supported")
     return struct.calcsize("<" + _FORMATS[kind])

@@ -1,7 +1,8 @@
-"""Message definitions given as text: `.msg` files, alone or with all that they refer to.
+"""Message definitions given as text: `.msg` files, alone or with all types that they refer to.
 
-A text may hold further types behind lines of `=`, each begun by `MSG: <type>`, as recordings hold them. What rosbags
-parses is checked here for what would only fail later: types that are not there, and types that hold themselves.
+A text may contain further types after lines of `=`, each introduced by `MSG: <type>`, as in recordings. This module
+checks parsed definitions for errors that rosbags would only find later: missing types, and types that contain
+themselves.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ _SEPARATOR = re.compile(r"^[ \t]*={3,}[ \t]*$", re.MULTILINE)
 _MSG = "MSG: "
 _HEADLINE = re.compile(r"MSG: [A-Za-z0-9/_]+[ \t]*")
 _PARSER = (TypesysError, ValueError, TypeError, KeyError, IndexError, AssertionError, AttributeError, RecursionError)
-"""What rosbags raises where a text is no definition: its own error, and what a strange text makes its parts raise."""
+"""Exceptions of rosbags for an invalid definition: its own error, and those that unusual texts cause in its parts."""
 
 _UNSUPPORTED = {"wstring": "wide strings are not supported", "float128": "numbers of 16 bytes are not supported"}
 
@@ -29,24 +30,24 @@ _UNSUPPORTED = {"wstring": "wide strings are not supported", "float128": "number
 _MISPLACED = "a line of `=` must stand before each further type and its `MSG: <type>`, and nowhere else"
 
 _LONGEST = 2**31
-"""So many elements has no array."""
+"""No array has this many elements."""
 
 _DEEPEST = 64
-"""How deep types may be nested: no real one comes near, and the stack bounds it."""
+"""Maximum nesting of types: no real type comes near it, and the stack is bounded."""
 
 
 @dataclass(frozen=True, slots=True)
 class Definition:
-    """What a message type is made of."""
+    """The definition of a message type."""
 
     name: str
     """The type, e.g. my_package/msg/Track."""
     text: str
-    """As a .msg file holds it."""
+    """The contents of a .msg file."""
 
 
 class DefinitionsError(ValueError):
-    """Definitions that cannot be used; `problems` has the type that each is about, and what is wrong."""
+    """Definitions that cannot be used; `problems` has the type and the reason of each."""
 
     def __init__(self, problems: Sequence[tuple[str, str]]) -> None:
         self.problems = tuple(problems)
@@ -55,7 +56,7 @@ class DefinitionsError(ValueError):
 
 @lru_cache(maxsize=512)
 def parsed(definition: Definition) -> Typesdict:
-    """The type, and those that the text holds beside it. Raises DefinitionsError, which gives the line."""
+    """The type, and the others in the text. Raises DefinitionsError with the line."""
     text = _SEPARATOR.sub("=" * 80, definition.text.replace("\r\n", "\n")).rstrip() + "\n"
     try:
         return get_types_from_msg(text, definition.name)
@@ -64,7 +65,7 @@ def parsed(definition: Definition) -> Typesdict:
 
 
 def from_idl(text: str) -> Typesdict:
-    """The types that an IDL file, as some recordings hold them, defines. Raises ValueError."""
+    """The types defined by an IDL file, as in some recordings. Raises ValueError."""
     try:
         return get_types_from_idl(text)
     except _PARSER as error:
@@ -72,7 +73,7 @@ def from_idl(text: str) -> Typesdict:
 
 
 def merged_types(definitions: Sequence[Definition]) -> Typesdict:
-    """All types that the definitions hold. Raises DefinitionsError, with the problems of all of them."""
+    """All types of the definitions. Raises DefinitionsError, with the problems of all of them."""
     types: Typesdict = {}
     given_in: dict[str, str] = {}
     problems: list[tuple[str, str]] = []
@@ -97,9 +98,9 @@ def merged_types(definitions: Sequence[Definition]) -> Typesdict:
 
 
 def check(definitions: Sequence[Definition], new: Typesdict, known: Mapping[str, Any]) -> None:
-    """That fields are there once, of types that are new or known, and that no type holds itself.
+    """Check that fields are unique and of new or known types, and that no type contains itself.
 
-    Raises DefinitionsError, which gives the field.
+    Raises DefinitionsError with the field.
     """
     problems = [
         (definition.name, f"{_place(definition, name, field)} {problem}")
@@ -134,11 +135,11 @@ def _wrong_fields(fields: Iterable[tuple[str, FieldDesc]], known: Collection[str
 
 
 class _EndlessError(ValueError):
-    """A type that holds itself, or is nested as if it did."""
+    """A type contains itself, or is nested too deeply."""
 
 
 def _depth(name: str, types: Typesdict, seen: dict[str, int], above: tuple[str, ...] = ()) -> int:
-    """How deep the type is nested, not counting what is known beforehand. Raises _EndlessError."""
+    """The nesting depth of the type, without types that are known already. Raises _EndlessError."""
     if name in above:
         circle = " → ".join((*above[above.index(name) :], name))
         raise _EndlessError(f"it contains itself ({circle}), which no message can")
@@ -153,7 +154,7 @@ def _depth(name: str, types: Typesdict, seen: dict[str, int], above: tuple[str, 
 
 
 def message_type_of(desc: FieldDesc) -> str | None:
-    """The message type that a field is of, or its elements are."""
+    """The message type of a field, or of its elements."""
     kind, detail = desc
     if kind is Nodetype.NAME:
         return str(detail)
@@ -168,7 +169,7 @@ def _missing(name: str) -> str:
 
 
 def _place(definition: Definition, type_name: str, field: str) -> str:
-    """The field, and the line where it stands."""
+    """The field, and its line."""
     inside = re.split(r"\n=+\n", _SEPARATOR.sub("===", definition.text))
     wanted = type_name if type_name != definition.name else None
     offset = 1
@@ -184,12 +185,12 @@ def _place(definition: Definition, type_name: str, field: str) -> str:
 
 
 def _same(written: str, type_name: str) -> bool:
-    """Whether a type as written behind MSG, perhaps without its folder, is that type."""
+    """Whether a type as written after MSG, perhaps without its folder, is that type."""
     return written.strip().replace("/msg/", "/") == type_name.replace("/msg/", "/")
 
 
 def _wrong_line(text: str) -> str | None:
-    """Which line is none of a definition; they stand each for itself."""
+    """The first invalid line of a definition; each line is independent."""
     for number, line in enumerate(text.split("\n"), start=1):
         if line == "=" * 80 or _HEADLINE.fullmatch(line):
             continue

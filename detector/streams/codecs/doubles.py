@@ -1,11 +1,11 @@
-"""Numbers as expressions want them: doubles, but integers that a double cannot hold exactly stay integers."""
+"""Numbers in expressions: doubles, except that integers beyond a double's precision stay integers."""
 
 from __future__ import annotations
 
 EXACT = 2**53
-"""Up to here, every integer is a double."""
+"""Every integer up to this one is a double."""
 
 
 def number(value: int) -> float | int:
-    """The integer as a double where that is exact enough, else as it is."""
+    """The integer as a double if that is exact, otherwise unchanged."""
     return float(value) if -EXACT <= value <= EXACT else value

@@ -1,4 +1,4 @@
-"""Which fields the messages of a stream have, where that is known beforehand."""
+"""The fields of a stream's messages, if they are known in advance."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from wayside.rules import BYTES, Fields, ItemFields
 
 
 def message_fields(stream: Stream, types: RosTypes | None = None) -> Fields | None:
-    """The fields of a ROS message type, none of a raw message; None for other encodings, which can have any."""
+    """The fields of a ROS message type, none for a raw message; None for other encodings, which can have any fields."""
     if stream.encoding is Encoding.RAW:
         return BYTES
     types = types or standard()

@@ -1,6 +1,6 @@
-"""JSON: read by msgspec, then its integers made doubles.
+"""JSON: read by msgspec, then its integers are converted to doubles.
 
-What JSON does not know (NaN, Infinity, trailing commas) is refused. Of a key that occurs twice, the last one counts.
+Invalid JSON (NaN, Infinity, trailing commas) is rejected. Of a repeated key, the last one counts.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from detector.streams.codecs.json_fields import json_fields
 from detector.streams.codecs.paths import Path
 
 MAX_DEPTH = 64
-"""How deeply maps and lists may be nested: no real message comes near, and a hostile one must not exhaust the stack."""
+"""Maximum nesting of maps and lists: no real message comes near it, and a hostile one must not exhaust the stack."""
 
 _read = msgspec.json.Decoder().decode
 
 
 class JsonDecoder:
-    """Reads JSON of any shape; only the stream knows which field is its stamp."""
+    """Reads JSON of any shape; the stream's configuration names its stamp."""
 
     def decode(self, payload: bytes) -> Any:
         """The value. Raises DecodeError for anything but one JSON value in UTF-8, nested at most MAX_DEPTH deep."""
@@ -31,16 +31,16 @@ class JsonDecoder:
         except (msgspec.DecodeError, UnicodeDecodeError) as error:
             raise DecodeError(f"not JSON: {error}") from None
         except RecursionError:
-            # msgspec counts its depth, so the stack is sound: this is its way of saying that the nesting is too deep.
+            # msgspec bounds its depth, so the stack is safe: it reports deep nesting by this error.
             raise _too_deep() from None
         return _with_doubles(value, MAX_DEPTH)
 
     def stamp(self, payload: bytes) -> int | None:
-        """None: the stream defines which field is the stamp."""
+        """None: the stream's configuration names the field of the stamp."""
         return None
 
     def field_reader(self, paths: Sequence[Path]) -> FieldReader | None:
-        """A reader of just these paths; None for an index at the beginning of a path, and for names with control
+        """A reader of only these paths; None for an index at the beginning of a path, and for names with control
         characters, quotes or backslashes."""
         return json_fields(paths, self.decode, lambda value: _with_doubles(value, MAX_DEPTH), MAX_DEPTH)
 

@@ -1,8 +1,8 @@
-"""JSON: reads a few fields, by structs of msgspec that have just these.
+"""JSON: reads a few fields, by msgspec structs that have only these.
 
-msgspec skips what a struct does not have, and looks at it less closely than when it decodes it: neither at UTF-8, nor
-at how large a number is, nor at our bound on the depth. What may fail there is decoded whole, and so is every message
-that does not fit the structs, so that the decoder decides what is read and what is refused.
+msgspec skips fields that a struct does not have, and checks them less strictly than the decoder: neither UTF-8, nor the
+size of numbers, nor our bound on the depth. Payloads that may fail these checks are decoded as a whole, and so is every
+message that does not fit the structs. The decoder thus decides what is accepted.
 """
 
 from __future__ import annotations
@@ -18,12 +18,13 @@ from detector.streams.codecs.doubles import number
 from detector.streams.codecs.paths import Path, complete, shortest, spread
 
 _SLICE = 64
-"""How many payloads are looked at together: one that is unlike the rest costs the others only this far."""
+"""Number of payloads that are checked together: an unusual one slows only these."""
 _PLAIN = frozenset((float, str, bool, type(None), type(MISSING)))
 
 _SHAPE = bytes.maketrans(b"0123456789E", b"0000000000e")
 _LARGE = b"0e000"
-"""Any exponent of three digits, once the digits are zeros; a number without one needs many digits to be too large."""
+"""Any exponent of three digits, after replacing digits by zeros; a number without one needs many digits to be too
+large."""
 _MANY = b"0" * 200
 
 _BRACKETS = bytes.maketrans(b"{}", b"[]")
@@ -33,10 +34,10 @@ _NO_BRACKETS = bytes(set(range(256)) - set(b'[]{}"'))
 def json_fields(
     paths: Sequence[Path], decode: Callable[[bytes], Any], plain: Callable[[Any], Any], max_depth: int
 ) -> FieldReader | None:
-    """Reads the paths; None where no struct can have them: an index at the beginning, or an unusual name.
+    """A reader of the paths; None if no struct can have them: an index at the beginning, or an unusual name.
 
-    `decode` reads a whole payload and refuses what is nested more than `max_depth` deep; `plain` makes a value of
-    msgspec what `decode` makes of it.
+    `decode` reads a whole payload and rejects a nesting of more than `max_depth`; `plain` converts a value of msgspec
+    as `decode` does.
     """
     names = [path[: next((at for at, step in enumerate(path) if type(step) is int), len(path))] for path in paths]
     if () in names:
@@ -78,7 +79,7 @@ def json_fields(
 
 
 def _struct(paths: Sequence[Path]) -> type[msgspec.Struct]:
-    """A struct that has the paths. Raises ValueError for names that no struct can have."""
+    """A struct with the paths. Raises ValueError for names that no struct can have."""
     fields: list[tuple[str, Any, Any]] = []
     for at, (name, below) in enumerate(_members(paths).items()):
         kind: Any = object if below == [()] else _struct(below)
@@ -88,14 +89,14 @@ def _struct(paths: Sequence[Path]) -> type[msgspec.Struct]:
 
 
 def _attributes(path: Path, paths: Sequence[Path]) -> str:
-    """Where the struct of the paths has this path."""
+    """The attributes of the paths' struct for this path."""
     members = _members(paths)
     attribute = f"f{list(members).index(path[0])}"
     return f"{attribute}.{_attributes(path[1:], members[path[0]])}" if path[1:] else attribute
 
 
 def _members(paths: Sequence[Path]) -> dict[str | int, list[Path]]:
-    """What lies below each first step."""
+    """The rest of the paths below each first step."""
     members: dict[str | int, list[Path]] = {}
     for path in paths:
         members.setdefault(path[0], []).append(path[1:])
@@ -103,7 +104,7 @@ def _members(paths: Sequence[Path]) -> dict[str | int, list[Path]]:
 
 
 def _converted(column: list[Any], plain: Callable[[Any], Any]) -> list[Any]:
-    """The column as the decoder gives it."""
+    """The column in the decoder's form."""
     kinds = set(map(type, column))
     if kinds <= _PLAIN:
         return column
@@ -113,7 +114,7 @@ def _converted(column: list[Any], plain: Callable[[Any], Any]) -> list[Any]:
 
 
 def _sure(payloads: Sequence[bytes], max_depth: int) -> bool:
-    """Whether nothing in the payloads, which have been read as structs, can make the decoder refuse them."""
+    """Whether the decoder certainly accepts these payloads, which have been read as structs."""
     joined = b"".join(payloads)
     if not joined.isascii():
         try:
@@ -131,13 +132,13 @@ def _sure(payloads: Sequence[bytes], max_depth: int) -> bool:
 
 
 def _depth_is_within(bound: int, payload: bytes) -> bool:
-    """Whether a valid payload is surely nested at most that deep."""
+    """Whether the nesting of a valid payload is certainly within the bound."""
     if payload.count(b"[") + payload.count(b"{") <= bound:
         return True
     if b"\\" in payload:
         payload = payload.replace(b"\\\\", b"").replace(b'\\"', b"")
-    # Texts without brackets leave nothing but their two quotes.
+    # Texts without brackets are reduced to their two quotes.
     brackets = payload.translate(_BRACKETS, _NO_BRACKETS).replace(b'""', b"")
     for _ in range(bound):
-        brackets = brackets.replace(b"[]", b"")  # of each branch, the deepest
+        brackets = brackets.replace(b"[]", b"")  # keeps the deepest of each branch
     return not brackets

@@ -1,4 +1,4 @@
-"""Paths into messages: which fields must be read for them, and how they are looked up in what was decoded."""
+"""Paths into messages: which fields must be read for them, and how they are looked up in decoded values."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from detector.engine.samples.sample import MISSING, DecodeError, Fields
 Path = tuple[str | int, ...]
 
 _ODD: Final = object()
-"""The path goes through what has no members."""
+"""The path goes through a value without members."""
 
 
 def shortest(paths: Iterable[Path]) -> list[Path]:
-    """The paths without those that lie below another one, each once; the shorter ones first."""
+    """The paths without those that lie below another one, without duplicates; the shorter ones first."""
     kept: dict[Path, None] = {}
     for path in sorted(paths, key=len):
         if not any(path[:length] in kept for length in range(len(path) + 1)):
@@ -29,7 +29,7 @@ def complete(
     left: Sequence[int],
     decode: Callable[[bytes], Any],
 ) -> Fields:
-    """The columns of the paths `read`, with what is found by decoding whole the payloads at the places `left`.
+    """The columns of the paths `read`, completed by decoding as a whole the payloads at the indices `left`.
 
     The columns hold the values of all other payloads, in order.
     """
@@ -54,7 +54,7 @@ def complete(
 
 
 def _merged(column: list[Any], places: Sequence[int], values: Sequence[Any]) -> list[Any]:
-    """The column with the values put in, so that they stand at the places."""
+    """The column with the values inserted at their indices."""
     merged: list[Any] = []
     taken = 0
     for place, value in zip(places, values, strict=True):
@@ -85,7 +85,7 @@ def spread(fields: Fields, read: Sequence[Path], paths: Sequence[Path]) -> Field
 
 
 def _look_up(value: Any, path: Path) -> Any:
-    """The value that the path leads to in a decoded value; MISSING or _ODD where it leads to none."""
+    """The value at the path in a decoded value; MISSING or _ODD if there is none."""
     for step in path:
         kind = type(value)
         if kind is dict:

@@ -1,15 +1,15 @@
-"""Raw: bytes that only functions of expressions, plugins and recordings look into."""
+"""Raw: bytes that only functions of expressions, plugins and recordings interpret."""
 
 from __future__ import annotations
 
 
 class RawDecoder:
-    """Gives the payload itself; of it, an expression sees the size (`sample.size`) and what functions make of bytes."""
+    """Returns the payload itself; expressions can read its size (`sample.size`), and pass the bytes to functions."""
 
     def decode(self, payload: bytes) -> bytes:
         """The payload."""
         return payload
 
     def stamp(self, payload: bytes) -> int | None:
-        """None: nothing is known of what the bytes mean."""
+        """None: the meaning of the bytes is unknown."""
         return None

@@ -1,4 +1,4 @@
-"""The ROS 2 message types that are known: those of a release, and what is defined beside or in place of them."""
+"""The known ROS 2 message types: those of a release, and definitions that extend or replace them."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ HEADER = "std_msgs/msg/Header"
 TIME = "builtin_interfaces/msg/Time"
 
 REGISTERING = threading.Lock()
-"""rosbags makes the classes of new types in a module of one name."""
+"""rosbags creates the classes of new types in one shared module."""
 
 
 class UnknownTypeError(ValueError):
-    """A ROS 2 message type that is not known; the text offers what may have been meant."""
+    """An unknown ROS 2 message type; the text suggests similar ones."""
 
     def __init__(self, name: str, types: RosTypes, field: str | None = None) -> None:
-        """`field` is where the name was given."""
+        """`field` is the place of the name."""
         close = difflib.get_close_matches(name, types.store.fielddefs, n=3, cutoff=0.8)
         remedy = f"did you mean {' or '.join(close)}? Otherwise give" if close else "give"
         where = f"{field}: " if field else ""
@@ -36,12 +36,12 @@ class RosTypes:
     """Message types by their names, e.g. geometry_msgs/msg/PoseStamped."""
 
     def __init__(self, load: Callable[[], Typestore]) -> None:
-        """`load` gives the types at their first use: the classes of a release take 0.1 s to make."""
+        """`load` returns the types on first use: creating the classes of a release takes 0.1 s."""
         self._load = load
 
     @cached_property
     def store(self) -> Typestore:
-        """As rosbags keeps them."""
+        """The types in rosbags' form."""
         return self._load()
 
     def known(self, name: str) -> bool:
@@ -53,11 +53,11 @@ class RosTypes:
         return self.store.fielddefs[name][1]
 
     def stamp_first(self, name: str) -> bool:
-        """Whether the message begins with a std_msgs/msg/Header, so that its stamp is always at the same place."""
+        """Whether the message begins with a std_msgs/msg/Header, so that its stamp is always at the same position."""
         return self._first_is(name, HEADER) and self._first_is(HEADER, TIME)
 
     def has_header(self, name: str) -> bool:
-        """Whether the message has a field `header` that holds a stamp."""
+        """Whether the message has a field `header` with a stamp."""
         header = dict(self.fields(name)).get("header")
         return (
             header is not None
@@ -66,7 +66,8 @@ class RosTypes:
         )
 
     def definition(self, name: str) -> str:
-        """The type and all that it refers to as ros2msg text, as recordings carry it. Raises UnknownTypeError."""
+        """The definition of the type and all types that it refers to as ros2msg text, as in recordings. Raises
+        UnknownTypeError."""
         if not self.known(name):
             raise UnknownTypeError(name, self)
         return self.store.generate_msgdef(name, ros_version=2)[0]
@@ -84,9 +85,9 @@ def standard() -> RosTypes:
 
 @lru_cache(maxsize=16)
 def types_with(definitions: tuple[Definition, ...]) -> RosTypes:
-    """The standard types, and those of the definitions: where both have one, that of the definitions counts.
+    """The standard types and those of the definitions, which take precedence.
 
-    Raises DefinitionsError, with all that is wrong with them.
+    Raises DefinitionsError with all problems of the definitions.
     """
     if not definitions:
         return standard()

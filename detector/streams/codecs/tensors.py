@@ -1,4 +1,5 @@
-"""Camera images and point clouds as arrays, straight from the bytes of a message: no list of a million numbers."""
+"""Camera images and point clouds as arrays, directly from the bytes of a message, without a list of a million
+numbers."""
 
 from __future__ import annotations
 
@@ -25,7 +26,7 @@ _PIXELS: dict[str, tuple[str, str]] = {
     "rgba8": ("u1", "rgba"),
     "bgra8": ("u1", "bgra"),
 }
-"""By ROS encoding: a pixel's number type, and its channels in order (v: one for all). OpenCV's 8UC3 is BGR."""
+"""By ROS encoding: the number type of a pixel, and its channels in order (v: one for all). OpenCV's 8UC3 is BGR."""
 
 _POINT_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """By sensor_msgs/msg/PointField.datatype."""
@@ -38,7 +39,7 @@ def image(payload: bytes) -> NDArray[np.float32]:
     """The pixels of a sensor_msgs/msg/Image as (height, width, 3) in the order R, G, B, or (height, width, 1) if gray.
 
     Raises:
-        DecodeError: no such message, an encoding that is not known, or fewer bytes than it declares.
+        DecodeError: invalid message, unknown encoding, or fewer bytes than it declares.
     """
     message = _message(payload, IMAGE)
     if message.encoding not in _PIXELS:
@@ -61,10 +62,11 @@ def gray(pixels: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def points(payload: bytes, fields: list[str]) -> NDArray[np.float64]:
-    """The points of a sensor_msgs/msg/PointCloud2 as (points, fields), without those that have a NaN there or no place.
+    """The points of a sensor_msgs/msg/PointCloud2 as (points, fields), without points that have a NaN in a field or in
+    their position.
 
     Raises:
-        DecodeError: no such message, a field that it does not have, or fewer bytes than it declares.
+        DecodeError: invalid message, missing field, or fewer bytes than it declares.
     """
     message = _message(payload, POINT_CLOUD)
     described = {field.name: field for field in message.fields}
@@ -98,5 +100,5 @@ def points(payload: bytes, fields: list[str]) -> NDArray[np.float64]:
 def _message(payload: bytes, kind: str) -> Any:
     try:
         return standard().store.deserialize_cdr(payload, kind)
-    except Exception as error:  # rosbags raises what its generated code meets: struct's, numpy's, assertions
+    except Exception as error:  # rosbags raises the errors of its generated code: struct's, numpy's, assertions
         raise DecodeError(f"not a valid {kind}: {error}") from error

@@ -1,7 +1,7 @@
-"""ETSI ITS messages in UPER: CAM, DENM, CPM, MAPEM, SPATEM and VAM, as they come over the air or bare.
+"""ETSI ITS messages in UPER: CAM, DENM, CPM, MAPEM, SPATEM and VAM, received over the air or bare.
 
-A message on its way: `packets` takes off GeoNetworking, security and BTP; `messages` knows its kind and definition;
-`reading`, made from the definition's `asn1` types, reads its `bits` into maps, with `quantities` in SI units.
+The path of a message: `packets` removes GeoNetworking, security and BTP; `messages` finds its kind and definition;
+`reading`, built from the definition's `asn1` types, reads its `bits` into maps, with `quantities` in SI units.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ class EtsiDecoder:
     """Reads ITS messages of one kind, or of any."""
 
     def __init__(self, type_name: str | None = None, own: OwnDefinitions | None = None) -> None:
-        """`type_name` is etsi/cam or the like, None for messages of all kinds; `own` are the user's definitions.
+        """`type_name` is etsi/cam or similar, None for messages of all kinds; `own` are the user's definitions.
 
-        Raises DefinitionError for a kind that is not known or for which there is no definition.
+        Raises DefinitionError for an unknown kind or one without a definition.
         """
         self._only = None if type_name is None else _kind(type_name)
         kinds = (self._only,) if self._only is not None else [kind for kind in KINDS if _is_defined(kind, own)]
@@ -37,26 +37,26 @@ class EtsiDecoder:
             number: {version: reader(each) for version, each in versions.items()} for number, versions in found.items()
         }
         self.fields = None if self._only is None else message_members(dict.fromkeys(found[self._only.number].values()))
-        """The fields of the messages, where they are of one kind."""
+        """The fields of the messages, if they are of one kind."""
 
     def decode(self, payload: bytes) -> Any:
-        """The message as a map: header, and what its ASN.1 type has beside it. Raises DecodeError."""
+        """The message as a map: the header and the other components of its ASN.1 type. Raises DecodeError."""
         return self._read(payload)[1]
 
     def stamp(self, payload: bytes) -> int | None:
-        """None: most messages give their time only together with the receive time."""
+        """None: most messages contain a time that is only complete together with the receive time."""
         return None
 
     def stamp_near(self, payload: bytes, received: int) -> int | None:
-        """The sender's time in nanoseconds since the epoch, where the message carries one. Raises DecodeError.
+        """The sender's time in nanoseconds since the epoch, if the message contains one. Raises DecodeError.
 
-        Of times that the message leaves open (generationDeltaTime recurs every 65.536 s), the one nearest to the
-        receive time.
+        If the message contains only a remainder of its time (generationDeltaTime recurs every 65.536 s), the time
+        nearest to the receive time.
         """
         kind, message = self._read(payload)
         try:
             return kind.stamp(message, received)
-        except (LookupError, TypeError):  # the user's definitions have its time elsewhere, or not at all
+        except (LookupError, TypeError):  # in the user's definitions its time is elsewhere, or absent
             return None
 
     def _read(self, payload: bytes) -> tuple[MessageKind, dict[str, Any]]:

@@ -1,8 +1,7 @@
-"""ASN.1 types as defined, independent of the tool that read the definitions: what is needed to read UPER, and nothing
-else.
+"""ASN.1 types, independent of the tool that read the definitions: everything needed to read UPER, and nothing else.
 
-Bounds are those that PER sees: `None` is no bound. `name` is the type's name in its module ("" for one written in
-place); the units of numbers hang on it (see `quantities`).
+Bounds are those visible to PER: `None` is unbounded. `name` is the type's name in its module ("" for an inline type);
+it determines the units of numbers (see `quantities`).
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ class Integer:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Enumerated:
-    """ENUMERATED: the names in the order of their values; `additions` is None where it cannot be extended."""
+    """ENUMERATED: the names in the order of their values; `additions` is None if it is not extensible."""
 
     root: tuple[str, ...]
     additions: tuple[str, ...] | None
@@ -47,7 +46,7 @@ class Enumerated:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Size:
-    """How many elements, octets, bits or characters; `extensible`: others are possible and marked as such."""
+    """Number of elements, octets, bits or characters; `extensible`: other numbers are possible and marked as such."""
 
     low: int
     high: int | None
@@ -67,7 +66,7 @@ class BitString:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OctetString:
-    """OCTET STRING; `containing` is the type that its octets hold, if the definition gives it."""
+    """OCTET STRING; `containing` is the type of its contents, if the definition gives it."""
 
     size: Size
     containing: Type | None = None
@@ -91,7 +90,7 @@ class SequenceOf:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Field:
-    """A component of a SEQUENCE. `absent` is its value where it is not sent: a default, as ASN.1 has it, or None."""
+    """A component of a SEQUENCE. `absent` is its value if it is not sent: an ASN.1 default, or None."""
 
     name: str
     type: Type
@@ -108,7 +107,7 @@ class Group:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sequence:
-    """SEQUENCE; `additions` is None where it cannot be extended."""
+    """SEQUENCE; `additions` is None if it is not extensible."""
 
     name: str
     root: tuple[Field, ...]
@@ -117,7 +116,7 @@ class Sequence:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Choice:
-    """CHOICE: the alternatives by their index; `additions` is None where it cannot be extended."""
+    """CHOICE: the alternatives by their index; `additions` is None if it is not extensible."""
 
     root: tuple[tuple[str, Type], ...]
     additions: tuple[tuple[str, Type], ...] | None
@@ -133,7 +132,7 @@ class Open:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Unreadable:
-    """A type that no ITS message uses, such as REAL; a message that holds one cannot be read."""
+    """A type that no ITS message uses, such as REAL; a message that contains one cannot be read."""
 
     kind: str
 

@@ -9,17 +9,17 @@ from collections.abc import Iterator
 from detector.engine.samples.sample import DecodeError
 
 _FRAGMENT = 16384
-"""A length beyond is sent in pieces of one to four times this many."""
+"""A length of this size or more is sent in fragments of one to four times this number."""
 
 _LONGEST = 8
-"""Bytes of a number without bounds."""
+"""Maximum bytes of an unbounded number."""
 
 _ELEMENTS_PER_OCTET = 8
-"""One for each bit. Elements that take no bits at all could otherwise be as many as their sender claims."""
+"""One per bit. The number of elements without bits would otherwise be unbounded."""
 
 
 class Bits:
-    """Reads bits from the first on. Raises DecodeError past the end, and nothing else."""
+    """Reads bits from the beginning. Raises only DecodeError, for reads past the end."""
 
     __slots__ = ("_data", "_elements", "_end", "position")
 
@@ -30,7 +30,7 @@ class Bits:
         self._elements = _ELEMENTS_PER_OCTET * (len(data) + 1)
 
     def take(self, count: int) -> int:
-        """The next `count` bits as a number that is not negative."""
+        """The next `count` bits as a non-negative number."""
         start = self.position
         stop = start + count
         if stop > self._end:
@@ -44,14 +44,14 @@ class Bits:
         return self.take(8 * count).to_bytes(count, "big")
 
     def elements(self, count: int) -> int:
-        """The same number, once it is certain that a message of this length can hold that number of elements."""
+        """The same number, after checking that a message of this length can contain that number of elements."""
         self._elements -= count
         if self._elements < 0:
             raise DecodeError("it claims more elements than its length allows")
         return count
 
     def lengths(self) -> Iterator[int]:
-        """An unbounded length, piece by piece; read what a piece announces before reading the next (11.9)."""
+        """An unbounded length, fragment by fragment; read the announced items before the next fragment (11.9)."""
         while True:
             if not self.take(1):
                 yield self.take(7)
@@ -65,15 +65,15 @@ class Bits:
             yield pieces * _FRAGMENT
 
     def blob(self) -> bytes:
-        """Octets with an unbounded length before them, as open types are sent."""
+        """Octets preceded by an unbounded length, the form of open types."""
         return b"".join([self.octets(length) for length in self.lengths()])
 
     def unsigned(self) -> int:
-        """A number without an upper bound, from zero on (11.7)."""
+        """A non-negative number without an upper bound (11.7)."""
         return int.from_bytes(self._number(), "big")
 
     def signed(self) -> int:
-        """A number without bounds (11.8)."""
+        """An unbounded number (11.8)."""
         return int.from_bytes(self._number(), "big", signed=True)
 
     def _number(self) -> bytes:
@@ -83,11 +83,11 @@ class Bits:
         return octets
 
     def small(self) -> int:
-        """A number that is normally small (11.6)."""
+        """A normally small number (11.6)."""
         return self.unsigned() if self.take(1) else self.take(6)
 
     def small_length(self) -> int:
-        """A length from one on that is normally small (11.9.3.4)."""
+        """A normally small length, at least one (11.9.3.4)."""
         if not self.take(1):
             return self.take(6) + 1
         return sum(self.lengths())

@@ -1,7 +1,7 @@
-"""Constraints as PER sees them: of several ranges, the one that spans them all (X.691 10.3.21).
+"""Constraints in PER's form: several ranges are replaced by the one that spans them (X.691 10.3.21).
 
-asn1tools takes the first range alone: `(unknown | passengerCar..tram)` would be one number without any bit. So what it
-parsed is simplified before it resolves it.
+asn1tools uses only the first range: `(unknown | passengerCar..tram)` would be one number without any bit. So the parsed
+modules are simplified before asn1tools resolves them.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ _MARKER = None
 
 
 def span_constraints(trees: Mapping[str, Any]) -> None:
-    """Replaces constraints of several ranges by one, in modules as asn1tools parses them."""
+    """Replaces constraints of several ranges by one, in modules parsed by asn1tools."""
     for tree in trees.values():
         _visit(tree["types"], trees)
 
@@ -35,12 +35,12 @@ def _visit(node: Any, trees: Mapping[str, Any]) -> None:
 
 
 def _root(ranges: list[Any]) -> list[Any]:
-    """What stands before the mark of extension."""
+    """The part before the extension marker."""
     return ranges[: ranges.index(_MARKER)] if _MARKER in ranges else ranges
 
 
 def _span(ranges: list[Any], node: Mapping[str, Any], trees: Mapping[str, Any]) -> tuple[int, int] | None:
-    """From the lowest to the highest; None where an end is not known, for asn1tools to complain about."""
+    """From the lowest to the highest; None if a bound is unknown, which asn1tools reports."""
     ends = [end for each in ranges for end in (each if isinstance(each, tuple) else (each,))]
     numbers = [_number(end, node, trees) for end in ends]
     known = [number for number in numbers if number is not None]
@@ -59,12 +59,12 @@ def _number(end: Any, node: Mapping[str, Any], trees: Mapping[str, Any]) -> int 
 
 
 def type_tree(name: str, trees: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The definition of the type, in whichever module it is; empty where there is none."""
+    """The definition of the type, in any of the modules; empty if there is none."""
     return next((tree["types"][name] for tree in trees.values() if name in tree["types"]), {})
 
 
 def aliases(name: str, trees: Mapping[str, Any]) -> list[str]:
-    """The name of the type, and those that it is another name for."""
+    """The name of the type, and its aliases."""
     names: list[str] = []
     while name and name not in names:
         names.append(name)
@@ -79,7 +79,7 @@ def named_numbers(names: list[str], trees: Mapping[str, Any]) -> dict[str, int]:
 
 
 def named_number(name: str, trees: Mapping[str, Any]) -> int | None:
-    """The number that the modules give that name."""
+    """The number with that name in the modules."""
     for tree in trees.values():
         found = tree["values"].get(name)
         if found is not None and isinstance(found["value"], int):

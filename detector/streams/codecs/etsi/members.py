@@ -1,4 +1,4 @@
-"""Which fields a message has, so that a misspelt one is found before any message has come."""
+"""The fields of a message, so that a misspelt one is found before any message has arrived."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _HEADER: Fields = dict.fromkeys(("protocolVersion", "messageId", "stationId"))
 
 
 def message_members(definitions: Iterable[asn1.Type]) -> Fields:
-    """The fields of a message that can come in several versions."""
+    """The fields of a message that can have several versions."""
     members: dict[str, Fields | None] = {}
     for definition in definitions:
         members = {**_joined(members, _members(definition) or {})}
@@ -20,7 +20,7 @@ def message_members(definitions: Iterable[asn1.Type]) -> Fields:
 
 
 def _members(kind: asn1.Type) -> Fields | None:
-    """The fields below a value of the type; None below numbers, texts, lists and what is not known."""
+    """The fields below a value of the type; None below numbers, texts, lists and unknown types."""
     match kind:
         case asn1.Sequence():
             parts = [*kind.root, *(kind.additions or ())]

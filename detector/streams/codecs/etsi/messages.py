@@ -1,4 +1,4 @@
-"""The ITS messages that are known: their numbers, their definitions, and where each carries its time."""
+"""The known ITS messages: their numbers, their definitions, and the fields of their times."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from detector.streams.codecs.etsi.packaged import packaged_type
 from detector.streams.codecs.etsi.reading import Read, Readers
 
 Stamp = Callable[[Mapping[str, Any], int], int | None]
-"""From a message and its receive time to the sender's time; nanoseconds since the epoch. None where it has none."""
+"""From a message and its receive time to the sender's time; nanoseconds since the epoch. None if it has none."""
 
 PREFIX = "etsi/"
-"""How a stream's type names a message: etsi/cam."""
+"""The prefix of a stream's type: etsi/cam."""
 
 
 def _milliseconds(seconds: float) -> int:
@@ -57,7 +57,7 @@ class MessageKind:
     number: int
     """messageId in the header (TS 102 894-2)."""
     types: tuple[str, ...]
-    """Its type in the ASN.1 modules, by any of the names that it has had."""
+    """The names of its type in the ASN.1 modules, in all versions."""
     packaged: Mapping[int, tuple[str, str]]
     """The package and module of pycrate that define it, by protocol version."""
     stamp: Stamp
@@ -84,9 +84,9 @@ BY_NUMBER = {kind.number: kind for kind in KINDS}
 
 @cache
 def packaged_definitions(kind: MessageKind) -> Mapping[int, Type]:
-    """The kind's type by protocol version, as the extra brings it.
+    """The kind's type by protocol version, from the installed extra.
 
-    Raises DefinitionError where the extra is not installed.
+    Raises DefinitionError if the extra is not installed.
     """
     made: dict[tuple[str, str], Type] = {}
     for package, module in kind.packaged.values():
@@ -96,10 +96,10 @@ def packaged_definitions(kind: MessageKind) -> Mapping[int, Type]:
 
 
 def definitions(kind: MessageKind, own: OwnDefinitions | None) -> Mapping[int, Type]:
-    """The kind's type by protocol version: the user's where their definitions have it.
+    """The kind's type by protocol version: from the user's definitions if they have it.
 
-    Messages of the first version, which are read otherwise, stay with the definitions that come with the extra. Raises
-    DefinitionError where there are none at all.
+    Messages of the first version, which are read differently, use the definitions of the extra. Raises DefinitionError
+    if there are none at all.
     """
     found = None if own is None else own.type(kind.types)
     if found is None:
@@ -113,7 +113,7 @@ def definitions(kind: MessageKind, own: OwnDefinitions | None) -> Mapping[int, T
 
 @lru_cache(maxsize=64)
 def reader(definition: Type) -> Read:
-    """What reads messages of the type."""
+    """The function that reads messages of the type."""
     return Readers().reader(definition)
 
 

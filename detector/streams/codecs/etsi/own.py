@@ -1,7 +1,7 @@
-"""ASN.1 definitions from files that the user brings: read and resolved by asn1tools (MIT).
+"""ASN.1 definitions from the user's files: read and resolved by asn1tools (MIT).
 
-asn1tools gives the types. What it leaves out is looked up in the text itself: which type an open type holds,
-as `{Type IDENTIFIED BY value}` of an information object set gives it.
+asn1tools provides the types. It lacks the types of open types, which are looked up in the text: `{Type IDENTIFIED BY
+value}` of an information object set gives them.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from detector.streams.codecs.etsi.quantities import UNITS
 from wayside.api.asn1 import Asn1Module
 
 _SUCCESSORS = re.compile(r"\bWITH\s+(SUCCESSORS|DESCENDANTS)\b")
-"""Says that a later version of a module will do; asn1tools does not know it."""
+"""Permits a later version of a module; asn1tools does not know it."""
 
 _COMMENT = re.compile(r"/\*.*?\*/|--.*?(?:--|$)", re.DOTALL | re.MULTILINE)
 
@@ -27,14 +27,14 @@ _OBJECT_SET = re.compile(r"\b([A-Z][\w-]*)\s+([A-Z][A-Z0-9-]*)\s*::=\s*\{")
 _ROW = re.compile(r"\{\s*([A-Z][\w-]*)\s+IDENTIFIED\s+BY\s+([\w-]+)\s*\}")
 
 _Tree = Mapping[str, Any]
-"""A module as asn1tools parses it."""
+"""A module parsed by asn1tools."""
 
 
 class OwnDefinitions:
     """The types of some ASN.1 modules, by name."""
 
     def __init__(self, texts: Sequence[str]) -> None:
-        """`texts` are modules, one or several in each. Raises DefinitionError for what cannot be read or resolved."""
+        """`texts` contain one or several modules each. Raises DefinitionError if they cannot be read or resolved."""
         self._trees: dict[str, _Tree] = {}
         self._rows: dict[str, list[tuple[str, str]]] = {}
         for text in texts:
@@ -45,7 +45,7 @@ class OwnDefinitions:
         self._done: dict[int, tuple[Any, asn1.Type]] = {}
 
     def type(self, names: Iterable[str]) -> asn1.Type | None:
-        """The first type of these names that there is."""
+        """The first existing type of these names."""
         for name in names:
             for types in self._types.values():
                 if name in types:
@@ -53,7 +53,7 @@ class OwnDefinitions:
         return None
 
     def _walk(self, found: Any, name: str = "") -> asn1.Type:
-        """`name` is the type's, where the compiled type itself does not give it."""
+        """`name` is the type's, if the compiled type itself does not have it."""
         made = self._done.get(id(found))
         if made is None:
             made = self._done[id(found)] = (found, self._convert(found, name or found.type_name))
@@ -124,7 +124,7 @@ class OwnDefinitions:
         return asn1.Field(member.name, kind, member.optional or member.default is not None, member.default)
 
     def _open_types(self, name: str) -> dict[str, asn1.Type]:
-        """The open types of a SEQUENCE, by component: what each holds hangs on another component."""
+        """The open types of a SEQUENCE, by component; the type of each depends on another component."""
         opened: dict[str, asn1.Type] = {}
         for member in bounds.type_tree(name, self._trees).get("members", ()):
             if not isinstance(member, dict) or not str(member.get("type")).endswith(".&Type"):
@@ -146,7 +146,7 @@ class OwnDefinitions:
 
 @lru_cache(maxsize=64)
 def parsed_modules(text: str) -> dict[str, Any]:
-    """The modules in the text. Raises DefinitionError, with line and column, where it is no ASN.1."""
+    """The modules in the text. Raises DefinitionError, with line and column, if it is not ASN.1."""
     tools = _asn1tools()
     try:
         return dict(tools.parse_string(_SUCCESSORS.sub(lambda found: " " * len(found[0]), text)))
@@ -157,7 +157,7 @@ def parsed_modules(text: str) -> dict[str, Any]:
 
 
 def read_module(module: Asn1Module) -> str:
-    """The text of ASN.1 modules, found sound. Raises DefinitionError."""
+    """The text of ASN.1 modules, after validation. Raises DefinitionError."""
     text = module.definition
     if text is None:
         try:
@@ -170,7 +170,7 @@ def read_module(module: Asn1Module) -> str:
 
 @lru_cache(maxsize=8)
 def own_definitions(texts: tuple[str, ...]) -> OwnDefinitions:
-    """The definitions of these texts, kept for the next time. Raises DefinitionError."""
+    """The definitions of these texts, cached. Raises DefinitionError."""
     return OwnDefinitions(texts)
 
 
@@ -198,7 +198,7 @@ def _inner(compiled: Any) -> Any:
 
 def _asn1tools() -> Any:
     try:
-        import asn1tools  # noqa: PLC0415  it takes a while, and only those who bring ASN.1 need it
+        import asn1tools  # noqa: PLC0415  slow, and only needed for the user's ASN.1 files
     except ImportError as error:
         raise asn1.DefinitionError(f"the ASN.1 reader is not installed: {REMEDY}") from error
     return asn1tools

@@ -1,7 +1,7 @@
-"""ASN.1 definitions out of pycrate's package, which carries those of CAM, DENM, MAPEM, SPATEM and an early VAM.
+"""ASN.1 definitions from the package pycrate, which contains those of CAM, DENM, MAPEM, SPATEM and an early VAM.
 
-pycrate (LGPL) is used for what its modules know of the types; the bytes are read by `reading`. Importing one of its
-modules takes some tenths of a second: it is done when a stream needs it.
+Only the type definitions of pycrate (LGPL) are used; `reading` reads the bytes. Importing one of its modules takes some
+tenths of a second, so it happens when a stream needs it.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ ALPHABETS = {
 def packaged_type(package: str, module: str, name: str) -> asn1.Type:
     """The type of that name, e.g. ("ITS_CAM_2", "CAM_PDU_Descriptions", "CAM").
 
-    Raises DefinitionError where pycrate is not installed.
+    Raises DefinitionError if pycrate is not installed.
     """
     try:
         imported = importlib.import_module(f"pycrate_asn1dir.{package}")
@@ -37,13 +37,13 @@ def packaged_type(package: str, module: str, name: str) -> asn1.Type:
 
 
 class _Walk:
-    """Goes through pycrate's objects, each once."""
+    """Visits pycrate's objects, each once."""
 
     def __init__(self) -> None:
         self._done: dict[int, asn1.Type] = {}
 
     def type(self, found: Any) -> asn1.Type:
-        """The type that a pycrate object stands for."""
+        """The type of a pycrate object."""
         made = self._done.get(id(found))
         if made is None:
             made = self._done[id(found)] = self._convert(found)
@@ -105,7 +105,7 @@ class _Walk:
         return asn1.Field(name, self.type(found), bool(found._opt) or found._def is not None, found._def)
 
     def _open(self, found: Any) -> asn1.Open:
-        """An open type of the only kind that ITS messages have: a regional extension, identified by its regionId."""
+        """An open type of the only kind in ITS messages: a regional extension, identified by its regionId."""
         table = found._const_tab
         entries = [] if table is None else [row for row in table._val.root if "Type" in row]
         return asn1.Open("regionId", {row["id"]: self.type(row["Type"]) for row in entries})

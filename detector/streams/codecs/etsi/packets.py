@@ -1,8 +1,9 @@
-"""What is around an ITS message on the air: GeoNetworking, the security envelope, BTP. It is taken off, not checked.
+"""The layers around an ITS message on the air: GeoNetworking, the security envelope, BTP. They are removed, not
+verified.
 
-The bytes show which of them are present. A message begins with its protocol version and a message number that is
-not zero, GeoNetworking's basic header has a zero in that place, and BTP begins with a port from 2001 on. Signatures
-are not verified: a rule that must rely on who sent a message needs a receiver that verifies before it forwards.
+The bytes show which layers are present. A message begins with its protocol version and a message number that is not
+zero, GeoNetworking's basic header has a zero at that position, and BTP begins with a port from 2001 on. Signatures are
+not verified: a rule that must rely on the sender of a message needs a receiver that verifies before it forwards.
 
 Headers as in ETSI EN 302 636-4-1 (GeoNetworking), EN 302 636-5-1 (BTP) and IEEE 1609.2 / TS 103 097 (security).
 """
@@ -21,10 +22,10 @@ _PORTS = range(2001, 2025)
 """BTP's well-known destination ports (TS 103 248): 2001 CAM, 2002 DENM, 2003 MAPEM, 2004 SPATEM, 2009 CPM, 2018 VAM."""
 
 _SECURED = 2
-"""What follows the basic header; 0 and 1 are the common header."""
+"""The header after the basic header; 0 and 1 are the common header."""
 
 _BTP_A, _BTP_B = 1, 2
-"""What follows the GeoNetworking headers; BTP's two kinds have the destination port in the same place."""
+"""The header after the GeoNetworking headers; BTP's two kinds have the destination port at the same position."""
 
 _BASIC, _COMMON_LENGTH, _BTP_LENGTH = 4, 8, 4
 
@@ -50,7 +51,7 @@ _NESTED = 4
 
 
 def message_in(payload: bytes) -> bytes:
-    """The message without what is around it. Raises DecodeError where there is none, or none that can be read."""
+    """The message without its outer layers. Raises DecodeError if there is none, or if it cannot be read."""
     if len(payload) > MAXIMUM:
         raise DecodeError(f"{len(payload)} bytes; an ITS packet has at most {MAXIMUM}")
     for _ in range(_NESTED):
@@ -102,7 +103,7 @@ def _from_geonetworking(packet: bytes) -> bytes:
 
 
 def _from_secured(data: bytes) -> bytes:
-    """The payload of IEEE 1609.2 data (canonical OER), however deep it lies."""
+    """The payload of IEEE 1609.2 data (canonical OER), at any depth."""
     for _ in range(_NESTED):
         if len(data) < 4:
             raise DecodeError("a secured packet that ends in its headers")
@@ -117,7 +118,7 @@ def _from_secured(data: bytes) -> bytes:
             raise DecodeError("the packet is encrypted for its receiver")
         if tag != _SIGNED:
             raise DecodeError(f"a secured packet without data (alternative {tag & 63})")
-        preamble = data[3]  # behind the hash algorithm
+        preamble = data[3]  # after the hash algorithm
         if not preamble & _DATA_PRESENT:
             raise DecodeError("a signed packet with only the hash of its data")
         data = data[4:]
@@ -125,7 +126,7 @@ def _from_secured(data: bytes) -> bytes:
 
 
 def _octets(data: bytes, start: int) -> bytes:
-    """An OCTET STRING in OER: its length, in one byte or behind the number of its bytes, then itself."""
+    """An OCTET STRING in OER: its length, in one byte or preceded by the number of its bytes, then the contents."""
     length, start = data[start], start + 1
     if length & _LONG:
         size = length & ~_LONG

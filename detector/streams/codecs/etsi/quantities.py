@@ -1,8 +1,8 @@
-"""Numbers of ITS messages in SI units (angles and positions in degrees), and null for what is unavailable.
+"""Numbers of ITS messages in SI units (angles and positions in degrees), with null for unavailable values.
 
-What a number means hangs on the name of its type, as the ETSI Common Data Dictionary (TS 102 894-2, releases 1 and 2)
-and DSRC (ISO/TS 19091, SAE J2735) give it. A type that is not listed here is a plain number: a code, an identifier, a
-count, or already in the unit that its definition names.
+The meaning of a number depends on the name of its type in the ETSI Common Data Dictionary (TS 102 894-2, releases 1 and
+2) and DSRC (ISO/TS 19091, SAE J2735). A type that is not listed here is a plain number: a code, an identifier, a count,
+or already in the unit that its definition names.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ UNAVAILABLE = frozenset({"unavailable", "outOfRange"})
 """The names of numbers and enumeration values that mean "no value"."""
 
 Plain = Callable[[int], float | int | None]
-"""Makes a number as it is sent one as expressions see it."""
+"""Converts a number as sent to its value in expressions."""
 
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """What one step of a number is worth."""
+    """The value of one step of a number."""
 
     symbol: str
-    """The unit that expressions see, for the documentation."""
+    """The unit in expressions, for the documentation."""
     step: Fraction
     null: frozenset[int] = frozenset()
-    """Numbers that mean "no value", where the definition gives them no name."""
+    """Numbers that mean "no value" and have no name in the definition."""
 
 
 def _units(symbol: str, step: str, *names: str, null: int | None = None) -> dict[str, Unit]:
@@ -91,7 +91,7 @@ UNITS: Mapping[str, Unit] = {
     **_units("s", "0.001", "DSecond", null=65535),
     **_units("s", "0.1", "TimeMark", null=36001),
 }
-"""By the name of the type; a number of a type that is not here is plain."""
+"""By the name of the type; numbers of other types are plain."""
 
 TIMESTAMP = "TimestampIts"
 """The type of absolute times, which become seconds since the Unix epoch."""
@@ -99,11 +99,11 @@ TIMESTAMP = "TimestampIts"
 _OF_OTHER_RELEASES: Mapping[tuple[str, int], Unit] = {
     ("CurvatureValue", 30001): Unit("1/m", Fraction(1, 30000)),
 }
-"""Types that had another step once, by name and upper bound."""
+"""Types that had another step in another release, by name and upper bound."""
 
 
 def quantity(kind: Integer) -> Plain:
-    """What makes numbers of the type those that expressions see."""
+    """The conversion of numbers of the type to their values in expressions."""
     null = {value for name, value in kind.named.items() if name in UNAVAILABLE}
     if kind.name == TIMESTAMP:
         return _time

@@ -1,8 +1,8 @@
-"""From ASN.1 types to functions that read UPER (ITU-T X.691) into plain maps, lists, strings and doubles.
+"""Compiles ASN.1 types to functions that read UPER (ITU-T X.691) into plain maps, lists, strings and doubles.
 
-A function is made once for each type. It makes values plain on the way: CHOICE → {name: value}, BIT STRING → list of
-names, ENUMERATED → name, numbers as `quantities` defines. Names of components have `_` for `-`, so that expressions can
-write them behind a point. What is not sent is not in the map.
+A function is built once per type. It also converts values: CHOICE → {name: value}, BIT STRING → list of names,
+ENUMERATED → name, numbers as in `quantities`. Names of components have `_` for `-`, so that expressions can use them
+after a dot. Absent components are not in the map.
 """
 
 from __future__ import annotations
@@ -16,26 +16,26 @@ from detector.streams.codecs.etsi.bits import Bits
 from detector.streams.codecs.etsi.quantities import UNAVAILABLE, quantity
 
 Read = Callable[[Bits], Any]
-"""Reads a value where the bits stand."""
+"""Reads a value at the current position of the bits."""
 
 _FIRST_WITHOUT_BOUND = 65536
-"""Lengths that may reach this are sent as if they had no bound (11.9.4)."""
+"""Lengths that may reach this value are sent as if unbounded (11.9.4)."""
 
 
 def expression_name(name: str) -> str:
-    """The name of a component as expressions write it."""
+    """The name of a component in expressions."""
     return name.replace("-", "_")
 
 
 class Readers:
-    """Makes the reading functions, one for each type."""
+    """Builds the reading functions, one per type."""
 
     def __init__(self) -> None:
         self._made: dict[int, tuple[asn1.Type, Read]] = {}
-        """By identity; the type is kept so that its identity stays its own."""
+        """By identity; the type is kept so that its identity stays unique."""
 
     def reader(self, kind: asn1.Type) -> Read:
-        """What reads values of the type."""
+        """The function that reads values of the type."""
         made = self._made.get(id(kind))
         if made is None:
             made = self._made[id(kind)] = (kind, self._make(kind))
@@ -98,7 +98,7 @@ class Readers:
             sent = bits.take(count)
             for index in range(count):
                 if sent >> (count - 1 - index) & 1:
-                    blob = bits.blob()  # one of a later version of the definition is passed over
+                    blob = bits.blob()  # the type of a later version of the definition is skipped
                     if index < len(additions):
                         value.update(additions[index](Bits(blob)))
             return value
@@ -112,7 +112,8 @@ class Readers:
         return lambda bits: {name: read(bits)}
 
     def _fields(self, fields: tuple[asn1.Field, ...]) -> Read:
-        """Reads components without a mark of extension: which optional ones are sent, then all that are."""
+        """Reads components without an extension marker: first which optional ones are present, then all present
+        ones."""
         readers: list[tuple[str, Read, int, Any]] = []
         opens: list[tuple[str, str, dict[int, Read]]] = []
         optional = sum(field.optional for field in fields)
@@ -209,7 +210,7 @@ def _enumerated(kind: asn1.Enumerated) -> Read:
 
 def _bit_string(kind: asn1.BitString) -> Read:
     def piece(bits: Bits, count: int) -> list[bool]:
-        # Through the digits: shifting a long number for each of its bits would take the square of their number.
+        # Through the digits: shifting a long number for each of its bits would take quadratic time.
         return [digit == "1" for digit in f"{bits.take(count):0{count}b}"] if count else []
 
     flags = _counted(kind.size, piece, lambda pieces: [flag for piece in pieces for flag in piece])
@@ -225,7 +226,7 @@ def _text(kind: asn1.Text) -> Read:
         return lambda bits: octets(bits).decode("utf-8", "replace")
     alphabet = kind.alphabet
     width = (len(alphabet) - 1).bit_length()
-    identity = ord(alphabet[-1]) < 1 << width  # the characters are sent as they are where that takes no more bits
+    identity = ord(alphabet[-1]) < 1 << width  # the characters are sent unchanged if that takes no more bits
 
     def characters(bits: Bits, count: int) -> str:
         codes = [bits.take(width) for _ in range(bits.elements(count))]
@@ -239,7 +240,7 @@ def _text(kind: asn1.Text) -> Read:
 
 
 def _counted(size: asn1.Size, take: Callable[[Bits, int], Any], join: Callable[[list[Any]], Any]) -> Read:
-    """Reads a length as `size` defines, then that number of items."""
+    """Reads a length as in `size`, then that number of items."""
 
     def unbounded(bits: Bits) -> Any:
         return join([take(bits, length) for length in bits.lengths()])
@@ -263,7 +264,7 @@ def _counted(size: asn1.Size, take: Callable[[Bits, int], Any], join: Callable[[
 
 
 def _absent(field: asn1.Field) -> Any:
-    """What expressions see of a component that is not sent: its default."""
+    """The value in expressions of an absent component: its default."""
     if isinstance(field.type, asn1.Integer) and isinstance(field.absent, int):
         return quantity(field.type)(field.absent)
     return field.absent

@@ -1,5 +1,5 @@
-"""ITS time: milliseconds of TAI since 2004-01-01T00:00:00Z (ETSI TS 102 894-2, TimestampIts), and what is left of it
-in fields that hold only a remainder.
+"""ITS time: milliseconds of TAI since 2004-01-01T00:00:00Z (ETSI TS 102 894-2, TimestampIts), and fields that contain
+only a remainder of it.
 
 All times here are nanoseconds since the Unix epoch unless a name states otherwise.
 """
@@ -51,7 +51,7 @@ def nearest_time(remainder: int, near: int) -> int:
 
 
 def in_year(minute: int, milliseconds: int, near: int) -> int:
-    """The Unix time nearest to `near` that is so far into its minute of some year (UTC)."""
+    """The Unix time nearest to `near` that is this far into this minute of some year (UTC)."""
     year = datetime.datetime.fromtimestamp(near / _SECOND, _UTC).year
     candidates = [
         (_seconds(each, 1, 1) + minute * 60) * _SECOND + milliseconds * _MILLISECOND
