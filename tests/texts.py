@@ -28,7 +28,7 @@ FOLDERS = ("wayside", "detector", "application_manager")
 LEVELS = {"debug", "info", "warning", "error", "exception", "critical", "log"}
 
 _FILLED = re.compile(r"\{(?:[^{}]|\{[^{}]*\})*\}")
-_CODE = re.compile(r"\(self\.|self\.\w+ (==|!=|in|\|\|) |=> |color-scheme|len\(|\w:\w+ \w+:|<\w")
+_CODE = re.compile(r"\(self\.|self\.\w+ (==|!=|in|\|\|) |=> |color-scheme|len\(|\w:\w+ \w+:|^<\w|</")
 
 
 class Use(StrEnum):

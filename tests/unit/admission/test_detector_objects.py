@@ -208,7 +208,7 @@ def test_options_for_the_pods_that_make_no_sense_are_refused(options: list[str],
         ({"mode": None, "pod": {}}, "set mode to Standalone or Sidecar, or remove pod"),
         ({"pod": {"volumes": [{"name": "a", "emptyDir": {}, "csi": {}}]}}, "give exactly one of persistentVolumeClaim"),
         ({"pod": {"volumes": [{"name": "a", "hostPath": {"path": "/"}}]}}, "hostPath"),
-        ({"pod": {"volumes": [{"name": "scratch", "emptyDir": {}}]}}, "names of the detector's own volumes"),
+        ({"pod": {"volumes": [{"name": "scratch", "emptyDir": {}}]}}, "are reserved"),
         ({"pod": {"volumeMounts": [{"name": "a", "mountPath": "/a"}]}}, "volumeMounts: /a: volumes has no a: add it"),
         (
             {
