@@ -140,7 +140,7 @@ def run(
         str | None,
         typer.Option(
             metavar="QUANTITY",
-            help="Memory of this manager and its worker processes, e.g. 1Gi: near it, new tasks are not taken in. "
+            help="Memory of this manager and its worker processes, e.g. 1Gi: near it, no new tasks are accepted. "
             "Default: the container's limit.",
         ),
     ] = None,
@@ -336,7 +336,7 @@ def check(
         typer.echo(f"warning: {line}", err=True)
     if checked.problems:
         raise typer.Exit(1)
-    typer.echo(f"{checked.looked_at} looked at: nothing that would be refused", err=True)
+    typer.echo(f"checked {checked.looked_at}: nothing would be refused", err=True)
 
 
 class Output(StrEnum):

@@ -55,7 +55,8 @@ def lease_key(given: str | None, namespaces: tuple[str, ...]) -> LeaseKey:
     namespace, _, name = (given or LEASE_NAME).rpartition("/")
     if not name or holder_of(name) is not None:
         raise ValueError(
-            f"{given!r} cannot be the managers' Lease: write NAME or NAMESPACE/NAME; wayside-… are detectors'"
+            f"--lease {given!r}: not a name for the managers' Lease: write NAME or NAMESPACE/NAME; names that "
+            "begin with wayside- are those of detectors"
         )
     if not namespace:
         own = os.environ.get("POD_NAMESPACE") or (_NAMESPACE_FILE.read_text() if _NAMESPACE_FILE.is_file() else "")
@@ -184,8 +185,8 @@ class Leadership:
         except (ApiError, Unreachable, TimeoutError) as error:
             gone = isinstance(error, ApiError) and error.code in (404, 409)
             level = logging.INFO if gone else logging.WARNING  # gone with its namespace, or taken
-            why = str(error) or "the API server does not answer"
-            log.log(level, "the Lease %s is not released, a standby waits for its end: %s", self._key, why)
+            why = str(error) or "the API server does not respond"
+            log.log(level, "cannot release the Lease %s; a standby takes over when it expires: %s", self._key, why)
         else:
             log.info("released the Lease %s", self._key)
 

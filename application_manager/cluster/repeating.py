@@ -37,13 +37,13 @@ async def until_answered(request: Callable[[], Awaitable[Answer]], pause: float 
             if isinstance(error, ApiError) and (error.permanent or error.code == 401):
                 raise
             if not waiting:
-                log.warning("%s; retrying until the API server answers", error)
+                log.warning("%s; retrying until the API server responds", error)
             waiting = True
             at_least = error.retry_after if isinstance(error, ApiError) else None
             await asyncio.sleep(max(pause, at_least or 0.0))
         else:
             if waiting:
-                log.info("the API server answers")
+                log.info("the API server responds")
             return answer
 
 

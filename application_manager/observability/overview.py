@@ -50,7 +50,7 @@ class Overview(Collector):
         yielded = GaugeMetricFamily(f"{PREFIX}namespaces_yielded", "Namespaces in which an older manager acts")
         yielded.add_metric((), self._cache.overlap.count)
         yield yielded
-        reached = GaugeMetricFamily(f"{PREFIX}api_reached", "1 while the API server answers")
+        reached = GaugeMetricFamily(f"{PREFIX}api_reached", "1 while the API server responds")
         reached.add_metric((), float(self._cache.healthy.reached))
         yield reached
 

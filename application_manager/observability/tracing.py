@@ -170,7 +170,7 @@ class TaskTraces:
     def _emit(self, span: Span) -> TraceContext:
         if self.tracing.failed and not self._said:
             self._said = True
-            log.warning("spans are not taken by %s; those lost are counted in the metrics", self.tracing.endpoint)
+            log.warning("%s does not accept spans; lost spans are counted in the metrics", self.tracing.endpoint)
         return self.tracing.emit(span)
 
     def _remembered(self, uid: str) -> _Known:
@@ -188,7 +188,7 @@ class LostSpans(Collector):
 
     def collect(self) -> Iterator[Metric]:
         """The metric as of now."""
-        family = CounterMetricFamily(f"{PREFIX}spans_dropped", "Spans that nobody got", labels=("cause",))
+        family = CounterMetricFamily(f"{PREFIX}spans_dropped", "Spans that were lost", labels=("cause",))
         family.add_metric(("full",), self._tracing.dropped)
         family.add_metric(("failed",), self._tracing.failed)
         yield family

@@ -117,7 +117,7 @@ class InstanceWork:
             await self._reconcile(name)
         except ApiError as error:
             if error.terminating:
-                log.debug("instance %s/%s: its namespace is going", *name)
+                log.debug("instance %s/%s: its namespace is being deleted", *name)
                 return
             raise
 

@@ -168,4 +168,4 @@ class TaskWork:
             self.again(name, since + self.ttl)
             return
         await self.client.delete(self.tasks, name[0], name[1], task.metadata.uid)
-        log.info("task %s/%s: deleted, %g s after it finished", *name, self.ttl)
+        log.info("task %s/%s: deleted %g s after it finished", *name, self.ttl)

@@ -63,7 +63,9 @@ class TemplateWork:
     async def _challenge(self, regarding: Kind, own: TemplateManager, now: float) -> None:
         """Find out by the template's status whether the manager is alive that looks after the namespace as well."""
         other = self.cache.overlap.waits_for(regarding.namespace)
-        note = f"the managers of the Leases {other} and {own.lease} look after this namespace: the second one waits"
+        note = (
+            f"this namespace is managed by the managers of the Leases {other} and {own.lease}: the second one stands by"
+        )
         self.statuses.recorder.event(regarding, Reason.MANAGERS_OVERLAP, note, now, once=True)
         await self.statuses.merge(self.templates, regarding, {"manager": own.to_json()})
 

@@ -187,11 +187,11 @@ class WorkQueue(Generic[Key]):
             self._failures.pop(key, None)  # once the namespace is granted, all its keys are enqueued
         except (ApiError, Unreachable) as error:
             pause = self._pause(key, error.retry_after if isinstance(error, ApiError) else None)
-            log.warning("%s %s: %s; again in %.1f s", self.name, _text(key), error, pause)
+            log.warning("%s %s: %s; retrying in %.1f s", self.name, _text(key), error, pause)
             self._add_after(key, pause)
         except Exception:  # a defect in one key's work must not stop the others; it is logged, and tried again
             pause = self._pause(key, None)
-            log.exception("%s %s failed; again in %.1f s", self.name, _text(key), pause)
+            log.exception("cannot reconcile %s %s; retrying in %.1f s", self.name, _text(key), pause)
             self._add_after(key, pause)
         else:
             failed = False

@@ -118,7 +118,7 @@ class Pool:
     def _ended(self, worker: asyncio.Task[None]) -> None:
         self._workers.discard(worker)
         if not worker.cancelled() and worker.exception() is not None:
-            log.error("a worker process could not be used: %s", worker.exception())
+            log.error("cannot use a worker process: %s", worker.exception())
         self._dispatch()
 
     def _next(self) -> _Ticket | None:
@@ -180,7 +180,7 @@ class Pool:
             if not error.of_time and ticket.attempts < _ATTEMPTS:
                 return await self._do(ticket, await Child.start(self.cpu_time))
             self._measures.job_exceeded()
-            log.warning("namespace %s: a process that evaluates expressions %s", ticket.namespace, error)
+            log.warning("namespace %s: a worker process %s", ticket.namespace, error)
             if not ticket.answer.done():
                 ticket.answer.set_exception(ExceededError(self._text(error)))
             return await Child.start(self.cpu_time)

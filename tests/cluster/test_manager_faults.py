@@ -342,7 +342,7 @@ def test_a_cluster_that_drops_selectable_fields_is_refused_at_the_start(
         wait_until(selects, lambda can: not can, what="the field cannot be selected")
         manager = processes.start("application-manager", "run", "--namespace", namespace)
         assert manager.wait() == 2
-        assert "ApplicationTasks cannot be selected by spec.templateName" in manager.output()
+        assert "cannot select ApplicationTasks by spec.templateName" in manager.output()
         assert "Kubernetes 1.31 or newer" in manager.output()
     finally:
         api.patch(kind, name, {"spec": {"versions": versions_with}})

@@ -112,10 +112,10 @@ def _why_not(name: str, metadata: Mapping[str, Any], spec: Mapping[str, Any], de
 def read_pod(review: Any) -> PodRequest:
     """The question in an AdmissionReview about a pod. Raises ReviewError."""
     if not isinstance(review, dict) or review.get("apiVersion") != REVIEW_VERSION:
-        raise ReviewError(f"is no AdmissionReview of {REVIEW_VERSION}: only the API server has business here")
+        raise ReviewError(f"is not an AdmissionReview of {REVIEW_VERSION}: only the API server may call this path")
     raw = review.get("request")
     if not isinstance(raw, dict) or not isinstance(raw.get("uid"), str):
-        raise ReviewError("request.uid: is missing: only the API server has business here")
+        raise ReviewError("request.uid: is missing: only the API server may call this path")
     pod, kind = raw.get("object"), raw.get("kind")
     made = raw.get("operation") == "CREATE" and not raw.get("subResource")
     ours = isinstance(kind, dict) and (kind.get("group"), kind.get("kind")) == ("", "Pod")

@@ -74,7 +74,8 @@ class Policy:
         for api_version, kind in sorted(self.kinds):
             if kind in _NEVER_KINDS or api_version.partition("/")[0] in _NEVER_GROUPS:
                 raise ValueError(
-                    f"{api_version}/{kind} can never be allowed: it could give a template rights beyond its namespace"
+                    f"{api_version}/{kind} can never be allowed: it could give a template permissions beyond its "
+                    "namespace"
                 )
 
     @classmethod
@@ -90,8 +91,8 @@ class Policy:
         """Raise ValueError for a kind that no manager of all namespaces may look at."""
         if SECRET in self.kinds:
             raise ValueError(
-                "v1/Secret needs a manager of named namespaces: one of all namespaces would read every Secret of the "
-                "cluster; name them by --namespace, or leave the kind out"
+                "v1/Secret needs --namespace, since a manager of all namespaces would read every Secret of the "
+                "cluster: set --namespace, or remove the kind"
             )
 
     def kind_problem(self, api_version: str, kind: str) -> str | None:
@@ -138,7 +139,7 @@ class Policy:
 def _parse_kind(text: str) -> KindKey:
     api_version, slash, kind = text.rpartition("/")
     if not slash or not api_version or not kind[:1].isupper():
-        raise ValueError(f"{text!r} is no kind: write apiVersion/Kind, e.g. apps/v1/Deployment or v1/Service")
+        raise ValueError(f"{text!r} is not a kind: write apiVersion/Kind, e.g. apps/v1/Deployment or v1/Service")
     return api_version, kind
 
 

@@ -114,7 +114,7 @@ def test_the_user_is_the_one_of_the_manager_or_left_to_the_cluster(user: int | N
     assert security["runAsNonRoot"] is True
     assert parse_user("cluster" if user is None else str(user)) == user
     for wrong in ("0", "root", "-1"):
-        with pytest.raises(ValueError, match="is no user"):
+        with pytest.raises(ValueError, match="is not a user"):
             parse_user(wrong)
 
 
@@ -187,10 +187,10 @@ def test_metrics_by_tls_are_probed_by_tls_and_their_secret_is_not_among_those_of
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--detector-metrics-secret", "a"], "do nothing without --detector-image"),
-        (["--detector-env", "A=b"], "do nothing without --detector-image"),
-        (["--detector-image", "a", "--detector-env", "A"], "'A' is no variable: write NAME=VALUE"),
-        (["--detector-image", "a", "--detector-env", "POD_NAME=b"], "POD_NAME is set for each pod by itself"),
+        (["--detector-metrics-secret", "a"], "have no effect without --detector-image"),
+        (["--detector-env", "A=b"], "have no effect without --detector-image"),
+        (["--detector-image", "a", "--detector-env", "A"], "'A' is not an environment variable: write NAME=VALUE"),
+        (["--detector-image", "a", "--detector-env", "POD_NAME=b"], "POD_NAME is set automatically in each pod"),
     ],
 )
 def test_options_for_the_pods_that_make_no_sense_are_refused(options: list[str], said: str) -> None:
@@ -263,7 +263,7 @@ def test_a_command_prints_the_account_of_a_detector_that_somebody_else_runs() ->
     assert list(yaml.safe_load_all(done.stdout)) == detector_roles("site", "town")
     refused = CliRunner().invoke(app, ["detector-rbac", "Town", "-n", "site"])
     assert refused.exit_code == 2
-    assert "'Town' is no Detector's name" in refused.stderr
+    assert "'Town' is not a Detector name" in refused.stderr
 
 
 def deployment(available: int) -> dict[str, Any]:
