@@ -58,9 +58,7 @@ class Headroom(Collector):
         """The metrics as of now."""
         used = GaugeMetricFamily(f"{PREFIX}memory_bytes", "Resident memory of the manager and its worker processes")
         used.add_metric((), _resident())
-        tight = GaugeMetricFamily(
-            f"{PREFIX}memory_tight", "1 while memory is short and no new tasks are accepted"
-        )
+        tight = GaugeMetricFamily(f"{PREFIX}memory_tight", "1 while memory is short and no new tasks are accepted")
         tight.add_metric((), float(self.tight()))
         yield from (used, tight)
         if self.limit is not None:

@@ -129,7 +129,7 @@ class Leadership:
         except ApiError as error:
             if error.terminating:
                 self._namespace_goes = True
-                self._log(logging.INFO, f"the namespace of the Lease {self._key} is not there, or going")
+                self._log(logging.INFO, f"the namespace of the Lease {self._key} does not exist, or is being deleted")
                 return
             if error.code not in (404, 409):
                 raise
@@ -144,10 +144,8 @@ class Leadership:
                 await self.look()
             except (ApiError, Unreachable) as error:
                 left = self.remaining()
-                until = f"; acting for {left:.0f} s more" if left > 0 else ""
-                self._log(
-                    logging.WARNING, f"the Lease {self._key} cannot be looked after{until}: {error}", str(type(error))
-                )
+                until = f"; active for {left:.0f} s more" if left > 0 else ""
+                self._log(logging.WARNING, f"cannot renew the Lease {self._key}{until}: {error}", str(type(error)))
                 pause = LOOK_EVERY
             else:
                 pause = RENEW_EVERY if self.active else LOOK_EVERY
@@ -199,8 +197,8 @@ class Leadership:
             self._namespace_goes = False
             self._log(logging.INFO, f"active: holds the Lease {self._key} as {self._candidate.identity}")
         elif was_active:
-            why = f"the Lease {self._key} was not renewed within {DEADLINE:g} s, or another manager has taken it"
-            self._log(logging.INFO if self._namespace_goes else logging.WARNING, f"not active any more: {why}")
+            why = f"the Lease {self._key} was not renewed within {DEADLINE:g} s, or another manager has acquired it"
+            self._log(logging.INFO if self._namespace_goes else logging.WARNING, f"no longer active: {why}")
         else:
             self._log(logging.INFO, f"{self.role}, by the Lease {self._key}")
         self._changed.set()

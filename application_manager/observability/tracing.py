@@ -100,7 +100,7 @@ class TaskTraces:
         elif applied is not None and ready is not None:
             self._ready(task, context, new, now, f"{ready.reason}: {ready.message}")
         elif known is not None and known.reconcile is not None:
-            self._ready(task, context, new, now, "NotReady: the task ended before its instance was seen ready")
+            self._ready(task, context, new, now, "NotReady: the task ended before its instance was ready")
         else:
             self._remembered(task.metadata.uid).unserved = True
 

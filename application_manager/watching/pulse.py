@@ -91,7 +91,7 @@ class Pulse(Collector):
         for resource, age in sorted(ages.items()):
             family.add_metric((resource,), age)
         yield family
-        restarts = CounterMetricFamily(f"{PREFIX}watch_restarts", "Watches that were silent and begun again")
+        restarts = CounterMetricFamily(f"{PREFIX}watch_restarts", "Watches that were silent and restarted")
         restarts.add_metric((), self._restarts)
         yield restarts
 

@@ -80,10 +80,10 @@ class TemplateWork:
             try:
                 found = await self.pool.run(name[0], TemplateJob(template, self.cache.policy))
             except ExceededError as error:
-                found = Findings((f"spec: to render the template {error}",))
+                found = Findings((f"spec: rendering the template {error}",))
             self.cache.note_findings(template, found)
         exceeded = self.cache.exceeded.get(name)
         if exceeded:
             instance, why = min(exceeded.items())
-            return replace(found, problems=(*found.problems, f"spec: to render instance {instance[1]} {why}"))
+            return replace(found, problems=(*found.problems, f"spec: rendering instance {instance[1]} {why}"))
         return found

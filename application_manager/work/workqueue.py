@@ -86,7 +86,7 @@ class WorkQueue(Generic[Key]):
         now = time.monotonic()
         for key, began in list(self._running.items()):
             if now - began > limit:
-                return f"{self.name} {_text(key)} is worked on for {now - began:.0f} s"
+                return f"{self.name} {_text(key)} has been in progress for {now - began:.0f} s"
         return None
 
     def add(self, key: Key) -> None:

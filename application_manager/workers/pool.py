@@ -164,7 +164,7 @@ class Pool:
         except Exception as error:
             self._running -= Counter((ticket.namespace,))
             if not ticket.answer.done():
-                ticket.answer.set_exception(JobError(f"there is no process for it: {error}"))
+                ticket.answer.set_exception(JobError(f"cannot start a worker process: {error}"))
             raise
         self._idle.append(child)
 
@@ -200,10 +200,10 @@ class Pool:
     def _text(self, error: EndedError) -> str:
         if error.of_time:
             return (
-                f"takes more than {self.cpu_time:g} s of CPU time and was ended: make its expressions simpler, above "
+                f"took more than {self.cpu_time:g} s of CPU time and was stopped: simplify its expressions, above "
                 "all loops and `matches`"
             )
-        return f"was ended, since its process {error}: make its expressions simpler, or their values smaller"
+        return f"was stopped, since its process {error}: simplify its expressions, or make their values smaller"
 
 
 def unpickled(answer: bytes) -> object:

@@ -216,7 +216,7 @@ def test_a_template_that_breaks_leaves_what_runs_as_it_was(api: Api, manager: Pr
         lambda raw: condition(raw, "Applied").get("reason") == "RenderFailed",
         what="the instance says what is wrong",
     )
-    assert "`parameters.version` is not known" in condition(told, "Applied")["message"]
+    assert "`parameters.version` does not exist" in condition(told, "Applied")["message"]
     wait_settled(api)
     after = quiet(api)
     assert {key: after[key] for key in before} == before

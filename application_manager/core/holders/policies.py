@@ -93,9 +93,9 @@ class TaskPolicy:
         spec = task.spec
         if spec.operation not in policy.operations:
             allowed = " or ".join(sorted(policy.operations)) or "nothing"
-            why = f"spec.operation: {spec.operation} is not allowed to holder {holder}, which may {allowed}"
+            why = f"spec.operation: {spec.operation} is not allowed for holder {holder}, which may {allowed}"
         elif policy.max_priority is not None and spec.priority > policy.max_priority:
-            why = f"spec.priority: {spec.priority} is above {policy.max_priority}, the highest of holder {holder}"
+            why = f"spec.priority: {spec.priority} is above {policy.max_priority}, the maximum for holder {holder}"
         else:
             return None
         message = f"{why}: change the rule, or have the administrator change --holder-policy"

@@ -103,12 +103,12 @@ class Policy:
         choice = (
             f"write {' or '.join(same)}" if same else f"allowed are {', '.join(sorted(map(kind_text, self.kinds)))}"
         )
-        return f"{kind_text((api_version, kind))} is not of the kinds that the administrator allows: {choice}"
+        return f"{kind_text((api_version, kind))} is not a kind that the administrator allows: {choice}"
 
     def pod_problems(self, manifest: dict[str, Any]) -> Iterator[tuple[str, str]]:
         """Field and problem of each thing in the manifest's pods that is not allowed."""
         if manifest.get("kind") == "Secret" and manifest.get("type") == _TOKEN_SECRET:
-            yield "type", f"{_TOKEN_SECRET} would hold a service account's token: remove it"
+            yield "type", f"{_TOKEN_SECRET} would contain a service account's token: remove it"
         for found in pods_and_accounts(manifest):
             if isinstance(found, NamedAccount):
                 yield from self._account_problems(found.where, found.account)
@@ -125,7 +125,7 @@ class Policy:
             listed = ", ".join(sorted(self.service_accounts))
             yield (
                 where,
-                f"{account!r} is not of the service accounts that the administrator lists: use one of {listed}",
+                f"{account!r} is not a service account that the administrator allows: use one of {listed}",
             )
 
     def completed(self, manifest: dict[str, Any]) -> dict[str, Any]:
@@ -144,7 +144,7 @@ def _parse_kind(text: str) -> KindKey:
 
 
 def _token_problems(spec: dict[str, Any], where: str) -> Iterator[tuple[str, str]]:
-    remedy = "remove it, or use a service account that the administrator lists"
+    remedy = "remove it, or use a service account that the administrator allows"
     if spec.get("automountServiceAccountToken"):
         yield f"{where}.automountServiceAccountToken", f"true would mount the token of the account default: {remedy}"
     volumes = spec.get("volumes")

@@ -106,10 +106,10 @@ def test_what_is_lacking_is_said_with_its_purpose_and_the_remedy(caplog: pytest.
     judge([(needed["deployments", False], "patch", "a")])
     (said,) = caplog.messages
     assert said == (
-        "its account may not patch deployments of apps in namespace a: no Deployment of a template is made, changed or "
-        "removed: grant what `application-manager rbac` prints"
+        "its service account cannot patch deployments of apps in namespace a, so no Deployment of a template is "
+        "created, changed or deleted: apply the output of `application-manager rbac`"
     )
-    with pytest.raises(ConfigurationError, match="may not list pods in all namespaces: why workloads do not run"):
+    with pytest.raises(ConfigurationError, match="cannot list pods in all namespaces, so statuses"):
         judge([(needed["pods", True], "list", None)])
 
 

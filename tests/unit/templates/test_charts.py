@@ -120,7 +120,7 @@ def test_what_a_manifest_may_not_be_a_charts_object_may_not_be() -> None:
             + SERVICE.replace("{name: app}", "{name: app, namespace: x}")
         )
     account, elsewhere = caught.value.problems
-    assert account.startswith("spec.helm: templates/service.yaml of chart app: v1/ServiceAccount is not of the kinds")
+    assert account.startswith("spec.helm: templates/service.yaml of chart app: v1/ServiceAccount is not a kind")
     assert account.endswith("or disable it by the chart's values")
     assert "'x' is not the template's own namespace" in elsewhere
 
@@ -135,7 +135,7 @@ def test_a_chart_that_is_still_to_come_is_no_error_and_one_that_cannot_be_had_ha
 
 
 def test_a_wrong_expression_in_the_values_is_found_when_the_template_is_compiled() -> None:
-    with pytest.raises(RenderError, match=r"spec\.helm\.values\.rate.*`parameters.rat` is not known"):
+    with pytest.raises(RenderError, match=r"spec\.helm\.values\.rate.*`parameters.rat` does not exist"):
         Renderer(template(helm=CHART | {"values": {"rate": "${parameters.rat}"}}), Policy())
 
 
