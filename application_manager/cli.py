@@ -48,10 +48,10 @@ HelmProgram = Annotated[
     str, typer.Option(help="The helm program, a path or a name on PATH, for templates with charts.")
 ]
 ChartCacheFolder = Annotated[
-    Path | None, typer.Option(help="The folder to keep fetched charts in. Default: ~/.cache/wayside/charts.")
+    Path | None, typer.Option(help="The folder for fetched charts. Default: ~/.cache/wayside/charts.")
 ]
 CHART_FOLDER = Path("/charts")
-ChartFolder = Annotated[Path, typer.Option(help="The folder with charts that templates may name by their path.")]
+ChartFolder = Annotated[Path, typer.Option(help="The folder with charts that templates may refer to by path.")]
 ServiceAccounts = Annotated[
     list[str] | None,
     typer.Option(help="A service account that templates may use; repeatable. Default: only `default`, without token."),
@@ -60,13 +60,15 @@ ServiceAccounts = Annotated[
 
 MaxInstances = Annotated[
     int | None,
-    typer.Option(min=1, help="How many instances a namespace may have, over all templates. Default: any number."),
+    typer.Option(min=1, help="The maximum number of instances in a namespace, over all templates. Default: no limit."),
 ]
 
 
 @app.callback()
 def _main(
-    debug: Annotated[bool, typer.Option(commandline.DEBUG, help="Show the trace of an error, and log more.")] = False,
+    debug: Annotated[
+        bool, typer.Option(commandline.DEBUG, help="Show the stack trace of an error, and log more.")
+    ] = False,
 ) -> None:
     logging.basicConfig(
         level=logging.DEBUG if debug else logging.INFO,
@@ -83,19 +85,19 @@ def _main(
 @app.command()
 def run(
     namespace: Annotated[
-        list[str] | None, typer.Option(help="A namespace to look after; repeatable. Default: all.")
+        list[str] | None, typer.Option(help="A namespace to manage; repeatable. Default: all.")
     ] = None,
     max_instances: MaxInstances = None,
     max_tasks: Annotated[
         int | None,
-        typer.Option(min=1, help="How many unfinished tasks a namespace may have. Default: any number."),
+        typer.Option(min=1, help="The maximum number of unfinished tasks in a namespace. Default: no limit."),
     ] = None,
     holder_policy: Annotated[
         list[str] | None,
         typer.Option(
             metavar="NAMESPACE/HOLDER:LIMITS",
-            help="What the tasks of holders may ask for, e.g. town/*:max-tasks=100,max-priority=10,operations=Deploy. "
-            "Repeatable; the first that matches a holder counts. Default: anything.",
+            help="Limits for the tasks of holders, e.g. town/*:max-tasks=100,max-priority=10,operations=Deploy. "
+            "Repeatable; the first one that matches a holder applies. Default: no limit.",
         ),
     ] = None,
     resync: Annotated[str, typer.Option(metavar="DURATION", help="How often to list everything again.")] = "60s",
@@ -104,22 +106,28 @@ def run(
     ] = "1h",
     stalled_after: Annotated[
         str,
-        typer.Option(metavar="DURATION", help="After how long without progress the watchdog ends this manager."),
+        typer.Option(metavar="DURATION", help="The watchdog ends this manager after this time without progress."),
     ] = "5m",
     watch_timeout: Annotated[
         str,
         typer.Option(
             metavar="DURATION",
-            help="After how long without an event or a bookmark a watch is restarted; after twice that time this "
-            "manager ends.",
+            help="Restart a watch after this time without an event or bookmark, and end this manager after twice "
+            "this time.",
         ),
     ] = "90s",
     metrics_port: Annotated[
-        int | None, typer.Option(min=0, max=65535, help="Serve /metrics, /healthz and /readyz here. Default: nowhere.")
+        int | None,
+        typer.Option(
+            min=0, max=65535, help="Serve /metrics, /healthz and /readyz on this port. Default: do not serve."
+        ),
     ] = None,
     metrics_certificates: Annotated[
         Path | None,
-        typer.Option(help="With --metrics-port: serve by TLS, with tls.crt and tls.key of this folder, also renewed."),
+        typer.Option(
+            help="With --metrics-port: serve with TLS, with tls.crt and tls.key from this folder; renewed "
+            "files are loaded."
+        ),
     ] = None,
     zenoh: Annotated[
         list[str] | None,
@@ -132,15 +140,14 @@ def run(
         str,
         typer.Option(
             metavar="DURATION",
-            help="CPU time that one evaluation of a template's or rule's expressions may take, in processes of their "
-            "own.",
+            help="The maximum CPU time to evaluate the expressions of a template or rule, in a worker process.",
         ),
     ] = "3s",
     memory_limit: Annotated[
         str | None,
         typer.Option(
             metavar="QUANTITY",
-            help="Memory of this manager and its worker processes, e.g. 1Gi: near it, new tasks are not taken in. "
+            help="Memory of this manager and its worker processes, e.g. 1Gi: near it, no new tasks are accepted. "
             "Default: the container's limit.",
         ),
     ] = None,
@@ -148,8 +155,8 @@ def run(
         str | None,
         typer.Option(
             metavar="[NAMESPACE/]NAME",
-            help="The Lease by which one of several managers of the same namespaces is active. Default: "
-            "application-manager, in the pod's namespace, else in the first that is looked after.",
+            help="The Lease that elects the active one of several managers of the same namespaces. Default: "
+            "application-manager, in the pod's namespace, else in the first managed one.",
         ),
     ] = None,
     helm: HelmProgram = "helm",
@@ -160,16 +167,17 @@ def run(
     detector_image: Annotated[
         str | None,
         typer.Option(
-            help="Run the Detectors of mode Standalone, and put those of mode Sidecar into pods, with this image where "
-            "they name none. Default: run none."
+            help="Run the Detectors of mode Standalone, and inject those of mode Sidecar into pods. Detectors "
+            "without an image use this one. Default: run no detectors."
         ),
     ] = None,
     detector_pull_policy: Annotated[
-        PullPolicy | None, typer.Option(help="Of detectors' images. Default: as Kubernetes chooses by the tag.")
+        PullPolicy | None,
+        typer.Option(help="The pull policy of detectors' images. Default: Kubernetes chooses by the tag."),
     ] = None,
     detector_pull_secret: Annotated[
         list[str] | None,
-        typer.Option(help="A Secret, in each namespace with detectors, by which their images are pulled; repeatable."),
+        typer.Option(help="A Secret, in each namespace with detectors, to pull their images with; repeatable."),
     ] = None,
     detector_env: Annotated[
         list[str] | None,
@@ -179,14 +187,14 @@ def run(
         str | None,
         typer.Option(
             metavar="UID|cluster",
-            help="The user of detectors: a number, or `cluster` where that chooses (OpenShift). Default: 65532.",
+            help="The user ID of detectors, or `cluster` to let the cluster choose (OpenShift). Default: 65532.",
         ),
     ] = None,
     detector_metrics_secret: Annotated[
         str | None,
         typer.Option(
-            help="A Secret with tls.crt and tls.key, in each namespace with detectors, by which they serve metrics and "
-            "health. Default: without TLS."
+            help="A Secret with tls.crt and tls.key, in each namespace with detectors, to serve metrics and health "
+            "with TLS. Default: without TLS."
         ),
     ] = None,
     admission_port: Annotated[
@@ -194,27 +202,24 @@ def run(
         typer.Option(
             min=1,
             max=65535,
-            help="Answer the API server's reviews of templates, rules and detectors here, as "
-            "`application-manager webhooks` makes it do. Default: nowhere.",
+            help="Serve the webhooks that `application-manager webhooks` prints on this port. Default: do not serve.",
         ),
     ] = None,
     admission_certificates: Annotated[
         Path | None,
-        typer.Option(help="With --admission-port: a folder with tls.crt and tls.key, which may change while it runs."),
+        typer.Option(help="With --admission-port: a folder with tls.crt and tls.key; renewed files are loaded."),
     ] = None,
     admission_service: Annotated[
         str | None,
         typer.Option(
             metavar="NAMESPACE/NAME",
-            help="Make the certificate for this Service, keep it in the Secret NAME-certificates of its namespace, "
-            "which must exist, renew it in time, and write the files into --admission-certificates.",
+            help="Create and renew the certificate for this Service. The manager stores it in the existing Secret "
+            "NAME-certificates of the Service's namespace and writes it to --admission-certificates.",
         ),
     ] = None,
     admission_webhooks: Annotated[
         str,
-        typer.Option(
-            metavar="NAME", help="With --admission-service: the webhook configurations that get the authority."
-        ),
+        typer.Option(metavar="NAME", help="With --admission-service: the webhook configurations that get the CA."),
     ] = "wayside",
     log_format: Annotated[
         commandline.LogFormat,
@@ -278,9 +283,9 @@ def render(
 ) -> None:
     """Print what would run, as YAML: merged instances and their manifests, without a cluster.
 
-    Templates with a chart need the program helm; a chart that is not here is fetched.
+    Templates with a chart need the program helm; charts that are not cached are fetched.
 
-    What waits, is held at a bound or is refused is printed on stderr; where something is refused, the exit code is 1.
+    Waiting, capped and refused tasks are printed on stderr. If a task is refused, the exit code is 1.
     """
     with importing():
         from application_manager.charts.helm import HelmRunner
@@ -310,7 +315,7 @@ def check(
 ) -> None:
     """Check templates, rules and detectors as the webhook would, without a cluster.
 
-    Exits with 1 where it would refuse something; its warnings are only printed.
+    Exits with 1 if the webhook would refuse an object; warnings are only printed.
     """
     with importing():
         from application_manager.commands.checking import check_files
@@ -336,7 +341,7 @@ def check(
         typer.echo(f"warning: {line}", err=True)
     if checked.problems:
         raise typer.Exit(1)
-    typer.echo(f"{checked.looked_at} looked at: nothing that would be refused", err=True)
+    typer.echo(f"checked {checked.looked_at}: nothing would be refused", err=True)
 
 
 class Output(StrEnum):
@@ -352,7 +357,7 @@ def explain(
     namespace: Annotated[str | None, typer.Option("--namespace", "-n", help="Default: the kubeconfig's.")] = None,
     output: Annotated[Output, typer.Option("--output", "-o", help="For people or for programs.")] = Output.TEXT,
 ) -> None:
-    """Explain why a task is served or not, and why an instance runs as it does: from the event to the pods."""
+    """Explain the state of a task or instance, from the event to the pods."""
     with importing():
         import asyncio
 

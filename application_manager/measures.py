@@ -31,21 +31,21 @@ class Measures:
         )
         self._ready = self._histogram("event_to_ready_seconds", "From an event's start to its task's Ready", _SERVICE)
         self._reconciled = self._histogram("reconcile_seconds", "Time that reconciling one object took", _WORK, "queue")
-        self._failures = self._counter("reconcile_failures", "Reconciliations that failed and are tried again", "queue")
-        self._refusals = self._counter("refusals", "Tasks that were refused, or became so for another reason", "reason")
+        self._failures = self._counter("reconcile_failures", "Reconciliations that failed and are retried", "queue")
+        self._refusals = self._counter("refusals", "Tasks that were refused, also again for another reason", "reason")
         self._requests = self._histogram("api_request_seconds", "Time to the API server's answer", _WORK, "method")
         self._errors = self._counter("api_errors", "Requests that the API server refused or did not answer", "code")
         self._events = self._counter("kubernetes_events", "Kubernetes Events that were posted", "reason")
         self._unposted = self._counter("kubernetes_events_dropped", "Kubernetes Events that were not posted", "cause")
-        self._reviews = self._counter(
-            "reviews", "Questions of the API server about objects to be stored", "kind", "answer"
-        )
+        self._reviews = self._counter("reviews", "Admission reviews of the API server", "kind", "answer")
         self._jobs = self._histogram("job_seconds", "Time that a worker process took for a job", _WORK)
-        self._exceeded = self._counter("jobs_exceeded", "Jobs that were ended for what they take")
+        self._exceeded = self._counter("jobs_exceeded", "Jobs that exceeded their limits")
         self._resynced = Gauge(
-            f"{PREFIX}resync_time_seconds", "When everything was last listed again, since 1970", registry=self.registry
+            f"{PREFIX}resync_time_seconds",
+            "Time of the last resync, in seconds since the epoch",
+            registry=self.registry,
         )
-        self._active = Gauge(f"{PREFIX}active", "1 for the manager that acts, 0 for a standby", registry=self.registry)
+        self._active = Gauge(f"{PREFIX}active", "1 for the active manager, 0 for a standby", registry=self.registry)
         ProcessCollector(registry=self.registry)
 
     def text(self) -> bytes:

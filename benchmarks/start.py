@@ -31,7 +31,7 @@ TARGET_S = 0.4
 PATIENCE = 120.0  # s
 BARE = "python -c pass"
 RUNS = "runs with 1 rule"
-ASKS = "retrying until the API server answers"
+ASKS = "retrying until the API server responds"
 IMPORTED = "import time:"
 """How a line of `python -X importtime` begins, one for each module."""
 

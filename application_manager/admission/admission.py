@@ -92,7 +92,7 @@ class Admission:
     async def _in_turn(self, request: Request) -> Findings:
         """The findings, unless the namespace has too many questions: the others' are answered all the same."""
         if self._under_way[request.namespace] >= AT_ONCE:
-            raise ReviewError(f"{AT_ONCE} questions of namespace {request.namespace} are being answered")
+            raise ReviewError(f"{AT_ONCE} reviews of namespace {request.namespace} are in progress: try again")
         self._under_way[request.namespace] += 1
         try:
             return await self._findings(request)
@@ -129,7 +129,9 @@ class Admission:
                 if findings.remarks:
                     await self._look_up(TEMPLATE, rule.namespace)
         except (ApiError, Unreachable, TimeoutError) as error:
-            log.warning("EventRule %s/%s is judged by what is known: %s", rule.namespace, rule.name, error)
+            log.warning(
+                "EventRule %s/%s: reviewed with the objects in the cache only: %s", rule.namespace, rule.name, error
+            )
             problems = (Finding(INVALID_RULE.name, each, rule.name) for each in findings.problems)
             return Findings((), (*problems, *findings.doubts), findings.remarks)
         return await self._judged(rule)
@@ -142,7 +144,7 @@ class Admission:
         try:
             return await self.pool.run(namespace, job)
         except ExceededError as error:
-            return Findings((f"spec: to judge it {error}",))
+            return Findings((f"spec: its review {error}",))
 
     async def _look_up(self, kind: KindKey, namespace: str) -> None:
         for raw in (await self.client.list(self.resources[kind], namespace))[0]:
@@ -161,7 +163,7 @@ class Admission:
             some = rules[first : first + _RULES_AT_ONCE]
             remarks += (await self._run(detector.namespace, DetectorJob(detector, before, some))).remarks
             if time.monotonic() > until and first + _RULES_AT_ONCE < len(rules):
-                unseen = "not all of its rules were looked at: their statuses will show whether they are in order"
+                unseen = "not all of its rules were reviewed: see their statuses"
                 remarks.append(Finding(BROKEN_RULE.name, unseen))
                 break
         return replace(findings, remarks=tuple(remarks))
@@ -180,7 +182,9 @@ class Admission:
             if error.permanent and error.code != _FORBIDDEN:
                 problem = f"spec.pod: {error.message}"
         except (Unreachable, TimeoutError) as error:
-            log.warning("the pod of Detector %s/%s is not checked: %s", detector.namespace, detector.name, error)
+            log.warning(
+                "Detector %s/%s: cannot check its pod by a dry run: %s", detector.namespace, detector.name, error
+            )
         return problem
 
 

@@ -48,7 +48,7 @@ def write_whole(folder: Path, files: Mapping[str, bytes]) -> None:
             new.replace(folder / name)
     except OSError as error:
         reason = error.strerror or error
-        raise ConfigurationError(f"{folder}: {reason}: give a folder that can be written to") from error
+        raise ConfigurationError(f"{folder}: {reason}: give a writable folder") from error
 
 
 def issued(hosts: Sequence[str], valid: datetime.timedelta = VALID) -> dict[str, bytes]:

@@ -76,4 +76,4 @@ class Injecting:
                 for raw in (await self.client.list(self.detectors, namespace, fields=f"metadata.name={name}"))[0]:
                     self.observe(raw)
         except (ApiError, Unreachable, TimeoutError) as error:
-            log.warning("Detector %s/%s, which a pod requests, cannot be looked up: %s", namespace, name, error)
+            log.warning("cannot look up Detector %s/%s, which a pod requests: %s", namespace, name, error)

@@ -71,14 +71,16 @@ class Issuing:
     async def follow(self) -> None:
         """Look again and again, until cancelled."""
         await asyncio.sleep(EVERY)
-        await repeatedly(self.look, EVERY, "cannot look after the webhook's certificate")
+        await repeatedly(self.look, EVERY, "cannot renew the webhook's certificate")
 
     async def look(self) -> None:
         """Look once: make a certificate where one is due, give the API server its authority, and write the files."""
         namespace, name = self.secret
         secret = await self.client.get(_SECRETS, namespace, name)
         if secret is None:
-            raise ConfigurationError(f"there is no Secret {namespace}/{name} for the webhook's certificate: create it")
+            raise ConfigurationError(
+                f"Secret {namespace}/{name} for the webhook's certificate does not exist: create it"
+            )
         files = {key: base64.b64decode(value) for key, value in (secret.get("data") or {}).items()}
         if _due(files, now := datetime.datetime.now(datetime.UTC)):
             files = issued(WebhookClientConfig.of_service(self.service).hosts)
@@ -90,7 +92,7 @@ class Issuing:
                 if error.code == 409:  # another manager was faster
                     return await self.look()
                 raise
-            log.info("made a certificate for the webhook, valid for %d days", VALID.days)
+            log.info("created a certificate for the webhook, valid for %d days", VALID.days)
         await self._trust(base64.b64encode(files[AUTHORITY]).decode())
         write_whole(self.folder, {each: files[each] for each in (AUTHORITY, CERTIFICATE, KEY)})
 
@@ -104,7 +106,7 @@ class Issuing:
             if any(each["clientConfig"].get("caBundle") != bundle for each in webhooks):
                 changed = [{"name": each["name"], "clientConfig": {"caBundle": bundle}} for each in webhooks]
                 await self.client.merge_members(resource, self.webhooks, {"webhooks": changed})
-                log.info("wrote the authority of the webhook's certificate into the %s", resource.kind)
+                log.info("wrote the CA of the webhook's certificate into the %s", resource.kind)
 
 
 def _due(files: dict[str, bytes], now: datetime.datetime) -> bool:

@@ -70,9 +70,9 @@ class Desk:
     async def answer(self, request: web.Request) -> web.Response:
         """The answer to one question; an HTTP error where there is none."""
         if not self._ready():
-            return self._none(503, "not everything is listed and watched yet")
+            return self._none(503, "the caches are not synced yet")
         if self._asked >= AT_ONCE:
-            return self._none(503, f"{AT_ONCE} questions are being answered")
+            return self._none(503, f"{AT_ONCE} reviews are in progress: try again")
         self._asked += 1
         try:
             question = msgspec.json.decode(await request.read())

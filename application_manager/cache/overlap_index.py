@@ -97,7 +97,7 @@ class OverlapIndex:
         if not state.tried:
             state.tried, state.until = True, now + ANSWER
             return Turn.CHALLENGE, state.until
-        self._resume(template[0], f"the manager of the Lease {state.rival.lease} does not answer")
+        self._resume(template[0], f"the manager of the Lease {state.rival.lease} does not respond")
         return Turn.ACT, now
 
     def waits_for(self, namespace: str) -> str:
@@ -116,8 +116,8 @@ class OverlapIndex:
         namespace = state.template[0]
         if namespace not in self._yielded:
             log.warning(
-                "namespace %s is also looked after by the manager of the Lease %s, older than ours: this one waits. "
-                "Give each its own namespaces, or one Lease to both",
+                "namespace %s is also managed by the manager of the Lease %s, which is older: this manager stands "
+                "by there. Give each manager its own namespaces, or both the same Lease",
                 namespace,
                 state.rival.lease,
             )
@@ -125,14 +125,15 @@ class OverlapIndex:
 
     def _resume(self, namespace: str, why: str) -> None:
         del self._yielded[namespace]
-        log.warning("namespace %s: %s: this manager acts there", namespace, why)
+        log.warning("namespace %s: %s: this manager is active there", namespace, why)
         self.resumed(namespace)
 
     def _report_younger(self, namespace: str, rival: TemplateManager) -> None:
         if (namespace, rival.lease) not in self._younger:
             self._younger.add((namespace, rival.lease))
             log.warning(
-                "namespace %s is also looked after by the manager of the Lease %s, which is younger and should wait",
+                "namespace %s is also managed by the manager of the Lease %s, which is younger and should stand "
+                "by. Give each manager its own namespaces, or both the same Lease",
                 namespace,
                 rival.lease,
             )

@@ -44,19 +44,19 @@ class ChartCache:
             return known if known is not None else await self._fetched(source)
         except OSError as error:
             raise HelmError(
-                f"charts cannot be kept in {self.folder}: {error.strerror or error}; give the manager --chart-cache "
-                "with a folder that it can write to"
+                f"cannot write charts to {self.folder}: {error.strerror or error}: start the manager with "
+                "--chart-cache and a writable folder"
             ) from None
 
     def _local(self, chart: str) -> Path:
         path = Path(chart).resolve()
         if not path.is_relative_to(self.local.resolve()):
             raise HelmError(
-                f"{chart} is not in {self.local}, where the administrator keeps charts: put it there, or start the "
-                "manager with --chart-folder"
+                f"chart {chart} is not in {self.local}, the manager's --chart-folder: put it there, or start the "
+                "manager with another --chart-folder"
             )
         if not path.exists():
-            raise HelmError(f"there is no {chart} in the manager's image: put the chart there, or correct the path")
+            raise HelmError(f"chart {chart} does not exist in the manager's image: put it there, or correct the path")
         return path
 
     def _known(self, source: ChartSource) -> Path | None:

@@ -120,7 +120,7 @@ class ChartDesk:
         try:
             outcome = await self._outcome(request)
         except Exception as error:  # a defect must not leave the instance waiting for ever
-            log.exception("the chart of %s/%s failed", request.namespace, request.release)
+            log.exception("cannot render the chart of %s/%s", request.namespace, request.release)
             outcome = ChartFailure(FAILED, f"spec.helm: chart {request.source}: {type(error).__name__}: {error}")
         finally:
             known.work = None

@@ -70,7 +70,7 @@ class HelmRunner:
         await self._run(arguments, self.pull_time, environment)
         archives = [folder / name for name in os.listdir(folder) if name.endswith(".tgz")]
         if len(archives) != 1:
-            raise HelmError(f"helm pull brought {len(archives)} archives, not one")
+            raise HelmError(f"helm pull returned {len(archives)} archives, not one")
         return archives[0]
 
     async def template(self, request: ChartRequest, chart: Path) -> str:
@@ -85,14 +85,14 @@ class HelmRunner:
         try:
             return written.decode()
         except UnicodeDecodeError:
-            raise HelmError("helm template wrote what is no UTF-8 text") from None
+            raise HelmError("the output of helm template is not UTF-8 text") from None
 
     async def _run(self, arguments: list[str], seconds: float, more: Mapping[str, str]) -> bytes:
         program = shutil.which(self.program)
         if program is None:
             raise HelmError(
-                f"there is no program {self.program!r} for the manager: install Helm 3.8 or newer on its PATH, or give "
-                "--helm"
+                f"the manager cannot find the program {self.program!r}: install Helm 3.8 or newer on its PATH, or "
+                "set --helm"
             )
         with _folder() as home:
             process = await asyncio.create_subprocess_exec(
@@ -117,7 +117,9 @@ class HelmRunner:
                 await process.wait()
         if code != 0:
             output = errors.decode(errors="replace")
-            raise HelmError(_cleaned(output) or f"helm {arguments[0]} ended with code {code}: it may have had a limit")
+            raise HelmError(
+                _cleaned(output) or f"helm {arguments[0]} ended with code {code}, perhaps at a resource limit"
+            )
         return written
 
 
@@ -152,7 +154,7 @@ async def _read(stream: asyncio.StreamReader | None) -> bytes:
     while stream is not None and (part := await stream.read(1 << 16)):
         found += part
         if len(found) > OUTPUT:
-            raise HelmError(f"it wrote more than {OUTPUT >> 20} MiB: use a smaller chart")
+            raise HelmError(f"its output is larger than {OUTPUT >> 20} MiB: use a smaller chart")
     return bytes(found)
 
 

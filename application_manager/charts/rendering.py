@@ -30,8 +30,9 @@ async def rendered(helm: HelmRunner, request: ChartRequest, path: Path) -> Chart
     if text != await helm.template(request, path):
         return ChartFailure(
             FAILED,
-            f"spec.helm: chart {request.source} gives other objects each time (by randAlphaNum, genCA, now or the "
-            "like), so the application would restart for nothing: give these values in spec.helm.values",
+            f"spec.helm: chart {request.source} renders different objects each time (with functions such as "
+            "randAlphaNum, genCA or now), which would restart the application: set these values in "
+            "spec.helm.values",
         )
     return await asyncio.to_thread(parse_chart, request.source, text)
 
@@ -50,7 +51,7 @@ async def rendered_at_once(helm: HelmRunner, cache: ChartCache, request: ChartRe
 
 def unavailable(source: ChartSource, error: HelmError) -> ChartFailure:
     """The chart cannot be had."""
-    return ChartFailure(UNAVAILABLE, f"spec.helm: chart {source} cannot be had: {error}")
+    return ChartFailure(UNAVAILABLE, f"spec.helm: cannot fetch chart {source}: {error}")
 
 
 def failed(source: ChartSource, error: HelmError) -> ChartFailure:

@@ -40,7 +40,8 @@ class FailedPodsLook:
                 self._forbidden_until = time.monotonic() + FORBIDDEN_FOR
             if not self._told:
                 log.info(
-                    "Events cannot be listed (%s): statuses lack the reason why pods of a StatefulSet cannot be made",
+                    "cannot list Events (%s): statuses do not give the reason why pods of a StatefulSet cannot be "
+                    "created",
                     error,
                 )
                 self._told = True

@@ -43,8 +43,8 @@ class Grants:
             if namespace not in self._granted | self._refused and not await self._ask(namespace):
                 self._refused.add(namespace)
                 log.warning(
-                    "namespace %s is not granted to this manager, which leaves it alone: to have it looked after, "
-                    "apply what `application-manager rbac --grant %s` prints, or add it to manager.grant of the chart",
+                    "namespace %s is not granted to this manager, which does not manage it: apply the output of "
+                    "`application-manager rbac --grant %s`, or add it to manager.grant of the chart",
                     namespace,
                     namespace,
                 )
@@ -57,7 +57,7 @@ class Grants:
     async def _look(self) -> None:
         granted = [each for each in sorted(self._refused) if await self._ask(each)]
         if granted:
-            log.info("granted to this manager: namespace %s", ", ".join(granted))
+            log.info("namespace %s is granted to this manager", ", ".join(granted))
             self._refused.difference_update(granted)
             self._changed()
 

@@ -66,7 +66,8 @@ def lease_key(given: str | None, namespaces: tuple[str, ...]) -> LeaseKey:
     namespace, _, name = (given or LEASE_NAME).rpartition("/")
     if not name or holder_of(name) is not None:
         raise ValueError(
-            f"{given!r} cannot be the managers' Lease: write NAME or NAMESPACE/NAME; wayside-… are detectors'"
+            f"--lease {given!r}: not a name for the managers' Lease: write NAME or NAMESPACE/NAME; names that "
+            "begin with wayside- are those of detectors"
         )
     if not namespace:
         namespace = os.environ.get("POD_NAMESPACE") or pod_namespace() or next(iter(sorted(namespaces)), "default")
@@ -138,7 +139,7 @@ class Leadership:
         except ApiError as error:
             if error.terminating:
                 self._namespace_goes = True
-                self._log(logging.INFO, f"the namespace of the Lease {self._key} is not there, or going")
+                self._log(logging.INFO, f"the namespace of the Lease {self._key} does not exist, or is being deleted")
                 return
             if error.code not in (404, 409):
                 raise
@@ -153,10 +154,8 @@ class Leadership:
                 await self.look()
             except RequestError as error:
                 left = self.remaining()
-                until = f"; acting for {left:.0f} s more" if left > 0 else ""
-                self._log(
-                    logging.WARNING, f"the Lease {self._key} cannot be looked after{until}: {error}", str(type(error))
-                )
+                until = f"; active for {left:.0f} s more" if left > 0 else ""
+                self._log(logging.WARNING, f"cannot renew the Lease {self._key}{until}: {error}", str(type(error)))
                 pause = LOOK_EVERY
             else:
                 pause = RENEW_EVERY if self.active else LOOK_EVERY
@@ -194,8 +193,8 @@ class Leadership:
         except (ApiError, Unreachable, TimeoutError) as error:
             gone = isinstance(error, ApiError) and error.code in (404, 409)
             level = logging.INFO if gone else logging.WARNING  # gone with its namespace, or taken
-            why = str(error) or "the API server does not answer"
-            log.log(level, "the Lease %s is not released, a standby waits for its end: %s", self._key, why)
+            why = str(error) or "the API server does not respond"
+            log.log(level, "cannot release the Lease %s; a standby takes over when it expires: %s", self._key, why)
         else:
             log.info("released the Lease %s", self._key)
 
@@ -208,8 +207,8 @@ class Leadership:
             self._namespace_goes = False
             self._log(logging.INFO, f"active: holds the Lease {self._key} as {self._candidate.identity}")
         elif was_active:
-            why = f"the Lease {self._key} was not renewed within {DEADLINE:g} s, or another manager has taken it"
-            self._log(logging.INFO if self._namespace_goes else logging.WARNING, f"not active any more: {why}")
+            why = f"the Lease {self._key} was not renewed within {DEADLINE:g} s, or another manager has acquired it"
+            self._log(logging.INFO if self._namespace_goes else logging.WARNING, f"no longer active: {why}")
         else:
             self._log(logging.INFO, f"{self.role}, by the Lease {self._key}")
         self._changed.set()

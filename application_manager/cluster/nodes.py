@@ -44,7 +44,7 @@ class NodeLook:
         except ApiError as error:
             self._until = time.monotonic() + (FORBIDDEN_FOR if error.code == 403 else FRESH)
             if not self._told:
-                log.info("nodes cannot be listed (%s): only the scheduler reports why a pod fits none", error)
+                log.info("cannot list nodes (%s): only the scheduler reports why a pod fits no node", error)
                 self._told = True
             return None
         except Unreachable:

@@ -24,7 +24,7 @@ def _lines(explanation: Explanation) -> Iterator[str]:
     if instance is None:
         task = explanation.task
         of_all = task is not None and task.operation != "Deploy" and task.standing in ("Counts", "Waiting")
-        yield "instances: it is for all of the template" if of_all else "instance: none"
+        yield "instances: all of the template" if of_all else "instance: none"
         return
     yield from _instance(instance, template.name)
     yield from _tasks(explanation, instance)
@@ -32,7 +32,9 @@ def _lines(explanation: Explanation) -> Iterator[str]:
     if explanation.parameters:
         yield "parameters"
     for each in explanation.parameters:
-        origin = {"default": ", the default", "earlier": ", kept from before", "none": ""}.get(each.source, "")
+        origin = {"default": ", the default", "earlier": ", kept from an earlier state", "none": ""}.get(
+            each.source, ""
+        )
         shown = "absent" if each.value is None else values.shown(each.value)
         yield f"  {each.name} = {shown} (merge {each.merge}{origin})" + (f": {each.note}" if each.note else "")
         for part in each.contributions:
@@ -66,24 +68,27 @@ def _task(task: ExplainedTask) -> Iterator[str]:
         lost = ", counted as lost" if task.holder_is_lost else ""
         yield f"  requested by detector {task.detector or '(unnamed)'}, holder {task.holder or 'none'}{age}{lost}"
     else:
-        yield "  requested by a person: it never lapses"
+        yield "  created by a person: it never lapses"
     yield f"  {task.operation}, priority {task.priority}, created {task.created or 'just now'}"
     yield f"  {task.standing}, {task.reason}: {task.message}"
     shown = ("Accepted", "Finished") if task.standing == "Finished" else ("Accepted",)  # by the line above
     yield from _conditions(task.conditions, but=shown)
     if task.not_looked_at:
-        yield "  the manager has not looked at it as it is now: does `application-manager run` run for this namespace?"
+        yield (
+            "  the manager has not processed its current generation: does `application-manager run` manage this "
+            "namespace?"
+        )
 
 
 def _instance(instance: ExplainedInstance, template: str) -> Iterator[str]:
     is_json = instance.key is not None and instance.key.startswith(("[", "{"))
     key = "" if instance.key is None else f", key {instance.key if is_json else values.shown(instance.key)}"
     state = (instance.phase or "no phase yet") if instance.exists else "not made yet"
-    by = "" if instance.managed else ", made by a person"
+    by = "" if instance.managed else ", created by a person"
     of = f" of template {instance.template}" if instance.template not in (None, template) else ""
     yield f"instance {instance.name}{of} ({state}{key}{by})"
     if instance.release_time is not None:
-        yield f"  it is released at {instance.release_time} unless a demand comes"
+        yield f"  it is released at {instance.release_time} unless a demand arrives"
     yield from _conditions(instance.conditions)
 
 

@@ -26,7 +26,7 @@ from wayside.manifests import to_yaml
 from wayside.process import commandline
 
 _DETECTORS = Resource(API_VERSION, "Detector", Detector.plural)
-_NO_IMAGE = "Detector {} names no image: give --detector-image, or its spec.pod.image"
+_NO_IMAGE = "Detector {} has no image: give --detector-image, or set its spec.pod.image"
 
 Manifest = dict[str, Any]
 
@@ -103,18 +103,20 @@ async def _looked_up(documents: list[Manifest], known: _Known) -> _Known:
     if not wanted:
         return known
     listed = ", ".join(sorted(name for _, name in wanted))
-    otherwise = "give its file by -f, or a kubeconfig of the cluster that has it"
+    otherwise = "give its file with -f, or use the kubeconfig of a cluster that has it"
     try:
         client = manager_client(await load_configuration())
     except ConfigurationError as error:
-        raise ConfigurationError(f"Detector {listed} is in none of the files: {error}: {otherwise}") from error
+        raise ConfigurationError(
+            f"Detector {listed} is in none of the files, and cannot be read from the cluster: {error}: {otherwise}"
+        ) from error
     try:
         for namespace, name in sorted(wanted):
             raw = await client.get(_DETECTORS, namespace, name)
             if raw is not None and (found := _detector(raw)) is not None:
                 known.found[namespace, name] = found
     except RequestError as error:
-        raise ConfigurationError(f"Detector {listed} cannot be looked up: {error}: {otherwise}") from error
+        raise ConfigurationError(f"Detector {listed} cannot be read from the cluster: {error}: {otherwise}") from error
     finally:
         await client.close()
     return known
@@ -158,11 +160,11 @@ def _read(file: str) -> list[Manifest]:
         text = sys.stdin.read() if file == "-" else Path(file).read_text(encoding="utf-8")
         documents = [each for each in yaml.safe_load_all(text) if each is not None]
     except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "is no UTF-8"
+        reason = error.strerror if isinstance(error, OSError) else "is not UTF-8 text"
         raise ConfigurationError(f"-f {file}: {reason}: give a readable YAML file, or - for stdin") from error
     except yaml.YAMLError as error:
-        raise ConfigurationError(f"-f {file}: is no YAML: {' '.join(str(error).split())}") from error
+        raise ConfigurationError(f"-f {file}: is not YAML: {' '.join(str(error).split())}") from error
     for each in documents:
         if not isinstance(each, dict) or not isinstance(each.get("kind"), str):
-            commandline.refuse(f"-f {file}: holds a document that is no manifest: each needs apiVersion and kind")
+            commandline.refuse(f"-f {file}: contains a document that is not a manifest: each needs apiVersion and kind")
     return documents

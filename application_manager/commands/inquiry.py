@@ -55,7 +55,7 @@ async def inquire(subject: str, namespace: str | None) -> Explanation:
     try:
         return await _inquire(client, subject, namespace or _namespace_of_context())
     except RequestError as error:
-        raise InquiryError(f"the API server does not answer: {error}") from error
+        raise InquiryError(f"the API server does not respond: {error}") from error
     finally:
         await client.close()
 
@@ -73,15 +73,15 @@ async def _inquire(client: Client, subject: str, namespace: str) -> Explanation:
     task = await _read(client, _TASKS, ApplicationTask, namespace, name, kind, _TASK_WORDS)
     existing = await _read(client, _INSTANCES, ApplicationInstance, namespace, name, kind, _INSTANCE_WORDS)
     if kind and kind.lower() not in _TASK_WORDS | _INSTANCE_WORDS:
-        raise InquiryError(f"{subject}: {kind} is neither task nor instance: write task/{name} or instance/{name}")
+        raise InquiryError(f"{subject}: {kind} is not a kind: write task/{name} or instance/{name}")
     if task is None and existing is None:
         what = kind or "ApplicationTask or ApplicationInstance"
         raise InquiryError(
-            f"there is no {what} {name!r} in namespace {namespace}: `kubectl get apptask,appinst -n {namespace}` lists "
-            "those that there are, and -n names another namespace"
+            f"there is no {what} {name!r} in namespace {namespace}: list them with `kubectl get apptask,appinst -n "
+            f"{namespace}`, or give another namespace with -n"
         )
     if task is not None and existing is not None:
-        raise InquiryError(f"{name} is a task and an instance: write task/{name} or instance/{name}")
+        raise InquiryError(f"{name} is the name of a task and of an instance: write task/{name} or instance/{name}")
     found = Found(
         await _templates(client, namespace),
         await _list(client, _TASKS, ApplicationTask, namespace),
@@ -121,7 +121,7 @@ async def _read(
     try:
         parsed = parse_object(raw)
     except ValueError as error:
-        raise InquiryError(f"{resource.kind} {name} cannot be read: {error}: correct it") from error
+        raise InquiryError(f"{resource.kind} {name} is not valid: {error}: correct it") from error
     return parsed if isinstance(parsed, model) else None
 
 

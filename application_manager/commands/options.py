@@ -72,7 +72,7 @@ def serving_of(port: int | None, certificates: Path | None, service: str | None,
     from application_manager.core.findings.webhooks import certificate_secret
 
     if port is None or certificates is None:
-        commandline.refuse(f"{PORT_OPTION} and {FOLDER_OPTION} go together: give both, or none")
+        commandline.refuse(f"give both {PORT_OPTION} and {FOLDER_OPTION}, or neither")
     if service is None:
         return Serving(port, certificates)
     try:
@@ -114,6 +114,6 @@ def detectors_of(
         return PodDefaults(image, policy, tuple(secrets or ()), environment, number, metrics_secret)
     if policy or secrets or environment or user or metrics_secret:
         commandline.refuse(
-            "options for detectors' pods do nothing without --detector-image: give it, or leave them out"
+            "options for detectors' pods have no effect without --detector-image: set it, or remove them"
         )
     return None

@@ -20,37 +20,40 @@ def webhooks(
     ] = None,
     url: Annotated[
         str | None,
-        typer.Option(metavar="https://HOST:PORT", help="In place of --service: a manager that is elsewhere."),
+        typer.Option(
+            metavar="https://HOST:PORT", help="In place of --service: the URL of a manager outside the cluster."
+        ),
     ] = None,
     ca_bundle: Annotated[
         Path | None,
         typer.Option(
-            help="The certificate (PEM) of the authority that signed the manager's. Without it somebody else "
-            "must write it in, as cert-manager does."
+            help="The certificate (PEM) of the CA that signed the manager's certificate. Without it, another "
+            "program must add it, such as cert-manager."
         ),
     ] = None,
     make_certificates: Annotated[
         Path | None,
         typer.Option(
             metavar="FOLDER",
-            help="In place of --ca-bundle, for trials: make an authority and a certificate "
-            "that is valid for a year, as ca.crt, tls.crt and tls.key in this folder.",
+            help="In place of --ca-bundle, for trials: create a CA and a certificate, valid for a year, as ca.crt, "
+            "tls.crt and tls.key in this folder.",
         ),
     ] = None,
     namespace: Annotated[
-        list[str] | None, typer.Option(help="As of `run`: the namespaces that the manager looks after; repeatable.")
+        list[str] | None, typer.Option(help="As for `run`: a namespace to manage; repeatable.")
     ] = None,
     detectors: Annotated[
         bool,
         typer.Option(
-            "--detectors", help="For a manager with --detector-image: also what puts detectors into pods (Sidecar)."
+            "--detectors",
+            help="For a manager with --detector-image: also the webhook that injects detectors into pods (Sidecar).",
         ),
     ] = False,
-    name: Annotated[str, typer.Option(help="Of the objects; managers of different namespaces need different ones.")] = (
-        "wayside"
-    ),
+    name: Annotated[
+        str, typer.Option(help="The name of the objects; managers of different namespaces need different ones.")
+    ] = ("wayside"),
 ) -> None:
-    """Print what makes the API server ask a manager with --admission-port about templates, rules and detectors."""
+    """Print the webhook configurations for a manager with --admission-port."""
     with importing():
         from application_manager.commands.webhooks import print_webhooks
 
@@ -60,12 +63,12 @@ def webhooks(
 def rbac(
     allowed_kinds: Annotated[
         list[str] | None,
-        typer.Option(help="As of `run`: a kind that templates may create; repeatable. Replaces the default."),
+        typer.Option(help="As for `run`: a kind that templates may create; repeatable. Replaces the default."),
     ] = None,
     namespace: Annotated[
         list[str] | None,
         typer.Option(
-            help="As of `run`: a namespace to look after, which gets a Role; repeatable. Default: a ClusterRole that "
+            help="As for `run`: a namespace to manage, which gets a Role; repeatable. Default: a ClusterRole that "
             "reads in all of them."
         ),
     ] = None,
@@ -73,30 +76,30 @@ def rbac(
         list[str] | None,
         typer.Option(
             metavar="NAMESPACE",
-            help="Without --namespace: a namespace in which the manager may write, by a RoleBinding; repeatable.",
+            help="Without --namespace: a namespace in which the manager may write, through a RoleBinding; repeatable.",
         ),
     ] = None,
     account: Annotated[
         str, typer.Option(metavar="NAMESPACE/NAME", help="The service account that the manager runs with.")
     ] = "wayside/application-manager",
     lease: Annotated[
-        str | None, typer.Option(metavar="[NAMESPACE/]NAME", help="As of `run`. Default: in the account's namespace.")
+        str | None,
+        typer.Option(metavar="[NAMESPACE/]NAME", help="As for `run`. Default: in the service account's namespace."),
     ] = None,
-    detectors: Annotated[
-        bool, typer.Option("--detectors", help="For a manager with --detector-image, which runs detectors too.")
-    ] = False,
+    detectors: Annotated[bool, typer.Option("--detectors", help="For a manager with --detector-image.")] = False,
     name: Annotated[
-        str, typer.Option(help="Of the roles and bindings; managers of different namespaces need different ones.")
+        str,
+        typer.Option(help="The name of the roles and bindings; managers of different namespaces need different ones."),
     ] = "wayside-application-manager",
     admission_service: Annotated[
         str | None,
-        typer.Option(metavar="NAMESPACE/NAME", help="As of `run`: a manager that makes its certificate."),
+        typer.Option(metavar="NAMESPACE/NAME", help="As for `run`: for a manager that creates its certificate."),
     ] = None,
-    admission_webhooks: Annotated[str, typer.Option(metavar="NAME", help="As of `run`.")] = "wayside",
+    admission_webhooks: Annotated[str, typer.Option(metavar="NAME", help="As for `run`.")] = "wayside",
 ) -> None:
-    """Print the roles that the manager's account needs for the kinds that templates may create, and no more.
+    """Print the minimal roles of the manager's service account for the kinds that templates may create.
 
-    Only a kind that is not one of the default ones is looked up in the cluster of the current kubeconfig.
+    Kinds other than the default ones are looked up in the cluster of the current kubeconfig.
     """
     with importing():
         from application_manager.commands.rbac import print_rbac
@@ -119,10 +122,12 @@ def detector_rbac(
     namespace: Annotated[str, typer.Option("--namespace", "-n", help="Its namespace.")],
     pod_account: Annotated[
         list[str] | None,
-        typer.Option(help="An account of pods that have the detector as a sidecar; repeatable. No other is made."),
+        typer.Option(
+            help="A service account of pods with the detector as a sidecar, instead of a new one; repeatable."
+        ),
     ] = None,
 ) -> None:
-    """Print the account of a detector that you run yourself, with the rights that it needs, and no more."""
+    """Print the service account and the minimal roles of a detector that you run yourself."""
     with importing():
         from application_manager.commands.rbac import print_detector_rbac
 
@@ -132,19 +137,25 @@ def detector_rbac(
 def inject(
     files: Annotated[
         list[str],
-        typer.Option("--file", "-f", metavar="FILE|-", help="A YAML file, or - for stdin; repeatable. Detectors too."),
+        typer.Option(
+            "--file",
+            "-f",
+            metavar="FILE|-",
+            help="A YAML file with manifests or Detectors, or - for stdin; repeatable.",
+        ),
     ],
     namespace: Annotated[
-        str, typer.Option("--namespace", "-n", help="Of manifests that name none, for Detectors of the cluster.")
+        str,
+        typer.Option("--namespace", "-n", help="The namespace of manifests without one, for Detectors of the cluster."),
     ] = "default",
     detector_image: Annotated[
-        str | None, typer.Option(help="As of `run`: the image of detectors that name none.")
+        str | None, typer.Option(help="As for `run`: the image of detectors without one.")
     ] = None,
 ) -> None:
-    """Print the manifests with the detectors in them that their pods ask for by the label wayside.dev/detector.
+    """Print manifests after injecting the detectors that pods request with the label wayside.dev/detector.
 
-    Pods, and what makes pods, e.g. a Deployment. The Detectors come from the files, else from the cluster of the
-    current kubeconfig. What requests none, or has it already, is printed unchanged. If a pod cannot
+    Injects into Pods and workloads, e.g. Deployments. Detectors come from the files, else from the cluster of the
+    current kubeconfig. Other objects are printed unchanged. If a pod cannot
     have its detector, an error gives the reason, the pod is printed unchanged, and the exit code is 1.
     """
     with importing():

@@ -51,11 +51,9 @@ def print_rbac(
     """
     where, _, who = account.partition("/")
     if not where or not who:
-        raise typer.BadParameter(f"{account!r} is no account: write NAMESPACE/NAME", param_hint="--account")
+        raise typer.BadParameter(f"{account!r} is not a service account: write NAMESPACE/NAME", param_hint="--account")
     if grant and namespaces:
-        raise typer.BadParameter(
-            "goes without --namespace, where each namespace has a Role that also allows writing", param_hint="--grant"
-        )
+        raise typer.BadParameter("remove it, or --namespace, whose Roles already permit writing", param_hint="--grant")
     try:
         policy = Policy.parse(allowed_kinds, None)
         if not namespaces:
@@ -85,7 +83,7 @@ def print_detector_rbac(name: str, namespace: str, pod_accounts: Sequence[str]) 
     """Print the account of a Detector and its rights as YAML; those of the accounts of pods, where there are any."""
     _named(name, "Detector", "NAME")
     for account in pod_accounts:
-        _named(account, "account", "--pod-account")
+        _named(account, "service account", "--pod-account")
     made = sidecar_roles(namespace, name, pod_accounts) if pod_accounts else detector_roles(namespace, name)
     sys.stdout.write(to_yaml(made))
 
@@ -96,7 +94,7 @@ def _named(name: str, what: str, option: str) -> None:
         TypeAdapter(ObjectName).validate_python(name)
     except ValidationError:
         raise typer.BadParameter(
-            f"{name!r} is no {what}'s name: small letters, digits and -, at most 63", param_hint=option
+            f"{name!r} is not a {what} name: use at most 63 lower-case letters, digits and -", param_hint=option
         ) from None
 
 
@@ -109,11 +107,13 @@ def plurals(policy: Policy) -> dict[KindKey, str]:
 
 async def _asked(kinds: list[KindKey]) -> dict[KindKey, str]:
     listed = ", ".join(map(kind_text, kinds))
-    remedy = "run this with the kubeconfig of a cluster that has it"
+    remedy = "use the kubeconfig of a cluster that has this kind"
     try:
         client = manager_client(await load_configuration())
     except ConfigurationError as error:
-        raise ConfigurationError(f"what roles call {listed} only a cluster knows: {error}") from error
+        raise ConfigurationError(
+            f"cannot look up the plural of {listed}, which roles need, without a cluster: {error}"
+        ) from error
     try:
         found = {}
         for kind in kinds:
@@ -127,6 +127,8 @@ async def _asked(kinds: list[KindKey]) -> dict[KindKey, str]:
             found[kind] = resource.plural
         return found
     except RequestError as error:
-        raise ConfigurationError(f"the cluster does not know what roles call {listed}: {error}: {remedy}") from error
+        raise ConfigurationError(
+            f"cannot look up the plural of {listed}, which roles need, in the cluster: {error}: {remedy}"
+        ) from error
     finally:
         await client.close()

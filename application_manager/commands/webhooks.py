@@ -45,7 +45,7 @@ def print_webhooks(
     if (service is None) == (url is None):
         commandline.refuse("give either --service NAMESPACE/NAME or --url https://HOST:PORT")
     if ca_bundle is not None and folder is not None:
-        commandline.refuse("--ca-bundle and --make-certificates exclude each other: give one")
+        commandline.refuse("give either --ca-bundle or --make-certificates")
     try:
         place = (
             WebhookClientConfig.of_service(service) if service is not None else WebhookClientConfig.of_url(url or "")
@@ -69,5 +69,5 @@ def _authority(given: Path | None, folder: Path | None, place: WebhookClientConf
     except OSError as error:
         raise ConfigurationError(f"--ca-bundle {given}: {error.strerror or error}: give a readable file") from error
     if b"-----BEGIN CERTIFICATE-----" not in content:
-        raise ConfigurationError(f"--ca-bundle {given}: holds no certificate: give a PEM file of the authority")
+        raise ConfigurationError(f"--ca-bundle {given}: contains no certificate: give the CA's PEM file")
     return content

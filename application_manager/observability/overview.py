@@ -36,21 +36,19 @@ class Overview(Collector):
         )
         yield self._templates()
         depth = GaugeMetricFamily(f"{PREFIX}queue_depth", "Keys that wait for a worker", labels=("queue",))
-        later = GaugeMetricFamily(
-            f"{PREFIX}queue_later", "Keys that wait for a time, or for another try", labels=("queue",)
-        )
+        later = GaugeMetricFamily(f"{PREFIX}queue_later", "Keys that wait for a time or a retry", labels=("queue",))
         for name, waiting, timed in self._queues():
             depth.add_metric((name,), waiting)
             later.add_metric((name,), timed)
         yield from (depth, later)
         yield self._leases()
-        shed = GaugeMetricFamily(f"{PREFIX}tasks_shed", "ApplicationTasks that were not taken in for want of memory")
+        shed = GaugeMetricFamily(f"{PREFIX}tasks_shed", "ApplicationTasks that wait because memory is short")
         shed.add_metric((), len(self._cache.store.shed))
         yield shed
-        yielded = GaugeMetricFamily(f"{PREFIX}namespaces_yielded", "Namespaces in which an older manager acts")
+        yielded = GaugeMetricFamily(f"{PREFIX}namespaces_yielded", "Namespaces in which an older manager is active")
         yielded.add_metric((), self._cache.overlap.count)
         yield yielded
-        reached = GaugeMetricFamily(f"{PREFIX}api_reached", "1 while the API server answers")
+        reached = GaugeMetricFamily(f"{PREFIX}api_reached", "1 while the API server responds")
         reached.add_metric((), float(self._cache.healthy.reached))
         yield reached
 

@@ -54,7 +54,7 @@ def stalled(measures: Measures, every: float, queues: Sequence[_Queue] = (), lea
         if stuck is not None:
             return stuck
         since = time.monotonic() - measures.looked
-        return f"no resync has ended for {since:.0f} s" if since > limit else None
+        return f"no resync has completed for {since:.0f} s" if since > limit else None
 
     return look
 

@@ -100,7 +100,7 @@ class TaskTraces:
         elif applied is not None and ready is not None:
             self._ready(task, context, new, now, f"{ready.reason}: {ready.message}")
         elif known is not None and known.reconcile is not None:
-            self._ready(task, context, new, now, "NotReady: the task ended before its instance was seen ready")
+            self._ready(task, context, new, now, "NotReady: the task ended before its instance was ready")
         else:
             self._remembered(task.metadata.uid).unserved = True
 
@@ -170,7 +170,7 @@ class TaskTraces:
     def _emit(self, span: Span) -> TraceContext:
         if self.tracing.failed and not self._said:
             self._said = True
-            log.warning("spans are not taken by %s; those lost are counted in the metrics", self.tracing.endpoint)
+            log.warning("%s does not accept spans; lost spans are counted in the metrics", self.tracing.endpoint)
         return self.tracing.emit(span)
 
     def _remembered(self, uid: str) -> _Known:
@@ -188,7 +188,7 @@ class LostSpans(Collector):
 
     def collect(self) -> Iterator[Metric]:
         """The metric as of now."""
-        family = CounterMetricFamily(f"{PREFIX}spans_dropped", "Spans that nobody got", labels=("cause",))
+        family = CounterMetricFamily(f"{PREFIX}spans_dropped", "Spans that were lost", labels=("cause",))
         family.add_metric(("full",), self._tracing.dropped)
         family.add_metric(("failed",), self._tracing.failed)
         yield family

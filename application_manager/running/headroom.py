@@ -58,7 +58,7 @@ class Headroom(Collector):
         """The metrics as of now."""
         used = GaugeMetricFamily(f"{PREFIX}memory_bytes", "Resident memory of the manager and its worker processes")
         used.add_metric((), _resident())
-        tight = GaugeMetricFamily(f"{PREFIX}memory_tight", "1 while new tasks are not taken in for want of memory")
+        tight = GaugeMetricFamily(f"{PREFIX}memory_tight", "1 while memory is short and no new tasks are accepted")
         tight.add_metric((), float(self.tight()))
         yield from (used, tight)
         if self.limit is not None:
@@ -73,8 +73,8 @@ class Headroom(Collector):
             used = _resident()
         tight = used > (_ROOM if self._tight else _FULL) * limit
         if tight != self._tight:
-            what = "new tasks are not taken in" if tight else "new tasks are taken in again"
-            log.warning("memory: %d of %d MiB are in use: %s", used >> 20, limit >> 20, what)
+            what = "not accepting new tasks" if tight else "accepting new tasks again"
+            log.warning("using %d of %d MiB of memory: %s", used >> 20, limit >> 20, what)
         self._tight = tight
 
 

@@ -31,8 +31,9 @@ async def recent_enough(client: Client) -> str:
     found = re.match(r"v?(\d+)\.(\d+)", version)
     if found is not None and (int(found[1]), int(found[2])) < OLDEST:
         raise ConfigurationError(
-            f"the API server is Kubernetes {version}, and {'.'.join(map(str, OLDEST))} is the oldest that works: older "
-            "ones drop selectableFields of custom resources, so no application would be released; upgrade the cluster"
+            f"the API server is Kubernetes {version}, but {'.'.join(map(str, OLDEST))} or newer is required: older "
+            "versions ignore selectableFields of custom resources, so applications would never be released; "
+            "upgrade the cluster"
         )
     return version
 
@@ -49,8 +50,8 @@ async def selectable(client: Client, resources: Mapping[KindKey, Resource], name
         if error.code != 400:
             raise
         raise ConfigurationError(
-            f"ApplicationTasks cannot be selected by spec.templateName ({error.message}), so no application would ever "
-            "be released: run kubectl apply -f crds/ on Kubernetes 1.31 or newer"
+            f"cannot select ApplicationTasks by spec.templateName ({error.message}), so applications would never be "
+            "released: run kubectl apply -f crds/ on Kubernetes 1.31 or newer"
         ) from None
 
 
@@ -67,7 +68,7 @@ async def discovered(client: Client, policy: Policy) -> dict[KindKey, Resource]:
         raise ConfigurationError(f"the cluster has no kind {', '.join(missing)}: run kubectl apply -f crds/")
     for kind in sorted(policy.kinds):
         if kind not in found:
-            log.warning("the cluster has no kind %s: templates that use it fail", kind_text(kind))
+            log.warning("the cluster has no kind %s: templates that use it are refused", kind_text(kind))
         elif not found[kind].namespaced:
             raise ConfigurationError(f"{kind_text(kind)} is not namespaced and can never be allowed")
     return found

@@ -74,7 +74,8 @@ async def serve(options: Options) -> None:
             await Manager(client, replace(options, helm=helm), resources, measures, leadership, traced).run()
     except ApiError as error:
         raise ConfigurationError(
-            f"the API server refuses what the manager needs: {error}; check the account and its rights"
+            f"the API server refuses a request that the manager needs: {error}; check its service account and "
+            "permissions"
         ) from error
     finally:
         await client.close()
@@ -185,8 +186,8 @@ class Manager:
 
     def _lacks(self, watching: asyncio.Event) -> str | None:
         if not watching.is_set() or not self._pulse.begun("applicationtasks"):
-            return "not everything is listed and watched yet"
-        return None if self._work.cache.healthy.reached else "the API server does not answer"
+            return "the caches are not synced yet"
+        return None if self._work.cache.healthy.reached else "the API server does not respond"
 
     async def _watch_and_act(self, watching: asyncio.Event, stop: asyncio.Event) -> None:
         tasks = [

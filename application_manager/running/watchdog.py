@@ -32,7 +32,7 @@ Stall = Callable[[], str | None]
 def end(reason: str) -> None:
     """End the process at once, and log the reason and where every thread is. It takes no lock: its holder may hang."""
     when = time.strftime("%Y-%m-%d %H:%M:%S")
-    line = f"{when},000 CRITICAL watchdog: {reason}; this manager ends, to be started again\n"
+    line = f"{when},000 CRITICAL watchdog: {reason}; ending this manager, to be restarted\n"
     os.write(2, line.encode())
     faulthandler.dump_traceback(2, all_threads=True)
     os._exit(STALLED)

@@ -50,7 +50,7 @@ class LeaseWatch:
             reached = await self._reached()
             self.cache.healthy.look(time.monotonic(), succeeded=reached)
             if reached != was_reached:
-                log.warning("the API server answers again" if reached else "the API server does not answer")
+                log.warning("the API server responds again" if reached else "the API server does not respond")
                 was_reached = reached
             await asyncio.sleep(LOOK_EVERY)
 

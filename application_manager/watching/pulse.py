@@ -62,7 +62,7 @@ class Pulse(Collector):
         """A watch was silent for too long and is begun again."""
         self._restarts += 1
         log.warning(
-            "the watch of %s%s had neither an event nor a bookmark for %g s and is restarted",
+            "the watch of %s%s had no event or bookmark for %g s; restarting it",
             watch[0],
             f" in {watch[1]}" if watch[1] else "",
             self.limit,
@@ -91,7 +91,7 @@ class Pulse(Collector):
         for resource, age in sorted(ages.items()):
             family.add_metric((resource,), age)
         yield family
-        restarts = CounterMetricFamily(f"{PREFIX}watch_restarts", "Watches that were silent and begun again")
+        restarts = CounterMetricFamily(f"{PREFIX}watch_restarts", "Watches that were silent and restarted")
         restarts.add_metric((), self._restarts)
         yield restarts
 

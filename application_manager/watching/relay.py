@@ -52,7 +52,7 @@ def relaying(observe: Handler, vanished: Handler, relist: Relist, failed: Callab
                 handle(raw)
             except Exception:  # a defect in handling one object must not stop the watch
                 name = raw["metadata"].get("name")
-                log.exception("cannot handle %s %s; the next resync retries it", raw.get("kind"), name)
+                log.exception("cannot handle %s %s; retrying at the next resync", raw.get("kind"), name)
                 failed()
             version = raw["metadata"]["resourceVersion"]
             del event, raw

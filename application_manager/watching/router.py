@@ -200,7 +200,7 @@ class Router:
         renewed = self.cache.leases.observe(key, raw, at)
         returns = renewed and (not before.renewed or before.unchanged >= before.duration)
         if returns:
-            log.info("holder %s/%s renews its Lease", *key)
+            log.info("holder %s/%s renews its Lease again", *key)
         if first or returns:  # only now is it known how long it lasts
             self._enqueue_all(self.cache.claims.holders().get(key, ()))
 

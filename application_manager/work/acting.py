@@ -129,6 +129,6 @@ async def _release(leadership: Leadership, client: Client) -> None:
     if not leadership.active:
         return
     if client.open_until > time.monotonic():
-        log.warning("requests are under way without an answer: the Lease is not released, a standby waits for its end")
+        log.warning("requests are still in progress: not releasing the Lease; a standby takes over when it expires")
         return
     await leadership.release()

@@ -228,7 +228,7 @@ async def apply_owned(
         return await client.apply(resource, manifest)
     except ApiError as error:
         if error.code == 409:  # deleted or replaced since the manager read it
-            return Obstacle("Waiting", f"{what} was deleted or replaced meanwhile; it is read again")
+            return Obstacle("Waiting", f"{what} was deleted or replaced in the meantime; reading it again")
         if not error.permanent or error.terminating:
             raise
         reason = reason_of(error.code, error.message)
@@ -247,9 +247,9 @@ def _readable(message: str) -> str:
         return message
     plain = re.sub(r"&value\.valueUnstructured\{Value:(.*)\}", r"\1", typed[1], flags=re.DOTALL)
     if "expected string, got" in plain:
-        plain += " (inside other text a value becomes text, and alone it keeps its type)"
+        plain += " (a value inside other text becomes text; alone, it keeps its type)"
     return f"{plain}: correct the template"
 
 
 def _counted(count: int) -> str:
-    return "1 object is as in the template" if count == 1 else f"{count} objects are as in the template"
+    return "1 object matches the template" if count == 1 else f"{count} objects match the template"

@@ -52,7 +52,7 @@ class ConfigurationWork:
         except ApiError as error:
             if not error.permanent and not error.terminating:
                 raise
-            log.warning("instance %s/%s: its pods get their configuration late: %s", *name, error)
+            log.warning("instance %s/%s: cannot announce the new configuration; its pods get it late: %s", *name, error)
             return
         if count:
             log.info("instance %s/%s: announced the new configuration to %d pods", *name, count)

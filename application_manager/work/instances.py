@@ -118,7 +118,7 @@ class InstanceWork:
             await self._reconcile(name)
         except ApiError as error:
             if error.terminating:
-                log.debug("instance %s/%s: its namespace is going", *name)
+                log.debug("instance %s/%s: its namespace is being deleted", *name)
                 return
             raise
 
@@ -144,7 +144,9 @@ class InstanceWork:
             self.absent(name, decision)
             return
         if instance is not None and instance.metadata.deletion_timestamp is not None:
-            self.not_made(name, decision, f"instance {name[1]} is being removed, and is made again once it is gone")
+            self.not_made(
+                name, decision, f"instance {name[1]} is being deleted; the manager creates it again afterwards"
+            )
             return  # its deletion enqueues it again
         template = self.cache.template((name[0], decision.template))
         await self._make(_Start(name, decision, instance, template, self.cache.records.get(name)))
@@ -155,7 +157,7 @@ class InstanceWork:
             self._leave(start, existing)
             return
         if decision.too_large and existing is None:
-            self.not_made(name, decision, f"instance {name[1]} is not made: {decision.too_large}")
+            self.not_made(name, decision, f"cannot create instance {name[1]}: {decision.too_large}")
             return
         wanted = drafting.draft(name, decision, existing)
         rendering = self.objects(wanted, start.template)
@@ -189,7 +191,7 @@ class InstanceWork:
         except ApiError as error:
             if start.existing is None and error.permanent and not error.terminating:
                 why = with_remedy(reason_of(error.code, error.message), error.message)
-                problem = f"instance {start.name[1]} cannot be made: {why}"
+                problem = f"cannot create instance {start.name[1]}: {why}"
                 self.not_made(start.name, start.decision, problem)
             raise
 
@@ -250,7 +252,7 @@ class InstanceWork:
     def _leave(self, start: _Start, instance: ApplicationInstance) -> None:
         """Note that the instance stays as it is, by a person's wish."""
         known = start.known(instance)
-        message = "as it was when the instance was paused"
+        message = "unchanged since the instance was paused"
         aspect = (
             Aspect("Applied", True, "Applied", message)
             if start.was_applied(instance) is not None
@@ -308,7 +310,7 @@ class InstanceWork:
             self.again(name, time.time() + _LOOK_AGAIN)  # one of the tasks that were listed may demand it
             return False
         await self.client.delete(self.instances, name[0], name[1], instance.metadata.uid)
-        why = over.yields or "no demand came within its linger"
+        why = over.yields or "no demand arrived within its linger"
         self.recorder.event(instance, Reason.PREEMPTED if over.yields else Reason.RELEASED, why, time.time())
         log.info("instance %s/%s: released: %s", *name, why)
         return True

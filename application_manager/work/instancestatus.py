@@ -88,7 +88,7 @@ class InstanceStatusWork:
         elif not await self.statuses.write(self.instances, instance, instance.status, new, now):
             return
         elif old.release_time is None and new.release_time is not None:
-            note = f"no demand is left; it is released at {new.release_time} unless a new one comes"
+            note = f"no demand is left; it is released at {new.release_time} unless a demand arrives"
             self.statuses.recorder.event(instance, Reason.LINGERING, note, now)
         # How many pods are ready stays with the instance: it changes often, and the tasks may be many.
         why_not = "" if applied.aspect.holds else applied.aspect.message
@@ -101,7 +101,7 @@ class InstanceStatusWork:
             late = f"instance {name[1]} was not ready for {record.decision.overdue}"
             why_not, reason = ": ".join(filter(None, (late, why_not))), reason or READY_TIMEOUT
         if record.decision.withheld and applied.aspect.holds:
-            why_not = f"instance {name[1]} is paused (annotation {PAUSE_ANNOTATION}): it does not get the task's values"
+            why_not = f"instance {name[1]} is paused (annotation {PAUSE_ANNOTATION}): the task's values are not applied"
         serves = applied.aspect.holds and not record.decision.withheld
         service = Service(
             name[1],

@@ -49,9 +49,7 @@ def settings(given: Sequence[str]) -> zenoh.Config:
         try:
             return zenoh.Config.from_file(given[0])
         except (zenoh.ZError, OSError) as error:
-            raise ConfigurationError(
-                f"--zenoh: {given[0]} is no Zenoh configuration that can be read: {error}"
-            ) from None
+            raise ConfigurationError(f"--zenoh: cannot read the Zenoh configuration {given[0]}: {error}") from None
     config = zenoh.Config()
     for path, value in (
         ("mode", "client"),
@@ -171,7 +169,7 @@ class Publisher:
                 return zenoh.open(config)
             except zenoh.ZError as error:
                 if backoff.failures == 0:
-                    log.warning("zenoh cannot be reached, configurations are not published there; trying on: %s", error)
+                    log.warning("zenoh: cannot connect; not publishing configurations; retrying: %s", error)
             with self._lock:
                 if self._lock.wait_for(lambda: self._ended, backoff.fail()):
                     return None
@@ -199,9 +197,9 @@ class Publisher:
                 now = time.monotonic()
                 self._repeats = [now + each for each in _REPEATS]
                 self._lock.notify()
-                log.info("zenoh: connected, %d configurations are published", len(self._contents))
+                log.info("zenoh: connected; publishing %d configurations", len(self._contents))
             elif not self._ended:
-                log.warning("zenoh: a connection is lost; trying on")
+                log.warning("zenoh: lost a connection; reconnecting")
 
     def _answer(self, query: zenoh.Query) -> None:
         """Zenoh's thread calls it for every query."""

@@ -163,7 +163,7 @@ class _Drops:
 
     def report(self, now: float) -> None:
         """Log how many there were, and why the last one was dropped."""
-        log.warning("%d Events were dropped since the last report, the last one: %s", self.count, self.why)
+        log.warning("dropped %d Events since the last report; the last one: %s", self.count, self.why)
         self.count, self.reported = 0, now
 
 

@@ -76,7 +76,7 @@ class Renderings:
             case Problem(reason, message):
                 return drafting.problem(template, reason, message)
             case Exceeded(message):
-                return drafting.problem(template, drafting.EXPRESSION_LIMIT, f"to render this instance {message}")
+                return drafting.problem(template, drafting.EXPRESSION_LIMIT, f"rendering this instance {message}")
         return None
 
     def forget(self, name: Name) -> None:

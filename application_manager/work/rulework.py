@@ -71,7 +71,7 @@ class RuleWork:
             try:
                 return old, await self.pool.run(namespace, job)
             except ExceededError as error:
-                return old, unreadable_status(old, RULE_INVALID, f"spec: to judge the rule {error}", generation, now)
+                return old, unreadable_status(old, RULE_INVALID, f"spec: compiling the rule {error}", generation, now)
         old, judged = DetectorStatus.model_validate(written), entry.model
         if not isinstance(judged, Detector):
             return old, unreadable_status(old, DETECTOR_INVALID, entry.problem, generation, now)
@@ -79,5 +79,5 @@ class RuleWork:
         try:
             return old, await self.pool.run(namespace, DetectorStatusJob(judged, rules, now, running))
         except ExceededError as error:
-            problem = f"spec: to judge the detector {error}"
+            problem = f"spec: compiling the detector {error}"
             return old, unreadable_status(old, DETECTOR_INVALID, problem, generation, now)

@@ -22,7 +22,7 @@ from wayside.api.base import Kind, Metadata
 from wayside.times import parse_seconds
 
 NEW = 3600.0  # s after its making in which a pod has its Event; as long as Kubernetes keeps Events, so none comes again
-_NOBODY = "it was made before its Detector, or while no manager answered the API server"
+_NOBODY = "it was created before its Detector, or while no webhook was available"
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +60,7 @@ class SidecarEvents:
             posted[uid] = _Posted(version, why)
             if last is None or last.why != why:
                 about = Metadata(name=metadata["name"], namespace=name[0], uid=uid)
-                note = f"it runs without a detector: {why}. A pod that is made after that is put right has one"
+                note = f"it runs without a detector: {why}. Recreate the pod once this is corrected"
                 regarding = Kind(api_version="v1", kind="Pod", metadata=about)
                 self.recorder.event(regarding, Reason.NOT_INJECTED, note, now, once=True)
         if posted:

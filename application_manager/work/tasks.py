@@ -29,8 +29,8 @@ from wayside.times import parse_seconds
 _SHED = Verdict(
     Standing.WAITING,
     "ManagerOverloaded",
-    "the application manager is near its memory limit and takes in no further tasks: it takes this one in once there "
-    "is room; end tasks, or raise the limit",
+    "the application manager is near its memory limit and accepts no new tasks: it accepts this one once memory is "
+    "free; end tasks, or raise the limit",
 )
 _OWN_CONDITIONS = ("Accepted", "Finished")  # the others are the instance's, which has Events about them
 
@@ -159,4 +159,4 @@ class TaskWork:
             self.again(name, since + self.ttl)
             return
         await self.client.delete(self.tasks, name[0], name[1], task.metadata.uid)
-        log.info("task %s/%s: deleted, %g s after it finished", *name, self.ttl)
+        log.info("task %s/%s: deleted %g s after it finished", *name, self.ttl)

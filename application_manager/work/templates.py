@@ -63,7 +63,9 @@ class TemplateWork:
     async def _challenge(self, regarding: Kind, own: TemplateManager, now: float) -> None:
         """Find out by the template's status whether the manager is alive that looks after the namespace as well."""
         other = self.cache.overlap.waits_for(regarding.namespace)
-        note = f"the managers of the Leases {other} and {own.lease} look after this namespace: the second one waits"
+        note = (
+            f"this namespace is managed by the managers of the Leases {other} and {own.lease}: the second one stands by"
+        )
         self.statuses.recorder.event(regarding, Reason.MANAGERS_OVERLAP, note, now, once=True)
         await self.statuses.merge(self.templates, regarding, {"manager": own.to_json()})
 
@@ -78,10 +80,10 @@ class TemplateWork:
             try:
                 found = await self.pool.run(name[0], TemplateJob(template, self.cache.policy))
             except ExceededError as error:
-                found = Findings((f"spec: to render the template {error}",))
+                found = Findings((f"spec: rendering the template {error}",))
             self.cache.note_findings(template, found)
         exceeded = self.cache.exceeded.get(name)
         if exceeded:
             instance, why = min(exceeded.items())
-            return replace(found, problems=(*found.problems, f"spec: to render instance {instance[1]} {why}"))
+            return replace(found, problems=(*found.problems, f"spec: rendering instance {instance[1]} {why}"))
         return found

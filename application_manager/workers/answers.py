@@ -97,7 +97,7 @@ class AnswerCache:
         except ExceededError as error:
             answer = Exceeded(str(error))
         except JobError as error:
-            log.error("%s: %s; tried again", key, error)
+            log.error("%s: %s; retrying", key, error)
             await asyncio.sleep(1.0)
             del self._requested[key]
             done()

@@ -53,7 +53,7 @@ class Claiming:
             case Refusal():
                 return refused(found)
             case Exceeded(message):
-                what = f"spec.parameters: to check them by template {template.name}"
+                what = f"spec.parameters: checking them against template {template.name}"
                 return Verdict(Standing.REFUSED, Refused.EXPRESSION_LIMIT, f"{what} {message}")
         return None
 

@@ -118,7 +118,7 @@ class Pool:
     def _ended(self, worker: asyncio.Task[None]) -> None:
         self._workers.discard(worker)
         if not worker.cancelled() and worker.exception() is not None:
-            log.error("a worker process could not be used: %s", worker.exception())
+            log.error("cannot use a worker process: %s", worker.exception())
         self._dispatch()
 
     def _next(self) -> _Ticket | None:
@@ -164,7 +164,7 @@ class Pool:
         except Exception as error:
             self._running -= Counter((ticket.namespace,))
             if not ticket.answer.done():
-                ticket.answer.set_exception(JobError(f"there is no process for it: {error}"))
+                ticket.answer.set_exception(JobError(f"cannot start a worker process: {error}"))
             raise
         self._idle.append(child)
 
@@ -180,7 +180,7 @@ class Pool:
             if not error.of_time and ticket.attempts < _ATTEMPTS:
                 return await self._do(ticket, await Child.start(self.cpu_time))
             self._measures.job_exceeded()
-            log.warning("namespace %s: a process that evaluates expressions %s", ticket.namespace, error)
+            log.warning("namespace %s: a worker process %s", ticket.namespace, error)
             if not ticket.answer.done():
                 ticket.answer.set_exception(ExceededError(self._text(error)))
             return await Child.start(self.cpu_time)
@@ -200,10 +200,10 @@ class Pool:
     def _text(self, error: EndedError) -> str:
         if error.of_time:
             return (
-                f"takes more than {self.cpu_time:g} s of CPU time and was ended: make its expressions simpler, above "
+                f"took more than {self.cpu_time:g} s of CPU time and was stopped: simplify its expressions, above "
                 "all loops and `matches`"
             )
-        return f"was ended, since its process {error}: make its expressions simpler, or their values smaller"
+        return f"was stopped, since its process {error}: simplify its expressions, or make their values smaller"
 
 
 def unpickled(answer: bytes) -> object:

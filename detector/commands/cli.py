@@ -91,7 +91,10 @@ def run(
     ] = None,
     metrics_certificates: Annotated[
         Path | None,
-        typer.Option(help="With --metrics-port: serve by TLS, with tls.crt and tls.key of this folder, also renewed."),
+        typer.Option(
+            help="With --metrics-port: serve with TLS, with tls.crt and tls.key from this folder; renewed "
+            "files are loaded."
+        ),
     ] = None,
     foxglove: Annotated[
         str | None,

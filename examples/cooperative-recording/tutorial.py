@@ -182,7 +182,7 @@ PAIR, OTHERS = "shuttle_1+taxi_1", "taxi_1+taxi_2"
 RECORDER, OTHER_RECORDER = 'scene-recorder ["shuttle_1","taxi_1"]', 'scene-recorder ["taxi_1","taxi_2"]'
 FUSION = "scene-fusion west"
 NOT_YET = "has 0 of 1 pods available"
-GOES = "unless a demand comes"
+GOES = "unless a demand arrives"
 OVER = "Finished: the demand ended"
 LOOK = ("kubectl get apptask", "kubectl get appinst")
 

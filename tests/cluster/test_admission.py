@@ -67,13 +67,13 @@ WRONG: list[tuple[Object, Object, list[str]]] = [
     (
         template("unknown"),
         {"manifests": [deployment("app:${parameters.version}")]},
-        ["spec.manifests[0]", "image, line 1, column", "`parameters.version` is not known", "region"],
+        ["spec.manifests[0]", "image, line 1, column", "`parameters.version` does not exist", "region"],
     ),
     (template("typed"), {"manifests": [config({"x": "${parameters.region + 1}"})]}, ["data.x", "`+` does not take"]),
     (
         template("forbidden"),
         {"manifests": [{"apiVersion": "v1", "kind": "ServiceAccount", "metadata": {"name": "${instance.name}"}}]},
-        ["spec.manifests[0].kind: v1/ServiceAccount is not of the kinds that the administrator allows"],
+        ["spec.manifests[0].kind: v1/ServiceAccount is not a kind that the administrator allows"],
     ),
     (
         template("elsewhere"),
@@ -83,7 +83,7 @@ WRONG: list[tuple[Object, Object, list[str]]] = [
     (
         template("misnamed"),
         {"manifests": [config({}, name="${instance.name}_A")]},
-        ["spec.manifests[0].metadata.name", "is no name for an object"],
+        ["spec.manifests[0].metadata.name", "is not a name for an object"],
     ),
     (
         template("the-same"),

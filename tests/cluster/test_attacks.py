@@ -68,8 +68,8 @@ def named(name: str, **metadata: Any) -> Object:
 
 
 RBAC = "rbac.authorization.k8s.io/v1"
-NOT_ALLOWED = "is not of the kinds that the administrator allows"
-NO_NAME = "is no name for an object"
+NOT_ALLOWED = "is not a kind that the administrator allows"
+NO_NAME = "is not a name for an object"
 JOB = {"template": {"spec": {"serviceAccountName": "admin", "containers": [{"name": "a", "image": "a"}]}}}
 BY_TEMPLATE: dict[str, tuple[Object, str]] = {
     "namespace": (named("${instance.name}", namespace="kube-system"), "is not the template's own namespace"),
@@ -88,12 +88,12 @@ BY_TEMPLATE: dict[str, tuple[Object, str]] = {
     "task": (of_kind("wayside.dev/v1alpha1", "ApplicationTask"), NOT_ALLOWED),
     "list": (of_kind("v1", "List", items=[of_kind("v1", "Secret")]), NOT_ALLOWED),
     "kind-by-parameter": (of_kind("v1", "${parameters.v}"), "must be literal"),
-    "pods-account": (pod(serviceAccountName="admin"), "'admin' is not of the service accounts"),
-    "pods-account-by-parameter": (pod(serviceAccountName="${parameters.v}"), "is not of the service accounts"),
-    "jobs-account": (of_kind("batch/v1", "Job", spec=JOB), "'admin' is not of the service accounts"),
+    "pods-account": (pod(serviceAccountName="admin"), "'admin' is not a service account"),
+    "pods-account-by-parameter": (pod(serviceAccountName="${parameters.v}"), "is not a service account"),
+    "jobs-account": (of_kind("batch/v1", "Job", spec=JOB), "'admin' is not a service account"),
     "cron-jobs-account": (
         of_kind("batch/v1", "CronJob", spec={"schedule": "* * * * *", "jobTemplate": {"spec": JOB}}),
-        "'admin' is not of the service accounts",
+        "'admin' is not a service account",
     ),
     "token": (pod(automountServiceAccountToken=True), "would mount the token of the account default"),
     "owner": (

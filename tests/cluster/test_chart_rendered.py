@@ -83,7 +83,7 @@ def test_the_linter_finds_nothing(helm: Helm) -> None:
             r"Detector town is in namespace town, which .* does not look after: .*\(north, south\)",
         ),
         ({"detectors": [DETECTOR], "manager": {"grant": ["north"]}}, r"does not look after: add it to manager\.grant"),
-        ({"manager": {"namespaces": ["a"], "grant": ["b"]}}, r"manager\.grant goes without manager\.namespaces"),
+        ({"manager": {"namespaces": ["a"], "grant": ["b"]}}, r"manager\.grant and manager\.namespaces: remove one"),
         ({"manager": {"allowedKinds": ["v1/Secret"]}}, r"v1/Secret needs manager\.namespaces"),
     ],
 )

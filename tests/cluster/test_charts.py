@@ -129,8 +129,8 @@ def test_charts_come_from_a_repository_and_from_a_registry_and_are_kept(
     ("files", "said"),
     [
         ({"templates/hook.yaml": HOOK}, "Job app-migrate in templates/hook.yaml is a hook (pre-install)"),
-        ({"crds/things.yaml": CRD}, "is a CRD, which is the whole cluster's"),
-        ({"templates/random.yaml": RANDOM}, "gives other objects each time"),
+        ({"crds/things.yaml": CRD}, "is a CRD, which is cluster-wide"),
+        ({"templates/random.yaml": RANDOM}, "renders different objects each time"),
         ({"templates/wrong.yaml": "{{ fail .Release.Name }}"}, "templates/wrong.yaml"),
         ({"templates/namespace.yaml": "apiVersion: v1\nkind: Namespace\nmetadata: {name: x}\n"}, "v1/Namespace is not"),
     ],

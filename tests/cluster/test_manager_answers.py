@@ -70,7 +70,7 @@ def test_columns_tell_what_is_wanted_what_runs_and_what_is_lacking(
     wait_column(control_plane, api, "apptask", "one", PHASE="Ready")
     assert columns(control_plane, api, "apptask", "one")["MESSAGE"] == ""
     api.delete("ApplicationTask", "one")
-    wait_column(control_plane, api, "appinst", NORTH, PHASE="Lingering", MESSAGE="unless a demand comes")
+    wait_column(control_plane, api, "appinst", NORTH, PHASE="Lingering", MESSAGE="unless a demand arrives")
     api.create({**template("other"), "spec": {"manifests": [{"apiVersion": "v1", "kind": "Role", "metadata": {}}]}})
     wait_column(control_plane, api, "apptpl", "other", READY="False", MESSAGE="spec.manifests[0].kind")
 
@@ -115,7 +115,7 @@ def test_what_cannot_be_explained_is_one_line_with_the_remedy(control_plane: Con
     api.create(task("waits", of="missing"))
     told = explain(control_plane, api, "waits").stdout
     assert "template missing: does not exist" in told
-    assert "the manager has not looked at it as it is now" in told
+    assert "the manager has not processed its current generation" in told
 
 
 def test_explain_knows_who_has_no_place_and_what_stands_in_for_whom(

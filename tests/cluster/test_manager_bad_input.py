@@ -91,13 +91,13 @@ def test_a_task_that_cannot_be_served_is_told_why(api: Api, spec: Object, reason
     [
         (
             changed({"image": "app:${parameters.version}"}),
-            ["spec.manifests[0].spec.template.spec.containers[0].image", "`parameters.version` is not known", "region"],
+            ["spec.manifests[0].spec.template.spec.containers[0].image", "`parameters.version` does not", "region"],
         ),
         (
             {**config({}), "apiVersion": "rbac.authorization.k8s.io/v1", "kind": "Role"},
             [
                 "spec.manifests[0].kind",
-                "rbac.authorization.k8s.io/v1/Role is not of the kinds that the administrator allows",
+                "rbac.authorization.k8s.io/v1/Role is not a kind that the administrator allows",
             ],
         ),
     ],

@@ -195,7 +195,7 @@ def test_the_status_says_why_it_does_not_run(api: Api, processes: Processes, nam
     state = {"name": "detector", "image": "wayside:1", "imageID": "", "ready": False, "restartCount": 0}
     status = {"phase": "Pending", "containerStatuses": [{**state, "state": waiting}]}
     api.patch("Pod", pod["metadata"]["name"], {"status": status}, subresource="status")
-    assert "image wayside:1 cannot be pulled: not found" in says(api, "False", "ImagePullFailed")["message"]
+    assert "cannot pull image wayside:1: not found" in says(api, "False", "ImagePullFailed")["message"]
 
 
 def test_the_pod_passes_the_restricted_standard(

@@ -97,7 +97,7 @@ def test_near_its_limit_it_serves_whom_it_served_and_tells_the_others_so(
     )
     assert waiting["status"]["phase"] == "Waiting"
     assert "memory limit" in condition(waiting, "Accepted")["message"]
-    assert "new tasks are not taken in" in tight.output()
+    assert "not accepting new tasks" in tight.output()
     assert api.get("Deployment", instance_name("app", "north"))["metadata"]["uid"] == before["uid"]
     assert api.find("Deployment", instance_name("app", "south")) is None
     tight.terminate()

@@ -12,7 +12,7 @@ from tests.cluster.processes import Processes
 OTHER = ("--lease", "other", "--allowed-kinds", "v1/ConfigMap")
 """Of the second release: to it, a template with a Deployment is invalid."""
 
-WAITS = r"also looked after by the manager of the Lease \S+/application-manager, older than ours: this one waits"
+WAITS = r"also managed by the manager of the Lease \S+/application-manager, which is older: this manager stands by"
 ATTEMPTS = 10
 """Writes of the second one that may be seen while a task is served: attempts, one in five seconds here."""
 
@@ -52,7 +52,7 @@ def test_the_younger_one_waits_until_the_older_one_is_gone(
         assert not [each for each in second.writes() if "/applicationinstances" in each.path]
 
         older.terminate()
-        younger.wait_for_output("does not answer: this manager acts there")
+        younger.wait_for_output("does not respond: this manager is active there")
         api.wait_for(
             "ApplicationTemplate",
             "app",

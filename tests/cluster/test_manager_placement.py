@@ -96,7 +96,7 @@ def test_the_node_that_a_task_names_gets_the_application_and_one_that_is_not_the
     wait_bound(api, "north", nodes[0])
     api.create(task("west", node="rsu-9"))
     named = "fits no node: nodeSelector: no node has the label kubernetes.io/hostname=rsu-9"
-    told = wait_told(api, "west", named, "no node takes the pod")
+    told = wait_told(api, "west", named, "no node fits the pod")
     assert nodes[0] in told["status"]["message"]  # what there is instead
     api.wait_for(
         "ApplicationInstance",
@@ -119,7 +119,7 @@ def test_affinity_and_tolerations_come_from_parameters_too(
     affinity = {"nodeAffinity": {"requiredDuringSchedulingIgnoredDuringExecution": required}}
     api.create(placed(affinity=affinity, tolerations=[{"key": "${parameters.tolerate}", "operator": "Exists"}]))
     api.create(task("south"))
-    wait_told(api, "south", "no node takes the pod", "untolerated taint")  # of what fits, the scheduler speaks
+    wait_told(api, "south", "no node fits the pod", "untolerated taint")  # of what fits, the scheduler speaks
     api.create(task("more", region="south", tolerate="edge"))
     wait_bound(api, "south", nodes[1])
     api.create(task("west"))

@@ -325,9 +325,9 @@ def test_what_nothing_works_without_ends_the_start_with_one_line(
     environment = {"KUBECONFIG": str(account)}
     manager = processes.start("application-manager", "run", "--namespace", namespace, *ALLOWED, environment=environment)
     assert manager.wait() == 2
-    said = f"its account may not watch applicationtasks of wayside.dev in namespace {namespace}: nothing can be decided"
+    said = f"its service account cannot watch applicationtasks of wayside.dev in namespace {namespace}, so nothing can"
     assert said in manager.output()
-    assert "grant what `application-manager rbac` prints" in manager.output()
+    assert "apply the output of `application-manager rbac`" in manager.output()
 
 
 def test_what_only_some_need_is_said_at_the_start_and_where_it_shows(
@@ -337,9 +337,7 @@ def test_what_only_some_need_is_said_at_the_start_and_where_it_shows(
     put(api, fewer := without(whole, "", "configmaps", "patch"))
     wait_in_force(account, namespace, fewer)
     manager = start_manager(processes, namespace, *ALLOWED, kubeconfig=account)
-    assert (
-        f"its account may not patch configmaps in namespace {namespace}: no ConfigMap of a template" in manager.output()
-    )
+    assert f"its service account cannot patch configmaps in namespace {namespace}, so no ConfigMap" in manager.output()
     api.create(template("other"))
     api.create(template(manifests=[deployment(), config({"a": "b"})]))
     api.create(task("north"))
@@ -352,7 +350,7 @@ def test_what_only_some_need_is_said_at_the_start_and_where_it_shows(
     )
     message = condition(told, "Applied")["message"]
     assert 'cannot patch resource "configmaps"' in message
-    assert "grant what `application-manager rbac` prints" in message
+    assert "apply the output of `application-manager rbac`" in message
     api.wait_for("Deployment", instance_name("other", "south"), lambda _: True, what="others are served")
     put(api, whole)
     api.wait_for("ConfigMap", f"{NORTH}-config", lambda _: True, what="with the right it is made")

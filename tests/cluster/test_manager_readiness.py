@@ -62,17 +62,15 @@ def test_why_its_pods_do_not_run_is_said_of_task_and_instance_until_they_do(api:
         "message": "0/3 nodes are free",
     }
     kubelet_says(api, pod, conditions=[unscheduled])
-    said("Unschedulable", "no node takes the pod: 0/3 nodes are free")
+    said("Unschedulable", "no node fits the pod: 0/3 nodes are free")
     kubelet_says(
         api, pod, conditions=[unscheduled | {"status": "True"}], containerStatuses=waiting("ErrImagePull", "not found")
     )
-    said("ImagePullFailed", "image registry.example/app:9 cannot be pulled: not found")
+    said("ImagePullFailed", "cannot pull image registry.example/app:9: not found")
     ended = {"exitCode": 137, "reason": "OOMKilled"}
     crashed = container({"waiting": {"reason": "CrashLoopBackOff"}}, lastState={"terminated": ended}, restartCount=2)
     kubelet_says(api, pod, containerStatuses=crashed)
-    said(
-        "CrashLoop", "container main crashes: it ended with exit code 137, killed for taking more memory than its limit"
-    )
+    said("CrashLoop", "container main crashes: it ended with exit code 137, killed for exceeding its memory limit")
 
     api.patch("Pod", pod, {"status": running(api.get("Pod", pod))}, subresource="status")
     wait_ready_says(api, "ApplicationTask", "north", status="True", reason="Ready", text="is ready")
@@ -141,7 +139,7 @@ def test_other_kinds_are_judged_by_what_they_say(api: Api, manager: Process) -> 
         )
 
     lacks_address = f"Service {NORTH}-out has no address"
-    wait_instance("has no pod that runs", f"PersistentVolumeClaim {NORTH}-data is not bound", lacks_address)
+    wait_instance("has no running pod", f"PersistentVolumeClaim {NORTH}-data is not bound", lacks_address)
     pod = its_pod(api)
     api.patch("Pod", pod, {"status": running(api.get("Pod", pod))}, subresource="status")
     api.patch("PersistentVolumeClaim", f"{NORTH}-data", {"status": {"phase": "Bound"}}, subresource="status")

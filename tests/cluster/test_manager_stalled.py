@@ -39,7 +39,7 @@ def test_a_manager_whose_event_loop_hangs_ends_and_another_takes_over(
     assert hanging.wait() == STALLED
     said = hanging.output()
     assert "CRITICAL watchdog: the event loop has not run for" in said
-    assert "this manager ends, to be started again" in said
+    assert "ending this manager, to be restarted" in said
     assert "in hang" in said, "and where it hangs"
     standby.wait_for_output("active: holds the Lease")
     api.create(task("south"))

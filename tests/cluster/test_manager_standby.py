@@ -24,7 +24,7 @@ from tests.cluster.waiting import wait_until
 from tests.ports import free_ports
 
 ACTIVE = r"active: holds the Lease"
-GIVEN_UP = "requests are under way without an answer: the Lease is not released"
+GIVEN_UP = "requests are still in progress: not releasing the Lease"
 LEASE = "application-manager"
 REGIONS = [f"r{index}" for index in range(30)]
 WAITING = {"232", "281", "22"}

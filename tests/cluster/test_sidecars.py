@@ -99,7 +99,7 @@ def test_a_pod_that_asks_gets_the_detector_once_and_as_the_command_prints_it(
     unlabelled = pod("unlabelled")
     del unlabelled["metadata"]["labels"]
     assert not sidecars(api.create(unlabelled))
-    message = "it runs in 0 of 3 pods that ask for it"
+    message = "it runs in 0 of 3 pods with its label"
     api.wait_for("Detector", HOLDER, lambda raw: condition(raw, "Running").get("message") == message, what=message)
 
 
@@ -165,7 +165,7 @@ def test_a_pod_that_cannot_have_it_is_made_and_its_event_says_why(api: Api, aske
     lost["metadata"]["labels"] = {"wayside.dev/detector": "nowhere"}
     for each in (lost, pod("foreign", account="other")):
         assert not sidecars(api.create(each))
-    event_of(api, "lost", f"namespace {api.namespace} has no Detector 'nowhere' that can be read: create it")
+    event_of(api, "lost", f"namespace {api.namespace} has no valid Detector 'nowhere': create or correct it")
     event_of(api, "foreign", f"serviceAccountNames of Detector {HOLDER} has only vehicle, not other: add it")
 
     api.patch("Detector", HOLDER, {"spec": {"mode": "Standalone", "serviceAccountNames": None}})
@@ -204,7 +204,7 @@ def test_a_manager_that_hangs_or_is_gone_keeps_no_pod_from_being_made(
         assert not sidecars(api.create(pod("while-it-is-gone")))
         webhook.manager.start()
         for name in ("while-it-hangs", "while-it-is-gone"):
-            event_of(api, name, "it was made before its Detector, or while no manager answered the API server")
+            event_of(api, name, "it was created before its Detector, or while no webhook was available")
 
 
 def test_an_event_is_not_told_again_by_the_next_manager(

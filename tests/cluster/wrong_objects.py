@@ -179,13 +179,13 @@ WRONG: list[tuple[str, str, Changes, str]] = [
         "Detector",
         "the layout of ROS 2 nodes for JSON",
         {f"{STREAM}.layout": "RmwZenoh", f"{STREAM}.encoding": "json", f"{STREAM}.type": None},
-        r"spec\.streams\[0\]\.layout: .*layout RmwZenoh is for ROS 2 messages: encoding must be cdr or raw",
+        r"spec\.streams\[0\]\.layout: .*layout RmwZenoh needs ROS 2 messages: encoding must be cdr or raw",
     ),
     (
         "Detector",
         "a domain without the layout that has one",
         {f"{STREAM}.domain": 7},
-        r"spec\.streams\[0\]\.domain: Forbidden: domain is for streams with layout RmwZenoh: remove it",
+        r"spec\.streams\[0\]\.domain: Forbidden: domain is valid only with layout RmwZenoh: remove it",
     ),
     (
         "Detector",

@@ -129,7 +129,7 @@ def test_a_pods_detector_sees_its_data_and_what_it_demands_goes_with_the_pod(
     wait_available(api, application)
     running = api.get("Pod", "car")
     assert sidecar_of(running)["restartCount"] == 0
-    said = "it runs in 1 of 1 pods that ask for it"
+    said = "it runs in 1 of 1 pods with its label"
     api.wait_for("Detector", DETECTOR, lambda raw: condition(raw, "Running")["message"] == said, what=said)
 
     api.delete("Pod", "car")

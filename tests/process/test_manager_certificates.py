@@ -66,7 +66,7 @@ def test_at_the_end_of_its_certificate_it_goes_on_with_the_new_one(
             authority.mount(mounted, "manager")
 
             def lost() -> list[float]:
-                return [each.created for each in caplog.records if "zenoh: a connection is lost" in each.getMessage()]
+                return [each.created for each in caplog.records if "zenoh: lost a connection" in each.getMessage()]
 
             wait_for(lambda: bool(lost()))
             wait_for(lambda: any(at > lost()[0] and text == '{"a": "1"}' for at, text in heard))

@@ -289,4 +289,4 @@ def test_what_does_not_go_together_is_said_with_its_place(tmp_path: Path) -> Non
     assert (first.line, first.field) == (6, "spec.streams[0]")
     assert "encoding must be cdr or raw, but is json" in first.message
     assert (second.line, second.field) == (10, "spec.streams[1]")
-    assert "domain is for streams with layout RmwZenoh" in second.message
+    assert "domain is valid only with layout RmwZenoh" in second.message

@@ -161,7 +161,7 @@ def test_what_is_wrong_with_a_call_is_told_with_its_place(tmp_path: Path) -> Non
         ({"layout": "Plain"}, "give start, stop or both"),
         (
             {"layout": "Plain", "domain": 3, "stop": call("pause", "Pause")},
-            "domain is for services with layout RmwZenoh",
+            "domain is valid only with layout RmwZenoh",
         ),
     ],
 )

@@ -92,7 +92,7 @@ def test_a_job_whose_process_is_killed_from_outside_is_done_by_another(tmp_path:
 
 def test_what_takes_too_much_memory_is_ended_too() -> None:
     async def work(pool: Pool) -> None:
-        with pytest.raises(ExceededError, match="was ended, since its process was ended by SIGABRT"):
+        with pytest.raises(ExceededError, match="was stopped, since its process was ended by SIGABRT"):
             await pool.run("a", Greedy())
         assert await pool.run("a", Evaluation(1)) == 0
 

@@ -119,7 +119,7 @@ class ApplicationInstanceStatus(Model):
     )
     release_time: Time | None = Field(
         default=None,
-        description="The end of the linger time. The instance is removed then unless a new demand arrives before.",
+        description="The end of the linger time. The instance is then removed, unless a new demand arrives before.",
     )
     objects: list[ObjectReference] = Field(
         default_factory=list,
@@ -138,11 +138,11 @@ class ApplicationInstanceStatus(Model):
     demands: Demands = Field(default=Demands(), description="The live tasks that the instance serves.")
     conditions: list[Condition] = conditions_field(
         "Applied: all objects match the template. Ready: the objects are applied and the workloads are ready. "
-        "Stalled: the objects were refused, or did not become ready in time. Capped: a merged Sum is limited to its "
-        "parameter's maximum. Suspended: the workloads are scaled to zero. Paused: the annotation wayside.dev/pause "
-        "stops changes to the instance. Held: the annotation wayside.dev/hold keeps the instance without demand. "
-        "TimedOut: the instance was not ready for the template's readyTimeout. StandsIn: the instance serves tasks of "
-        "instances that timed out, as their fallback."
+        "Stalled: the objects were refused, or did not become ready in time. Capped: a merged Sum is limited to "
+        "its parameter's maximum. Suspended: the workloads are scaled to zero. Paused: the annotation "
+        "wayside.dev/pause stops changes to the instance. Held: the annotation wayside.dev/hold keeps the instance "
+        "without demand. TimedOut: the instance was not ready for the template's readyTimeout. StandsIn: the "
+        "instance is a fallback and serves tasks of instances that timed out."
     )
 
 

@@ -70,8 +70,8 @@ class TaskEvent(Model):
     values: dict[str, NestedValue] = Field(
         default_factory=dict,
         max_length=256,
-        description="The values of the rule's variables at the start of the episode. The detector leaves out the "
-        "largest ones beyond 64 KiB in total.",
+        description="The values of the rule's variables at the start of the episode. If they exceed 64 KiB in "
+        "total, the detector omits the largest ones.",
     )
 
 
@@ -99,7 +99,7 @@ class ApplicationTaskSpec(Model):
     )
     requester: Requester = Field(
         default=Requester(),
-        description="The holder that emitted the task, and the clients on whose behalf. Immutable.",
+        description="The holder that emitted the task, and the clients of the episode. Immutable.",
         json_schema_extra=immutable(_IMMUTABLE),
     )
     event: TaskEvent | None = Field(default=None, description="The event that caused the task. Immutable.")

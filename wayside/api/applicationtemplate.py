@@ -205,7 +205,9 @@ class TemplateManager(Model):
     """An application manager, by its Lease."""
 
     lease: str = Field(max_length=320, description="Namespace and name of its Lease.")
-    since: Time = Field(description="When the Lease was created: of two managers, the one with the older Lease acts.")
+    since: Time = Field(
+        description="The creation time of the Lease. Of two managers, the one with the older Lease is active."
+    )
 
 
 class ApplicationTemplateStatus(Model):
@@ -216,7 +218,7 @@ class ApplicationTemplateStatus(Model):
     )
     instances: int = Field(default=0, description="The number of instances.")
     manager: TemplateManager | None = Field(
-        default=None, description="The application manager that looks after the namespace."
+        default=None, description="The application manager that is active in the namespace."
     )
     conditions: list[Condition] = conditions_field(
         "Accepted, Ready: the template can be rendered. Stalled: the template is invalid and must be corrected."

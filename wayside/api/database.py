@@ -40,7 +40,7 @@ class DatabaseFiles(Model):
     bytes: PositiveQuantity | None = Field(
         default=None,
         description="The maximum size of the folder. At the limit, further data is omitted from the documents and "
-        "counted. Default: no limit but the disk's.",
+        "counted. Default: limited only by the disk.",
     )
 
 
@@ -63,8 +63,8 @@ class DatabaseConnection(Model):
     )
     write_concern: WriteConcern = Field(
         default=WriteConcern.MAJORITY,
-        description="When a document counts as written. Majority: when most members of the replica set have it. One: "
-        "when the primary has it; a change of the primary can still undo the write.",
+        description="When a document counts as written. Majority: a majority of the replica set has it. One: the "
+        "primary has it; a failover can still roll the write back.",
     )
     spool: DatabaseSpool | None = Field(
         default=None,

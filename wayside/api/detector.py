@@ -176,7 +176,7 @@ class DetectorSpec(Model):
     maps: list[MapFile] = Field(
         default_factory=list,
         max_length=16,
-        description="Files with more places. Lanelet2 maps, and origin, need the extra maps.",
+        description="Files with more places. Lanelet2 maps and origin need pip install 'wayside[maps]'.",
         json_schema_extra=ATOMIC_LIST,
     )
     buffer: BufferLimits = Field(default=BufferLimits(), description="The limits of the buffer of samples.")
@@ -192,11 +192,13 @@ class DetectorSpec(Model):
     )
     lateness: Duration = Field(
         default=Duration("200ms"),
-        description="With clock Data: tick t runs after a stamp later than t, and at least t + lateness, was received.",
+        description="Only with clock Data: how late samples may arrive. Tick t runs once a stamp was received that "
+        "is later than t and at least t + lateness.",
     )
     max_ahead: Duration = Field(
         default=Duration("1s"),
-        description="With clock Data: a sample whose stamp is further ahead of all others is dropped and counted.",
+        description="Only with clock Data: how far ahead of all others a stamp may be. A sample further ahead is "
+        "dropped and counted.",
     )
     state: State | None = Field(
         default=None,

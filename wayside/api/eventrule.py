@@ -82,12 +82,15 @@ OF_AN_EPISODE = frozenset(
 """The aggregates of an open episode: they need no more than a few numbers, however long it lasts."""
 
 _SOURCE = "give exactly one of stream, ruleName, model, plugin and of (aggregate Age with over: Episode needs none)"
-_OF = "a signal with of has no value or where, and its aggregate is not Age or Active"
-_LAG = "lag is for a signal with of, and not with over: Episode"
-_EPISODE = f"over: Episode is for a signal with of and the aggregates {', '.join(sorted(OF_AN_EPISODE))}; Age has no of"
+_OF = "a signal with of cannot have value, where, or the aggregates Age and Active: remove them"
+_LAG = "lag needs a signal with of, and is not valid with over: Episode"
+_EPISODE = (
+    f"over: Episode needs a signal with of and one of the aggregates {', '.join(sorted(OF_AN_EPISODE))}; "
+    "only Age has no of"
+)
 _QUANTILE = "aggregate Quantile needs quantile, e.g. quantile: 0.95, and other aggregates have none"
-_CLIENT = "client is for a signal with stream or ruleName: remove it"
-_ENDS = "samples: Ends is for a signal with ruleName and an aggregate other than Active"
+_CLIENT = "client is valid only with stream or ruleName: remove it"
+_ENDS = "samples: Ends needs a signal with ruleName and an aggregate other than Active"
 
 
 class Signal(Model):
@@ -108,7 +111,7 @@ class Signal(Model):
         ),
         (
             "self.aggregate != 'Active' || (has(self.ruleName) && !has(self.over) && !has(self.where))",
-            "aggregate Active is for a signal with ruleName, without over and where",
+            "aggregate Active needs a signal with ruleName, without over and where",
             ".aggregate",
         ),
         (
@@ -129,7 +132,7 @@ class Signal(Model):
         ("self.samples == 'Starts' || (has(self.ruleName) && self.aggregate != 'Active')", _ENDS, ".samples"),
         (
             "!(has(self.model) || has(self.plugin)) || !(has(self.where) || has(self.over) || has(self.value))",
-            "the signal of a model or plugin has no value, where or over: remove them",
+            "the signal of a model or plugin cannot have value, where or over: remove them",
         ),
     )
 
@@ -143,8 +146,8 @@ class Signal(Model):
     )
     samples: Samples = Field(
         default=Samples.STARTS,
-        description="Only with rule: Starts or Ends of its episodes. msg of an end contains endTime and reason as "
-        "well, and the values at the end.",
+        description="Only with rule: whether the samples are the starts or the ends of its episodes. In an end, "
+        "msg also contains endTime, reason and the values at the end.",
     )
     model: ModelSource | None = Field(
         default=None, description="Instead of a stream: an ONNX model over other signals, an image or a point cloud."
@@ -156,21 +159,24 @@ class Signal(Model):
     )
     of: Expression | None = Field(
         default=None,
-        description="Instead of a stream: CEL over what `when` sees, such as another signal or the distance of a pair. "
-        "The samples are the values of the expression at the evaluations of the subject. Without over and lag, the "
-        "signal is the value itself. In a pairs scope, the value belongs to the pair: expressions use the bare name. "
-        "The values are kept for over and lag: at most 25 bytes for each evaluation of each subject.",
+        description="Instead of a stream: CEL over the variables of `when`, such as another signal or the distance "
+        "of a pair. The samples are the values of the expression at the evaluations of the subject. "
+        "Without over and lag, the signal is the value itself. In a pairs scope, the value belongs to "
+        "the pair: expressions use the bare name. The values are kept for over and lag: at most 25 "
+        "bytes for each evaluation of each subject.",
     )
     client: ClientName | None = Field(
         default=None,
-        description="With stream or rule: the client whose samples or episodes these are, for every subject, e.g. a "
-        "traffic light. Unknown while that client is not known. Default: the subject's own.",
+        description="Only with stream or rule: the client whose samples or episodes the signal uses for every "
+        "subject, e.g. a traffic light. The signal is unknown while the detector does not know this "
+        "client. Default: the subject's own client.",
     )
     value: Expression | None = Field(
         default=None,
-        description="CEL over msg (the decoded sample), item (its item, if the stream has items), before (the client's "
-        "message or item before, unless it was stale by then), key (the captured chunks), sample (stamp, received, "
-        "latency, size) and parameters. Required, except with the aggregates Count, Age and Active.",
+        description="CEL over msg (the decoded sample), item (its item, if the stream has items), before (the "
+        "client's previous message or item, unless it was stale by then), key (the captured chunks), "
+        "sample (stamp, received, latency, size) and parameters. Required, except with the aggregates "
+        "Count, Age and Active.",
     )
     where: Expression | None = Field(
         default=None, description="CEL over msg, key, sample and parameters. Only samples for which it is true count."
@@ -178,9 +184,9 @@ class Signal(Model):
     over: WindowLength | None = Field(
         default=None,
         description="The length of the window: at tick t it is (t - over, t]. Required, except with the aggregates "
-        "Last, First, Previous, Age and Active. Episode, for a signal with of: the evaluations of the open episode, "
-        "from its start to its end. Such a signal is known while an episode is open: the events of start and end have "
-        "it, and actions can use it, but conditions and other signals cannot.",
+        "Last, First, Previous, Age and Active. Episode, for a signal with of: the evaluations of the "
+        "open episode, from its start to its end. Such a signal is known only while an episode is "
+        "open. Events and actions can use it; conditions and other signals cannot.",
     )
     lag: PositiveDuration | None = Field(
         default=None,
@@ -189,12 +195,12 @@ class Signal(Model):
     aggregate: Aggregate = Field(
         default=Aggregate.LAST,
         description="How the samples become one value. Last, Previous, First: the newest, the second newest, the "
-        "oldest value. Min, Max, Mean, Sum, StdDev (of the population), Quantile: of numbers. Delta: last - first. "
-        "Rate: Delta per second. Slope: of the line of least squares, per second. All, Any: of booleans. Distinct: "
-        "the list of distinct values. Count: the number of samples. Age: seconds "
-        "since the last sample was received; over an episode, since its start. Active (only with ruleName): whether an "
-        "episode is open. MinTime, MaxTime: when the smallest or largest number first occurred, seconds since the "
-        "epoch.",
+        "oldest value. Min, Max, Mean, Sum, StdDev (of the population), Quantile: of numbers. Delta: "
+        "last - first. Rate: Delta per second. Slope: the slope of the least-squares line, per second. "
+        "All, Any: of booleans. Distinct: the list of distinct values. Count: the number of samples. "
+        "Age: seconds since the last sample was received; over an episode, since its start. Active "
+        "(only with ruleName): whether an episode is open. MinTime, MaxTime: the time of the first "
+        "smallest or largest number, in seconds since the epoch.",
     )
 
     quantile: float | None = Field(
@@ -228,14 +234,16 @@ class Signal(Model):
             raise ValueError(_ENDS)
         if self.model is not None or self.plugin is not None:
             if self.value or self.where or self.over or self.aggregate is not Aggregate.LAST:
-                raise ValueError("the signal of a model or plugin has no value, where, over or aggregate: remove them")
+                raise ValueError(
+                    "the signal of a model or plugin cannot have value, where, over or aggregate: remove them"
+                )
             return self
         if self.of is not None and (self.value or self.where or self.aggregate in (Aggregate.AGE, Aggregate.ACTIVE)):
             raise ValueError(_OF)
         if self.aggregate in WINDOWED and self.over is None:
             raise ValueError(f"aggregate {self.aggregate} needs a window: give over, e.g. over: 5s")
         if self.aggregate is Aggregate.ACTIVE and (self.rule_name is None or self.over or self.where):
-            raise ValueError("aggregate Active is for a signal with ruleName, without over and where")
+            raise ValueError("aggregate Active needs a signal with ruleName, without over and where")
         if self.of is None and self.aggregate not in WITHOUT_VALUE and self.value is None:
             raise ValueError(f"aggregate {self.aggregate} needs a value, e.g. value: msg.speed")
         if self.aggregate in WITHOUT_VALUE and self.value is not None:
@@ -275,10 +283,11 @@ class EventRuleSpec(Model):
     margin: dict[Identifier, Annotated[float, Field(gt=0)]] | None = Field(
         default=None,
         max_length=64,
-        description="Gives the rule the signal margin: by how much `when` holds, or fails to (negative). It is the "
-        "distance of each comparison to its threshold, the smaller for &&, the larger for ||, the negative for !. "
-        "Where `when` compares several quantities, each needs a scale here: by signal (or distance, closingSpeed), "
-        "the difference that counts as 1. Results list the ten largest margins without an episode.",
+        description="Adds the signal margin to the rule: how far `when` is from changing, positive while it holds "
+        "and negative while it does not. The margin of a comparison is the distance to its threshold; "
+        "&& has the smaller margin, || the larger, ! the negated one. If `when` compares several "
+        "quantities, each needs a scale here: the signal (or distance, closingSpeed) and the "
+        "difference that counts as 1. Results list the ten largest margins without an episode.",
     )
     until: Expression | None = Field(
         default=None,
@@ -289,7 +298,7 @@ class EventRuleSpec(Model):
     )
     cooldown: Duration = Field(
         default=Duration("0s"),
-        description="The rest time of a subject after the end of an episode. No onset falls within it.",
+        description="The time after the end of an episode during which the subject cannot have a new onset.",
     )
     max_episodes_per_hour: int | None = Field(
         default=None,

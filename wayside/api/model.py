@@ -128,8 +128,8 @@ class ModelPoints(Model):
     count: int = Field(
         ge=1,
         le=1_000_000,
-        description="The number of points. Of more points, every n-th is used; fewer are padded with zeros. Points "
-        "with a NaN in a field or in x, y, z are omitted.",
+        description="The number of points. A larger cloud is thinned to every n-th point; a smaller one is padded "
+        "with zeros. Points with a NaN in a field or in x, y, z are omitted.",
     )
     scale: list[float] = Field(
         default_factory=list,

@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 from wayside.api.base import ATOMIC_LIST, ClientName, Model, validations
 
 _SHAPE = "give area, line, or both"
-_WIDTH = "width is for a line without area: remove it, or give a line alone"
+_WIDTH = "width is valid only for a line without area: remove width or area"
 
 Corner = Annotated[list[float], Field(min_length=2, max_length=2, json_schema_extra=ATOMIC_LIST)]
 """x and y, or latitude and longitude."""
@@ -48,11 +48,12 @@ class Place(Model):
         default=None,
         min_length=2,
         max_length=1000,
-        description="The points of a line, in its direction. With an area: the middle of the lane that the area is.",
+        description="The points of a line, in its direction. With an area: the centreline of the lane, whose "
+        "surface is the area.",
         json_schema_extra=ATOMIC_LIST,
     )
     width: float | None = Field(
-        default=None, gt=0, le=1000, description="The width in metres of a lane, of which line is the middle."
+        default=None, gt=0, le=1000, description="The width in metres of a lane. Its centreline is line."
     )
 
     @model_validator(mode="after")
@@ -84,17 +85,17 @@ class MapFile(Model):
     file: str = Field(
         min_length=1,
         max_length=1024,
-        description="The path of a GeoJSON file (.geojson, .json) or a lanelet2 map (.osm), as the detector sees it: "
-        "relative to its working directory, or on a mounted volume. Names of places are the name in its properties or "
-        "tags, or the id.",
+        description="The path of a GeoJSON file (.geojson, .json) or a lanelet2 map (.osm), as the detector sees "
+        "it: relative to its working directory, or on a mounted volume. The name of a place is the "
+        "property or tag `name`, or else the id.",
     )
     origin: Origin | None = Field(
         default=None,
-        description="The point at which x and y are 0: the places are in metres, by projection. Default: they are "
-        "on the Earth, in degrees.",
+        description="The point at which x and y are 0. With it, places are in metres, by projection. Default: "
+        "places are in degrees (WGS 84).",
     )
     projection: Projection = Field(
         default=Projection.UTM,
         description="Only with origin. Utm: metres of the UTM zone of the origin. LocalCartesian: metres east and "
-        "north on the plane that touches the Earth there.",
+        "north on the plane that touches the Earth at the origin.",
     )

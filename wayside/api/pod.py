@@ -25,7 +25,7 @@ from wayside.api.freedata import of_bounded_size
 _SOURCES = ("persistentVolumeClaim", "ephemeral", "emptyDir", "configMap", "secret", "projected", "csi")
 _ONE_VOLUME = f"give exactly one of {', '.join(_SOURCES[:-1])} and {_SOURCES[-1]}"
 _OWN_VOLUMES = "^(scratch|folder-[0-9]+|secret-[0-9]+)$"
-_OWN_VOLUME = "scratch, folder-<n> and secret-<n> are names of the detector's own volumes: choose another name"
+_OWN_VOLUME = "the names scratch, folder-<n> and secret-<n> are reserved: choose another name"
 _ONE_SOURCE = "give exactly one of value and valueFrom"
 _ONE_REFERENCE = "give exactly one of secretKeyRef, configMapKeyRef, fieldRef and resourceFieldRef"
 _ANY_KEY = "without key, operator must be Exists; with operator Exists, remove value"

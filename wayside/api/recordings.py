@@ -68,8 +68,8 @@ class Recordings(Model):
     )
     when_full: WhenFull = Field(
         default=WhenFull.DROP_OLDEST,
-        description="DropOldest: the oldest recordings are deleted to make room, but none in progress. Stop: existing "
-        "recordings are kept; a recording that finds no room ends and is marked as cut.",
+        description="DropOldest: the oldest complete recordings are deleted. Stop: existing recordings are kept; a "
+        "recording that reaches the limit ends and is marked as cut.",
     )
     on_request: OnRequest | None = Field(
         default=None, description="Allows others to request recordings. Default: not allowed."

@@ -106,7 +106,9 @@ def _structural(node: dict[str, Any], definitions: dict[str, Any]) -> dict[str, 
                 # Else, server-side apply notes an owner for each key of whatever is inside.
                 result["x-kubernetes-map-type"] = "atomic"
     elif result.get("type") == "array":
-        result["items"] = _structural(node.get("items", {}), definitions)
+        result["items"] = items = _structural(node.get("items", {}), definitions)
+        if items.get("description", "") in result.get("description", ""):
+            items.pop("description", None)  # `kubectl explain` prints both, one after the other
     elif "type" not in result and "x-kubernetes-int-or-string" not in result:
         result["x-kubernetes-preserve-unknown-fields"] = True
     return result

@@ -70,9 +70,9 @@ class DataSourceEntity(CharacteristicValue):
     EVENT_SOURCE_ENTITY = (
         "EventSourceEntity",
         "event source entity",
-        "the entity whose own change of state is the event produces the data",
+        "the data comes from the entity whose change of state is the event",
     )
-    EXTERNAL = "External", "external", "another entity produces the data"
+    EXTERNAL = "External", "external", "the data comes from another entity"
 
 
 class EventDetectionEntity(CharacteristicValue):
@@ -81,13 +81,17 @@ class EventDetectionEntity(CharacteristicValue):
     EVENT_SOURCE_ENTITY = (
         "EventSourceEntity",
         "event source entity",
-        "the entity whose own change of state is the event detects it",
+        "the detecting entity is the one whose change of state is the event",
     )
-    DATA_SOURCE_ENTITY = "DataSourceEntity", "data source entity", "the entity that produces the data detects the event"
+    DATA_SOURCE_ENTITY = (
+        "DataSourceEntity",
+        "data source entity",
+        ("the detecting entity is the one that produces the data"),
+    )
     EXTERNAL = (
         "External",
         "external",
-        "an entity that is neither the source of the event nor of the data detects the event",
+        "the detecting entity is neither the source of the event nor of the data",
     )
 
 
@@ -97,9 +101,9 @@ class ActingEntity(CharacteristicValue):
     EVENT_DETECTION_ENTITY = (
         "EventDetectionEntity",
         "event detection entity",
-        "the entity that detects the event also acts",
+        "the acting entity is the one that detects the event",
     )
-    EXTERNAL = "External", "external", "another entity acts"
+    EXTERNAL = "External", "external", "the acting entity is another one"
 
 
 class AffectedEntity(CharacteristicValue):

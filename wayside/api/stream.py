@@ -112,7 +112,9 @@ class StreamPosition(Model):
     heading: Expression | None = Field(
         default=None, description="CEL over msg: the direction in degrees, clockwise from north."
     )
-    speed: Expression | None = Field(default=None, description="CEL over msg: the speed in that direction, m/s.")
+    speed: Expression | None = Field(
+        default=None, description="CEL over msg: the speed in the direction of yaw or heading, in m/s."
+    )
 
     @property
     def axes(self) -> dict[str, str]:
@@ -158,23 +160,23 @@ class Stream(Model):
         ),
         (
             "!has(self.framePrefix) || (has(self.type) && self.type == 'tf2_msgs/msg/TFMessage')",
-            "framePrefix is for streams of type tf2_msgs/msg/TFMessage",
+            "framePrefix is valid only for streams of type tf2_msgs/msg/TFMessage",
             ".framePrefix",
             "Forbidden",
         ),
         (
             "self.layout != 'RmwZenoh' || self.encoding in ['cdr', 'raw']",
-            "layout RmwZenoh is for ROS 2 messages: encoding must be cdr or raw",
+            "layout RmwZenoh needs ROS 2 messages: encoding must be cdr or raw",
             ".layout",
         ),
         (
             "self.layout != 'RmwZenoh' || self.source == 'zenoh'",
-            "layout RmwZenoh is for streams whose source is zenoh: remove one of them",
+            "layout RmwZenoh needs source zenoh: remove one of them",
             ".layout",
         ),
         (
             "!has(self.domain) || self.layout == 'RmwZenoh'",
-            "domain is for streams with layout RmwZenoh: remove it",
+            "domain is valid only with layout RmwZenoh: remove it",
             ".domain",
             "Forbidden",
         ),
@@ -185,7 +187,7 @@ class Stream(Model):
         ),
         (
             "!has(self.items) || !(self.latched || (has(self.type) && self.type == 'tf2_msgs/msg/TFMessage'))",
-            "items is not for latched streams and transforms: remove items or latched",
+            "items is not valid for latched streams and transforms: remove items or latched",
             ".items",
             "Forbidden",
         ),
@@ -227,14 +229,15 @@ class Stream(Model):
         max_length=512,
         pattern=r"^([A-Za-z0-9._:-]{1,63}|.*[$][{].*)$",
         description="The client of the samples, if the key does not capture it: a name, or a template over the "
-        "message such as its-${msg.header.stationId}. The template is CEL over msg, over key for the captures of the "
-        "key, and with items over item.",
+        "message such as its-${msg.header.stationId}. Expressions in the template can use msg, key "
+        "(the captured chunks) and, with items, item.",
     )
     items: Expression | None = Field(
         default=None,
         description="CEL over msg: a list, e.g. msg.objects. Each item becomes a sample of the client that "
-        "`client` names, e.g. ${item.id}, and expressions over the stream see item beside msg. Such a client is lost "
-        "when its newest sample is older than staleAfter; the same name is a new client then.",
+        "`client` names, e.g. ${item.id}, and expressions over the stream can use item and msg. Such a "
+        "client is lost when its newest sample is older than staleAfter; a later item with the same "
+        "name is a new client.",
     )
     encoding: Encoding = Field(
         description="The encoding of the payload: cdr (ROS 2 messages), json, cbor, uper (ETSI ITS messages), or raw "
@@ -255,8 +258,8 @@ class Stream(Model):
     )
     position: StreamPosition | None = Field(
         default=None,
-        description="Where the client is by a sample. Expressions over a sample see it as position, and scopes of "
-        "pairs can refer to it.",
+        description="The position of the client in a sample. Expressions over a sample use it as position, and "
+        "pairs scopes can refer to it.",
     )
     stale_after: Duration | str | None = Field(
         default=None,
@@ -295,13 +298,13 @@ class Stream(Model):
             raise ValueError(f"a {self.encoding} stream has no type: remove it")
         if self.layout is Layout.RMW_ZENOH and self.encoding not in (Encoding.CDR, Encoding.RAW):
             raise ValueError(
-                f"layout RmwZenoh is for ROS 2 messages: encoding must be cdr or raw, but is {self.encoding}; "
+                f"layout RmwZenoh needs ROS 2 messages: encoding must be cdr or raw, but is {self.encoding}; "
                 "correct it, or remove layout"
             )
         if self.layout is Layout.RMW_ZENOH and self.source != ZENOH:
-            raise ValueError(f"layout RmwZenoh is for samples from zenoh, not {self.source}: remove one of them")
+            raise ValueError(f"layout RmwZenoh needs source zenoh, not {self.source}: remove one of them")
         if self.domain is not None and self.layout is not Layout.RMW_ZENOH:
-            raise ValueError("domain is for streams with layout RmwZenoh: remove it")
+            raise ValueError("domain is valid only with layout RmwZenoh: remove it")
         if self.type is not None and (self.encoding is Encoding.UPER) != self.type.startswith("etsi/"):
             example = "etsi/cam" if self.encoding is Encoding.UPER else "geometry_msgs/msg/PoseStamped"
             raise ValueError(f"{self.type} is not a message type of {self.encoding} streams: use one such as {example}")
@@ -313,7 +316,7 @@ class Stream(Model):
         if self.items is not None:
             self._check_items()
         if self.frame_prefix is not None and not self.carries_transforms:
-            raise ValueError("framePrefix is for streams of type tf2_msgs/msg/TFMessage: remove it")
+            raise ValueError("framePrefix is valid only for streams of type tf2_msgs/msg/TFMessage: remove it")
         if self.stale_after is not None and self.stale_after != "Never":
             try:
                 PositiveDuration.parse(self.stale_after)
@@ -326,7 +329,7 @@ class Stream(Model):
             raise ValueError("items needs client, a template that names the client of each item, e.g. ${item.id}")
         if self.latched or self.carries_transforms:
             what = "latched streams" if self.latched else "transforms"
-            raise ValueError(f"items is not for {what}: remove items{' or latched' if self.latched else ''}")
+            raise ValueError(f"items is not valid for {what}: remove items{' or latched' if self.latched else ''}")
 
     @property
     def names_by_message(self) -> bool:

@@ -123,4 +123,4 @@ def _reason(error: BaseException) -> str:
         return "it is not YAML: " + " ".join(str(error).split())
     if isinstance(error, ConfigException):
         return str(error)
-    return f"it is of another shape ({type(error).__name__}: {error})"
+    return f"it is not a kubeconfig ({type(error).__name__}: {error})"

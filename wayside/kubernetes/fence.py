@@ -38,7 +38,7 @@ class FencedRequest(aiohttp.ClientRequest):
         await super().write_bytes(writer, conn, content_length)
 
 
-_REASON = "this manager is not the active one any more"
+_REASON = "this manager is no longer active"
 
 
 def _over() -> bool:

@@ -74,7 +74,7 @@ class _Token:
         if not found:
             raise AccountError(f"{self._file} is empty")
         if self._token and found != self._token:
-            log.info("the token of the pod's account was renewed")
+            log.info("read the renewed token of the pod's service account")
         self._token, self._said = found, False
         return found
 
@@ -86,6 +86,6 @@ class _Token:
             return self.read()
         except AccountError as error:
             if not self._said:
-                log.warning("the pod's account: %s; using the token that was read before", error)
+                log.warning("cannot read the token of the pod's service account: %s; using the previous token", error)
             self._said = True
             return self._token

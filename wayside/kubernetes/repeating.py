@@ -37,12 +37,12 @@ async def until_answered(request: Callable[[], Awaitable[Answer]], pause: float 
             if isinstance(error, ApiError) and (error.permanent or error.code == 401):
                 raise
             if not waiting:
-                log.warning("%s; retrying until the API server answers", error)
+                log.warning("%s; retrying until the API server responds", error)
             waiting = True
             await asyncio.sleep(max(pause, error.retry_after or 0.0))
         else:
             if waiting:
-                log.info("the API server answers")
+                log.info("the API server responds")
             return answer
 
 

@@ -102,7 +102,7 @@ class WorkQueue(Generic[Key]):
         now = time.monotonic()
         for key, began in list(self._running.items()):
             if now - began > limit:
-                return f"{self.name} {_text(key)} is worked on for {now - began:.0f} s"
+                return f"{self.name} {_text(key)} has been in progress for {now - began:.0f} s"
         return None
 
     def add(self, key: Key) -> None:
@@ -210,11 +210,11 @@ class WorkQueue(Generic[Key]):
             self._failures.pop(key, None)  # once the namespace is granted, all its keys are enqueued
         except RequestError as error:
             pause = self._pause(key, error.retry_after)
-            log.warning("%s %s: %s; again in %.1f s", self.name, _text(key), error, pause)
+            log.warning("%s %s: %s; retrying in %.1f s", self.name, _text(key), error, pause)
             self._add_after(key, pause)
         except Exception:  # a defect in one key's work must not stop the others; it is logged, and tried again
             pause = self._pause(key, None)
-            log.exception("%s %s failed; again in %.1f s", self.name, _text(key), pause)
+            log.exception("cannot reconcile %s %s; retrying in %.1f s", self.name, _text(key), pause)
             self._add_after(key, pause)
         else:
             failed = False

@@ -126,13 +126,13 @@ def _on_what_runs(template: ApplicationTemplate, task: ApplicationTask, given: M
         name, value = next(iter(rest.items()))
         return Refusal(
             Refused.INVALID_PARAMETERS,
-            f"spec.parameters.{name}: {values.shown(value)} is given, but a Suspend task changes no parameter: remove "
+            f"spec.parameters.{name}: {values.shown(value)}: a Suspend task cannot change parameters: remove "
             f"it{_which(of_key)}",
         )
     if operation is Operation.RECONFIGURE and not rest:
         return Refusal(
             Refused.INVALID_PARAMETERS,
-            f"spec.parameters: {values.shown(dict(given))} has nothing to change: give at least one parameter of "
+            f"spec.parameters: {values.shown(dict(given))} changes nothing: give at least one parameter of "
             f"template {template.name}{_which(of_key)}",
         )
     if template.spec.key is None:
@@ -143,15 +143,16 @@ def _on_what_runs(template: ApplicationTemplate, task: ApplicationTask, given: M
     if missing:
         return Refusal(
             Refused.INVALID_KEY,
-            f"spec.parameters.{missing[0]}: is missing, and the key of template {template.name}, {template.spec.key}, "
-            "needs it to identify the instance: give it, or give none of the key's parameters to mean all instances",
+            f"spec.parameters.{missing[0]}: is missing, and the key of template {template.name}, "
+            f"{template.spec.key}, needs it to identify the instance: give it, or omit all parameters of the key "
+            "to select all instances",
         )
     key = _key_or_refusal(template, given)
     return key if isinstance(key, Refusal) else Claim(task, instance_name(template.name, key), key, rest)
 
 
 def _which(of_key: frozenset[str]) -> str:
-    return f" (the key's, {', '.join(sorted(of_key))}, only identify the instance)" if of_key else ""
+    return f" ({', '.join(sorted(of_key))} of the key only identify the instance)" if of_key else ""
 
 
 def _key_or_refusal(template: ApplicationTemplate, given: Mapping[str, Any]) -> str | Refusal:
@@ -196,7 +197,7 @@ def instance_key(template: ApplicationTemplate, complete: Mapping[str, Any]) -> 
     value = compiled.render({"parameters": {name: complete.get(name) for name in declared}})
     if value is None:
         raise InterpolationError(
-            "is null for this task", path="spec.key", hint="give the parameters that it is made from"
+            "is null for this task", path="spec.key", hint="give the parameters that the key refers to"
         )
     return values.text(value)
 
@@ -231,5 +232,5 @@ def unknown_members(known: Mapping[str, tuple[str, ...]], each: Embedded) -> Ite
         if each.text.strip() != f"${{{each.expression.source}}}":
             hint += "; write `$${` for a literal `${`"
         line, column = position(each.text, each.offset)
-        message = f"`{path[0]}.{path[1]}` is not known"
+        message = f"`{path[0]}.{path[1]}` does not exist"
         yield InterpolationError(message, path=each.path, line=line, column=column, hint=hint)

@@ -83,7 +83,7 @@ def merge(
             if total != value:
                 limit = "maximum" if total > value else "minimum"
                 capped.append(
-                    f"{name}: the sum of {len(given)} values, {_shown(total)}, is held at the {limit} of {value:g}"
+                    f"{name}: the sum of {len(given)} values, {_shown(total)}, is capped at the {limit} of {value:g}"
                 )
         result[name] = values.normal(value)
     return Merged(result, conflicts, tuple(capped))

@@ -150,9 +150,9 @@ def _stop_verdict(name: str, each: Claim, served: Sequence[Claim], runs: bool) -
     higher = _outbids(served, each)
     if higher is not None:
         message = (
-            f"spec.priority: {each.task.spec.priority} is below {higher.task.spec.priority} of task "
-            f"{higher.task.name}, which deploys instance {name}: give at least that priority, or wait until that task "
-            "ends"
+            f"spec.priority: {each.task.spec.priority} is below the priority {higher.task.spec.priority} of task "
+            f"{higher.task.name}, which deploys instance {name}: set at least that priority, or wait until that "
+            "task ends"
         )
         return Verdict(Standing.REFUSED, Refused.OUTBID, message)
     return Verdict(Standing.COUNTS, ACCEPTED, f"suspends instance {name}", name, acts=True)
@@ -160,8 +160,8 @@ def _stop_verdict(name: str, each: Claim, served: Sequence[Claim], runs: bool) -
 
 def _waiting(name: str, each: Claim) -> Verdict:
     message = (
-        f"no task deploys instance {name}, and a {each.operation} task starts nothing: it takes effect as soon as one "
-        "does"
+        f"no task deploys instance {name}, and a {each.operation} task starts nothing: it takes effect once a task "
+        "deploys it"
     )
     return Verdict(Standing.WAITING, NOTHING_RUNS, message)
 
@@ -169,8 +169,8 @@ def _waiting(name: str, each: Claim) -> Verdict:
 def waiting_for_any(claim: Claim) -> Verdict:
     """The verdict of a task that means all instances of a template that has none."""
     message = (
-        f"no task deploys any instance of template {template_of_all(claim.instance)}, and a {claim.operation} task "
-        "starts nothing: it takes effect as soon as one does"
+        f"no task deploys an instance of template {template_of_all(claim.instance)}, and a {claim.operation} task "
+        "starts nothing: it takes effect once a task deploys one"
     )
     return Verdict(Standing.WAITING, NOTHING_RUNS, message)
 
@@ -193,5 +193,5 @@ def gathered(claim: Claim, parts: Mapping[str, Verdict], otherwise: Verdict) -> 
     names = ", ".join(counting[:_SHOWN]) + (f" and {len(counting) - _SHOWN} more" if len(counting) > _SHOWN else "")
     message = f"{verb} instance{'s' if len(counting) > 1 else ''} {names}"
     if others:
-        message += f"; but not {len(others)}, the first since {others[0].message}"
+        message += f"; except {len(others)}, the first since {others[0].message}"
     return Verdict(Standing.COUNTS, ACCEPTED, message, counting[0] if len(counting) == 1 else None)

@@ -115,5 +115,5 @@ def template_problems(template: ApplicationTemplate) -> list[str]:
         if problem:
             found.append(f"spec.parameters.{name}.pattern: {problem}")
         elif parameter.default is not None and (problem := patterns.mismatch(parameter.pattern, parameter.default)):
-            found.append(f"spec.parameters.{name}.default: {problem}: correct one of the two")
+            found.append(f"spec.parameters.{name}.default: {problem}: correct the default or the bounds")
     return found

@@ -27,7 +27,7 @@ def pattern_problem(pattern: str) -> str | None:
     try:
         _matcher(pattern).evaluate({"text": ""})
     except (EvaluationError, ExpressionError) as error:
-        return f"{values.shown(pattern)} is no regular expression: {error.message}: correct it (RE2 syntax)"
+        return f"{values.shown(pattern)} is not a regular expression: {error.message}: correct it (RE2 syntax)"
     return None
 
 
@@ -38,7 +38,7 @@ def mismatch(pattern: str, value: Any) -> str | None:
     for index, text in enumerate(value if isinstance(value, list) else [value]):
         which = f"item {index}, {values.shown(text)}," if isinstance(value, list) else values.shown(text)
         if (size := len(text.encode(errors="replace"))) > LONGEST_INPUT:
-            return f"{which} has {size} bytes, more than the {LONGEST_INPUT} that a pattern is matched with"
+            return f"{which} has {size} bytes: a pattern can match at most {LONGEST_INPUT}"
         # CEL would see only what is before a NUL.
         if "\0" in text or not _matcher(pattern).evaluate({"text": text}):
             return f"{which} does not match the pattern {pattern}"

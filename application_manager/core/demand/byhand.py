@@ -18,8 +18,8 @@ HOLD_ANNOTATION = "wayside.dev/hold"
 """On an instance: it is not released though nobody demands it. Demands that come are served as ever."""
 
 _CONDITIONS = (
-    ("Paused", PAUSE_ANNOTATION, "the instance and its objects are left as they are"),
-    ("Held", HOLD_ANNOTATION, "the instance is kept, demanded or not"),
+    ("Paused", PAUSE_ANNOTATION, "the instance and its objects are not changed"),
+    ("Held", HOLD_ANNOTATION, "the instance is kept, with or without demand"),
 )
 _BARE = frozenset({"", "true"})  # values without a reason
 

@@ -239,8 +239,8 @@ def precedence(task: ApplicationTask) -> tuple[int, str, str]:
 
 def _left_alone(instance: ApplicationInstance, claims: list[Claim]) -> Decision:
     message = (
-        f"ApplicationInstance {instance.name} was made by a person and is left alone: "
-        "delete it, or give it another name, so that tasks can be served"
+        f"ApplicationInstance {instance.name} was created by a person and is not changed: delete it, or give it "
+        "another name, so that tasks can be served"
     )
     refused = Verdict(Standing.REFUSED, Refused.INSTANCE_NOT_MANAGED, message)
     verdicts = {each.task.name: refused for each in claims}

@@ -79,8 +79,8 @@ def without_template(wanted: ApplicationInstance, template: TemplateState) -> As
     of = wanted.spec.template_name
     if template is None:
         message = (
-            f"spec.templateName: there is no ApplicationTemplate {of!r} in namespace {wanted.namespace}: create it; "
-            "until then what runs stays as it is"
+            f"spec.templateName: there is no ApplicationTemplate {of!r} in namespace {wanted.namespace}: create "
+            "it; until then, the running objects are not changed"
         )
         return Aspect("Applied", False, "TemplateNotFound", message)
     if isinstance(template, InvalidTemplate):

@@ -145,13 +145,14 @@ def turned(verdict: Verdict, task: str, to: Fallback | None, others: Mapping[str
     found = others.get(task)
     if refusal is None and found is not None and found.standing is Standing.COUNTS:
         message = (
-            f"instance {verdict.instance} is not ready: instance {found.instance} of template {to.template} serves"
+            f"instance {verdict.instance} is not ready: instance {found.instance} of template {to.template} serves "
+            "the task"
         )
-        return replace(found, reason=FALLEN_BACK, message=f"{message} instead, until it is")
+        return replace(found, reason=FALLEN_BACK, message=f"{message} until then")
     if refusal is None and found is None:
         return verdict
     why = refusal or (found.message if found else "")
-    message = f"instance {verdict.instance} is not ready, and template {to.template} cannot serve instead: {why}"
+    message = f"instance {verdict.instance} is not ready, and its fallback, template {to.template}, cannot serve: {why}"
     return replace(verdict, reason=FALLBACK_FAILED, message=message)
 
 
@@ -171,13 +172,17 @@ def aspects(
         message = f"it was not ready for {late}"
         if turns is not None and turns.instances:
             names = ", ".join(sorted(turns.instances))
-            message += f": its tasks are served by {names} of template {turns.template}, until it was ready for {late}"
+            message += (
+                f": its tasks are served by {names} of template {turns.template} until it has been ready for {late}"
+            )
         elif turns is not None and turns.refused:
-            message += f", and template {turns.template} cannot serve instead: {next(iter(turns.refused.values()))}"
+            message += (
+                f", and its fallback, template {turns.template}, cannot serve: {next(iter(turns.refused.values()))}"
+            )
         yield Aspect(TIMED_OUT, True, READY_TIMEOUT, message)
     elif find(conditions, TIMED_OUT) is not None:
-        yield Aspect(TIMED_OUT, False, "InTime", "it is ready, or has time to become so")
+        yield Aspect(TIMED_OUT, False, "InTime", "it is ready, or within its readyTimeout")
     if others:
-        yield Aspect("StandsIn", True, "Fallback", f"it serves tasks in place of {others}, which is not ready")
+        yield Aspect("StandsIn", True, "Fallback", f"it serves the tasks of {others}, which is not ready")
     elif find(conditions, "StandsIn") is not None:
-        yield Aspect("StandsIn", False, "NoFallback", "it serves its own tasks only")
+        yield Aspect("StandsIn", False, "NoFallback", "it serves only its own tasks")

@@ -64,7 +64,7 @@ def placed(decision: Decision, place: GrantedPlace | None, *, exists: bool, now:
     if place is None:
         return decision
     if place.starts:
-        return _marked(decision, f", in place of {place.preempts}, which it preempts") if place.preempts else decision
+        return _marked(decision, f", and preempts {place.preempts}") if place.preempts else decision
     if exists and place.given:
         return decision
     reason, message = _why(decision, place)
@@ -92,24 +92,26 @@ def placed(decision: Decision, place: GrantedPlace | None, *, exists: bool, now:
 
 def _why(decision: Decision, place: GrantedPlace) -> tuple[str, str]:
     if place.given:
-        instead = f" in place of {place.preempts}, which it preempts," if place.preempts else ""
-        return LIMIT_REACHED, f"instance {decision.name} starts{instead} as soon as {place.awaits} is gone"
+        instead = f", and preempts {place.preempts}" if place.preempts else ""
+        return LIMIT_REACHED, f"instance {decision.name} starts once {place.awaits} is deleted{instead}"
     if decision.rank is None:
-        return LIMIT_REACHED, f"{place.limit}, and nobody demands instance {decision.name}"
+        return LIMIT_REACHED, f"{place.limit}, and no task demands instance {decision.name}"
     remedy = "raise the limit, or wait until another ends"
     if place.yields_to:
-        message = f"instance {decision.name} gave way to {place.yields_to}, since {place.limit}: {remedy}"
+        message = f"instance {decision.name} was preempted by {place.yields_to}, since {place.limit}: {remedy}"
         return PREEMPTED, message
     if place.outbid_from is not None and place.outbid_from <= -decision.rank[0] and place.next_change is not None:
-        remedy = f"it gets one after {format_seconds(place.next_change)}, until when another has its minimumUptime"
+        remedy = (
+            f"it can start after {format_seconds(place.next_change)}, when the minimumUptime of another instance ends"
+        )
     elif place.outbid_from is not None:
-        remedy = f"{remedy}, or give a priority of {place.outbid_from} or more"
-    return LIMIT_REACHED, f"instance {decision.name} waits for a place, since {place.limit}: {remedy}"
+        remedy = f"{remedy}, or set a priority of {place.outbid_from} or more"
+    return LIMIT_REACHED, f"instance {decision.name} waits, since {place.limit}: {remedy}"
 
 
 def _waiting(decision: Decision, each: Verdict, reason: str, message: str) -> Verdict:
     if each.acts:
-        what = f"instance {decision.name} has no place to run ({reason}): this takes effect as soon as it has"
+        what = f"instance {decision.name} does not run ({reason}): the task takes effect once it runs"
         return Verdict(Standing.WAITING, NOTHING_RUNS, what)
     return Verdict(Standing.WAITING, reason, message)
 

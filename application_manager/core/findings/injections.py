@@ -21,8 +21,8 @@ from wayside.api.pod import DetectorMode
 
 _MIRROR = "kubernetes.io/config.mirror"
 _NO_IMAGE = (
-    "the manager runs no detectors: start it with --detector-image and with the rights that `application-manager rbac "
-    "--detectors` prints"
+    "the manager runs no detectors: start it with --detector-image, and with the permissions that "
+    "`application-manager rbac --detectors` prints"
 )
 
 
@@ -82,7 +82,7 @@ def injection(
     if defaults is None:
         return Injection(why_not=_NO_IMAGE)
     if detector is None:
-        missing = f"namespace {namespace} has no Detector {name!r} that can be read: create it"
+        missing = f"namespace {namespace} has no valid Detector {name!r}: create or correct it"
         return Injection(why_not=f"label {SIDECAR_LABEL}: {missing}")
     why_not = _why_not(name, metadata, spec, detector)
     if why_not is not None:
@@ -105,17 +105,17 @@ def _why_not(name: str, metadata: Mapping[str, Any], spec: Mapping[str, Any], de
     if detector_findings(detector).problems:
         return f"Detector {name} is not accepted: its condition Accepted gives the reason"
     if _MIRROR in (metadata.get("annotations") or {}):
-        return "a static pod has no account: make it by the API server"
+        return "a static pod has no service account: create the pod through the API server"
     return None
 
 
 def read_pod(review: Any) -> PodRequest:
     """The question in an AdmissionReview about a pod. Raises ReviewError."""
     if not isinstance(review, dict) or review.get("apiVersion") != REVIEW_VERSION:
-        raise ReviewError(f"is no AdmissionReview of {REVIEW_VERSION}: only the API server has business here")
+        raise ReviewError(f"is not an AdmissionReview of {REVIEW_VERSION}: only the API server may call this path")
     raw = review.get("request")
     if not isinstance(raw, dict) or not isinstance(raw.get("uid"), str):
-        raise ReviewError("request.uid: is missing: only the API server has business here")
+        raise ReviewError("request.uid: is missing: only the API server may call this path")
     pod, kind = raw.get("object"), raw.get("kind")
     made = raw.get("operation") == "CREATE" and not raw.get("subResource")
     ours = isinstance(kind, dict) and (kind.get("group"), kind.get("kind")) == ("", "Pod")
@@ -131,5 +131,5 @@ def answer_pod(request: PodRequest, found: Injection) -> Json:
         operations = json.dumps(patch(request.pod["spec"], found.addition)).encode()
         response |= {"patchType": "JSONPatch", "patch": base64.b64encode(operations).decode()}
     if found.why_not is not None:
-        response["warnings"] = shortened((f"it is made without a detector: {found.why_not}",))
+        response["warnings"] = shortened((f"created without a detector: {found.why_not}",))
     return {"apiVersion": REVIEW_VERSION, "kind": "AdmissionReview", "response": response}

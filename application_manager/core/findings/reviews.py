@@ -60,10 +60,10 @@ class Request:
 def read(review: Any) -> Request:
     """The question in an AdmissionReview. Raises ReviewError."""
     if not isinstance(review, dict) or review.get("apiVersion") != REVIEW_VERSION:
-        raise ReviewError(f"is no AdmissionReview of {REVIEW_VERSION}: only the API server has business here")
+        raise ReviewError(f"is not an AdmissionReview of {REVIEW_VERSION}: only the API server may call this path")
     raw = review.get("request")
     if not isinstance(raw, dict) or not isinstance(raw.get("uid"), str):
-        raise ReviewError("request.uid: is missing: only the API server has business here")
+        raise ReviewError("request.uid: is missing: only the API server may call this path")
     kind, new, old = (raw.get(name) for name in ("kind", "object", "oldObject"))
     kind = kind if isinstance(kind, dict) else {}
     new = dict(new) if isinstance(new, dict) else {}

@@ -121,4 +121,4 @@ def _remedies(detectors: Sequence[Detector], invalid: Sequence[str]) -> Iterator
     ]
     if wanted:
         yield f"correct metadata.labels: {'; '.join(wanted)}"
-    yield from (f"correct Detector {name}, whose status shows what is wrong with it" for name in sorted(invalid))
+    yield from (f"correct Detector {name}; its status gives the error" for name in sorted(invalid))

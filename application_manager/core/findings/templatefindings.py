@@ -101,7 +101,7 @@ def _on_examples(template: ApplicationTemplate, policy: Policy) -> Findings:
             if not read & example.made_up:
                 problems.append(problem)
             elif not read & unguessable & example.given.keys():
-                remarks.append(Finding(FAILING_EXAMPLE.name, f"{problem}; so it is {example.phrase}"))
+                remarks.append(Finding(FAILING_EXAMPLE.name, f"{problem}; this occurs {example.phrase}"))
     if FAILING_EXAMPLE.name in ignored_by(template.metadata.annotations):
         remarks.clear()
     return Findings(tuple(dict.fromkeys(problems)), remarks=tuple(dict.fromkeys(remarks)))

@@ -146,6 +146,6 @@ def _instead(key: str, nodes: Nodes) -> str:
         return ""
     found = sorted(nodes) if not key else sorted({labels[key] for labels in nodes.values() if key in labels})
     if not found:
-        return " (none has a label of that key)"
+        return " (no node has a label with this key)"
     more = f" and {len(found) - _SHOWN} more" if len(found) > _SHOWN else ""
     return f" (there {'is' if len(found) == 1 else 'are'} {', '.join(found[:_SHOWN])}{more})"

@@ -80,12 +80,12 @@ def trouble(pod: Mapping[str, Any]) -> Trouble | None:
         if found is not None:
             return found
     if status.get("phase") == "Failed":
-        why = status.get("message") or status.get("reason") or "no reason is given"
+        why = status.get("message") or status.get("reason") or "no reason given"
         return Trouble(TroubleReason.POD_FAILED, f"a pod failed: {_plain(why)}")
     for condition in status.get("conditions") or ():
         if condition.get("type") == "PodScheduled" and condition.get("status") == "False":
-            why = condition.get("message") or condition.get("reason") or "no reason is given"
-            return Trouble(TroubleReason.UNSCHEDULABLE, f"no node takes the pod: {_plain(why)}")
+            why = condition.get("message") or condition.get("reason") or "no reason given"
+            return Trouble(TroubleReason.UNSCHEDULABLE, f"no node fits the pod: {_plain(why)}")
     return None
 
 
@@ -122,10 +122,10 @@ def _of_container(
     if reason in _IMAGE:
         image = images.get(name) or container.get("image", "")
         cause = _pull_cause(waiting.get("message") or "") or reason
-        return Trouble(TroubleReason.IMAGE_PULL_FAILED, f"image {image} cannot be pulled: {cause}")
+        return Trouble(TroubleReason.IMAGE_PULL_FAILED, f"cannot pull image {image}: {cause}")
     if reason in _CREATION:
         cause = _plain(waiting.get("message") or reason)
-        return Trouble(TroubleReason.CONTAINER_FAILED, f"{what} cannot be started: {cause}")
+        return Trouble(TroubleReason.CONTAINER_FAILED, f"cannot start {what}: {cause}")
     ended = state.get("terminated") or (container.get("lastState") or {}).get("terminated") or {}
     if not ended.get("exitCode") or container.get("ready"):
         return None
@@ -141,7 +141,7 @@ def _ending(ended: Mapping[str, Any]) -> str:
     code, reason = ended["exitCode"], ended.get("reason")
     text = f"exit code {code}"
     if reason == "OOMKilled":
-        text += ", killed for taking more memory than its limit"
+        text += ", killed for exceeding its memory limit"
     elif reason and reason != "Error":
         text += f" ({reason})"
     message = _plain(ended.get("message") or "")

@@ -39,7 +39,7 @@ def not_ready(live: Mapping[str, Any]) -> str | None:
             return _claim(status)
         case "Service":
             pending = spec.get("type") == _LOAD_BALANCER and not (status.get("loadBalancer") or {}).get("ingress")
-            return "has no address from the load balancer yet" if pending else None
+            return "has no load balancer address yet" if pending else None
     return _by_conditions(live, status)
 
 
@@ -51,7 +51,7 @@ def is_unseen(live: Mapping[str, Any]) -> bool:
 
 def _stale(live: Mapping[str, Any], status: Mapping[str, Any]) -> str | None:
     seen, generation = status.get("observedGeneration", 0), live["metadata"].get("generation", 0)
-    return None if seen >= generation else "has not been looked at by its controller yet"
+    return None if seen >= generation else "has not been processed by its controller yet"
 
 
 def _deployment(spec: Mapping[str, Any], status: Mapping[str, Any]) -> str | None:
@@ -65,7 +65,7 @@ def _deployment(spec: Mapping[str, Any], status: Mapping[str, Any]) -> str | Non
         return None
     refused = _find(status, "ReplicaFailure")
     if refused.get("status") == "True":
-        return f"{problem}, for they cannot be made: {without_names(str(refused.get('message', '')))}"
+        return f"{problem}, and pods cannot be created: {without_names(str(refused.get('message', '')))}"
     progress = _find(status, "Progressing")
     if progress.get("status") == "False":
         return f"{problem}, and makes no progress"
@@ -95,11 +95,11 @@ def _daemon_set(spec: Mapping[str, Any], status: Mapping[str, Any]) -> str | Non
 def _job(spec: Mapping[str, Any], status: Mapping[str, Any]) -> str | None:
     failed = _find(status, "Failed")
     if failed.get("status") == "True":
-        return f"has failed: {failed.get('message') or failed.get('reason') or 'no reason is given'}"
+        return f"has failed: {failed.get('message') or failed.get('reason') or 'no reason given'}"
     if spec.get("suspend"):
         return "is suspended (spec.suspend)"
     running = (status.get("ready") or 0) > 0 or (status.get("succeeded") or 0) > 0
-    return None if running or _condition(status, "Complete") else "has no pod that runs"
+    return None if running or _condition(status, "Complete") else "has no running pod"
 
 
 def _claim(status: Mapping[str, Any]) -> str | None:
@@ -120,10 +120,10 @@ def _by_conditions(live: Mapping[str, Any], status: Mapping[str, Any]) -> str | 
         if not condition:
             continue
         if isinstance(seen := status.get("observedGeneration"), int) and seen < live["metadata"].get("generation", 0):
-            return "has not been looked at by its controller yet"
+            return "has not been processed by its controller yet"
         if condition.get("status") == "True":
             return None
-        why = condition.get("message") or condition.get("reason") or "no reason is given"
+        why = condition.get("message") or condition.get("reason") or "no reason given"
         return f"is not {type_.lower()}: {why}"
     return None
 
@@ -138,7 +138,7 @@ def _count(word: str, have: int | None, want: int) -> str | None:
 
 
 def _present(have: int, want: int) -> str | None:
-    return _count("of its present version", have, want)
+    return _count("of its current version", have, want)
 
 
 def _pods(count: int) -> str:

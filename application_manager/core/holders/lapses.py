@@ -59,8 +59,8 @@ def _lapse(
         message = f"holder {holder} has been lost for over an hour"
         return Verdict(Standing.FINISHED, "DetectorLost", message), None
     message = (
-        f"holder {holder} is lost: its Lease {lease_name(holder)} was not renewed for {limit:g} s; "
-        "the demand counts again when it is"
+        f"holder {holder} is lost: its Lease {lease_name(holder)} was not renewed for {limit:g} s; the demand "
+        "counts again once it is renewed"
     )
     return Verdict(Standing.LAPSED, HOLDER_LOST, message), since + FINISH_LOST_AFTER
 

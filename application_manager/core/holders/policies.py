@@ -16,7 +16,10 @@ from application_manager.core.claims.operations import Standing, Verdict
 from wayside.api import ApplicationTask
 from wayside.api.operation import Operation
 
-_FORM = "NAMESPACE/HOLDER:max-tasks=N,max-priority=N,operations=Deploy+Reconfigure+Suspend, each of the three if wanted"
+_FORM = (
+    "NAMESPACE/HOLDER:max-tasks=N,max-priority=N,operations=Deploy+Reconfigure+Suspend, with at least one of "
+    "the three limits"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +46,7 @@ class HolderPolicy:
         who, colon, rest = text.partition(":")
         namespace, slash, holder = who.partition("/")
         if not (colon and slash and namespace and holder):
-            raise ValueError(f"{text!r} is no policy of holders: write {_FORM}")
+            raise ValueError(f"{text!r} is not a holder policy: write {_FORM}")
         numbers: dict[str, int | None] = {"max-tasks": None, "max-priority": None}
         operations = frozenset(Operation)
         for part in rest.split(","):
@@ -53,7 +56,7 @@ class HolderPolicy:
             elif name in numbers and value.removeprefix("-").isdigit():
                 numbers[name] = int(value)
             else:
-                raise ValueError(f"{part!r} in {text!r} is no limit of holders: write {_FORM}")
+                raise ValueError(f"{part!r} in {text!r} is not a limit of a holder policy: write {_FORM}")
         if (numbers["max-tasks"] or 0) < 0:
             raise ValueError(f"max-tasks in {text!r} is below 0: write {_FORM}")
         return cls(namespace, holder, numbers["max-tasks"], numbers["max-priority"], operations)
@@ -90,9 +93,9 @@ class TaskPolicy:
         spec = task.spec
         if spec.operation not in policy.operations:
             allowed = " or ".join(sorted(policy.operations)) or "nothing"
-            why = f"spec.operation: {spec.operation} is not allowed to holder {holder}, which may {allowed}"
+            why = f"spec.operation: {spec.operation} is not allowed for holder {holder}, which may {allowed}"
         elif policy.max_priority is not None and spec.priority > policy.max_priority:
-            why = f"spec.priority: {spec.priority} is above {policy.max_priority}, the highest of holder {holder}"
+            why = f"spec.priority: {spec.priority} is above {policy.max_priority}, the maximum for holder {holder}"
         else:
             return None
         message = f"{why}: change the rule, or have the administrator change --holder-policy"
@@ -103,4 +106,4 @@ def _operation(text: str, whole: str) -> Operation:
     try:
         return Operation(text)
     except ValueError:
-        raise ValueError(f"{text!r} in {whole!r} is no operation: write {' or '.join(Operation)}") from None
+        raise ValueError(f"{text!r} in {whole!r} is not an operation: write {' or '.join(Operation)}") from None

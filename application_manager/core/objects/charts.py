@@ -93,7 +93,7 @@ Charts = Callable[[ChartRequest], ChartOutcome | None]
 
 def no_charts(request: ChartRequest) -> ChartOutcome:
     """For where there is no Helm."""
-    return ChartFailure(UNAVAILABLE, f"spec.helm: chart {request.source} cannot be rendered here: there is no helm")
+    return ChartFailure(UNAVAILABLE, f"spec.helm: cannot render chart {request.source} here: helm is not available")
 
 
 def parse_chart(source: ChartSource, text: str) -> ChartOutcome:
@@ -106,7 +106,7 @@ def parse_chart(source: ChartSource, text: str) -> ChartOutcome:
         try:
             manifest = yaml.load(part, Loader=_Loader)  # noqa: S506  a safe loader, with fewer types
         except yaml.YAMLError as error:
-            problems.append(f"{file} is no YAML: {error}")
+            problems.append(f"{file} is not YAML: {error}")
             continue
         if manifest is None:
             continue
@@ -117,7 +117,7 @@ def parse_chart(source: ChartSource, text: str) -> ChartOutcome:
     if len(objects) > MAXIMUM_OBJECTS:
         problems.append(f"it has {len(objects)} objects, more than {MAXIMUM_OBJECTS}: use a smaller chart")
     if not objects and not problems:
-        problems.append("it has no objects with these values: give others")
+        problems.append("it renders no objects with these values: correct the values")
     if problems:
         return ChartFailure(FAILED, f"spec.helm: chart {source}: {'; '.join(problems)}")
     return ChartObjects(tuple(objects))
@@ -125,7 +125,7 @@ def parse_chart(source: ChartSource, text: str) -> ChartOutcome:
 
 def _problems(file: str, manifest: Any) -> Iterator[str]:
     if not isinstance(manifest, dict) or not all(isinstance(manifest.get(each), str) for each in _LITERAL):
-        yield f"{file} has something that is no object: apiVersion and kind are missing"
+        yield f"{file} contains a document without apiVersion and kind"
         return
     metadata = manifest.get("metadata")
     name = metadata.get("name") if isinstance(metadata, dict) else None
@@ -133,12 +133,12 @@ def _problems(file: str, manifest: Any) -> Iterator[str]:
     annotations = metadata.get("annotations") if isinstance(metadata, dict) else None
     if isinstance(annotations, dict) and _HOOK in annotations:
         yield (
-            f"{what} is a hook ({annotations[_HOOK]}), and nothing here runs hooks: turn it off by the chart's values, "
-            "or make its work part of the application"
+            f"{what} is a hook ({annotations[_HOOK]}), and hooks are not supported: disable it by the chart's "
+            "values, or do its work in the application"
         )
     elif manifest["kind"] == "CustomResourceDefinition":
         yield (
-            f"{what} is a CRD, which is the whole cluster's: let the administrator install it, and turn it off by the "
+            f"{what} is a CRD, which is cluster-wide: let the administrator install it, and disable it by the "
             "chart's values, or use the chart without its folder crds/"
         )
 

@@ -71,8 +71,8 @@ class Configuration:
             text = _text(name, value)
             if text is None:
                 problems.append(
-                    f"{_path(name)}: is {_kind(value)}, and the name has no format: name the file .yaml or .json, or "
-                    "give a text"
+                    f"{_path(name)}: is {_kind(value)}, but the file name gives no format: end the name with .yaml "
+                    "or .json, or give a text"
                 )
             else:
                 files[name] = text

@@ -82,7 +82,7 @@ def foreign(live: Mapping[str, Any], owner: Kind, what: str, recorded: str | Non
         recorded: its uid, if the owner's status lists it; None: it does not.
     """
     if live["metadata"].get("deletionTimestamp"):
-        return Obstacle("Waiting", f"{what} is being deleted; it is applied again once it is gone")
+        return Obstacle("Waiting", f"{what} is being deleted; the manager applies it again afterwards")
     controller = _controller(live)
     if controller is None:
         if live["metadata"]["uid"] == recorded:
@@ -90,10 +90,10 @@ def foreign(live: Mapping[str, Any], owner: Kind, what: str, recorded: str | Non
     elif controller["uid"] == owner.metadata.uid:
         return None
     elif (controller["apiVersion"], controller["kind"], controller["name"]) == (API_VERSION, owner.kind, owner.name):
-        return Obstacle("Waiting", f"{what} of the previous {owner.kind} {owner.name} is still being removed")
+        return Obstacle("Waiting", f"{what} of the previous {owner.kind} {owner.name} is still being deleted")
     whose = f"is controlled by {controller['kind']} {controller['name']}" if controller else "has no controller"
-    remedy = f"delete or rename it, or choose another name for the one of {owner.kind} {owner.name}"
-    return Obstacle("ObjectExists", f"{what} exists already, {whose} and is left alone: {remedy}")
+    remedy = f"delete or rename it, or choose another name in {owner.kind} {owner.name}"
+    return Obstacle("ObjectExists", f"{what} already exists, {whose} and is not changed: {remedy}")
 
 
 def references(uids: Mapping[ObjectKey, str | None]) -> tuple[ObjectReference, ...]:

@@ -43,7 +43,7 @@ def parse_user(given: str) -> int | None:
     if given == "cluster":
         return None
     if not given.isdigit() or int(given) == 0:
-        raise ValueError(f"{given!r} is no user: give a number other than 0, or `cluster` for one that it chooses")
+        raise ValueError(f"{given!r} is not a user: give a number other than 0, or `cluster` to let the cluster choose")
     return int(given)
 
 
@@ -53,8 +53,10 @@ def parse_environment(given: Iterable[str]) -> dict[str, str]:
     for each in given:
         name, equals, value = each.partition("=")
         if not equals or _VARIABLE.fullmatch(name) is None:
-            raise ValueError(f"{each!r} is no variable: write NAME=VALUE, the name of letters, digits and _")
+            raise ValueError(
+                f"{each!r} is not an environment variable: write NAME=VALUE; names have letters, digits and _"
+            )
         if name in RESERVED_VARIABLES:
-            raise ValueError(f"{name} is set for each pod by itself: leave it out")
+            raise ValueError(f"{name} is set automatically in each pod: remove it")
         found[name] = value
     return found

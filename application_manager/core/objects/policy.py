@@ -74,7 +74,8 @@ class Policy:
         for api_version, kind in sorted(self.kinds):
             if kind in _NEVER_KINDS or api_version.partition("/")[0] in _NEVER_GROUPS:
                 raise ValueError(
-                    f"{api_version}/{kind} can never be allowed: it could give a template rights beyond its namespace"
+                    f"{api_version}/{kind} can never be allowed: it could give a template permissions beyond its "
+                    "namespace"
                 )
 
     @classmethod
@@ -90,8 +91,8 @@ class Policy:
         """Raise ValueError for a kind that no manager of all namespaces may look at."""
         if SECRET in self.kinds:
             raise ValueError(
-                "v1/Secret needs a manager of named namespaces: one of all namespaces would read every Secret of the "
-                "cluster; name them by --namespace, or leave the kind out"
+                "v1/Secret needs --namespace, since a manager of all namespaces would read every Secret of the "
+                "cluster: set --namespace, or remove the kind"
             )
 
     def kind_problem(self, api_version: str, kind: str) -> str | None:
@@ -102,12 +103,12 @@ class Policy:
         choice = (
             f"write {' or '.join(same)}" if same else f"allowed are {', '.join(sorted(map(kind_text, self.kinds)))}"
         )
-        return f"{kind_text((api_version, kind))} is not of the kinds that the administrator allows: {choice}"
+        return f"{kind_text((api_version, kind))} is not a kind that the administrator allows: {choice}"
 
     def pod_problems(self, manifest: dict[str, Any]) -> Iterator[tuple[str, str]]:
         """Field and problem of each thing in the manifest's pods that is not allowed."""
         if manifest.get("kind") == "Secret" and manifest.get("type") == _TOKEN_SECRET:
-            yield "type", f"{_TOKEN_SECRET} would hold a service account's token: remove it"
+            yield "type", f"{_TOKEN_SECRET} would contain a service account's token: remove it"
         for found in pods_and_accounts(manifest):
             if isinstance(found, NamedAccount):
                 yield from self._account_problems(found.where, found.account)
@@ -124,7 +125,7 @@ class Policy:
             listed = ", ".join(sorted(self.service_accounts))
             yield (
                 where,
-                f"{account!r} is not of the service accounts that the administrator lists: use one of {listed}",
+                f"{account!r} is not a service account that the administrator allows: use one of {listed}",
             )
 
     def completed(self, manifest: dict[str, Any]) -> dict[str, Any]:
@@ -138,12 +139,12 @@ class Policy:
 def _parse_kind(text: str) -> KindKey:
     api_version, slash, kind = text.rpartition("/")
     if not slash or not api_version or not kind[:1].isupper():
-        raise ValueError(f"{text!r} is no kind: write apiVersion/Kind, e.g. apps/v1/Deployment or v1/Service")
+        raise ValueError(f"{text!r} is not a kind: write apiVersion/Kind, e.g. apps/v1/Deployment or v1/Service")
     return api_version, kind
 
 
 def _token_problems(spec: dict[str, Any], where: str) -> Iterator[tuple[str, str]]:
-    remedy = "remove it, or use a service account that the administrator lists"
+    remedy = "remove it, or use a service account that the administrator allows"
     if spec.get("automountServiceAccountToken"):
         yield f"{where}.automountServiceAccountToken", f"true would mount the token of the account default: {remedy}"
     volumes = spec.get("volumes")

@@ -166,7 +166,7 @@ class Renderer:
             for where, manifest in self._chart_manifests(spec.helm, self._values, instance, variables, charts):
                 found = [f"{where}: {field}: {problem}" for field, problem in self._problems(manifest, instance)]
                 if kind_problem := self._policy.kind_problem(manifest["apiVersion"], manifest["kind"]):
-                    found.append(f"{where}: {kind_problem}; or turn it off by the chart's values")
+                    found.append(f"{where}: {kind_problem}; or disable it by the chart's values")
                 problems += found
                 if not found:
                     manifests.append(labelled(self._policy.completed(manifest), instance))
@@ -209,12 +209,12 @@ class Renderer:
             return
         name = metadata.get("name")
         if not isinstance(name, str) or not name:
-            yield "metadata.name", f"{values.shown(name)} is no name: give a text, e.g. ${{instance.name}}"
+            yield "metadata.name", f"{values.shown(name)} is not a name: give a text, e.g. ${{instance.name}}"
         elif len(name) > _LONGEST_NAME or not _NAME.fullmatch(name):
             yield (
                 "metadata.name",
-                f"{values.shown(name)} is no name for an object: it takes at most {_LONGEST_NAME} lower-case letters, "
-                "digits, - and ., with a letter or digit at both ends",
+                f"{values.shown(name)} is not a name for an object: use at most {_LONGEST_NAME} lower-case "
+                "letters, digits, - and ., with a letter or digit at both ends",
             )
         elif self._keyed and instance.name not in name:
             yield (
@@ -226,8 +226,8 @@ class Renderer:
         if namespace != instance.namespace:
             yield (
                 "metadata.namespace",
-                f"{namespace!r} is not the template's own namespace, {instance.namespace}: remove the field, "
-                "or make the template in that namespace",
+                f"{namespace!r} is not the template's own namespace, {instance.namespace}: remove the field, or "
+                "create the template in that namespace",
             )
         for reserved in _RESERVED_METADATA:
             if reserved in metadata:
@@ -235,7 +235,7 @@ class Renderer:
         for member in ("labels", "annotations"):
             texts = metadata.get(member)
             if texts is not None and not isinstance(texts, dict):
-                yield f"metadata.{member}", f"{values.shown(texts)} is no map: give names and texts"
+                yield f"metadata.{member}", f"{values.shown(texts)} is not a map: give names and texts"
         yield from self._policy.pod_problems(manifest)
 
 
@@ -274,6 +274,6 @@ def _duplicates(manifests: list[Manifest]) -> list[str]:
     for manifest in manifests:
         key = object_key(manifest)
         if key in seen:
-            found.append(f"spec.manifests: {key[1]} {key[2]!r} is there twice: give each its own name")
+            found.append(f"spec.manifests: {key[1]} {key[2]!r} is given twice: names must be unique")
         seen.add(key)
     return found

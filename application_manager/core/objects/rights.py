@@ -53,10 +53,10 @@ class Right:
         """The message where the verb is not allowed; `where` is "in namespace x" or "in all namespaces"."""
         of = f" of {self.group}" if self.group else ""
         name = f" {self.name}" if self.name else ""
-        return f"its account may not {verb} {self.resource}{name}{of} {where}: {self.purpose}"
+        return f"its service account cannot {verb} {self.resource}{name}{of} {where}, so {self.purpose}"
 
 
-REMEDY = "grant what `application-manager rbac` prints"
+REMEDY = "apply the output of `application-manager rbac`"
 
 
 def rights(plurals: Mapping[KindKey, str], *, detectors: bool = False) -> list[Right]:
@@ -81,7 +81,7 @@ def writing(needed: Iterable[Right]) -> list[Right]:
 
 def granting() -> Right:
     """The right that a manager of all namespaces queries to learn whether it may write in one."""
-    return Right(_GROUP, "applicationtasks/status", ("patch",), "nobody learns how they are")
+    return Right(_GROUP, "applicationtasks/status", ("patch",), "their statuses are not written")
 
 
 def _narrowed(needed: Iterable[Right], wanted: Callable[[str], bool]) -> list[Right]:
@@ -112,10 +112,10 @@ def sidecar_rights(name: str) -> list[Right]:
 
 def _detecting(name: str, hold: str) -> Iterator[Right]:
     tasks = ("get", "list", "watch", "create", "patch", "delete")
-    yield Right(_GROUP, "detectors", _LOOKING, "it does not know what to take in", vital=True, name=name)
+    yield Right(_GROUP, "detectors", _LOOKING, "it does not know its configuration", vital=True, name=name)
     yield Right(_GROUP, "detectors", (hold,), "the chart's policy refuses its tasks and its Lease", name=name)
     yield Right(_GROUP, "eventrules", _LOOKING, "it does not know its rules", vital=True)
-    yield Right(_GROUP, "applicationtasks", tasks, "what it detects has no consequence", vital=True)
+    yield Right(_GROUP, "applicationtasks", tasks, "it creates no tasks", vital=True)
 
 
 def lease_rights(name: str) -> list[Right]:
@@ -145,26 +145,26 @@ def certificate_rights(secret: str, webhooks: str) -> tuple[list[Right], list[Ri
 
 def node_rights() -> list[Right]:
     """What is of use for the whole cluster, and can be done without: nodes belong to no namespace."""
-    return [Right("", "nodes", ("list",), "only the scheduler reports that no node is as a template requires")]
+    return [Right("", "nodes", ("list",), "only the scheduler reports that no node fits a template")]
 
 
 def _own() -> Iterator[Right]:
     yield Right(_GROUP, "applicationtemplates", ("get", *_LOOKING), "nothing can be decided", vital=True)
     instances = ("get", *_LOOKING, "create", "patch", "delete")
-    yield Right(_GROUP, "applicationinstances", instances, "no instance is made, changed or released", vital=True)
+    yield Right(_GROUP, "applicationinstances", instances, "no instance is created, changed or released", vital=True)
     yield Right(_GROUP, "applicationtasks", _LOOKING, "nothing can be decided", vital=True)
-    yield Right(_GROUP, "applicationtasks", ("delete",), "finished tasks stay for ever")
-    yield Right(_GROUP, "detectors", _LOOKING, "nothing can be judged", vital=True)
-    yield Right(_GROUP, "eventrules", _LOOKING, "nothing can be judged", vital=True)
+    yield Right(_GROUP, "applicationtasks", ("delete",), "finished tasks are never deleted")
+    yield Right(_GROUP, "detectors", _LOOKING, "rules and detectors have no status", vital=True)
+    yield Right(_GROUP, "eventrules", _LOOKING, "rules and detectors have no status", vital=True)
     for plural in ("applicationinstances", "applicationtasks", "applicationtemplates", "detectors", "eventrules"):
-        yield Right(_GROUP, f"{plural}/status", ("patch",), "nobody learns how they are")
-    yield Right(_LEASES, "leases", ("get", *_LOOKING), "holders that are lost are not noticed", vital=True)
+        yield Right(_GROUP, f"{plural}/status", ("patch",), "their statuses are not written")
+    yield Right(_LEASES, "leases", ("get", *_LOOKING), "lost holders are not noticed", vital=True)
     yield Right("events.k8s.io", "events", ("create", "patch"), "no Kubernetes Events are posted")
 
 
 def _running_detectors() -> Iterator[Right]:
     """To make a detector's objects; what it hands on by their Roles, the manager must have itself (no `escalate`)."""
-    no_detector = "no detector is run"
+    no_detector = "no detector runs"
     for group, resource in (
         ("", "serviceaccounts"),
         (_RBAC, "roles"),
@@ -172,7 +172,7 @@ def _running_detectors() -> Iterator[Right]:
         ("apps", "deployments"),
     ):
         yield Right(group, resource, ("get", "list", "create", "patch", "delete"), no_detector)
-    yield Right("", "pods", ("list",), "why a detector does not run, or is not in a pod, is not seen")
+    yield Right("", "pods", ("list",), "statuses do not give the reason why a detector does not run")
     for each in (*detector_rights(""), *sidecar_rights("")):
         yield Right(each.group, each.resource, each.verbs, no_detector)
 
@@ -181,9 +181,9 @@ def _children(plurals: Mapping[KindKey, str]) -> Iterator[Right]:
     all_verbs = ("get", *_LOOKING, "create", "patch", "delete")
     for (api_version, kind), plural in sorted(plurals.items()):
         group = api_version.rpartition("/")[0]
-        yield Right(group, plural, _LOOKING, f"what becomes of each {kind} is not seen", vital=True)
+        yield Right(group, plural, _LOOKING, f"the status of each {kind} is unknown", vital=True)
         others = tuple(verb for verb in all_verbs if verb not in _LOOKING)
-        yield Right(group, plural, others, f"no {kind} of a template is made, changed or removed")
+        yield Right(group, plural, others, f"no {kind} of a template is created, changed or deleted")
         if (api_version, kind) in SCALED:
             yield Right(group, f"{plural}/scale", ("patch",), f"no {kind} is suspended or resumed")
     if _TOLD_BY_EVENTS & plurals.keys():
@@ -191,11 +191,11 @@ def _children(plurals: Mapping[KindKey, str]) -> Iterator[Right]:
             "events.k8s.io",
             "events",
             ("list",),
-            "statuses lack the reason why pods of other workloads than Deployments are refused",
+            "statuses do not give the reason why pods of workloads other than Deployments are refused",
         )
     if ("v1", "Pod") not in plurals:
-        yield Right("", "pods", _LOOKING, "why workloads do not run is not seen", vital=True)
-        yield Right("", "pods", ("patch",), "running applications learn of a changed configuration late")
+        yield Right("", "pods", _LOOKING, "statuses do not give the reason why workloads do not run", vital=True)
+        yield Right("", "pods", ("patch",), "running applications get a changed configuration late")
 
 
 def roles(

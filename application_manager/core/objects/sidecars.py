@@ -76,7 +76,7 @@ def addition(spec: Mapping[str, Any], detector: Detector, defaults: PodDefaults)
     for each in volumes:
         if each["name"] in there and there[each["name"]] != each:
             raise SidecarError(
-                f"spec.volumes: the name {each['name']} is taken, and the detector needs it: rename the pod's volume"
+                f"spec.volumes: the name {each['name']} is reserved for the detector: rename the pod's volume"
             )
     keys = {each.get("name") for each in _list(spec, "imagePullSecrets")}
     items = {

@@ -42,13 +42,13 @@ Object = Mapping[str, Any]
 _LATER = {
     Merge.MAX: "a larger value counts",
     Merge.MIN: "a smaller value counts",
-    Merge.HIGHEST_PRIORITY: "a task that comes before it counts",
+    Merge.HIGHEST_PRIORITY: "a task of higher priority counts",
     Merge.ALL: "another task gives false",
     Merge.ANY: "another task gives true",
 }
 """Why a value is outbid."""
 
-_BELOW = "a task that reconfigures lies over it"
+_BELOW = "a Reconfigure task overrides it"
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,28 +18,30 @@ NOT_RUN = Aspect(
     RUNNING,
     False,
     "NotRun",
-    "this manager runs no detectors: start it with --detector-image and with the rights that `application-manager rbac "
-    "--detectors` prints, or remove spec.mode and run the detector yourself",
+    "the manager runs no detectors: start it with --detector-image, and with the permissions that "
+    "`application-manager rbac --detectors` prints; or remove spec.mode and run the detector yourself",
 )
 """The condition where the manager has no image."""
 
-NOT_ACCEPTED = Aspect(RUNNING, False, "NotAccepted", "nothing is made of a Detector that is not accepted")
+NOT_ACCEPTED = Aspect(RUNNING, False, "NotAccepted", "no objects are created for a Detector that is not accepted")
 """The condition of a Detector that cannot run and was never made."""
 
 
 def carried(detector: Detector, pods: Sequence[Mapping[str, Any]]) -> Aspect:
     """The condition Running of one in others' pods, by the pods that ask for it; those that are over do not count."""
     if not detector.spec.service_account_names:
-        return Aspect(RUNNING, False, "NoAccounts", "spec.serviceAccountNames is empty: name the accounts of its pods")
+        return Aspect(
+            RUNNING, False, "NoAccounts", "spec.serviceAccountNames: is empty: list the service accounts of its pods"
+        )
     pods = [each for each in pods if not _is_over(each)]
     sidecars = list(sidecar_pods(pods))
     troubles = summary(found for each in sidecars if (found := trouble(each)) is not None)
-    of = f"of {len(pods)} pods that ask for it"
+    of = f"of {len(pods)} pods with its label"
     running = sum(1 for each in sidecars if _runs(each))
     if troubles:
         return Aspect(RUNNING, False, troubles[0].reason.value, f"it runs in {running} {of}: {troubles[0].text}")
     missing = len(pods) - len(sidecars)
-    but = f"; {missing} were made without it: their Events give the reason" if missing else ""
+    but = f"; {missing} were created without it: their Events give the reason" if missing else ""
     return Aspect(RUNNING, True, "InPods", f"it runs in {running} {of}{but}")
 
 
@@ -59,7 +61,7 @@ def _runs(pod: Mapping[str, Any]) -> bool:
 def running(deployment: Mapping[str, Any] | None, troubles: Sequence[Trouble]) -> Aspect:
     """The condition Running, by the Deployment as it is and what keeps its pods from running."""
     if deployment is None:
-        return Aspect(RUNNING, False, "NotReady", "its Deployment is not there yet")
+        return Aspect(RUNNING, False, "NotReady", "its Deployment does not exist yet")
     what = f"Deployment {deployment['metadata']['name']}"
     problem = not_ready(deployment)
     if problem is None:

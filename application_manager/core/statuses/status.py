@@ -159,7 +159,7 @@ def _task_message(verdict: Verdict, service: Service | None, suspends: bool) -> 
         return _short(verdict.message)
     notes = [] if verdict.reason == ACCEPTED else [verdict.message]
     if service is None:
-        return _short("; ".join([*notes, f"instance {verdict.instance} is not made yet"]))
+        return _short("; ".join([*notes, f"instance {verdict.instance} does not exist yet"]))
     done, word = (service.stopped, "suspended") if suspends else (service.ready, "ready")
     if service.applied and done:
         return _short("; ".join(notes))
@@ -236,7 +236,7 @@ def suspension_aspect(
     whose = f"task {decision.suspender} suspends it" if decision.suspender else "spec.suspended is true"
     if left:
         return Aspect("Suspended", False, "Stopping", f"{whose}: {', '.join(left)} left")
-    resting = "".join(f"; HorizontalPodAutoscaler {each} rests until then" for each in autoscalers(there))
+    resting = "".join(f"; HorizontalPodAutoscaler {each} is inactive until then" for each in autoscalers(there))
     return Aspect("Suspended", True, "Suspended", f"{whose}, and its workloads are at zero{resting}")
 
 
@@ -254,7 +254,7 @@ def _capped(known: Sequence[Condition], decision: Decision) -> list[Aspect]:
     if decision.capped:
         return [Aspect("Capped", True, "SumBeyondBounds", "; ".join(decision.capped))]
     if find(known, "Capped") is not None:
-        return [Aspect("Capped", False, "WithinBounds", "all merged values are those of the tasks")]
+        return [Aspect("Capped", False, "WithinBounds", "no merged value is capped")]
     return []
 
 
@@ -265,9 +265,9 @@ def _instance_message(instance: ApplicationInstance, decision: Decision, applied
     elif not ready.holds:
         parts.append(ready.message)
     if decision.release_time is not None:
-        parts.append(f"released at {format_seconds(decision.release_time)} unless a demand comes")
+        parts.append(f"released at {format_seconds(decision.release_time)} unless a demand arrives")
     elif byhand.is_held(instance) and not decision.wanted:
-        parts.append("held though nobody demands it")
+        parts.append("held without demand")
     parts += decision.capped
     parts += [f"stands in for {each}" for each in decision.stands_in_for]
     return _short("; ".join(parts))

@@ -114,7 +114,7 @@ def test_the_user_is_the_one_of_the_manager_or_left_to_the_cluster(user: int | N
     assert security["runAsNonRoot"] is True
     assert parse_user("cluster" if user is None else str(user)) == user
     for wrong in ("0", "root", "-1"):
-        with pytest.raises(ValueError, match="is no user"):
+        with pytest.raises(ValueError, match="is not a user"):
             parse_user(wrong)
 
 
@@ -187,10 +187,10 @@ def test_metrics_by_tls_are_probed_by_tls_and_their_secret_is_not_among_those_of
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--detector-metrics-secret", "a"], "do nothing without --detector-image"),
-        (["--detector-env", "A=b"], "do nothing without --detector-image"),
-        (["--detector-image", "a", "--detector-env", "A"], "'A' is no variable: write NAME=VALUE"),
-        (["--detector-image", "a", "--detector-env", "POD_NAME=b"], "POD_NAME is set for each pod by itself"),
+        (["--detector-metrics-secret", "a"], "have no effect without --detector-image"),
+        (["--detector-env", "A=b"], "have no effect without --detector-image"),
+        (["--detector-image", "a", "--detector-env", "A"], "'A' is not an environment variable: write NAME=VALUE"),
+        (["--detector-image", "a", "--detector-env", "POD_NAME=b"], "POD_NAME is set automatically in each pod"),
     ],
 )
 def test_options_for_the_pods_that_make_no_sense_are_refused(options: list[str], said: str) -> None:
@@ -208,7 +208,7 @@ def test_options_for_the_pods_that_make_no_sense_are_refused(options: list[str],
         ({"mode": None, "pod": {}}, "set mode to Standalone or Sidecar, or remove pod"),
         ({"pod": {"volumes": [{"name": "a", "emptyDir": {}, "csi": {}}]}}, "give exactly one of persistentVolumeClaim"),
         ({"pod": {"volumes": [{"name": "a", "hostPath": {"path": "/"}}]}}, "hostPath"),
-        ({"pod": {"volumes": [{"name": "scratch", "emptyDir": {}}]}}, "names of the detector's own volumes"),
+        ({"pod": {"volumes": [{"name": "scratch", "emptyDir": {}}]}}, "are reserved"),
         ({"pod": {"volumeMounts": [{"name": "a", "mountPath": "/a"}]}}, "volumeMounts: /a: volumes has no a: add it"),
         (
             {
@@ -263,7 +263,7 @@ def test_a_command_prints_the_account_of_a_detector_that_somebody_else_runs() ->
     assert list(yaml.safe_load_all(done.stdout)) == detector_roles("site", "town")
     refused = CliRunner().invoke(app, ["detector-rbac", "Town", "-n", "site"])
     assert refused.exit_code == 2
-    assert "'Town' is no Detector's name" in refused.stderr
+    assert "'Town' is not a Detector name" in refused.stderr
 
 
 def deployment(available: int) -> dict[str, Any]:
@@ -279,9 +279,9 @@ def test_it_runs_when_its_pod_is_ready_and_else_it_is_said_why() -> None:
     assert running(deployment(1), []).holds
     assert running(None, []).reason == "NotReady"
     assert "0 of 1 pods" in running(deployment(0), []).message
-    pulled = running(deployment(0), [Trouble(TroubleReason.IMAGE_PULL_FAILED, "image x cannot be pulled: not found")])
+    pulled = running(deployment(0), [Trouble(TroubleReason.IMAGE_PULL_FAILED, "cannot pull image x: not found")])
     assert (pulled.holds, pulled.reason) == (False, "ImagePullFailed")
-    assert "image x cannot be pulled" in pulled.message
+    assert "cannot pull image x" in pulled.message
 
 
 def test_the_condition_goes_with_the_mode() -> None:

@@ -112,13 +112,13 @@ def error(*arguments: str) -> str:
 
 def test_what_cannot_be_used_is_said_with_its_place_and_the_remedy(detector: Path, tmp_path: Path) -> None:
     (pod := tmp_path / "pod.yaml").write_text(yaml.safe_dump({"kind": "Pod", **template(name="car")}))
-    assert "Detector town names no image: give --detector-image" in error("-f", str(pod), "-f", str(detector))
+    assert "Detector town has no image: give --detector-image" in error("-f", str(pod), "-f", str(detector))
     assert "Detector town is in none of the files" in error("-f", str(pod), *IMAGE)
     assert "No such file or directory: give a readable YAML file, or -" in error("-f", str(tmp_path / "none.yaml"))
     (broken := tmp_path / "broken.yaml").write_text("a: [")
-    assert f"-f {broken}: is no YAML" in error("-f", str(broken))
+    assert f"-f {broken}: is not YAML" in error("-f", str(broken))
     broken.write_text("- a\n")
-    assert "holds a document that is no manifest" in error("-f", str(broken))
+    assert "contains a document that is not a manifest" in error("-f", str(broken))
     detector.write_text(DETECTOR.replace("mode: Sidecar", "mode: Passenger"))
     said = error("-f", str(pod), "-f", str(detector), *IMAGE)
     assert "Detector town: spec.mode" in said

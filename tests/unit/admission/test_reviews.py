@@ -112,7 +112,7 @@ def test_warnings_are_few_short_lines_whatever_is_in_them(texts: list[str]) -> N
 
 @pytest.mark.parametrize("asked", [None, [], {}, {"apiVersion": "admission.k8s.io/v1"}, question() | {"request": {}}])
 def test_what_is_no_review_is_said_to_be_none(asked: Any) -> None:
-    with pytest.raises(ReviewError, match="only the API server has business here"):
+    with pytest.raises(ReviewError, match="only the API server may call this path"):
         read(asked)
 
 

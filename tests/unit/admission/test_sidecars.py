@@ -223,13 +223,13 @@ def test_in_the_nodes_network_it_takes_no_port() -> None:
 @pytest.mark.parametrize(
     ("asked", "of", "said"),
     [
-        (pod(), None, "namespace site has no Detector 'town'"),
+        (pod(), None, "namespace site has no valid Detector 'town'"),
         (pod(), detector(mode="Standalone", serviceAccountNames=None), "is of mode Standalone: give it mode Sidecar"),
         (pod(), detector(mode=None, serviceAccountNames=None), "is without a mode: give it mode Sidecar"),
         (pod(serviceAccountName="other"), detector(), "has only vehicle, not other"),
         (pod(serviceAccountName=None), detector(), "has only vehicle, not default"),
         (pod(), detector(serviceAccountNames=[]), "has none, not vehicle"),
-        (pod(volumes=[{"name": "wayside-scratch", "hostPath": {}}]), detector(), "the name wayside-scratch is taken"),
+        (pod(volumes=[{"name": "wayside-scratch", "hostPath": {}}]), detector(), "name wayside-scratch is reserved"),
         (pod(), detector(state={"path": TOKEN}), f"has two volumes at {TOKEN}"),
         (pod() | {"metadata": {"labels": LABELS, "annotations": MIRROR}}, detector(), "static"),
     ],
@@ -276,7 +276,7 @@ def test_the_answer_always_allows_with_a_patch_or_a_warning() -> None:
         "response"
     ]
     assert (response["allowed"], "patch" in response) == (True, False)
-    assert "it is made without a detector: label wayside.dev/detector" in response["warnings"][0]
+    assert "created without a detector: label wayside.dev/detector" in response["warnings"][0]
 
 
 def test_only_a_new_pod_is_looked_at() -> None:
@@ -310,7 +310,7 @@ def test_who_puts_it_into_pods_by_hand_is_told_the_same_rights() -> None:
     done = CliRunner().invoke(app, options)
     assert list(yaml.safe_load_all(done.stdout)) == sidecar_roles("site", "town", ["vehicle"])
     refused = CliRunner().invoke(app, [*options[:-1], "Vehicle"])
-    assert "'Vehicle' is no account's name" in refused.stderr
+    assert "'Vehicle' is not a service account name" in refused.stderr
 
 
 def state(one: Json, **how: Any) -> Json:
@@ -324,12 +324,12 @@ def test_the_condition_says_in_how_many_pods_it_runs_and_what_keeps_it_from_runn
     said = carried(of, [runs, pod()])
     assert (said.holds, said.message) == (
         True,
-        "it runs in 1 of 2 pods that ask for it; 1 were made without it: their Events give the reason",
+        "it runs in 1 of 2 pods with its label; 1 were created without it: their Events give the reason",
     )
     waiting = {"waiting": {"reason": "ErrImagePull", "message": "not found"}}
     said = carried(of, [runs, state(injected(pod(), of), state=waiting)])
     assert (said.holds, said.reason) == (False, "ImagePullFailed")
-    assert said.message == "it runs in 1 of 2 pods that ask for it: image wayside:1 cannot be pulled: not found"
+    assert said.message == "it runs in 1 of 2 pods with its label: cannot pull image wayside:1: not found"
     broken = runs | {"status": runs["status"] | {"containerStatuses": [{"name": "main", "state": waiting}]}}
     assert carried(of, [broken]).holds
     assert [each["spec"]["initContainers"][0]["name"] for each in sidecar_pods([broken, pod()])] == [CONTAINER]
@@ -341,7 +341,7 @@ def test_pods_that_are_over_are_no_trouble() -> None:
     one = state(injected(pod(restartPolicy="OnFailure"), of), state=killed)
     over = one | {"status": one["status"] | {"containerStatuses": [{"name": "main", "state": killed}]}}
     said = carried(of, [over, one | {"metadata": one["metadata"] | {"deletionTimestamp": "2026-01-01T00:00:00Z"}}])
-    assert (said.holds, said.message) == (True, "it runs in 0 of 0 pods that ask for it")
+    assert (said.holds, said.message) == (True, "it runs in 0 of 0 pods with its label")
     assert carried(of, [one]).reason == "CrashLoop"
 
 

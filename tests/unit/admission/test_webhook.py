@@ -93,7 +93,7 @@ def test_nothing_is_answered_before_everything_is_known(folder: Path) -> None:
         return {}
 
     async def scenario(ask: Ask) -> None:
-        assert await ask() == (503, "not everything is listed and watched yet\n")
+        assert await ask() == (503, "the caches are not synced yet\n")
         known.append(True)
         assert (await ask())[0] == 200
 
@@ -208,9 +208,9 @@ def test_check_says_where_in_the_files_what_would_be_refused_is(
     assert "no valid Detector in namespace default selects the rule" in said
     file.write_text(file.read_text().replace("regoin", "region"))
     code, _, said = command("check", str(file))
-    assert (code, said.splitlines()[-1]) == (0, "2 looked at: nothing that would be refused")
+    assert (code, said.splitlines()[-1]) == (0, "checked 2: nothing would be refused")
     assert [line.rpartition(" ")[2] for line in said.splitlines()[:-1]] == ["[failing-example]", "[rule-not-selected]"]
-    alone = (0, "", "2 looked at: nothing that would be refused\n")
+    alone = (0, "", "checked 2: nothing would be refused\n")
     ignoring = ("--ignore", "rule-not-selected", "--ignore", "failing-example")
     assert command("check", str(file), *ignoring) == alone
     annotation = "annotations: {wayside.dev/ignore-findings: rule-not-selected}"
@@ -232,11 +232,11 @@ def test_check_finds_nothing_that_would_be_refused_in_the_examples(
 @pytest.mark.parametrize(
     ("arguments", "part"),
     [
-        (["run", "--admission-port", "9443"], "go together: give both"),
+        (["run", "--admission-port", "9443"], "give both --admission-port"),
         (["webhooks"], "give either --service NAMESPACE/NAME or --url"),
-        (["webhooks", "--service", "manager"], "'manager' is no Service: write NAMESPACE/NAME"),
+        (["webhooks", "--service", "manager"], "'manager' is not a Service: write NAMESPACE/NAME"),
         (["webhooks", "--service", "a/b", "--ca-bundle", "nowhere.crt"], "nowhere.crt: No such file"),
-        (["webhooks", "--service", "a/b", "--ca-bundle", "pyproject.toml"], "holds no certificate"),
+        (["webhooks", "--service", "a/b", "--ca-bundle", "pyproject.toml"], "contains no certificate"),
     ],
 )
 def test_bad_usage_is_one_line_with_the_remedy(

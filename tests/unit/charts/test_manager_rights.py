@@ -84,8 +84,8 @@ def test_the_command_prints_what_the_table_says() -> None:
         (["--account", "manager"], "write NAMESPACE/NAME"),
         (["--allowed-kinds", "rbac.authorization.k8s.io/v1/Role"], "can never be allowed"),
         (["--lease", "wayside-town"], "write NAME or NAMESPACE/NAME"),
-        (["--allowed-kinds", "v1/Secret"], "needs a manager of named namespaces"),
-        (["--namespace", "a", "--grant", "b"], "goes without --namespace"),
+        (["--allowed-kinds", "v1/Secret"], "needs --namespace"),
+        (["--namespace", "a", "--grant", "b"], "remove it, or --namespace"),
     ],
 )
 def test_what_cannot_be_is_refused(arguments: list[str], said: str) -> None:
@@ -98,7 +98,7 @@ def test_a_kind_that_nobody_knows_is_looked_up_in_a_cluster(monkeypatch: pytest.
     monkeypatch.setenv("KUBECONFIG", "/nonexistent")
     done = CliRunner().invoke(app, ["rbac", "--allowed-kinds", "example.com/v1/Widget"])
     assert isinstance(done.exception, ConfigurationError)
-    assert "what roles call example.com/v1/Widget only a cluster knows" in str(done.exception)
+    assert "cannot look up the plural of example.com/v1/Widget" in str(done.exception)
 
 
 def test_what_is_lacking_is_said_with_its_purpose_and_the_remedy(caplog: pytest.LogCaptureFixture) -> None:
@@ -106,10 +106,10 @@ def test_what_is_lacking_is_said_with_its_purpose_and_the_remedy(caplog: pytest.
     report_missing([(needed["deployments", False], "patch", "a")])
     (said,) = caplog.messages
     assert said == (
-        "its account may not patch deployments of apps in namespace a: no Deployment of a template is made, changed or "
-        "removed: grant what `application-manager rbac` prints"
+        "its service account cannot patch deployments of apps in namespace a, so no Deployment of a template is "
+        "created, changed or deleted: apply the output of `application-manager rbac`"
     )
-    with pytest.raises(ConfigurationError, match="may not list pods in all namespaces: why workloads do not run"):
+    with pytest.raises(ConfigurationError, match="cannot list pods in all namespaces, so statuses"):
         report_missing([(needed["pods", True], "list", None)])
 
 

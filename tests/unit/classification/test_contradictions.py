@@ -96,9 +96,9 @@ WAYS = [
     way("numberOfParticipants", "One", "[0]: One (a single participant) contradicts the rule: spec.scope.fleet",
         "Multiple", scope=FLEET, when="size(members) > 3.0"),
     Way({"numberOfParticipants": ["One"], "eventDetectionEntity": ["External"]}, {},
-        "spec.classification.eventDetectionEntity[0]: External (an entity that is neither the source of the event nor",
+        "spec.classification.eventDetectionEntity[0]: External (the detecting entity is neither",
         {"numberOfParticipants": ["Two"], "eventDetectionEntity": ["External"]}),
-    way("actingEntity", "External", "[0]: External (another entity acts) "
+    way("actingEntity", "External", "[0]: External (the acting entity is another one) "
         "contradicts the rule: the detector itself carries out spec.actions[0].record, spec.actions[1].database: "
         "write EventDetectionEntity", "EventDetectionEntity", actions=act(RECORD, DATABASE)),
     way("observationPeriod", "Immediate", "[0]: Immediate (a single sample is enough to detect the event) "

@@ -110,7 +110,7 @@ def test_a_task_that_waits_and_a_capped_sum_are_said_without_an_error(render: An
     result = render(template, *(task(name, parameters={"region": "n", "load": 4}) for name in ("a", "b")), night)
     assert result.exit_code == 0, result.stderr
     assert "night: NothingRuns: no task deploys instance" in result.stderr
-    assert "load: the sum of 2 values, 8, is held at the maximum of 5" in result.stderr
+    assert "load: the sum of 2 values, 8, is capped at the maximum of 5" in result.stderr
 
 
 def test_bad_files_and_bad_options_are_one_clear_line_and_exit_code_2(

@@ -75,7 +75,7 @@ def test_one_beyond_them_waits_and_says_for_what() -> None:
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
-        ("town", "is no policy of holders"),
+        ("town", "is not a holder policy"),
         ("town/det:max-tasks=many", "'max-tasks=many'"),
         ("town/det:operations=Stop", "'Stop'"),
         ("town/det:max-tasks=-1", "max-tasks"),

@@ -144,7 +144,7 @@ def test_the_fallback_serves_with_what_it_knows_and_the_first_one_tries_on() -> 
     verdict = outcome.verdicts["a"]
     assert (verdict.standing, verdict.reason, verdict.instance) == (Standing.COUNTS, "FallenBack", LITE_NORTH)
     assert verdict.message == (
-        f"instance {NORTH} is not ready: instance {LITE_NORTH} of template lite serves instead, until it is"
+        f"instance {NORTH} is not ready: instance {LITE_NORTH} of template lite serves the task until then"
     )
 
 
@@ -153,7 +153,7 @@ def test_both_instances_say_it() -> None:
     first, other = outcome.instances[NORTH], outcome.instances[LITE_NORTH]
     (timed_out,) = aspects([], first.overdue, first.fallback, first.stands_in_for)
     assert (timed_out.type, timed_out.holds, timed_out.reason) == ("TimedOut", True, "ReadyTimeout")
-    assert f"served by {LITE_NORTH} of template lite, until it was ready for 60s" in timed_out.message
+    assert f"served by {LITE_NORTH} of template lite until it has been ready for 60s" in timed_out.message
     (stands_in,) = aspects([], other.overdue, other.fallback, other.stands_in_for)
     assert (stands_in.type, stands_in.holds) == ("StandsIn", True)
     assert NORTH in stands_in.message

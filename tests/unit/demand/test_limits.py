@@ -89,12 +89,12 @@ def test_a_higher_priority_preempts_and_both_tasks_name_the_other() -> None:
     assert (running(outcome), going(outcome)) == (set(), {"low"})  # the limit holds also in between
     assert outcome.verdicts["low"].reason == "Preempted"
     assert "task high, priority 5" in outcome.verdicts["low"].message
-    assert "which it preempts, as soon as" in outcome.verdicts["high"].message
+    assert "is deleted, and preempts" in outcome.verdicts["high"].message
     assert "task low" in outcome.verdicts["high"].message
     after = of(served(low), high)
     assert running(after) == {"high"}
     assert after.verdicts["low"].reason == "Preempted"
-    assert f"gave way to instance {instance_name('app', 'high')} (task high" in after.verdicts["low"].message
+    assert f"was preempted by instance {instance_name('app', 'high')} (task high" in after.verdicts["low"].message
     assert f"in place of instance {instance_name('app', 'low')} (task low" in after.verdicts["high"].message
     assert running(of(served(low), instances=[runs("high", release_at=NOW + 9)])) == set()  # until what lingers is gone
     assert running(of(served(low))) == {"low"}
@@ -122,7 +122,7 @@ def test_what_is_being_deleted_has_its_place_until_it_is_gone() -> None:
     metadata = there.metadata.model_copy(update={"deletion_timestamp": format_seconds(NOW)})
     outcome = of(wants("b"), instances=[there.model_copy(update={"metadata": metadata})])
     assert running(outcome) == set()
-    assert f"starts as soon as {there.name} is gone" in outcome.verdicts["b"].message
+    assert f"starts once {there.name} is deleted" in outcome.verdicts["b"].message
 
 
 def test_a_lower_limit_stops_the_last_in_order() -> None:
@@ -164,7 +164,7 @@ def test_what_acts_on_an_instance_without_a_place_waits_with_it() -> None:
     tasks = [wants("a"), wants("b", created=1), task("stop", {"region": "b"}, operation="Suspend")]
     verdict = of(*tasks).verdicts["stop"]
     assert (verdict.standing, verdict.reason) == (Standing.WAITING, "NothingRuns")
-    assert "has no place to run" in verdict.message
+    assert "does not run" in verdict.message
 
 
 # --- minimumUptime
@@ -177,9 +177,7 @@ def test_nothing_is_preempted_before_its_minimum_uptime_and_then_it_is() -> None
     outcome = of(*tasks, templates=templates, instances=young)
     assert running(outcome) == {"low"}
     assert outcome.next_change == NOW + 1
-    assert (
-        f"after {format_seconds(NOW + 1)}, until when another has its minimumUptime" in outcome.verdicts["high"].message
-    )
+    assert f"after {format_seconds(NOW + 1)}, when the minimumUptime of another" in outcome.verdicts["high"].message
     later = of(*tasks, templates=templates, instances=young, now=NOW + 1)
     assert going(later) == set()
     assert later.verdicts["low"].reason == "Preempted"

@@ -113,7 +113,7 @@ def test_a_claim_that_takes_too_much_is_refused_and_settles_nothing() -> None:
     verdict = book.verdict(NAME)
     assert isinstance(verdict, Verdict)
     assert (verdict.standing, verdict.reason) == (Standing.REFUSED, Refused.EXPRESSION_LIMIT)
-    assert "by template app takes more than 2 s" in verdict.message
+    assert "against template app takes more than 2 s" in verdict.message
     assert book.unsettled(OF)
     book.note(NAME, Entry({}, task(ended=True)), made)
     assert not book.unsettled(OF)

@@ -113,8 +113,8 @@ def test_the_instance_says_that_a_sum_is_capped_and_when_it_is_no_more() -> None
         return (decision.parameters or {}).get("rate"), said
 
     assert after(20) == (20, None)
-    assert after(20, 40) == (50, ("True", "rate: the sum of 2 values, 60, is held at the maximum of 50"))
-    assert after(20) == (20, ("False", "all merged values are those of the tasks"))
+    assert after(20, 40) == (50, ("True", "rate: the sum of 2 values, 60, is capped at the maximum of 50"))
+    assert after(20) == (20, ("False", "no merged value is capped"))
 
 
 @given(st.lists(st.tuples(st.sampled_from(["x", "y"]), NUMBERS), min_size=1, max_size=5))
@@ -178,7 +178,7 @@ def test_a_value_is_matched_with_pattern_and_enum(spec: dict[str, Any], value: A
 @pytest.mark.parametrize(
     ("spec", "message"),
     [
-        ({"type": "string", "pattern": "("}, r'spec.parameters.p.pattern: "\(" is no regular expression: .*missing \)'),
+        ({"type": "string", "pattern": "("}, r'spec.parameters.p.pattern: "\(" is not a regular .*missing \)'),
         ({"type": "string", "pattern": "^a", "default": "b"}, r'spec.parameters.p.default: "b" does not match'),
     ],
 )

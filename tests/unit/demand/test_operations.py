@@ -113,7 +113,7 @@ def test_one_for_all_says_where_it_conflicts() -> None:
     assert (values(outcome)["model"], values(outcome, SOUTH)["model"]) == ("large", "tiny")
     verdict = outcome.verdicts["all"]
     assert (verdict.standing, verdict.instance) == (Standing.COUNTS, SOUTH)
-    assert "but not 1, the first since spec.parameters.model" in verdict.message
+    assert "except 1, the first since spec.parameters.model" in verdict.message
     refused = of(deploy("a"), here, change("all", {"model": "tiny"})).verdicts["all"]
     assert (refused.standing, refused.reason) == (Standing.REFUSED, "Conflict")
 
@@ -128,10 +128,10 @@ TWO = {
     ("wrong", "spec", "reason", "message"),
     [
         (change("c", {"a": "x", "n": 1}), TWO, "InvalidKey", "spec.parameters.b: is missing, and the key"),
-        (change("c", {"a": "x", "b": "y"}), TWO, "InvalidParameters", "has nothing to change: give at least one"),
-        (change("c", {}), TWO, "InvalidParameters", "has nothing to change"),
+        (change("c", {"a": "x", "b": "y"}), TWO, "InvalidParameters", "changes nothing: give at least one"),
+        (change("c", {}), TWO, "InvalidParameters", "changes nothing"),
         (change("c", {"rateHz": 99}), FUSION, "InvalidParameters", "99 is above the maximum of 50"),
-        (stop("c", {"region": "n", "rateHz": 1}), FUSION, "InvalidParameters", "a Suspend task changes no parameter"),
+        (stop("c", {"region": "n", "rateHz": 1}), FUSION, "InvalidParameters", "a Suspend task cannot change"),
     ],
 )
 def test_what_cannot_act_on_what_runs_is_refused(wrong: Any, spec: Any, reason: str, message: str) -> None:
@@ -143,7 +143,7 @@ def test_what_cannot_act_on_what_runs_is_refused(wrong: Any, spec: Any, reason: 
 def test_a_capped_sum_below_a_reconfiguration_is_not_spoken_of() -> None:
     heavy = [deploy("a", load=6), deploy("b", load=6)]
     assert of(*heavy).instances[NORTH].capped == (
-        "load: the sum of 2 values, 12, is held at the maximum of 9",
+        "load: the sum of 2 values, 12, is capped at the maximum of 9",
     )  # fmt: skip
     assert of(*heavy, change("c", {"load": 1})).instances[NORTH].capped == ()
 
@@ -161,7 +161,7 @@ def test_a_suspension_wins_from_the_highest_priority_that_deploys(priority: int,
     if not suspended:
         verdict = outcome.verdicts["s"]
         assert (verdict.standing, verdict.reason) == (Standing.REFUSED, "Outbid")
-        assert "spec.priority: 1 is below 2 of task b" in verdict.message
+        assert "spec.priority: 1 is below the priority 2 of task b" in verdict.message
 
 
 def test_a_task_that_is_refused_outbids_nobody() -> None:

@@ -143,7 +143,7 @@ def test_a_write_whose_time_ends_before_it_is_sent_is_not_sent(looks: int) -> No
 
     async def scenario() -> None:
         async with serving(handle, may_act=lambda: answers.pop() if answers else 0.0) as client:
-            with pytest.raises(Unreachable, match="not the active one"):
+            with pytest.raises(Unreachable, match="no longer active"):
                 await client.replace(LEASES, BODY)
             await client.get(LEASES, "n", "x")
 
@@ -178,7 +178,7 @@ def test_rights_that_lack_are_told_with_the_remedy() -> None:
 
     async def scenario() -> None:
         async with serving(handle) as client:
-            with pytest.raises(ApiError, match="grant what `application-manager rbac` prints"):
+            with pytest.raises(ApiError, match="apply the output of `application-manager rbac`"):
                 await client.get(LEASES, "n", "x")
 
     asyncio.run(scenario())

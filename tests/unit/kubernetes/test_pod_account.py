@@ -42,7 +42,7 @@ def test_while_the_file_is_away_the_last_token_serves_and_that_is_said_once(
     use_pod_account(configuration, folder)
     (folder / "token").unlink()
     assert [token(configuration) for _ in range(3)] == ["Bearer first"] * 3
-    assert len([each for each in caplog.messages if "using the token that was read before" in each]) == 1
+    assert len([each for each in caplog.messages if "using the previous token" in each]) == 1
     (folder / "token").write_text("second")
     assert token(configuration) == "Bearer second"
 

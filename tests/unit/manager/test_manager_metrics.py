@@ -129,7 +129,7 @@ def test_pages_are_served_and_what_is_lacking_is_503() -> None:
                 assert await get("/readyz") == (200, "ok\n")
                 measures.looked -= STALLED_AFTER + 1
                 status, text = await get("/healthz")
-                assert (status, text.startswith("no resync has ended for 30")) == (503, True)
+                assert (status, text.startswith("no resync has completed for 30")) == (503, True)
             with pytest.raises(ConfigurationError, match=rf"--metrics-port {port}: .*: give another port"):
                 async with pages(port, measures, lambda: None, lambda: None):
                     pass

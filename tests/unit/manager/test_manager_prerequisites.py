@@ -33,6 +33,6 @@ def test_recent_versions_and_unknown_ones_are_let_through(version: str) -> None:
 
 @pytest.mark.parametrize("version", ["v1.30.14", "v1.9.11", "v1.30.0-gke.1"])
 def test_older_ones_are_refused_with_the_reason_and_the_remedy(version: str) -> None:
-    with pytest.raises(ConfigurationError, match=r"1\.31 is the oldest that works: .*upgrade the cluster") as refused:
+    with pytest.raises(ConfigurationError, match=r"1\.31 or newer is required: .*upgrade the cluster") as refused:
         checked(version)
     assert version in str(refused.value)

@@ -73,7 +73,7 @@ def test_events_are_relayed_and_kopf_sees_versions_alone(
     versions = [each["object"]["metadata"]["resourceVersion"] for each in seen if isinstance(each, dict)]
     assert versions == ["6", "7", "8", "9"]
     assert {each["type"] for each in seen if isinstance(each, dict)} == {"BOOKMARK"}
-    assert "faulty; the next resync retries it" in caplog.text
+    assert "faulty; retrying at the next resync" in caplog.text
     assert b'reconcile_failures_total{queue="watch"} 1.0' in measures.text()
 
 

@@ -35,8 +35,8 @@ def test_an_api_server_that_is_away_or_overloaded_is_waited_for_and_it_is_said_o
     ]
     assert asked(*failures) == "answer"
     assert [record.getMessage() for record in caplog.records] == [
-        "GET /apis: refused; retrying until the API server answers",
-        "the API server answers",
+        "GET /apis: refused; retrying until the API server responds",
+        "the API server responds",
     ]
 
 

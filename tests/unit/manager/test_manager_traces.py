@@ -96,7 +96,7 @@ def spans(monkeypatch: pytest.MonkeyPatch, run: Run) -> dict[str, Received]:
 def failed(found: dict[str, Received]) -> None:
     assert found.keys() == {"reconcile app", "apply", "ready"}
     ready, reconciled = found["ready"], found["reconcile app"]
-    assert ready.error == "NotReady: the task ended before its instance was seen ready"
+    assert ready.error == "NotReady: the task ended before its instance was ready"
     assert (ready.parent, ready.attributes["wayside.instance"]) == (reconciled.id, "app")
     assert found["apply"].error is reconciled.error is None
 

@@ -41,7 +41,7 @@ def test_an_event_loop_that_hangs_is_ended() -> None:
 
 def test_what_has_stalled_is_ended_if_it_lasts(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(watchdog, "PERSISTENT", 0.2)
-    assert ended_by(lambda: "no resync has ended for 300 s") == "no resync has ended for 300 s"
+    assert ended_by(lambda: "no resync has completed for 300 s") == "no resync has completed for 300 s"
 
 
 def test_one_that_works_is_left_alone() -> None:
@@ -87,5 +87,5 @@ def test_a_worker_that_is_at_one_key_for_too_long_has_stalled() -> None:
 
     before, found, after = asyncio.run(scenario())
     assert before is None
-    assert "instance north is worked on for" in str(found)
+    assert "instance north has been in progress for" in str(found)
     assert after is None

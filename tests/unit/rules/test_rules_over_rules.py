@@ -200,7 +200,7 @@ def test_a_rule_over_an_unknown_one_is_refused_until_that_one_is_there() -> None
     [
         ({"name": "s", "aggregate": "Count", "over": "1s"}, "exactly one of stream, ruleName, model, plugin and of"),
         ({"name": "s", "ruleName": "r", "stream": "s", "aggregate": "Count", "over": "1s"}, "exactly one of stream"),
-        ({"name": "s", "stream": "s", "aggregate": "Active"}, "Active is for a signal with ruleName"),
+        ({"name": "s", "stream": "s", "aggregate": "Active"}, "Active needs a signal with ruleName"),
         ({"name": "s", "ruleName": "r", "aggregate": "Active", "over": "1s"}, "without over and where"),
         ({"name": "s", "ruleName": "r", "aggregate": "Active", "value": "msg.episode"}, "uses no value"),
     ],
@@ -263,7 +263,7 @@ def test_an_end_by_loss_counts_for_the_other_client_of_a_pair_alone() -> None:
 )
 def test_ends_are_of_rules_and_never_active(signal: dict[str, Any]) -> None:
     with pytest.raises(
-        ValidationError, match="samples: Ends is for a signal with ruleName and an aggregate other than Active"
+        ValidationError, match="samples: Ends needs a signal with ruleName and an aggregate other than Active"
     ):
         a_rule(signals=[{"name": "s", **signal}], when="s")
 

@@ -89,7 +89,7 @@ def test_a_rule_that_names_its_plugin_rightly_has_no_problems(tmp_path: Path) ->
     ],
 )
 def test_a_signal_has_one_source_and_a_plugin_gives_the_value_itself(signal: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match=r"exactly one of stream|has no value, where, over or aggregate"):
+    with pytest.raises(ValueError, match=r"exactly one of stream|cannot have value, where, over or aggregate"):
         plugin_rule(signals=[signal])
 
 

@@ -67,7 +67,7 @@ def test_pairs_fleets_and_episodes_see_it_as_well() -> None:
     [
         (
             {"name": "s", "plugin": {"name": "p"}, "client": "a"},
-            "client is for a signal with stream or ruleName: remove it",
+            "client is valid only with stream or ruleName: remove it",
         ),
         ({"name": "s", "stream": "speed", "value": "msg.v", "client": "a b"}, "client"),
     ],

@@ -23,7 +23,7 @@ FUSION = {
     "key": "${parameters.region}",
 }
 NAME = "app-3q3f46oudt"
-WHY = f"Deployment {NAME} has 0 of 1 pods available: image fusion:9 cannot be pulled: not found"
+WHY = f"Deployment {NAME} has 0 of 1 pods available: cannot pull image fusion:9: not found"
 
 
 def emitted(name: str, parameters: dict[str, Any], subject: str = "car1+car2", **more: Any) -> ApplicationTask:
@@ -149,7 +149,7 @@ def test_objects_and_pods_say_why_they_are_not_ready() -> None:
         ("Deployment", "has 0 of 1 pods available"),
         ("Service", "does not exist"),
     ]
-    assert [each.problem for each in found.pods] == ["image fusion:9 cannot be pulled: not found"]
+    assert [each.problem for each in found.pods] == ["cannot pull image fusion:9: not found"]
 
 
 def test_the_text_says_what_each_task_does_and_whose_values_lost_and_why() -> None:
@@ -162,11 +162,11 @@ def test_the_text_says_what_each_task_does_and_whose_values_lost_and_why() -> No
     assert "scene-a (scene of car1+car2, Deploy, priority 3) Counts" in lines
     assert "thin (by a person, Reconfigure, priority 0) Counts" in lines
     assert "rest (by a person, Suspend, priority 5) Counts" in lines
-    assert "20 of scene-a (car1+car2) is outbid: a task that reconfigures lies over it" in lines
+    assert "20 of scene-a (car1+car2) is outbid: a Reconfigure task overrides it" in lines
     assert "2 of thin is it" in lines
     assert not [each for each in lines if " of rest " in each], "its parameters only say which instance it means"
     of_all = explanation_text(explained("thin", tasks)).splitlines()
-    assert "instances: it is for all of the template" in of_all
+    assert "instances: all of the template" in of_all
 
 
 def test_who_has_no_place_under_a_limit_waits_though_nobody_has_written_it() -> None:
@@ -182,7 +182,7 @@ def test_a_sum_that_is_held_at_its_bound_says_what_it_would_be() -> None:
     tasks = [task("one", {"uplink": 60}), task("two", {"uplink": 70})]
     found = Found([template(**spec)], tasks, [])
     told = explanation_text(explain(found, task="one", instance=serving(found, tasks[0], NOW), now=NOW))
-    assert "  uplink = 100 (merge Sum): the sum of 2 values, 130, is held at the maximum of 100\n" in told
+    assert "  uplink = 100 (merge Sum): the sum of 2 values, 130, is capped at the maximum of 100\n" in told
 
 
 def test_what_is_over_does_not_push_what_counts_out_of_sight() -> None:

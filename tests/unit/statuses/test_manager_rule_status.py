@@ -108,13 +108,13 @@ def test_a_key_that_is_none_is_told_with_its_place() -> None:
 
 def test_what_is_accepted_is_so_only_as_far_as_can_be_told_here() -> None:
     for status in (rule_status(rule(), [detector()], NOW), detector_status(detector(), [], NOW)):
-        assert "as far as can be known without the message types" in status.conditions[0].message
+        assert "message types are checked only by the detector" in status.conditions[0].message
 
 
 def test_a_rule_that_nobody_selects_is_told_of_detectors_that_are_none() -> None:
     condition = rule_status(rule(), [], NOW, ["det"]).conditions[0]
     assert (condition.status, condition.reason) == ("False", "NotSelected")
-    assert "correct Detector det, whose status shows what is wrong" in condition.message
+    assert "correct Detector det; its status gives the error" in condition.message
 
 
 @pytest.mark.parametrize(("kind", "reason"), [("EventRule", "RuleInvalid"), ("Detector", "DetectorInvalid")])

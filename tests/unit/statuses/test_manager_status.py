@@ -84,7 +84,7 @@ def test_a_task_that_does_not_count_is_not_ready_for_the_same_reason(standing: S
 
 
 def test_a_tasks_conditions_name_the_trouble_of_its_instance_before_and_after_it_was_ready() -> None:
-    pulling = Service("app", True, False, "image app:1 cannot be pulled: not found", "ImagePullFailed")
+    pulling = Service("app", True, False, "cannot pull image app:1: not found", "ImagePullFailed")
     waiting = task_status(task("a"), COUNTS, pulling, NOW)
     ready = next(each for each in waiting.conditions if each.type == "Ready")
     assert (ready.status, ready.reason, ready.message) == ("False", "ImagePullFailed", pulling.problem)

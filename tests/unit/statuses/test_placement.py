@@ -32,7 +32,7 @@ def expression(key: str, operator: str, *values: str) -> dict[str, Any]:
     [
         ({"nodeName": "rsu-9"}, "nodeName: there is no node rsu-9 (there are rsu-1, rsu-2)"),
         ({"nodeSelector": {"site": "west"}}, "nodeSelector: no node has the label site=west (there are north, south)"),
-        ({"nodeSelector": {"zone": "a"}}, "no node has the label zone=a (none has a label of that key)"),
+        ({"nodeSelector": {"zone": "a"}}, "no node has the label zone=a (no node has a label with this key)"),
         (
             {"nodeSelector": {"site": "south", "gpus": "2"}},
             "no node has the label gpus=2 and nodeSelector: no node has the label site=south at once",

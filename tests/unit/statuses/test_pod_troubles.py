@@ -55,17 +55,17 @@ def said(status: dict[str, Any]) -> tuple[str, str] | None:
     ],
 )
 def test_an_image_that_cannot_be_pulled_gives_the_same_words_at_each_attempt(status: dict[str, Any]) -> None:
-    assert said(status) == ("ImagePullFailed", f"image app:1 cannot be pulled: {CAUSE}")
+    assert said(status) == ("ImagePullFailed", f"cannot pull image app:1: {CAUSE}")
 
 
 def test_an_image_whose_cause_is_not_told_is_named_with_the_kubelets_word() -> None:
     back_off = waiting("ImagePullBackOff", 'Back-off pulling image "app:1"')
-    assert said(back_off) == ("ImagePullFailed", "image app:1 cannot be pulled: ImagePullBackOff")
+    assert said(back_off) == ("ImagePullFailed", "cannot pull image app:1: ImagePullBackOff")
 
 
 def test_an_init_containers_image_is_named_too() -> None:
     init = [{"name": "first", "state": {"waiting": {"reason": "InvalidImageName", "message": "no name"}}}]
-    assert said({"initContainerStatuses": init}) == ("ImagePullFailed", "image setup:2 cannot be pulled: no name")
+    assert said({"initContainerStatuses": init}) == ("ImagePullFailed", "cannot pull image setup:2: no name")
 
 
 ENDED = {"exitCode": 3, "reason": "Error", "finishedAt": "2026-01-01T00:00:00Z"}
@@ -95,7 +95,7 @@ def test_a_container_that_is_ready_again_is_no_trouble() -> None:
 
 def test_want_of_memory_and_a_containers_last_words_are_told() -> None:
     killed = container({"terminated": {"exitCode": 137, "reason": "OOMKilled"}})
-    assert "exit code 137, killed for taking more memory than its limit" in str(said(killed))
+    assert "exit code 137, killed for exceeding its memory limit" in str(said(killed))
     speaks = container({"terminated": {**ENDED, "message": "no\nmap"}})
     assert str(said(speaks)).endswith("exit code 3: no map')")
 
@@ -105,11 +105,11 @@ def test_want_of_memory_and_a_containers_last_words_are_told() -> None:
     [
         (
             waiting("CreateContainerConfigError", 'secret "key" not found'),
-            ("ContainerFailed", 'container main cannot be started: secret "key" not found'),
+            ("ContainerFailed", 'cannot start container main: secret "key" not found'),
         ),
         (
             {"conditions": [{"type": "PodScheduled", "status": "False", "message": "0/3 nodes are available"}]},
-            ("Unschedulable", "no node takes the pod: 0/3 nodes are available"),
+            ("Unschedulable", "no node fits the pod: 0/3 nodes are available"),
         ),
         (
             {"phase": "Failed", "reason": "Evicted", "message": "The node was low on memory."},
@@ -152,7 +152,7 @@ def test_the_book_knows_an_instances_troubles_and_whether_news_change_them() -> 
     assert not book.note(pod())
     assert book.note(pod(**waiting("ErrImagePull", "no")))
     assert not book.note(pod("app-2", **waiting("ErrImagePull", "no")))
-    assert [each.message for each in book.troubles(of)] == ["image app:1 cannot be pulled: no"]
+    assert [each.message for each in book.troubles(of)] == ["cannot pull image app:1: no"]
     assert not book.forget(pod("app-2"))
     assert book.note(pod())
     assert book.troubles(of) == []

@@ -25,11 +25,11 @@ FULL = {"availableReplicas": 2, "updatedReplicas": 2, "replicas": 2}
     [
         ({}, "has 0 of 2 pods available"),
         (FULL, None),
-        (FULL | {"updatedReplicas": 1}, "has 1 of 2 pods of its present version"),
+        (FULL | {"updatedReplicas": 1}, "has 1 of 2 pods of its current version"),
         (FULL | {"replicas": 3}, "still runs 1 pod of its previous version"),
         (
             condition("ReplicaFailure", "True", message="exceeded quota: small"),
-            "has 0 of 2 pods available, for they cannot be made: exceeded quota: small",
+            "has 0 of 2 pods available, and pods cannot be created: exceeded quota: small",
         ),
         (condition("Progressing", "False"), "has 0 of 2 pods available, and makes no progress"),
         (FULL | condition("Progressing", "False"), None),
@@ -40,7 +40,7 @@ def test_a_deployment(status: dict[str, Any], expected: str | None) -> None:
 
 
 def test_what_a_controller_has_not_seen_yet_is_not_judged_by_its_old_status() -> None:
-    assert judged("Deployment", FULL, generation=2, replicas=2) == "has not been looked at by its controller yet"
+    assert judged("Deployment", FULL, generation=2, replicas=2) == "has not been processed by its controller yet"
     assert judged("Deployment", FULL | {"observedGeneration": 2}, generation=2, replicas=2) is None
 
 
@@ -52,7 +52,7 @@ def test_a_workload_that_is_stopped_is_ready() -> None:
 @pytest.mark.parametrize(
     ("spec", "expected"),
     [
-        ({}, "has 0 of 1 pods of its present version"),
+        ({}, "has 0 of 1 pods of its current version"),
         ({"updateStrategy": {"type": "OnDelete"}}, None),
         ({"updateStrategy": {"rollingUpdate": {"partition": 1}}}, None),
     ],
@@ -68,7 +68,7 @@ def test_a_stateful_set_that_rolls_out(spec: dict[str, Any], expected: str | Non
     [
         ({}, "is not scheduled yet"),
         ({"desiredNumberScheduled": 3, "numberAvailable": 1}, "has 1 of 3 pods available"),
-        ({"desiredNumberScheduled": 1, "numberAvailable": 1}, "has 0 of 1 pods of its present version"),
+        ({"desiredNumberScheduled": 1, "numberAvailable": 1}, "has 0 of 1 pods of its current version"),
         ({"desiredNumberScheduled": 1, "numberAvailable": 1, "updatedNumberScheduled": 1}, None),
     ],
 )
@@ -79,7 +79,7 @@ def test_a_daemon_set(status: dict[str, Any], expected: str | None) -> None:
 @pytest.mark.parametrize(
     ("status", "expected"),
     [
-        ({}, "has no pod that runs"),
+        ({}, "has no running pod"),
         ({"ready": 1}, None),
         ({"succeeded": 1}, None),
         (condition("Complete", "True"), None),
@@ -98,7 +98,7 @@ def test_pods_claims_and_services() -> None:
     assert judged("PersistentVolumeClaim", {"phase": "Lost"}) == "has lost its volume"
     assert judged("PersistentVolumeClaim", {"phase": "Bound"}) is None
     assert judged("Service", type="ClusterIP") is None
-    assert judged("Service", type="LoadBalancer") == "has no address from the load balancer yet"
+    assert judged("Service", type="LoadBalancer") == "has no load balancer address yet"
     assert judged("Service", {"loadBalancer": {"ingress": [{"ip": "10.0.0.1"}]}}, type="LoadBalancer") is None
 
 
@@ -112,7 +112,7 @@ def test_pods_claims_and_services() -> None:
         (condition("Synced", "False"), None),
         (condition("Ready", "False", reason="Broken"), "is not ready: Broken"),
         (condition("Available", "Unknown", message="no answer"), "is not available: no answer"),
-        (condition("Ready", "True") | {"observedGeneration": 1}, "has not been looked at by its controller yet"),
+        (condition("Ready", "True") | {"observedGeneration": 1}, "has not been processed by its controller yet"),
     ],
 )
 def test_any_other_kind_goes_by_its_condition_ready_or_available(status: dict[str, Any], expected: str | None) -> None:

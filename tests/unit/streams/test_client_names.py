@@ -54,7 +54,7 @@ def test_messages_without_a_valid_name_are_dropped_and_counted_with_the_reason(c
             ('{"v": 50}', "all/speeds: client: "),
             ('{"id": "a b", "v": 50}', "all/speeds: client: 'a b' is no name: it takes 1 to 63 of A-Z a-z 0-9 . _ : -"),
             ('{"id": "", "v": 50}', "all/speeds: client: '' is no name"),
-            ('{"id": {"x": 1}, "v": 50}', "is no name"),
+            ('{"id": {"x": 1}, "v": 50}', "is not a name"),
         ]
     ):
         assert drive.take(sent(index + 0.5, text), until=index + 1) == []

@@ -239,7 +239,7 @@ def test_items_are_read_from_every_encoding(stream: Mapping[str, Any], payload: 
     ("stream", "problem"),
     [
         ({**a_list(), "client": "north"}, "items needs client, a template that names the client of each item"),
-        (a_list(latched=True), "items is not for latched streams: remove items or latched"),
+        (a_list(latched=True), "items is not valid for latched streams: remove items or latched"),
     ],
 )
 def test_items_need_a_client_of_each(stream: Mapping[str, Any], problem: str) -> None:

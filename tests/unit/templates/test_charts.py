@@ -77,22 +77,25 @@ def test_a_hook_is_refused_with_its_file_and_a_remedy() -> None:
     hook = SERVICE.replace("{name: app}", '{name: app, annotations: {"helm.sh/hook": pre-install}}')
     assert refusal(SERVICE + hook) == (
         "spec.helm: chart app 1.0.0 of https://charts.example.com: Service app in templates/service.yaml is a hook "
-        "(pre-install), and nothing here runs hooks: turn it off by the chart's values, or make its work part of the "
+        "(pre-install), and hooks are not supported: disable it by the chart's values, or do its work in the "
         "application"
     )
 
 
 def test_a_crd_is_refused_with_its_file_and_a_remedy() -> None:
     crd = SERVICE.replace("kind: Service", "kind: CustomResourceDefinition").replace("templates/service", "crds/thing")
-    assert "CustomResourceDefinition app in crds/thing.yaml is a CRD, which is the whole cluster's" in refusal(crd)
+    assert "CustomResourceDefinition app in crds/thing.yaml is a CRD, which is cluster-wide" in refusal(crd)
 
 
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
-        ("", "has no objects with these values"),
-        ("---\n# Source: app/templates/a.yaml\n- 1\n", "templates/a.yaml has something that is no object"),
-        ("---\n# Source: app/templates/a.yaml\n{\n", "templates/a.yaml is no YAML"),
+        ("", "renders no objects with these values"),
+        (
+            "---\n# Source: app/templates/a.yaml\n- 1\n",
+            "templates/a.yaml contains a document without apiVersion",
+        ),
+        ("---\n# Source: app/templates/a.yaml\n{\n", "templates/a.yaml is not YAML"),
         (SERVICE * 257, "has 257 objects, more than 256"),
     ],
 )
@@ -117,8 +120,8 @@ def test_what_a_manifest_may_not_be_a_charts_object_may_not_be() -> None:
             + SERVICE.replace("{name: app}", "{name: app, namespace: x}")
         )
     account, elsewhere = caught.value.problems
-    assert account.startswith("spec.helm: templates/service.yaml of chart app: v1/ServiceAccount is not of the kinds")
-    assert account.endswith("or turn it off by the chart's values")
+    assert account.startswith("spec.helm: templates/service.yaml of chart app: v1/ServiceAccount is not a kind")
+    assert account.endswith("or disable it by the chart's values")
     assert "'x' is not the template's own namespace" in elsewhere
 
 
@@ -126,13 +129,13 @@ def test_a_chart_that_is_still_to_come_is_no_error_and_one_that_cannot_be_had_ha
     renderer = Renderer(template(helm=CHART), Policy())
     with pytest.raises(ChartPending):
         renderer.render(instance(), lambda request: None)
-    with pytest.raises(RenderError, match="there is no helm") as caught:
+    with pytest.raises(RenderError, match="helm is not available") as caught:
         renderer.render(instance())
     assert caught.value.reason == "ChartUnavailable"
 
 
 def test_a_wrong_expression_in_the_values_is_found_when_the_template_is_compiled() -> None:
-    with pytest.raises(RenderError, match=r"spec\.helm\.values\.rate.*`parameters.rat` is not known"):
+    with pytest.raises(RenderError, match=r"spec\.helm\.values\.rate.*`parameters.rat` does not exist"):
         Renderer(template(helm=CHART | {"values": {"rate": "${parameters.rat}"}}), Policy())
 
 

@@ -74,8 +74,8 @@ def test_another_configuration_changes_its_config_map_alone() -> None:
 
 def test_a_list_in_a_file_without_a_format_is_refused_with_the_remedy() -> None:
     assert refusal({"sources.txt": "${parameters.sources}"}, sources=["a"]) == (
-        "spec.configuration.sources.txt: is a list, and the name has no format: name the file .yaml or .json, or "
-        "give a text"
+        "spec.configuration.sources.txt: is a list, but the file name gives no format: end the name with .yaml or "
+        ".json, or give a text"
     )
 
 
@@ -84,7 +84,7 @@ def test_all_wrong_expressions_are_named_with_their_files() -> None:
         render({"a.yaml": {"x": "${parameters.rat}"}, "b.yaml": ["${nothing}"]})
     first, second = caught.value.problems
     assert first.startswith("spec.configuration.a.yaml.x")
-    assert "`parameters.rat` is not known" in first
+    assert "`parameters.rat` does not exist" in first
     assert second.startswith("spec.configuration.b.yaml[0]")
 
 
@@ -93,7 +93,7 @@ def test_a_file_whose_value_fails_is_named() -> None:
 
 
 def test_without_a_configuration_there_is_no_name_of_its_config_map() -> None:
-    with pytest.raises(RenderError, match=r"`instance\.configMap` is not known"):
+    with pytest.raises(RenderError, match=r"`instance\.configMap` does not exist"):
         Renderer(template(parameters=DECLARED, manifests=[_mounting()]), Policy())
 
 
@@ -103,13 +103,13 @@ def test_files_that_no_config_map_can_hold_are_refused() -> None:
 
 def test_where_config_maps_are_not_allowed_there_is_no_configuration() -> None:
     policy = Policy(DEFAULT_KINDS - {("v1", "ConfigMap")})
-    with pytest.raises(RenderError, match="becomes a ConfigMap, but v1/ConfigMap is not of"):
+    with pytest.raises(RenderError, match="becomes a ConfigMap, but v1/ConfigMap is not a kind"):
         render({"a": "b"}, policy)
 
 
 def test_a_manifest_of_the_same_name_is_refused() -> None:
     own = {"apiVersion": "v1", "kind": "ConfigMap", "metadata": {"name": "${instance.configMap}"}}
-    with pytest.raises(RenderError, match="ConfigMap 'app-configuration' is there twice"):
+    with pytest.raises(RenderError, match="ConfigMap 'app-configuration' is given twice"):
         Renderer(template(configuration={"a": "b"}, manifests=[own]), Policy()).render(instance())
 
 

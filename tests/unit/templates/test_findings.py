@@ -112,7 +112,7 @@ def test_a_template_of_the_guide_has_nothing_wrong() -> None:
 @pytest.mark.parametrize(
     ("spec", "parts"),
     [
-        ({"manifests": [container(image="app:${parameters.version}")]}, ["image", "`parameters.version` is not known"]),
+        ({"manifests": [container(image="app:${parameters.version}")]}, ["image", "`parameters.version` does not"]),
         ({"manifests": [container(args=["${parameters.rate + 'x'}"])]}, ["args[0]", "column 19", "`+` does not take"]),
         ({"configuration": {"a.yaml": "${parameters.rate.fast}"}}, ["spec.configuration.a.yaml"]),
         ({"helm": {"chart": "/charts/a", "values": {"rate": "${parameters.raet}"}}}, ["spec.helm.values.rate", "raet"]),
@@ -120,12 +120,12 @@ def test_a_template_of_the_guide_has_nothing_wrong() -> None:
         ({"key": "${parameters.region + 1}"}, ["spec.key", "`+` does not take"]),
         ({"key": "${parameters.region}", "manifests": [{**DEPLOYMENT, "metadata": {"name": "fixed"}}]},
          ["spec.manifests[0].metadata.name: 'fixed'", "must contain ${instance.name}"]),
-        ({"manifests": [{**DEPLOYMENT, "metadata": {"name": "${instance.name}_A"}}]}, ["app_A", "no name for an obj"]),
+        ({"manifests": [{**DEPLOYMENT, "metadata": {"name": "${instance.name}_A"}}]}, ["app_A", "not a name for"]),
         ({"manifests": [{**DEPLOYMENT, "metadata": {"name": "a", "namespace": "kube-system"}}]},
          ["spec.manifests[0].metadata.namespace: 'kube-system'", "remove the field"]),
         ({"manifests": [{**DEPLOYMENT, "apiVersion": "rbac.authorization.k8s.io/v1", "kind": "Role"}]},
          ["spec.manifests[0].kind", "administrator allows"]),
-        ({"manifests": [DEPLOYMENT, DEPLOYMENT]}, ["spec.manifests", "is there twice"]),
+        ({"manifests": [DEPLOYMENT, DEPLOYMENT]}, ["spec.manifests", "is given twice"]),
         ({"manifests": [container(args=["${10 / (parameters.rate - 10) > 1 ? parameters.list[3] : 'x'}"])]},
          ["args[0]", "no index 3"]),
     ],

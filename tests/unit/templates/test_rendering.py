@@ -113,15 +113,15 @@ def test_a_listed_account_keeps_its_token() -> None:
             "${parameter.region}",
             ["spec.manifests[0].spec.template.metadata.labels.x", "parameter", "did you mean"],
         ),
-        ("spec.replicas", "${parameters.n}", ["spec.manifests[0].spec.replicas", "`parameters.n` is not known"]),
-        ("metadata.name", "${instance.nam}", ["`instance.nam` is not known", "name, key, namespace"]),
+        ("spec.replicas", "${parameters.n}", ["spec.manifests[0].spec.replicas", "`parameters.n` does not exist"]),
+        ("metadata.name", "${instance.nam}", ["`instance.nam` does not exist", "name, key, namespace"]),
         ("spec.template.spec.containers.0.args", ["cd ${HOME}"], ["containers[0].args[0]", "HOME", "`$${`"]),
         ("spec.template.spec.containers.0.args", ["echo ${x"], ["containers[0].args[0]", "not closed", "`$${`"]),
         ("metadata.namespace", "elsewhere", ["metadata.namespace: 'elsewhere' is not the template's own", "remove"]),
         ("kind", "ServiceAccount", ["spec.manifests[0].kind", "apps/v1/ServiceAccount", "allowed are"]),
         ("apiVersion", "apps/v1beta1", ["apps/v1beta1/Deployment", "write apps/v1/Deployment"]),
-        ("metadata.name", 7, ["metadata.name: 7 is no name"]),
-        ("metadata.name", None, ["metadata.name", "is no name"]),
+        ("metadata.name", 7, ["metadata.name: 7 is not a name"]),
+        ("metadata.name", None, ["metadata.name", "is not a name"]),
         ("metadata.ownerReferences", [], ["metadata.ownerReferences", "remove it"]),
         ("metadata.finalizers", ["x/y"], ["metadata.finalizers", "remove it"]),
         (
@@ -166,7 +166,7 @@ def test_a_pod_is_judged_by_its_shape_whatever_kind_it_is_in(api_version: str, k
     containers = [{"name": "main", "image": "app:1"}]
     manifest = making_pods(api_version, kind, where, {"containers": containers, "serviceAccountName": "admin"})
     assert list(policy.pod_problems(manifest)) == [
-        (f"{where}.serviceAccountName", "'admin' is not of the service accounts that the administrator lists: "
+        (f"{where}.serviceAccountName", "'admin' is not a service account that the administrator allows: "
          "use one of default")
     ]  # fmt: skip
     mounting = making_pods(api_version, kind, where, {"containers": containers, "automountServiceAccountToken": True})
@@ -188,7 +188,7 @@ def test_what_does_not_compile_and_what_there_is_not_are_told_together() -> None
     manifest = changed(DEPLOYMENT, "spec.replicas", "${parameters.n}")
     manifest = changed(manifest, "spec.template.spec.containers.0.args", ["${1 +}", "${instance.nam}"])
     message = refusal(manifest)
-    for part in ("`parameters.n` is not known", "args[0], line 1", "`instance.nam` is not known"):
+    for part in ("`parameters.n` does not exist", "args[0], line 1", "`instance.nam` does not exist"):
         assert part in message
 
 
@@ -203,7 +203,7 @@ def test_all_problems_are_told_at_once() -> None:
 
 def test_a_secret_needs_leave_and_never_holds_a_service_accounts_token() -> None:
     secret = {"apiVersion": "v1", "kind": "Secret", "metadata": {"name": "s"}}
-    assert "v1/Secret is not of the kinds that the administrator allows" in refusal(secret)
+    assert "v1/Secret is not a kind that the administrator allows" in refusal(secret)
     allowed = Policy(DEFAULT_KINDS | {SECRET})
     assert len(render(secret, policy=allowed).manifests) == 1
     token = {**secret, "type": "kubernetes.io/service-account-token"}
@@ -217,7 +217,7 @@ def test_with_a_key_each_name_must_tell_the_instance() -> None:
 
 
 def test_two_objects_of_one_kind_and_name_are_refused() -> None:
-    assert "Deployment 'app' is there twice" in refusal(DEPLOYMENT, DEPLOYMENT)
+    assert "Deployment 'app' is given twice" in refusal(DEPLOYMENT, DEPLOYMENT)
 
 
 def test_an_expression_that_fails_on_the_values_is_told_with_its_place() -> None:

@@ -101,7 +101,7 @@ def test_the_instance_says_who_suspends_it_what_is_left_and_what_rests() -> None
     assert said(stopped, live(0, 0), scaler, None) == (
         "True",
         "Suspended",
-        "task night suspends it, and its workloads are at zero; HorizontalPodAutoscaler scaler rests until then",
+        "task night suspends it, and its workloads are at zero; HorizontalPodAutoscaler scaler is inactive until then",
     )
 
 

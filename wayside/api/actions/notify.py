@@ -143,8 +143,8 @@ class NotifyAction(Model):
     labels: dict[Identifier, Annotated[str, Field(max_length=1024)]] = Field(
         default_factory=dict,
         max_length=32,
-        description="Labels for the receiver to filter or route by, such as severity, with ${…}; the labels of an "
-        "alert.",
+        description="Labels for the receiver to filter or route by, such as severity, with ${…}. An alert has them "
+        "as its labels.",
     )
     grouping: Grouping | None = Field(
         default=None, description="Groups several events into one message. Default: one message per event."

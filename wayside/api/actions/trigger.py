@@ -34,7 +34,7 @@ ServiceType = Annotated[
 """The type of a ROS 2 service, e.g. rosbag2_interfaces/srv/Snapshot."""
 
 _CALL = "give start, stop or both: otherwise nothing is called"
-_DOMAIN = "domain is for services with layout RmwZenoh: remove it"
+_DOMAIN = "domain is valid only with layout RmwZenoh: remove it"
 
 
 class TriggerDetector(Model):
@@ -202,7 +202,7 @@ class TriggerAction(Model):
     )
     give_up_after: PositiveDuration = Field(
         default=PositiveDuration("5m"),
-        description="How long a start or stop that is not confirmed is retried.",
+        description="How long to retry a start or stop that is not confirmed.",
     )
     timeout: PositiveDuration = Field(
         default=PositiveDuration("3s"), description="The timeout of one reply over Zenoh."
