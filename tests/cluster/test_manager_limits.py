@@ -81,7 +81,7 @@ def test_a_higher_priority_gets_the_place_of_a_lower_one_and_gives_it_back(
         gave = wait_task(api, "low", "Waiting", "Preempted")
         assert f"was preempted by instance {HIGH} (task high, priority 5)" in gave["status"]["message"]
         got = wait_task(api, "high", "Active")
-        assert f"in place of instance {LOW} (task low, priority 0)" in condition(got, "Accepted")["message"]
+        assert f"preempts instance {LOW} (task low, priority 0)" in condition(got, "Accepted")["message"]
         wait_settled(api)
         assert [each["metadata"]["name"] for each in api.list("ApplicationInstance")] == [HIGH]
         wait_event(api, "Preempted")

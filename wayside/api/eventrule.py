@@ -146,7 +146,7 @@ class Signal(Model):
     )
     samples: Samples = Field(
         default=Samples.STARTS,
-        description="Only with rule: whether the samples are the starts or the ends of its episodes. In an end, "
+        description="Only with ruleName: whether the samples are the starts or the ends of its episodes. In an end, "
         "msg also contains endTime, reason and the values at the end.",
     )
     model: ModelSource | None = Field(
@@ -167,7 +167,7 @@ class Signal(Model):
     )
     client: ClientName | None = Field(
         default=None,
-        description="Only with stream or rule: the client whose samples or episodes the signal uses for every "
+        description="Only with stream or ruleName: the client whose samples or episodes the signal uses for every "
         "subject, e.g. a traffic light. The signal is unknown while the detector does not know this "
         "client. Default: the subject's own client.",
     )

@@ -95,7 +95,7 @@ def test_a_higher_priority_preempts_and_both_tasks_name_the_other() -> None:
     assert running(after) == {"high"}
     assert after.verdicts["low"].reason == "Preempted"
     assert f"was preempted by instance {instance_name('app', 'high')} (task high" in after.verdicts["low"].message
-    assert f"in place of instance {instance_name('app', 'low')} (task low" in after.verdicts["high"].message
+    assert f"preempts instance {instance_name('app', 'low')} (task low" in after.verdicts["high"].message
     assert running(of(served(low), instances=[runs("high", release_at=NOW + 9)])) == set()  # until what lingers is gone
     assert running(of(served(low))) == {"low"}
 
