@@ -9,16 +9,18 @@ processes, from a file of JSON lines; measured is their CPU time. The aim: at mo
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import os
 import statistics
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import yaml
+
+from tests.recorded import write_json_lines
 
 HZ = 10
 START = 1_700_000_000_000_000_000
@@ -65,19 +67,7 @@ def replayed(folder: Path, output: str, more: list[str]) -> float:
 
 def write(folder: Path, vehicles: int, seconds: int) -> None:
     """The recording, the Detector and the rules."""
-    with (folder / "drive.jsonl").open("w") as file:
-        for step in range(seconds * HZ):
-            at = step / HZ
-            for car in range(vehicles):
-                phase = car * 0.7
-                value = {
-                    "x": round(300 * math.cos(at * 0.05 + phase) + 20 * car, 3),
-                    "y": round(200 * math.sin(at * 0.04 + phase * 1.3), 3),
-                    "speed": round(15 + 8 * math.sin(at * 0.11 + phase) + 0.3 * math.sin(at * 1.7), 3),
-                    "brake": math.sin(at * 0.3 + phase) > 0.9,
-                }
-                message = {"t": START + step * 10**9 // HZ, "key": f"vehicles/car{car}/odom", "value": value}
-                file.write(json.dumps(message) + "\n")
+    write_json_lines(folder / "drive.jsonl", messages(vehicles, seconds))
     stream = {"name": "odom", "key": "vehicles/${client:*}/odom", "encoding": "json", "staleAfter": "1s"}
     head = {"apiVersion": "wayside.dev/v1alpha1"}
     detector = {**head, "kind": "Detector", "metadata": {"name": "cars"}, "spec": {"mode": "Standalone"}}
@@ -89,6 +79,21 @@ def write(folder: Path, vehicles: int, seconds: int) -> None:
         for number, spec in enumerate(specs)
     ]
     (folder / "rules.yaml").write_text(yaml.safe_dump_all(rules))
+
+
+def messages(vehicles: int, seconds: int) -> Iterator[tuple[int, str, dict[str, object]]]:
+    """Time, key and value of each message."""
+    for step in range(seconds * HZ):
+        at = step / HZ
+        for car in range(vehicles):
+            phase = car * 0.7
+            value = {
+                "x": round(300 * math.cos(at * 0.05 + phase) + 20 * car, 3),
+                "y": round(200 * math.sin(at * 0.04 + phase * 1.3), 3),
+                "speed": round(15 + 8 * math.sin(at * 0.11 + phase) + 0.3 * math.sin(at * 1.7), 3),
+                "brake": math.sin(at * 0.3 + phase) > 0.9,
+            }
+            yield START + step * 10**9 // HZ, f"vehicles/car{car}/odom", value
 
 
 def of_one(number: int) -> dict[str, object]:

@@ -10,6 +10,8 @@ from pathlib import Path
 
 from mcap.writer import Writer
 
+from tests.recorded import write_json_lines
+
 START = 1_700_000_000_000_000_000
 SECOND = 10**9
 HZ = 10
@@ -85,13 +87,6 @@ def drive(seed: int, seconds: float, cars: int = 3) -> Iterator[tuple[int, str, 
             yield begin + step * SECOND // HZ, f"vehicles/car{car}/odom", value
 
 
-def write_json_lines(path: Path, seed: int, seconds: float, cars: int = 3) -> Path:
-    with path.open("w") as file:
-        for time, key, value in drive(seed, seconds, cars):
-            file.write(json.dumps({"t": time, "key": key, "value": value}) + "\n")
-    return path
-
-
 def write_mcap(path: Path, seed: int, seconds: float, cars: int = 3) -> Path:
     with path.open("wb") as file:
         writer = Writer(file, chunk_size=8192)
@@ -117,7 +112,7 @@ def write_fleet(folder: Path, recordings: int, seconds: float, broken: int = 3) 
     for seed in range(recordings):
         name = f"car-{seed:03}-drive"
         if seed % 2:
-            write_json_lines(drives / f"{name}.jsonl", seed, seconds)
+            write_json_lines(drives / f"{name}.jsonl", drive(seed, seconds))
         else:
             write_mcap(drives / f"{name}.mcap", seed, seconds)
     for number in range(broken):
@@ -125,7 +120,7 @@ def write_fleet(folder: Path, recordings: int, seconds: float, broken: int = 3) 
         if number % 3 == 0:
             name.with_suffix(".mcap").write_bytes(b"no recording at all")
         elif number % 3 == 1:
-            path = write_json_lines(name.with_suffix(".jsonl"), 1000 + number, 5)
+            path = write_json_lines(name.with_suffix(".jsonl"), drive(1000 + number, 5))
             path.write_text(path.read_text() + "{nothing}\n")
         else:
             path = write_mcap(name.with_suffix(".mcap"), 1000 + number, seconds)

@@ -1,10 +1,12 @@
-"""What recordings hold, message by message."""
+"""Recordings, message by message: what they hold, and JSON lines as users write them."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
 from detector.engine.samples.sample import Arrival
 from detector.replay.batches import batched, messages_of
@@ -25,3 +27,10 @@ def messages_in(
 def arrivals_of(router: Router, messages: Iterable[Message]) -> Iterator[Arrival]:
     """The arrivals that the router makes of the messages."""
     return chain.from_iterable(router.arrivals(batched(messages)))
+
+
+def write_json_lines(path: Path, messages: Iterable[tuple[int, str, Any]]) -> Path:
+    """The file, with a line for the time (nanoseconds), key and value of each message."""
+    with path.open("w") as file:
+        file.writelines(json.dumps({"t": time, "key": key, "value": value}) + "\n" for time, key, value in messages)
+    return path

@@ -15,6 +15,7 @@ from detector.engine.episodes.events import Event
 from detector.replay.comparing import compare
 from tests import onnx_models
 from tests.driving import START, a_detector, a_rule, at
+from tests.recorded import write_json_lines
 from wayside.inputerror import InputError
 from wayside.process.commandline import run
 
@@ -97,11 +98,10 @@ def test_a_learning_based_and_a_rule_based_rule_over_one_recording(
     (tmp_path / "detector.yaml").write_text(json.dumps(a_detector().to_json()))
     (tmp_path / "rules.yaml").write_text("\n---\n".join(json.dumps(rule.to_json()) for rule in (learned, threshold)))
     speeds = [0] * 5 + [20] * 10 + [0] * 10 + [20] + [0] * 10  # the last is too short for the mean
-    lines = [
-        json.dumps({"t": START + round((n + 0.5) * 1e9), "key": "vehicles/car/speed", "value": {"v": value}})
-        for n, value in enumerate(speeds)
-    ]
-    (tmp_path / "drive.jsonl").write_text("\n".join(lines))
+    write_json_lines(
+        tmp_path / "drive.jsonl",
+        ((START + round((n + 0.5) * 1e9), "vehicles/car/speed", {"v": value}) for n, value in enumerate(speeds)),
+    )
     files = ["--detector", str(tmp_path / "detector.yaml"), "--rules", str(tmp_path / "rules.yaml")]
     command = ["replay", str(tmp_path / "drive.jsonl"), *files, "--output", str(tmp_path / "out")]
     assert run(cli.app, "detector", (InputError,), [*command, "--set", "threshold=learned"]) == 0

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from detector.engine.samples.sample import Arrival
+from tests.recorded import write_json_lines
 from wayside.api import Detector, EventRule
 from wayside.api.documents import load_documents
 
@@ -110,8 +111,7 @@ def arrivals() -> list[Arrival]:
 def write(folder: Path) -> tuple[Path, Path, Path]:
     """The recording, the Detector and the rules as files."""
     files = folder / "drive.jsonl", folder / "detector.yaml", folder / "rules.yaml"
-    lines = (json.dumps({"t": time, "key": key, "value": value}) for time, key, value in messages())
-    files[0].write_text("\n".join(lines) + "\n")
+    write_json_lines(files[0], messages())
     files[1].write_text(DETECTOR)
     files[2].write_text(RULES)
     return files

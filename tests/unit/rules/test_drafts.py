@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 from detector.commands.cli import app
 from detector.commands.drafts import drafts
 from tests.driving import START, a_detector
+from tests.recorded import write_json_lines
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
 STREAM = {"name": "state", "key": "vehicles/${client:*}/state", "encoding": "json"}
@@ -18,7 +19,7 @@ STREAM = {"name": "state", "key": "vehicles/${client:*}/state", "encoding": "jso
 
 def drive(path: Path) -> None:
     """Two cars meet and stand still; car1 becomes hot and leaves the area; both brake hard at the eighth second."""
-    lines = []
+    messages = []
     for step in range(400):
         at = step / 10
         for car in range(2):
@@ -26,9 +27,8 @@ def drive(path: Path) -> None:
             x = (at * 10 - 80) * (1 - 2 * car) if moving else 5.0 * car
             y = 200.0 if car and at > 30 else 0.0
             value = {"x": x, "y": y, "speed": 10.0 if moving else 0.0, "temperature": 20 + at * (1 + car)}
-            time = START + step * 10**8
-            lines.append(json.dumps({"t": time, "key": f"vehicles/car{car}/state", "value": value}))
-    path.write_text("\n".join(lines) + "\n")
+            messages.append((START + step * 10**8, f"vehicles/car{car}/state", value))
+    write_json_lines(path, messages)
 
 
 @pytest.mark.parametrize("case", drafts())
