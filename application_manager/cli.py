@@ -122,13 +122,7 @@ def run(
             min=0, max=65535, help="Serve /metrics, /healthz and /readyz on this port. Default: do not serve."
         ),
     ] = None,
-    metrics_certificates: Annotated[
-        Path | None,
-        typer.Option(
-            help="With --metrics-port: serve with TLS, with tls.crt and tls.key from this folder; renewed "
-            "files are loaded."
-        ),
-    ] = None,
+    metrics_certificates: commandline.MetricsCertificates = None,
     zenoh: Annotated[
         list[str] | None,
         typer.Option(
@@ -221,10 +215,7 @@ def run(
         str,
         typer.Option(metavar="NAME", help="With --admission-service: the webhook configurations that get the CA."),
     ] = "wayside",
-    log_format: Annotated[
-        commandline.LogFormat,
-        typer.Option(envvar="WAYSIDE_LOG_FORMAT", help="Log lines for people, or one JSON object a line."),
-    ] = commandline.LogFormat.TEXT,
+    log_format: commandline.LogFormatOption = commandline.LogFormat.TEXT,
 ) -> None:
     """Run the operator, in the cluster of the current kubeconfig or of the pod."""
     commandline.log_as(log_format)
@@ -304,14 +295,11 @@ def render(
 
 @app.command()
 def check(
-    files: Annotated[list[Path] | None, typer.Argument(help="YAML files or folders.")] = None,
+    files: commandline.CheckedFiles = None,
     allowed_kinds: AllowedKinds = None,
     service_accounts: ServiceAccounts = None,
-    ignore: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME", help="Do not report the warnings of this name; may be repeated."),
-    ] = None,
-    listing: Annotated[bool, typer.Option("--list", help="Print the names of all findings, and exit.")] = False,
+    ignore: commandline.IgnoredFindings = None,
+    listing: commandline.ListFindings = False,
 ) -> None:
     """Check templates, rules and detectors as the webhook would, without a cluster.
 

@@ -89,13 +89,7 @@ def run(
         int | None,
         typer.Option(help="Serve /metrics, /healthz and /readyz on this port; 0: on any free port.", min=0, max=65535),
     ] = None,
-    metrics_certificates: Annotated[
-        Path | None,
-        typer.Option(
-            help="With --metrics-port: serve with TLS, with tls.crt and tls.key from this folder; renewed "
-            "files are loaded."
-        ),
-    ] = None,
+    metrics_certificates: commandline.MetricsCertificates = None,
     foxglove: Annotated[
         str | None,
         typer.Option(
@@ -104,10 +98,7 @@ def run(
             "reaches it.",
         ),
     ] = None,
-    log_format: Annotated[
-        commandline.LogFormat,
-        typer.Option(envvar="WAYSIDE_LOG_FORMAT", help="Log lines for people, or one JSON object a line."),
-    ] = commandline.LogFormat.TEXT,
+    log_format: commandline.LogFormatOption = commandline.LogFormat.TEXT,
 ) -> None:
     """Detect events live: with files (--detector, --rules), or in a cluster (--name)."""
     commandline.log_as(log_format)
@@ -321,7 +312,7 @@ def schema(
 
 @app.command()
 def check(
-    files: Annotated[list[Path] | None, typer.Argument(help="YAML files or folders.")] = None,
+    files: commandline.CheckedFiles = None,
     recordings: Annotated[
         list[Path] | None,
         typer.Option(
@@ -333,11 +324,8 @@ def check(
         ),
     ] = None,
     strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 if there are warnings.")] = False,
-    ignore: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME", help="Do not report the warnings of this name; may be repeated."),
-    ] = None,
-    listing: Annotated[bool, typer.Option("--list", help="Print the names of all findings, and exit.")] = False,
+    ignore: commandline.IgnoredFindings = None,
+    listing: commandline.ListFindings = False,
 ) -> None:
     """Compile and type-check EventRules and Detectors; exit with 1 where something is wrong.
 

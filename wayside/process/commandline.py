@@ -10,7 +10,8 @@ import os
 import sys
 from collections.abc import Sequence
 from enum import StrEnum
-from typing import NoReturn, cast
+from pathlib import Path
+from typing import Annotated, NoReturn, cast
 
 import typer
 
@@ -21,6 +22,19 @@ class LogFormat(StrEnum):
     TEXT = "text"
     JSON = "json"
 
+
+LogFormatOption = Annotated[
+    LogFormat, typer.Option(envvar="WAYSIDE_LOG_FORMAT", help="Log lines for people, or one JSON object a line.")
+]
+MetricsCertificates = Annotated[
+    Path | None,
+    typer.Option(help="With --metrics-port: serve by TLS, with tls.crt and tls.key of this folder, also renewed."),
+]
+CheckedFiles = Annotated[list[Path] | None, typer.Argument(help="YAML files or folders.")]
+IgnoredFindings = Annotated[
+    list[str] | None, typer.Option(metavar="NAME", help="Do not report the warnings of this name; may be repeated.")
+]
+ListFindings = Annotated[bool, typer.Option("--list", help="Print the names of all findings, and exit.")]
 
 BAD_INPUT = 2
 INTERRUPTED = 130
