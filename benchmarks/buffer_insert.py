@@ -22,7 +22,7 @@ START = 1_767_225_600_000_000_000
 
 
 class Undecoded:
-    """Nothing is decoded here: no rule asks for it."""
+    """Nothing is decoded here: no rule needs it."""
 
     def decode(self, payload: bytes) -> object:
         raise AssertionError(payload)
@@ -32,7 +32,7 @@ class Undecoded:
 
 
 def engine_holding(size: int) -> tuple[Engine, list[Arrival]]:
-    """An engine whose buffer holds so many samples of one client, and the next ones to insert."""
+    """An engine whose buffer contains this number of samples of one client, and the next ones to insert."""
     detector = Detector.model_validate(
         {
             "kind": "Detector",

@@ -34,12 +34,12 @@ PATIENCE = 300.0  # s
 NAME = "follower"
 FOLLOW = """
 import pathlib, time
-file, told = pathlib.Path("/configuration/number"), None
+file, last = pathlib.Path("/configuration/number"), None
 while True:
     text = file.read_text()
-    if text != told:
+    if text != last:
         print(text, time.time(), flush=True)
-        told = text
+        last = text
     time.sleep(0.01)
 """
 
@@ -97,7 +97,7 @@ def change(node: Node, api: Api, pod: Object, number: int) -> float:
     logs = ("--namespace", api.namespace, "logs", "--tail=1", pod["metadata"]["name"])
     last = wait_until(
         lambda: node.plane.kubectl(*logs).split(),
-        lambda said: bool(said) and float(said[0]) == number,
+        lambda logged: bool(logged) and float(logged[0]) == number,
         timeout=PATIENCE,
         what=f"the container has read {number}",
     )

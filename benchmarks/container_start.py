@@ -2,8 +2,9 @@
 
 The pod is as the manager makes it, and the detector reads its Detector from the API server. Beside it, in turn, the
 least that a program with Zenoh takes, in the same image. Each begins when its container's first process does, which
-says so, and ends when a publisher outside the cluster sees a listener; how long the node took to make the container is
-told too. The first round warms up and does not count. Needs root. Exits with 1 where the median start misses its goal.
+logs it, and ends when a publisher outside the cluster sees a listener; how long the node took to make the container is
+measured too. The first round warms up and does not count. Needs root. Exits with 1 where the median start misses its
+goal.
 
     python -m benchmarks.container_start [--rounds 7]
 """

@@ -84,10 +84,10 @@ def with_the_action(detector: Detector, samples: list[EpisodeSample], name: str)
     entries = inlets(detector)
     around = Surroundings(detector, entries.decoders, entries.types)
     done = threading.Event()
-    told: list[Outcome] = []
+    reported: list[Outcome] = []
 
     def report(episode: Episode, outcome: Outcome) -> None:
-        told.append(outcome)
+        reported.append(outcome)
         if outcome.state is not OutcomeState.RUNNING:
             done.set()
 
@@ -107,7 +107,7 @@ def with_the_action(detector: Detector, samples: list[EpisodeSample], name: str)
     done.wait()
     taken = time.perf_counter() - begin
     action.close()
-    assert told[-1].state is OutcomeState.DONE, told[-1]
+    assert reported[-1].state is OutcomeState.DONE, reported[-1]
     return taken
 
 

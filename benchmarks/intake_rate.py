@@ -52,7 +52,7 @@ class Run(NamedTuple):
     """Samples a second."""
     count: int
     report: Mapping[str, Any]
-    """What the receiver says of itself."""
+    """The receiver's measurements."""
 
 
 def main() -> int:

@@ -1,8 +1,8 @@
 """What a live view costs: `detector run --foxglove` with a client of 20 channels attached against the same without.
 
 A hundred vehicles send at 10 Hz; eight rules are about each of them, two about pairs. One detector runs throughout, and
-a client that is not the SDK's own connects and leaves in turn; measured is the detector's CPU time. The aim: at most
-10 % more. On a machine that is too busy the detector leaves out evaluations, and the ratio says little: their number is
+a client that is not the SDK's own connects and leaves in turn; measured is the detector's CPU time. The aim: at most 10
+% more. On a machine that is too busy the detector leaves out evaluations, and the ratio means little: their number is
 printed.
 
     python -m benchmarks.live_view [--vehicles 100] [--seconds 20] [--rounds 3]

@@ -68,10 +68,10 @@ async def fill(manager: subprocess.Popen[bytes], namespace: str, count: int, siz
 async def _all_told(client: Client, namespace: str) -> None:
     async with asyncio.timeout(PATIENCE):
         while True:
-            told = [
+            reported = [
                 "phase" in raw.get("status", {}) async for page, _ in client.pages(TASKS, namespace) for raw in page
             ]
-            if all(told):
+            if all(reported):
                 return
             await asyncio.sleep(0.5)
 

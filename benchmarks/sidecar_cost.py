@@ -68,7 +68,7 @@ class Cost:
 
 
 def cost(pid: int, seconds: float) -> Cost:
-    """What the process takes during so many seconds, and then holds."""
+    """The CPU time of the process during this number of seconds, and its memory afterwards."""
     before, began = _cpu(pid), time.monotonic()
     time.sleep(seconds)
     used = (_cpu(pid) - before) / (time.monotonic() - began)

@@ -195,7 +195,7 @@ def soak(folder: Path, broker_port: int, seconds: int, speed: float, replay: boo
     sent = Sent()
     begun = time.monotonic()
     try:
-        asked = send(detector, broker_port, seconds, speed, sent)
+        requested = send(detector, broker_port, seconds, speed, sent)
         wall = time.monotonic() - begun
         metrics = detector.rest(seconds + FLUSH - LATENESS - 1)
     finally:
@@ -207,7 +207,7 @@ def soak(folder: Path, broker_port: int, seconds: int, speed: float, replay: boo
     look_at_memory(verdict, detector.series, seconds, folder)
     look_at_drops(verdict, metrics, sent)
     look_at_streams(verdict, metrics, sent)
-    look_at_rules(verdict, metrics, folder, seconds, sent, asked)
+    look_at_rules(verdict, metrics, folder, seconds, sent, requested)
     if replay:
         look_at_replay(verdict, folder, environment())
     for text in verdict.wrong:
@@ -219,12 +219,12 @@ def soak(folder: Path, broker_port: int, seconds: int, speed: float, replay: boo
 
 
 def send(detector: Detector, broker_port: int, seconds: int, speed: float, sent: Sent) -> int:
-    """Publish the traffic, at most so much faster than it happens, and never far ahead of the evaluation.
+    """Publish the traffic, at most by this factor faster than real time, and never far ahead of the evaluation.
 
-    Once a minute the rule on-demand is asked, and the token of a vehicle is withdrawn for a moment. Returns how often
-    the rule answered.
+    Once a minute the rule on-demand is evaluated, and the token of a vehicle is withdrawn for a moment. Returns how
+    often the rule answered.
     """
-    asked, answered = 0, 0
+    requested, answered = 0, 0
     config = zenoh.Config()
     for key, value in (
         ("mode", '"client"'),
@@ -235,7 +235,7 @@ def send(detector: Detector, broker_port: int, seconds: int, speed: float, sent:
     with zenoh.open(config) as session, publisher(broker_port) as over_mqtt:
         publishers: dict[str, Any] = {}
         tokens = {vehicle.name: Token(session, vehicle.name) for vehicle in VEHICLES}
-        begun, told = time.monotonic(), time.monotonic()
+        begun, reported = time.monotonic(), time.monotonic()
         for after, key, payload in traffic(SEED, START, seconds, sent):
             due = begun + after / 1e9 / speed
             while (early := due - time.monotonic()) > 0.005 or after / 1e9 - detector.evaluated > AHEAD:
@@ -249,13 +249,13 @@ def send(detector: Detector, broker_port: int, seconds: int, speed: float, sent:
                     publishers[key] = session.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK)
                 publishers[key].put(payload)
             tokens[VEHICLES[0].name].keep()
-            if after >= asked * 60 * 10**9 + 30 * 10**9:
-                asked += 1
+            if after >= requested * 60 * 10**9 + 30 * 10**9:
+                requested += 1
                 question = "wayside/detectors/soak/evaluate?rule=on-demand"
                 tokens[VEHICLES[0].name].withdraw()
                 answered += sum(reply.ok is not None for reply in session.get(question, timeout=30))
-            if time.monotonic() - told > 15:
-                told = time.monotonic()
+            if time.monotonic() - reported > 15:
+                reported = time.monotonic()
                 memory = detector.series[-1][2] / 2**20 if detector.series else 0
                 print(f"  {after / 6e10:.1f} min sent, {detector.evaluated / 60:.1f} min evaluated, {memory:.1f} MiB")
         time.sleep(1.0)  # what is batched goes out

@@ -1,8 +1,8 @@
 """The start of each command, beside that of a bare `python -c pass`, and how many modules it loads.
 
-A command that ends by itself is measured from its start to its end; one that serves, to the line by which it says that
-it works: `detector run` that the detector runs, `application-manager run` that it asks the API server (there is none).
-Commands and baseline in turn. Exits with 1 where the median CPU time of a `--help` misses its target.
+A command that ends by itself is measured from its start to its end; one that serves, to the line by which it reports
+that it works: `detector run` that the detector runs, `application-manager run` that it queries the API server (there is
+none). Commands and baseline in turn. Exits with 1 where the median CPU time of a `--help` misses its target.
 
     python -m benchmarks.start [--rounds 5]
 """
@@ -31,7 +31,7 @@ TARGET_S = 0.4
 PATIENCE = 120.0  # s
 BARE = "python -c pass"
 RUNS = "runs with 1 rule"
-ASKS = "retrying until the API server responds"
+RETRIES = "retrying until the API server responds"
 IMPORTED = "import time:"
 """How a line of `python -X importtime` begins, one for each module."""
 
@@ -99,7 +99,7 @@ def _commands(folder: Path) -> dict[str, Command]:
         "detector run": Command([*detector, "run", *files, f"--output={folder}/out"], RUNS),
         "application-manager --help": Command([*manager, "--help"]),
         "application-manager render": Command([*manager, "render", *rendered]),
-        "application-manager run": Command([*manager, "run"], ASKS),
+        "application-manager run": Command([*manager, "run"], RETRIES),
     }
 
 
@@ -110,9 +110,9 @@ def _modules(command: Command, folder: Path) -> int:
 
 
 def _start(command: Command, folder: Path) -> tuple[Start, str]:
-    """Start the command, and kill it when it says `until`; also what it wrote on stderr up to then.
+    """Start the command, and kill it when it prints `until`; also what it wrote on stderr up to then.
 
-    Raises RuntimeError if it fails, TimeoutError if it does not say `until` in time or before its end.
+    Raises RuntimeError if it fails, TimeoutError if it does not print `until` in time or before its end.
     """
     environment = os.environ | {"KUBECONFIG": str(folder / "kubeconfig")}
     began = time.monotonic()
@@ -142,7 +142,7 @@ def _start(command: Command, folder: Path) -> tuple[Start, str]:
     if command.until is None and process.returncode:
         raise RuntimeError(f"{command.words} ended with {process.returncode}:\n{log[-2000:]}")
     if command.until is not None and command.until not in log:
-        raise TimeoutError(f"{command.words} did not say {command.until!r}:\n{log[-2000:]}")
+        raise TimeoutError(f"{command.words} did not print {command.until!r}:\n{log[-2000:]}")
     return Start(wall, used.ru_utime + used.ru_stime), log
 
 

@@ -2,7 +2,7 @@
 
 Sequential: one task after the other, alternated with the raw calls: create the task, apply the instance, apply the
 Deployment, by the same client library, in a namespace that no manager looks at. Burst: many tasks at once, beside as
-many raw series at once, each twice and each first once. The managed Deployments' existence is told by a watch. Exits
+many raw series at once, each twice and each first once. A watch reports the managed Deployments. Exits
 with 1 where the sequential ratio misses its target.
 
     python -m benchmarks.task_to_deployment [--sequential 60] [--burst 1000]
@@ -150,7 +150,7 @@ class Seen:
                     self._news.notify_all()
 
     async def wait(self, count: int) -> None:
-        """Wait until so many were seen."""
+        """Wait until this number was seen."""
         async with self._news, asyncio.timeout(PATIENCE):
             await self._news.wait_for(lambda: len(self.at) >= count)
 

@@ -103,10 +103,10 @@ class Drive:
 
     def note(self, events: Sequence[Event]) -> list[str]:
         self.events += events
-        return told(events)
+        return reported(events)
 
 
-def told(events: Sequence[Event]) -> list[str]:
+def reported(events: Sequence[Event]) -> list[str]:
     """Events in a few words: `r car1 started 3`, `r car1 Until 5`; times in seconds after the start."""
     return [
         f"{event.rule} {event.subject} {event.reason or 'started'} "

@@ -45,7 +45,7 @@ class Receiver:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._spans: list[Received] = []
-        self.asked = threading.Event()
+        self.requested = threading.Event()
         self._free = threading.Event()
         self._free.set()
         receiver = self
@@ -53,7 +53,7 @@ class Receiver:
         class Handler(BaseHTTPRequestHandler):
             def do_POST(self) -> None:
                 body = self.rfile.read(int(self.headers["Content-Length"]))
-                receiver.asked.set()
+                receiver.requested.set()
                 receiver._free.wait()
                 if self.headers.get("Content-Encoding") == "gzip":
                     body = gzip.decompress(body)

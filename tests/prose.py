@@ -14,7 +14,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 
-NOT_YET = ("benchmarks", "examples", "tests")
+NOT_YET = ("tests",)
 """Folders with retired phrases. Each is removed here once it is clean."""
 
 EXCEPT = ("LICENSE",)

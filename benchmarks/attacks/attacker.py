@@ -81,7 +81,7 @@ class Attacker:
 
     async def _make(self, tasks: Iterator[dict[str, Any]]) -> None:
         for each in tasks:
-            with contextlib.suppress(ApiError):  # refused: as it may be, who attacks goes on
+            with contextlib.suppress(ApiError):  # a refusal is expected: the attacker continues
                 await self._client.create(TASKS, each)
                 self.made += 1
                 if self.made % 1000 == 0:

@@ -84,7 +84,7 @@ def look_at_streams(verdict: Verdict, metrics: Metrics, sent: Sent) -> None:
     verdict.equal("gaps", metrics["gaps_total",], 0)
 
 
-def look_at_rules(verdict: Verdict, metrics: Metrics, folder: Path, seconds: int, sent: Sent, asked: int) -> None:
+def look_at_rules(verdict: Verdict, metrics: Metrics, folder: Path, seconds: int, sent: Sent, requested: int) -> None:
     started: Counter[str] = Counter()
     ended: Counter[str] = Counter()
     lost = 0
@@ -125,7 +125,7 @@ def look_at_rules(verdict: Verdict, metrics: Metrics, folder: Path, seconds: int
             suppressed = metrics.get(("losses_total", "suppressed", name, ""), 0)
             verdict.true(f"{name} suppressed episodes", suppressed > 0 or seconds < 1800)
         if evaluation.get("onDemand"):
-            verdict.equal(f"answers of {name}", asked, seconds // 60)
+            verdict.equal(f"answers of {name}", requested, seconds // 60)
         quiet = {"that-is-disabled", *QUIET}
         verdict.true(f"{name} has episodes", started[name] > 0 or name in quiet or seconds < 600)
 

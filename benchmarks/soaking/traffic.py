@@ -33,22 +33,22 @@ START = 1_767_225_600_000_000_000
 
 TELEMETRY_EVERY = 200_000_000
 WARNED = 25
-"""A vehicle warns once in so many of its telemetry messages."""
+"""A vehicle warns once per this number of its telemetry messages."""
 
 ITS_EPOCH = 1_072_915_200_000 - 5_000
 """2004-01-01 in milliseconds since the Unix epoch, and the leap seconds since, which ITS time counts."""
 
 BAD_EVERY = 60 * 10**9
-"""Of each kind of bad sample there is one in so many nanoseconds."""
+"""Each kind of bad sample is sent once per this number of nanoseconds."""
 
 LATENESS = 10
-"""Seconds: what the Detector says."""
+"""Seconds, as in the Detector."""
 
 FLUSH = 20
-"""Seconds that the clock goes on alone, so that everything before has been evaluated."""
+"""Seconds that the clock advances without samples, so that everything before is evaluated."""
 
 CAMERAS = 2
-"""So many vehicles have a camera."""
+"""Number of vehicles with a camera."""
 
 SIDE = 8
 """Pixels of an image's side."""

@@ -1,4 +1,4 @@
-"""A crowd in a square: each client walks at random and says once a second where it is."""
+"""A crowd in a square: each client walks at random and reports its position once a second."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ class Run(NamedTuple):
 
 
 class PeerError(RuntimeError):
-    """The peer cannot be built or does not run; the text says why."""
+    """The peer cannot be built or does not run; the text gives the reason."""
 
 
 def build() -> None:

@@ -26,7 +26,7 @@ MEAN, SWING, PACE = 27.0, 8.0, 0.7  # m/s, m/s, rad/s
 
 
 class Limits(NamedTuple):
-    """What a rule says: an episode starts above one speed and ends below another. Seconds; m/s."""
+    """The condition of a rule: an episode starts above one speed and ends below another. Seconds; m/s."""
 
     name: str
     window: int

@@ -1,6 +1,6 @@
-"""Four electric buses and what their batteries say; one is worn out, one wears out, one is only badly told of.
+"""Four electric buses and their batteries' reports; one is worn out, one wears out, one only has wrong reports.
 
-The truth is each battery's health over time. What its management system says of it is noisy, and at times nonsense.
+The truth is each battery's health over time. The reports of its management system are noisy, and sometimes wrong.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 
 from examples.running.drawing import Chart
 from examples.running.playing import Played, seconds
-from examples.running.recording import lacking, read_recording, within
+from examples.running.recording import missing_messages, read_recording, within
 from examples.running.ros import header, make, ros_message
 from examples.running.scenario import SECOND, Episode, Message, Scenario, as_json
 
@@ -24,7 +24,7 @@ THRESHOLD, RECOVERED = 0.80, 0.82
 WINDOW_S, ENOUGH, LASTING_S = 60, 30, 10
 REPORT_S = 30
 NOISE_S = 1.5
-"""A mean of noisy reports crosses a threshold so much sooner or later than the mean of the truth."""
+"""By how much earlier or later a mean of noisy reports crosses a threshold than the true mean."""
 NEW_BATTERY_S, WEAR_S = 150.0, 90.0
 BATTERY = "sensor_msgs/msg/BatteryState"
 
@@ -58,7 +58,7 @@ def scenario(seed: int = SEED) -> Scenario:
 
 
 def messages(seed: int) -> Iterator[Message]:
-    """Each bus tells of its battery once a second, and of itself every ten seconds."""
+    """Each bus reports its battery once a second, and itself every ten seconds."""
     for number, (bus, health) in enumerate(TRUTH.items()):
         rng = np.random.default_rng([seed, number])
         phase = round((0.1 + 0.2 * number) * SECOND)
@@ -85,13 +85,13 @@ def messages(seed: int) -> Iterator[Message]:
 
 
 def _said(bus: str, t: float, health: float) -> float:
-    """The capacity in Ah that the battery management system tells."""
+    """The capacity in Ah that the battery management system reports."""
     if bus == "bus-3" and 60 <= t < 63:
-        return 0.0  # it starts anew
+        return 0.0  # it restarts
     if bus == "bus-3" and 63 <= t < 66:
         return math.nan
     if bus == "bus-3" and 120 <= t < 128:
-        return 0.70 * DESIGN_AH  # it estimates anew, and is wrong at first
+        return 0.70 * DESIGN_AH  # it restarts its estimate, which is wrong at first
     return DESIGN_AH * health
 
 
@@ -125,33 +125,33 @@ def episodes() -> list[Episode]:
 
 
 def check(played: Played, sent: list[Message]) -> Iterator[str]:
-    """The operator was told of the right health, and each report holds a minute and a half of that bus."""
-    told = {each.content["subject"]: each.content["data"]["notification"] for each in played.notices}
+    """The operator received the right health, and each recording contains a minute and a half of that bus."""
+    reported = {each.content["subject"]: each.content["data"]["notification"] for each in played.notices}
     for event in played.events:
         if event.rule == "battery-health" and event.started:
             at = seconds(event.start_time)
             truth = np.mean([TRUTH[event.subject](t) for t in np.arange(max(0.0, at - WINDOW_S), at, 0.5)])
-            said = float(told[event.subject]["labels"]["health"]) if event.subject in told else math.nan
-            if not abs(said - truth) < 0.005:
-                yield f"the operator was told that the health of {event.subject} is {said}; it is {truth:.3f}"
+            logged = float(reported[event.subject]["labels"]["health"]) if event.subject in reported else math.nan
+            if not abs(logged - truth) < 0.005:
+                yield f"the operator was notified that the health of {event.subject} is {logged}; it is {truth:.3f}"
     spans = {event.subject: event for event in played.events if event.rule == "battery-report" and not event.started}
     for folder in played.recordings("battery-report"):
         (bus,) = (each for each in spans if f"_{each}_" in folder.name)
         first, last = seconds(spans[bus].onset_time) - 60, seconds(spans[bus].end_time or 0)
         must = within(sent, [bus], first, last)
-        yield from lacking(must, read_recording(folder), f"the report of {bus}")
+        yield from missing_messages(must, read_recording(folder), f"the report of {bus}")
 
 
 def picture(seed: int, due: list[Episode]) -> str:
-    """What the batteries are said to hold, and who is reported when."""
+    """The reported capacity of the batteries, and the times of the notifications."""
     chart = Chart(DURATION_S)
-    said = []
+    logged = []
     for number, (bus, health) in enumerate(TRUTH.items()):
         rng = np.random.default_rng([seed, number])
         noise = 0.004 * rng.standard_normal(DURATION_S)
         values = [_said(bus, t, health(t) * (1 + noise[t])) / DESIGN_AH for t in range(DURATION_S)]
-        said.append((bus, [(t, value) for t, value in enumerate(values) if not math.isnan(value)]))
-    chart.curves("state of health as the batteries tell it", said, 0.6, 1.0, ("threshold", THRESHOLD))
+        logged.append((bus, [(t, value) for t, value in enumerate(values) if not math.isnan(value)]))
+    chart.curves("state of health as reported by the batteries", logged, 0.6, 1.0, ("threshold", THRESHOLD))
     for rule in ("battery-health", "battery-report"):
         rows = [
             (each.subject, [(each.start_s + NOISE_S, DURATION_S if each.end_s is None else each.end_s + NOISE_S, "")])

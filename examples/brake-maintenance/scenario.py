@@ -27,7 +27,7 @@ RECENT_H, LONGER_H, NOTICE_H, WORTH_IT = 2.0, 6.0, 12.0, 0.0008
 ENOUGH, LASTING_H = 400, 1 / 6
 NOISE = 0.015
 UNCERTAIN_H = 1.0
-"""So many hours sooner or later the noisy means give the notice."""
+"""By how many hours the noisy means may notify earlier or later."""
 
 VANS = ("van-1", "van-2", "van-3")
 
@@ -107,17 +107,17 @@ def episodes() -> list[Episode]:
 
 
 def check(played: Played) -> Iterator[str]:
-    """The workshop is told how long the brakes will do."""
-    told = {each.content["subject"]: each.content["data"]["notification"]["labels"] for each in played.notices}
+    """The workshop is notified of the brakes' remaining time."""
+    reported = {each.content["subject"]: each.content["data"]["notification"]["labels"] for each in played.notices}
     for event in played.events:
-        said, at = float(told[event.subject]["hours"]), seconds(event.start_time) / HOUR_S
+        logged, at = float(reported[event.subject]["hours"]), seconds(event.start_time) / HOUR_S
         truth = (gives(event.subject, at - RECENT_H / 2) - LEAST) / WEAR_PER_HOUR
-        if not abs(said - truth) < 0.15 * truth:
-            yield f"the workshop was told that {event.subject} has {said:.1f} hours left; they are {truth:.1f}"
+        if not abs(logged - truth) < 0.15 * truth:
+            yield f"the workshop was notified that {event.subject} has {logged:.1f} hours left; they are {truth:.1f}"
 
 
 def picture(seed: int, due: Sequence[Episode]) -> str:
-    """What the brakings say, and when the workshop is told."""
+    """The measured brakings, and when the workshop is notified."""
     chart = Chart(HOURS * HOUR_S)
     curves = []
     for van in VANS:
@@ -125,5 +125,5 @@ def picture(seed: int, due: Sequence[Episode]) -> str:
         curves.append((van, points[::4]))
     chart.curves("mm/s² per bar of pressure", curves, 40, 70, ("least", 1000 * LEAST))
     rows = [(each.subject, [(each.start_s + UNCERTAIN_H * HOUR_S, HOURS * HOUR_S, "")]) for each in due]
-    chart.bars("workshop told", rows, "#d1495b")
+    chart.bars("workshop notified", rows, "#d1495b")
     return chart.svg()

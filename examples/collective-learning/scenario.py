@@ -14,7 +14,7 @@ import numpy as np
 
 from examples.running.drawing import Chart
 from examples.running.playing import Played, seconds
-from examples.running.recording import lacking, read_recording, within
+from examples.running.recording import missing_messages, read_recording, within
 from examples.running.ros import cloud, header, make, ros_message
 from examples.running.scenario import SECOND, START_NS, Episode, Message, Scenario, as_json
 
@@ -24,7 +24,7 @@ PERIOD_NS = SECOND // 10
 LATENCY_NS = 50_000_000
 REACH_M = 130.0
 SCENE_M = 60.0
-"""The scene is the square of so many metres to each side of the crossroads' middle."""
+"""The scene is the square of this number of metres to each side of the crossroads' centre."""
 NOISE_M = 0.15
 PERSIST_S = 1.0
 BEFORE_S, AFTER_S = 3.0, 2.0
@@ -78,7 +78,7 @@ TRUTH = (
     Error("car-1", "pedestrian", 7.0, 11.0),
     Error("car-2", "truck", 11.5, 12.1),  # too short to matter
     Error("car-2", "ghost", 13.0, 16.5),
-    Error("car-2", "tractor", 8.0, 20.0),  # not at the scene: whoever is there need not see it
+    Error("car-2", "tractor", 8.0, 20.0),  # not at the scene: vehicles there need not see it
     Error("car-1", "cyclist", 20.0, 24.0),  # has left the scene by then
 )
 
@@ -98,7 +98,7 @@ def scenario(seed: int = SEED) -> Scenario:
 
 
 def messages(seed: int) -> Iterator[Message]:
-    """Each vehicle tells its pose and its objects ten times a second, and its point cloud five times."""
+    """Each vehicle sends its pose and its objects ten times a second, and its point cloud five times."""
     for number, (vehicle, heading) in enumerate(VEHICLES.items()):
         rng = np.random.default_rng([seed, number])
         for index in range(DURATION_S * SECOND // PERIOD_NS):
@@ -177,7 +177,7 @@ def check(played: Played, sent: list[Message]) -> Iterator[str]:
             yield f"{subject} from {seconds(start):g} s on: {len(recorded)} recordings; expected: one"
             continue
         must = within(sent, subject.split("+"), first, last)
-        yield from lacking(must, read_recording(recorded[0]), f"the recording of {subject}")
+        yield from missing_messages(must, read_recording(recorded[0]), f"the recording of {subject}")
 
 
 def picture(due: list[Episode]) -> str:

@@ -45,7 +45,7 @@ LOOK_S = 1.0
 
 
 def main() -> int:
-    """Run the demo; 1 means that what was detected is not what the positions say."""
+    """Run the demo; 1 means that the detected episodes differ from those computed from the positions."""
     parser = argparse.ArgumentParser(prog="demo.py", description=__doc__)
     parser.add_argument("--output", type=Path, default=Path("out"), help="the folder for what comes out (%(default)s)")
     output: Path = parser.parse_args().output
@@ -169,7 +169,7 @@ class Timeline:
         self._begin = time.monotonic()
 
     def look(self, events: queue.Queue[dict[str, Any]]) -> None:
-        """Wait a moment for an event, then tell what is new."""
+        """Wait a moment for an event, then print what is new."""
         with suppress(queue.Empty):
             self._event(events.get(timeout=0.1))
             while True:

@@ -51,8 +51,8 @@ def main() -> int:
         environment = os.environ | {"KUBECONFIG": str(kubeconfig)}
         run = ["run", "--namespace", NAMESPACE]
         stack.enter_context(_program("application_manager.cli", run, output / "manager.log", environment))
-        told = ["--name", "town", "--output", str(output)]
-        stack.enter_context(_program("detector.commands.cli", [*run, *told], output / "detector.log", environment))
+        reported = ["--name", "town", "--output", str(output)]
+        stack.enter_context(_program("detector.commands.cli", [*run, *reported], output / "detector.log", environment))
         console.print(f"To look on from another terminal: export KUBECONFIG={kubeconfig}")
         console.print(f"                                  kubectl -n {NAMESPACE} get wayside,deployments")
         drive = subprocess.Popen(

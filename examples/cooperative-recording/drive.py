@@ -19,7 +19,7 @@ DETECTOR = "tcp/127.0.0.1:7447"
 
 
 def main() -> int:
-    """Run the drive that the command line asks for; 2 means that it asks for something impossible."""
+    """Run the drive of the command line; 2 means that its options are impossible."""
     options = _options()
     drive = simulate(options.seed, horizon_s=options.duration)
     if options.record is not None:

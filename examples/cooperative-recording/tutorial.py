@@ -1,8 +1,8 @@
-"""The run that docs/tutorial.md tells of: a real control plane, both programs, and vehicles that stand where it says.
+"""The run of docs/tutorial.md: a real control plane, both programs, and vehicles at its positions.
 
-There are no nodes, so this also says of pods what a kubelet would. At each step it prints what happens and what the
-commands say. With --pause it waits for Enter after each, and you can look for yourself from another terminal; with
---write it puts the output into docs/tutorial.md.
+There are no nodes, so this also sets the status of pods as a kubelet would. At each step it prints what happens and the
+outputs of the commands. With --pause it waits for Enter after each, and you can look for yourself from another
+terminal; with --write it puts the output into docs/tutorial.md.
 """
 
 from __future__ import annotations
@@ -93,12 +93,12 @@ class Stage:
         return max((each for each in self.tasks() if _about(each) == f"{action} {subject}"), key=_start)
 
     def wait(self, tasks: Mapping[str, str], instances: Mapping[str, str], *, kubelet: bool = False) -> None:
-        """Wait until just these tasks and instances are there, and are said to have come that far.
+        """Wait until exactly these tasks and instances exist, in these phases.
 
         Args:
             tasks: phases, by action and subject; a text after a colon must be part of the message, else there is none.
             instances: likewise, by template and key.
-            kubelet: say of all pods that they run meanwhile.
+            kubelet: set all pods to running in the meantime.
         """
 
         def look() -> bool:
@@ -131,7 +131,7 @@ class Stage:
         return wait_until(of_image, lambda found: len(found) == 1, what=f"one pod has the image {image}")[0]
 
     def cannot_pull(self, image: str, why: str) -> None:
-        """Say of the pod with that image what a kubelet says that cannot pull it."""
+        """Set the status of the pod with that image as a kubelet does that cannot pull it."""
         waiting = {"reason": "ErrImagePull", "message": why}
         container = {"name": "fusion", "image": image, "imageID": "", "ready": False, "restartCount": 0}
         status = {"containerStatuses": [{**container, "state": {"waiting": waiting}}]}
@@ -173,7 +173,7 @@ def _start(task: Object) -> str:
 class Step:
     """One step: what happens, until when it is waited, and what is then typed."""
 
-    says: str
+    shows: str
     happens: Callable[[Stage], None]
     commands: tuple[str, ...]
 
@@ -284,18 +284,18 @@ STEPS = (
 )
 
 
-def play(stage: Stage, *, pause: Callable[[], None] = lambda: None, tell: Callable[[str], None] = print) -> list[str]:
-    """Play all steps, and `tell` of each; what they print, made uniform: a text a step, its commands included."""
-    told = []
+def play(stage: Stage, *, pause: Callable[[], None] = lambda: None, report: Callable[[str], None] = print) -> list[str]:
+    """Play all steps, and `report` each; returns their uniform outputs: one text per step, including its commands."""
+    reported = []
     for number, step in enumerate(STEPS):
-        tell(f"# {step.says}")
+        report(f"# {step.shows}")
         stage.uniform.step = number
         step.happens(stage)
         printed = [stage.run(command) for command in step.commands]
-        tell("".join(printed))
-        told.append("".join(map(stage.uniform.text, printed)))
+        report("".join(printed))
+        reported.append("".join(map(stage.uniform.text, printed)))
         pause()
-    return told
+    return reported
 
 
 @contextmanager
@@ -346,16 +346,16 @@ def blocks(guide: str) -> list[str]:
     return [f"$ {each}" for each in BLOCK.findall(guide)]
 
 
-def with_blocks(guide: str, told: Sequence[str]) -> str:
+def with_blocks(guide: str, reported: Sequence[str]) -> str:
     """The tutorial with these texts in place of those that it shows. ValueError: it has another number of them."""
-    if len(blocks(guide)) != len(told):
-        raise ValueError(f"the tutorial has {len(blocks(guide))} blocks that begin with a command, not {len(told)}")
-    texts = iter(told)
+    if len(blocks(guide)) != len(reported):
+        raise ValueError(f"the tutorial has {len(blocks(guide))} blocks that begin with a command, not {len(reported)}")
+    texts = iter(reported)
     return BLOCK.sub(lambda _: f"```console\n{next(texts)}```\n", guide)
 
 
 def _wait_for_enter() -> None:
-    input("# Enter: go on ")
+    input("# Enter: continue ")
 
 
 def main() -> int:
@@ -374,9 +374,9 @@ def main() -> int:
         print("# To look for yourself, type this into another terminal, and then what stands after each $:")
         programs = f"{plane.binaries.kubectl.parent}:{Path(sys.executable).parent}"
         print(f"#   export KUBECONFIG={stage.kubeconfig} PATH={programs}:$PATH")
-        told = play(stage, pause=_wait_for_enter if options.pause else lambda: None)
+        reported = play(stage, pause=_wait_for_enter if options.pause else lambda: None)
     if options.write:
-        GUIDE.write_text(with_blocks(GUIDE.read_text(encoding="utf-8"), told), encoding="utf-8")
+        GUIDE.write_text(with_blocks(GUIDE.read_text(encoding="utf-8"), reported), encoding="utf-8")
     return 0
 
 

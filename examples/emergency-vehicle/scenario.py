@@ -1,7 +1,7 @@
 """An ambulance in operation, two that are in no hurry, a road sweeper, and five cars on and near the route.
 
 The truth is where everybody drives, and the operation. Who is on the route follows from the distance to its roads; the
-control center is told of a polygon around them instead.
+control center receives a polygon around them instead.
 """
 
 from __future__ import annotations
@@ -70,13 +70,13 @@ def scenario(seed: int = SEED) -> Scenario:
         episodes=due,
         actions={"emergency-vehicle/navigation": 3, "car-connected/navigation": len(CARS)},
         moments=[moment(at) for at in (7.0, 26.0, 37.0, 56.0, 72.0)],
-        real_time=True,  # a CAM tells its time modulo 65 s
+        real_time=True,  # a CAM contains its time modulo 65 s
         picture=lambda: picture(due),
     )
 
 
 def messages(seed: int) -> Iterator[Message]:
-    """Two CAM a second of everybody, a DENM a second of the ambulance, and what the rescue service tells."""
+    """Two CAM a second from each vehicle, a DENM a second from the ambulance, and the rescue service's messages."""
     for station in WAYS:
         rng = np.random.default_rng([seed, station])
         phase = int(rng.integers(0, SECOND // 2))
@@ -110,7 +110,7 @@ def messages(seed: int) -> Iterator[Message]:
 
 
 def _operation(second: int, station: int, roads: Sequence[str], corners: Corners) -> Message:
-    """What the rescue service tells: who is in operation, and a polygon around its route."""
+    """The rescue service's messages: the vehicles in operation, and a polygon around the route."""
     corridor = [list(_place(*corner)) for corner in corners]
     content = {"station": station, "roads": list(roads), "corridor": corridor}
     return Message(second * SECOND, "center/operations", as_json(content))
@@ -135,12 +135,12 @@ def spans() -> dict[int, tuple[float, float]]:
 
 
 def episodes() -> list[Episode]:
-    """Who is on the route for four seconds is told; it is over when it has left it, or the operation is."""
-    told = [
+    """Vehicles on the route for four seconds are warned, until they have left it or the operation is over."""
+    reported = [
         Episode("emergency-vehicle", f"its-{AMBULANCE}+its-{car}", start + LASTING_S, end, 1.5)
         for car, (start, end) in spans().items()
     ]
-    return told + [Episode("car-connected", f"its-{car}", 0.0, None) for car in CARS]
+    return reported + [Episode("car-connected", f"its-{car}", 0.0, None) for car in CARS]
 
 
 def moment(at_s: float) -> Moment:
@@ -156,7 +156,7 @@ def moment(at_s: float) -> Moment:
 
 
 def picture(due: list[Episode]) -> str:
-    """How far everybody is from the route, and who is told."""
+    """The vehicles' distances from the route, and the warnings."""
     chart = Chart(DURATION_S)
     times = [float(t) for t in np.arange(0, DURATION_S, 1.0)]
     chart.curves(
@@ -167,10 +167,10 @@ def picture(due: list[Episode]) -> str:
     chart.bars(
         "the ambulance", [("operation", [(BEGINS_S, OVER_S, "")]), ("light bar", [(LIGHT_BAR_S, DURATION_S, "")])]
     )
-    told = {each.subject: each for each in due if each.rule == "emergency-vehicle"}
+    reported = {each.subject: each for each in due if each.rule == "emergency-vehicle"}
     rows = []
     for car in CARS:
-        each = told.get(f"its-{AMBULANCE}+its-{car}")
+        each = reported.get(f"its-{AMBULANCE}+its-{car}")
         rows.append((f"car {car}", [(each.start_s, each.end_s or DURATION_S, "Ring, Station Street")] if each else []))
     chart.bars("navigation avoids", rows, "#d1495b")
     return chart.svg()

@@ -1,4 +1,4 @@
-"""Five cars on a highway; three of them must be asked to take over, each for another reason.
+"""Five cars on a highway; three of them must receive a take-over request, each for another reason.
 
 The truth is where each car is and goes: its speed over time, its route, and when its driver takes over.
 """
@@ -93,7 +93,7 @@ def scenario(seed: int = SEED) -> Scenario:
 
 
 def messages() -> Iterator[Message]:
-    """Each car tells its route when it changes, and how far it is five times a second."""
+    """Each car sends its route when it changes, and its position on it five times a second."""
     for number, (name, car) in enumerate(CARS.items()):
         for begin, route in car.routes.items():
             after = round(begin * SECOND)
@@ -113,7 +113,7 @@ def messages() -> Iterator[Message]:
 
 
 def episodes() -> list[Episode]:
-    """From the truth: asked once the exit is nearer than both leads allow, until the driver has taken over."""
+    """From the truth: requested once the exit is nearer than both leads allow, until the driver has taken over."""
     found = []
     for name, car in CARS.items():
         for step in range(round(DURATION_S / STEP_S)):
@@ -125,23 +125,23 @@ def episodes() -> list[Episode]:
 
 
 def check(played: Played) -> Iterator[str]:
-    """Each driver was told how far it is, and each display that it is over."""
+    """Each driver received the distance, and each display the end."""
     starts = {event.subject: seconds(event.start_time) for event in played.events if event.started}
-    told: dict[str, list[str]] = {}
+    reported: dict[str, list[str]] = {}
     for notice in played.notices:
         vehicle, kind = notice.content["subject"], notice.content["type"].rpartition(".")[2]
-        told.setdefault(vehicle, []).append(kind)
+        reported.setdefault(vehicle, []).append(kind)
         distance = float(notice.content["data"]["notification"]["labels"]["distance"])
         truth = CARS[vehicle].to_exit(starts[vehicle])
         if not abs(distance - truth) < 0.01:
-            yield f"the driver of {vehicle} was told that it is {distance} m to the exit; it is {truth:.2f} m"
+            yield f"the driver of {vehicle} received a distance of {distance} m to the exit; it is {truth:.2f} m"
     for vehicle in starts:
-        if told.get(vehicle) != ["started", "ended"]:
-            yield f"the driver of {vehicle} was told {told.get(vehicle)}; expected: started, ended"
+        if reported.get(vehicle) != ["started", "ended"]:
+            yield f"the driver of {vehicle} received {reported.get(vehicle)}; expected: started, ended"
 
 
 def picture(due: list[Episode]) -> str:
-    """How far it is to each car's exit, and who is asked to take over when."""
+    """The distance to each car's exit, and the take-over requests."""
     chart = Chart(DURATION_S)
     curves = []
     for name, car in CARS.items():

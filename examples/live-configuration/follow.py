@@ -23,14 +23,14 @@ import yaml
 import zenoh
 
 POLL = 0.2  # s between two looks at the file: the kubelet replaces a mounted file as a whole, by renaming a link
-ASK = 10.0  # s between two questions over Zenoh: what changes while our own connection is lost is not told twice
+ASK = 10.0  # s between two queries over Zenoh: changes while our own connection is lost are not repeated
 MEMORY = 180.0  # s that a replaced content is remembered; the kubelet brings every change within two minutes
 
 
 class Latest:
     """The newest content of two ways, of which the one by file is late.
 
-    What came over Zenoh counts at once. What the file says counts too, unless Zenoh has replaced just that content
+    What came over Zenoh counts at once. The file's content counts too, unless Zenoh has replaced just that content
     within the last `MEMORY` seconds: then the file is only late. Should Zenoh fall silent, the file has the last word.
     """
 
@@ -51,7 +51,7 @@ class Latest:
             return True
 
     def by_file(self, content: str, now: float) -> bool:
-        """Take what the file says; whether it is new."""
+        """Take the file's content; returns whether it is new."""
         with self._lock:
             self._replaced = {each: since for each, since in self._replaced.items() if now - since < MEMORY}
             if content == self.content or content in self._replaced:
@@ -70,9 +70,9 @@ class Fusion:
         self._lock = threading.Lock()
 
     def follow(self, way: str) -> None:
-        """Subscribe to what is new and leave what is gone; all else goes on without a gap."""
+        """Subscribe to new items and leave removed ones; the others continue without a gap."""
         with self._lock:
-            try:  # the newest of all, whichever way and thread asked
+            try:  # the newest of all, whichever way and thread it came by
                 wanted = set((yaml.safe_load(self._latest.content or "") or {}).get("sources") or [])
             except (yaml.YAMLError, AttributeError) as error:
                 print(f"a configuration that cannot be read is left aside: {error}", flush=True)
@@ -105,7 +105,7 @@ def main() -> None:
     with zenoh.open(config) as session:
         fusion = Fusion(session, latest)
 
-        def told(sample: zenoh.Sample) -> None:
+        def reported(sample: zenoh.Sample) -> None:
             if sample.kind == zenoh.SampleKind.DELETE:
                 return  # the instance is gone, and so are we soon
             content = json.loads(sample.payload.to_bytes()).get(given.file.name)
@@ -114,13 +114,13 @@ def main() -> None:
 
         def answered(reply: zenoh.Reply) -> None:
             if reply.ok is not None:
-                told(reply.ok)
+                reported(reply.ok)
 
-        subscriber = session.declare_subscriber(key, told)  # first: what changes while we ask is not missed
-        asked = float("-inf")
+        subscriber = session.declare_subscriber(key, reported)  # first: what changes while we ask is not missed
+        requested = float("-inf")
         while not ended.wait(POLL):
-            if time.monotonic() - asked >= ASK:
-                asked = time.monotonic()
+            if time.monotonic() - requested >= ASK:
+                requested = time.monotonic()
                 session.get(key, answered)
             try:
                 content = given.file.read_text()

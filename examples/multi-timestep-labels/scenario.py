@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from examples.running.drawing import Chart
 from examples.running.playing import Played, seconds
-from examples.running.recording import lacking, read_recording, within
+from examples.running.recording import missing_messages, read_recording, within
 from examples.running.ros import cloud, header, make, ros_message
 from examples.running.scenario import SECOND, START_NS, Episode, Message, Scenario, as_json
 
@@ -31,7 +31,7 @@ AHEAD, BEHIND = 60.0, 15.0
 SURE_M = 40.0
 """How far it is sure of what it sees."""
 GIVEN_UP_S = 3.0
-"""What the tracker has not seen for so long is no longer in its list; seen again, it has a new number."""
+"""An object that the tracker has not seen for this time leaves its list; seen again, it has a new number."""
 MISSED_S, LOOKS_BACK_S = 1.0, 6.0
 NOISE_M = 0.15
 BEFORE_S, AFTER_S = 6.0, 2.0
@@ -62,7 +62,7 @@ class Thing:
 
 @dataclass(frozen=True, slots=True)
 class Error:
-    """What is wrong about a thing from one second to another: it is taken for something else, or overlooked."""
+    """An error about an object from one second to another: it is misclassified, or overlooked."""
 
     thing: str
     start_s: float
@@ -187,12 +187,14 @@ def check(played: Played, sent: list[Message]) -> Iterator[str]:
     folders = played.recordings("multi-timestep-labels")
     for event, (_, number), folder in zip(
         ended, known_better(), folders, strict=False
-    ):  # how many there are is told already
+    ):  # their number is checked already
         first, last = seconds(event.onset_time) - BEFORE_S, seconds(event.end_time or 0) + AFTER_S
-        yield from lacking(within(sent, ["ego"], first, last), read_recording(folder), f"the recording {folder.name}")
-        said = json.loads((folder / "recording.json").read_text(encoding="utf-8"))["metadata"].get("tracks")
-        if said != [number]:
-            yield f"the recording {folder.name} names the tracks {said}; expected: {[number]}"
+        yield from missing_messages(
+            within(sent, ["ego"], first, last), read_recording(folder), f"the recording {folder.name}"
+        )
+        logged = json.loads((folder / "recording.json").read_text(encoding="utf-8"))["metadata"].get("tracks")
+        if logged != [number]:
+            yield f"the recording {folder.name} names the tracks {logged}; expected: {[number]}"
 
 
 def picture(due: list[Episode]) -> str:
@@ -203,7 +205,7 @@ def picture(due: list[Episode]) -> str:
         places = [(t / 5, thing.ahead(t / 5)) for t in range(DURATION_S * 5)]
         curves.append((thing.name, [(t, ahead) for t, ahead in places if ahead is not None]))
     chart.curves("metres ahead of the vehicle", curves, -BEHIND, AHEAD, ("sure below", SURE_M))
-    for mistaken, title in ((True, "taken for something else"), (False, "overlooked")):
+    for mistaken, title in ((True, "misclassified"), (False, "overlooked")):
         rows = [
             (each.thing, [(max(start, each.start_s), min(end, each.end_s), each.taken_for)])
             for each in TRUTH

@@ -10,7 +10,7 @@ from shaking import RATE_HZ, Samples, add, asphalt, cobbles, pothole, speed_bump
 
 from examples.running.drawing import Chart
 from examples.running.playing import Played, seconds
-from examples.running.recording import lacking, read_recording
+from examples.running.recording import missing_messages, read_recording
 from examples.running.ros import header, make, ros_message
 from examples.running.scenario import SECOND, START_NS, Episode, Message, Scenario, as_json
 
@@ -63,7 +63,7 @@ def scenario(seed: int = SEED) -> Scenario:
 
 
 def messages(seed: int) -> Iterator[Message]:
-    """Fifty messages of the inertial sensor a second, and one that says where the car is."""
+    """Fifty messages of the inertial sensor a second, and one with the car's position."""
     rest = np.zeros(9)
     for number, car in enumerate(CARS):
         for index, value in enumerate(shaking(car, seed)):
@@ -110,12 +110,12 @@ def episodes() -> list[Episode]:
 
 
 def check(played: Played, sent: list[Message]) -> Iterator[str]:
-    """The road operator was told of the right places, and the recordings hold all around them."""
-    told = sorted((each.content["subject"], float(_labels(each.content)["latitude"])) for each in played.notices)
+    """The road operator received the right places, and the recordings contain all data around them."""
+    reported = sorted((each.content["subject"], float(_labels(each.content)["latitude"])) for each in played.notices)
     must = sorted((each.car, latitude(each.start_s)) for each in TRUTH if each.kind == "pothole")
-    for (car, said), (_, truth) in zip(told, must, strict=False):  # how many there are is told already
-        if not abs(said - truth) < 2 * SPEED:
-            yield f"the road operator was told of a pothole of {car} at {said}; it is at {truth:.5f}"
+    for (car, logged), (_, truth) in zip(reported, must, strict=False):  # their number is checked already
+        if not abs(logged - truth) < 2 * SPEED:
+            yield f"the road operator received a pothole of {car} at {logged}; it is at {truth:.5f}"
     spans = sorted(
         ((each.onset_time, each.end_time or 0, each.subject) for each in played.events if not each.started),
     )
@@ -124,7 +124,7 @@ def check(played: Played, sent: list[Message]) -> Iterator[str]:
             each for each in sent
             if each.key.split("/")[1] == car and onset - 2 * SECOND < START_NS + each.after_ns <= end + SECOND
         ]  # fmt: skip
-        yield from lacking(around, read_recording(folder), f"the recording of {car} at {seconds(onset):g} s")
+        yield from missing_messages(around, read_recording(folder), f"the recording of {car} at {seconds(onset):g} s")
 
 
 def _labels(content: dict[str, dict[str, dict[str, dict[str, str]]]]) -> dict[str, str]:

@@ -11,7 +11,7 @@ Samples = NDArray[np.float64]
 
 
 def asphalt(count: int, rng: np.random.Generator) -> Samples:
-    """So many samples of good road."""
+    """Number of samples of good road."""
     return rng.normal(0.0, 0.25, count)
 
 

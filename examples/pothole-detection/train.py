@@ -119,7 +119,7 @@ def save(model: dict[str, Array], path: Path) -> None:
 
 
 def right(model: dict[str, Array], seed: int) -> float:
-    """The share of windows of another seed that are told rightly."""
+    """The share of windows of another seed that are classified correctly."""
     samples, labels = windows(1000, np.random.default_rng(seed))
     return float(np.mean((answers(model, samples) > 0.5) == (labels == 1)))
 
@@ -127,4 +127,4 @@ def right(model: dict[str, Array], seed: int) -> float:
 if __name__ == "__main__":
     trained = train()
     save(trained, MODEL)
-    print(f"{MODEL.name}: {right(trained, SEED + 1):.1%} of 1000 other windows are told rightly")
+    print(f"{MODEL.name}: {right(trained, SEED + 1):.1%} of 1000 other windows are classified correctly")

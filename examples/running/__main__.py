@@ -24,7 +24,7 @@ _WIDTH = 120
 
 
 def main() -> int:
-    """Do what the command line asks for; 1: something is not as it must be, 2: it cannot be done."""
+    """Run the command line's request; 1: a result differs from the expected one, 2: it cannot be run."""
     options = _options()
     unknown = [name for name in options.names if name not in use_cases()]
     if unknown:
@@ -95,7 +95,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("names", nargs="*", metavar="USE-CASE", help="default: all")
     parser.add_argument("--output", type=Path, metavar="FOLDER", help="keep recordings, events and tasks there")
     parser.add_argument("--record", type=Path, metavar="FILE", help="only write the scenario as an MCAP file")
-    parser.add_argument("--pictures", action="store_true", help="only draw the folders' pictures anew")
+    parser.add_argument("--pictures", action="store_true", help="only redraw the folders' pictures")
     return parser.parse_args()
 
 

@@ -116,10 +116,10 @@ def play(folder: Path, recording: Path, output: Path) -> Played:
                 versions[name] = task
                 played.history.append((seconds(engine.now), task))
 
-    def heard(which: Which, episode: str, said: ActionOutcome) -> None:
-        if said.state is not OutcomeState.RUNNING:
+    def heard(which: Which, episode: str, logged: ActionOutcome) -> None:
+        if logged.state is not OutcomeState.RUNNING:
             with lock:
-                played.outcomes.append((which, said))
+                played.outcomes.append((which, logged))
 
     host.outcomes.on_outcome = heard
     entries = inlets(detector)
@@ -188,7 +188,7 @@ class _Wire:
         self.notices: list[Notice] = []
 
     def publish(self, key: str, payload: bytes, encoding: str) -> None:
-        if not key.startswith("wayside/"):  # what the detector tells of itself
+        if not key.startswith("wayside/"):  # the detector's own messages
             self.notices.append(Notice(key, json.loads(payload)))
 
     def query(

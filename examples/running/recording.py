@@ -70,7 +70,7 @@ def within(messages: Iterable[Message], clients: Collection[str], first_s: float
     ]  # fmt: skip
 
 
-def lacking(expected: Iterable[Message], found: Iterable[Recorded], what: str) -> list[str]:
+def missing_messages(expected: Iterable[Message], found: Iterable[Recorded], what: str) -> list[str]:
     """How what was recorded differs from the messages that must be in it: a line, or none."""
     must = sorted(Recorded(each.after_ns, each.key, each.payload) for each in expected)
     there = sorted(found)

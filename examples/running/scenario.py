@@ -48,7 +48,7 @@ class Moment:
 
     at_s: float
     runs: Mapping[str, Mapping[str, Any]]
-    """By `<template>/<key>`: what its configuration must say, of the values named here. Nothing else runs."""
+    """By `<template>/<key>`: the expected values of its configuration. Nothing else runs."""
     suspended: Collection[str] = ()
     """Those of them that must be suspended; the others must not."""
 
@@ -68,11 +68,11 @@ class Scenario:
     """An SVG."""
     picture_file: str = "scenario.svg"
     real_time: bool = False
-    """Whether it can only be played as fast as it happens, since its messages do not tell the whole time."""
+    """Whether it can only be played in real time, because its messages contain only a part of the time."""
     moments: Sequence[Moment] = ()
     """What must run; of a use case with templates."""
     check: Callable[[Played], Iterable[str]] = field(default=lambda played: ())
-    """What else is not as it must be, a line each: what was recorded, told, or would run."""
+    """Other differences from the expected results, one line each: recordings, notifications, applications."""
 
 
 def as_json(value: Mapping[str, Any]) -> bytes:

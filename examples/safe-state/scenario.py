@@ -1,6 +1,6 @@
 """Three shuttles in the spray of a wet road. One slows down in time, one cannot, one drives elsewhere.
 
-The truth is how far each perception sees and how fast each shuttle goes, over time; and when a person lets one go on.
+The truth is how far each perception sees and how fast each shuttle goes, over time; and when a person releases one.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def _value(curve: Curve, t: float) -> float:
 
 
 SHUTTLES = {
-    # The spray of a lorry; told to go slower, it does, and all is well.
+    # The spray of a lorry; it slows down on request, and all is well.
     "shuttle-1": Shuttle([(10, 80), (12, 35), (22, 35), (24, 80)], [(13.4, 13), (15.4, 10), (24, 10), (26, 13)]),
     # The same, but it goes downhill on wet leaves and does not get slower; the safe stop brings it to rest.
     "shuttle-2": Shuttle([(14, 80), (16, 35), (48, 35), (50, 80)], [(21.5, 13), (26, 0), (46, 0), (49, 6)]),
@@ -97,7 +97,7 @@ def messages(seed: int) -> Iterator[Message]:
 
 
 def episodes() -> list[Episode]:
-    """From the truth: too fast for half a second; that for four seconds more; until a person says so."""
+    """From the truth: too fast for half a second; that for four seconds more; until a person releases it."""
     found = [Episode("shuttle-drives", name, 0.0) for name in SHUTTLES]
     for name, shuttle in SHUTTLES.items():
         onset: float | None = None
@@ -131,10 +131,10 @@ def moment(at_s: float, due: Sequence[Episode]) -> Moment:
 
 
 def check(played: Played) -> Iterator[str]:
-    """The control room was told of the one shuttle, of its safe stop and of its end."""
-    told = [(each.content["subject"], each.content["type"].rpartition(".")[2]) for each in played.notices]
-    if told != [("shuttle-2", "started"), ("shuttle-2", "ended")]:
-        yield f"the control room was told {told}; expected: that shuttle-2 stops, and that it goes on"
+    """The control room received the safe stop of the one shuttle, and its end."""
+    reported = [(each.content["subject"], each.content["type"].rpartition(".")[2]) for each in played.notices]
+    if reported != [("shuttle-2", "started"), ("shuttle-2", "ended")]:
+        yield f"the control room received {reported}; expected: that shuttle-2 stops, and that it continues"
 
 
 def picture(due: Sequence[Episode]) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 
 from examples.running.drawing import Chart
 from examples.running.playing import Played, seconds
-from examples.running.recording import lacking, read_recording, within
+from examples.running.recording import missing_messages, read_recording, within
 from examples.running.ros import cloud
 from examples.running.scenario import SECOND, START_NS, Episode, Message, Scenario, as_json
 
@@ -137,9 +137,11 @@ def episodes() -> list[Episode]:
 def check(played: Played, sent: list[Message]) -> Iterator[str]:
     """Each recording holds the inputs and outputs of both, from three seconds before until two seconds after."""
     ended = [event for event in played.events if not event.started]
-    for event, folder in zip(ended, played.recordings("shadow-mode"), strict=False):  # their number is told already
+    for event, folder in zip(ended, played.recordings("shadow-mode"), strict=False):  # their number is checked already
         first, last = seconds(event.onset_time) - BEFORE_S, seconds(event.end_time or 0) + AFTER_S
-        yield from lacking(within(sent, ["ego"], first, last), read_recording(folder), f"the recording {folder.name}")
+        yield from missing_messages(
+            within(sent, ["ego"], first, last), read_recording(folder), f"the recording {folder.name}"
+        )
 
 
 def picture(due: list[Episode]) -> str:

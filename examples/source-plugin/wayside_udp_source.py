@@ -25,10 +25,10 @@ class UdpSource(Source[UdpParameters]):
     Parameters = UdpParameters
 
     def run(self, feed: Feed) -> None:
-        """Listen until told to stop. A port that is taken raises OSError: the detector logs it and tries again."""
+        """Listen until stopped. A port that is in use raises OSError: the detector logs it and tries again."""
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
             receiver.bind((self.parameters.address, self.parameters.port))
-            receiver.settimeout(0.2)  # so often it looks whether to stop
+            receiver.settimeout(0.2)  # the period of checks for a stop
             while not feed.stopping:
                 try:
                     datagram = receiver.recv(65536)

@@ -19,7 +19,7 @@ PERIOD_NS = SECOND // 2
 TIMES = [each / 20 for each in range(20, DURATION_S * 20)]
 """Those that the truth is looked at, in seconds."""
 NOISE_S = 0.6
-"""Means of noisy measurements cross a threshold so much sooner or later than those of the truth."""
+"""By how much earlier or later means of noisy measurements cross a threshold than the true ones."""
 LOOKS_S = 1.0
 """The rules look every half second, and so do the sensors."""
 
@@ -77,7 +77,7 @@ def scenario(seed: int = SEED) -> Scenario:
 
 
 def messages(seed: int) -> Iterator[Message]:
-    """What each car's sensors say, twice a second."""
+    """The measurements of each car's sensors, twice a second."""
     for number, (car, weather) in enumerate(TRUTH.items()):
         rng = np.random.default_rng([seed, number])
         for index in range(DURATION_S * SECOND // PERIOD_NS):
@@ -134,7 +134,7 @@ def moment(at_s: float, due: Sequence[Episode]) -> Moment:
 
 
 def picture(due: Sequence[Episode]) -> str:
-    """The weather, and what perception is told of it."""
+    """The weather, and the configuration of perception."""
     chart = Chart(DURATION_S)
     times = [each / 2 for each in range(DURATION_S * 2)]
     rain = [(car, [(t, weather.rain_at(t)) for t in times]) for car, weather in TRUTH.items()]

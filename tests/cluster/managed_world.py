@@ -175,10 +175,10 @@ def _tasks(tasks: list[ApplicationTask], outcome: Outcome) -> Iterator[str]:
             yield f"task {task.name}: instance {task.status.instance_name}, not {should.instance_name}"
         if verdict.standing is not Standing.COUNTS and task.status.phase != should.phase:
             yield f"task {task.name}: phase {task.status.phase}, not {should.phase}"
-        said = {each.type: (each.status, each.reason) for each in task.status.conditions}
+        logged = {each.type: (each.status, each.reason) for each in task.status.conditions}
         for each in should.conditions:
-            if said.get(each.type) != (each.status, each.reason):
-                yield f"task {task.name}: {each.type} is {said.get(each.type)}, not {(each.status, each.reason)}"
+            if logged.get(each.type) != (each.status, each.reason):
+                yield f"task {task.name}: {each.type} is {logged.get(each.type)}, not {(each.status, each.reason)}"
 
 
 # --- What the tests make

@@ -51,7 +51,7 @@ def rule(name: str = "close", **spec: Any) -> Object:
     return made
 
 
-def told(api: Api, kind: str, name: str) -> Object:
+def reported(api: Api, kind: str, name: str) -> Object:
     """The condition Accepted, once it speaks of the spec as it is."""
     found = api.wait_for(
         kind,
@@ -134,7 +134,7 @@ def test_what_is_wrong_is_refused_the_old_version_stays_and_a_condition_says_the
 ) -> None:
     api.create(detector())
     refusals: dict[str, str] = {}
-    with webhook.asked():
+    with webhook.requested():
         for good, change, parts in WRONG:
             kind, name = good["kind"], good["metadata"]["name"]
             if kind != "Detector":
@@ -149,12 +149,12 @@ def test_what_is_wrong_is_refused_the_old_version_stays_and_a_condition_says_the
     webhook.wait_unasked()
     for good, _, _ in WRONG:
         kind, name = good["kind"], good["metadata"]["name"]
-        assert told(api, kind, name)["status"] == "True"
+        assert reported(api, kind, name)["status"] == "True"
     for good, change, _ in WRONG:
         kind, name = good["kind"], good["metadata"]["name"]
         api.patch(kind, name, spoilt(good, change))
-        said = told(api, kind, name)
-        assert (said["status"], said["message"]) == ("False", refusals[name])
+        logged = reported(api, kind, name)
+        assert (logged["status"], logged["message"]) == ("False", refusals[name])
         if kind == "Detector":
             api.replace({**api.get(kind, name), "spec": good["spec"]})
 
@@ -169,34 +169,34 @@ def test_kubectl_prints_what_is_refused_and_what_is_warned_of_as_the_guide_shows
     written, shown = (re.search(f"```{kind}\n(.*?)```", guide, re.DOTALL) for kind in ("yaml", "console"))
     assert written is not None
     assert shown is not None
-    with webhook.asked():
-        _, said = kubectl_apply(control_plane, yaml.safe_load(written[1]), namespace)
-        assert said.replace(namespace, "default") == shown[1].partition("\n")[2]
+    with webhook.requested():
+        _, logged = kubectl_apply(control_plane, yaml.safe_load(written[1]), namespace)
+        assert logged.replace(namespace, "default") == shown[1].partition("\n")[2]
         for options in ((), ("--dry-run=server",)):
-            code, said = kubectl_apply(control_plane, rule(when="distence < 150"), namespace, *options)
+            code, logged = kubectl_apply(control_plane, rule(when="distence < 150"), namespace, *options)
             assert code != 0
             for part in ('EventRule "close" is invalid', "spec.when", "line 1, column 1", "distence"):
-                assert part in said
-        code, said = kubectl_apply(control_plane, rule(), namespace)
+                assert part in logged
+        code, logged = kubectl_apply(control_plane, rule(), namespace)
         assert (code, api.get("EventRule", "close")["spec"]["when"]) == (0, "distance < 150")
-        assert f"Warning: no valid Detector in namespace {namespace} selects the rule: create a Detector" in said
-        code, said = kubectl_apply(control_plane, doubtful, namespace)
+        assert f"Warning: no valid Detector in namespace {namespace} selects the rule: create a Detector" in logged
+        code, logged = kubectl_apply(control_plane, doubtful, namespace)
         assert code == 0
         for part in ("Warning: spec.manifests[0].data.lane", "`parameters.lane` is null", "where tasks give no param"):
-            assert part in said
-        code, said = kubectl_apply(control_plane, detector(), namespace)
-        assert (code, said) == (0, "")
+            assert part in logged
+        code, logged = kubectl_apply(control_plane, detector(), namespace)
+        assert (code, logged) == (0, "")
         blind = detector()
         blind["spec"]["streams"] = [each for each in blind["spec"]["streams"] if each["name"] != "odometry"]
-        code, said = kubectl_apply(control_plane, blind, namespace)
+        code, logged = kubectl_apply(control_plane, blind, namespace)
         assert code == 0
-        assert "Warning: EventRule close, spec.signals[0].stream" in said
+        assert "Warning: EventRule close, spec.signals[0].stream" in logged
 
 
 def test_only_a_new_spec_is_refused(api: Api, webhook: Webhook) -> None:
     wrong = template("wrong", manifests=[config({}, name="fixed")])
     api.create(wrong)  # while nobody asks
-    with webhook.asked():
+    with webhook.requested():
         api.patch("ApplicationTemplate", "wrong", {"metadata": {"labels": {"a": "b"}, "finalizers": ["test.dev/x"]}})
         status = {"status": {"instances": 7}}
         api.patch("ApplicationTemplate", "wrong", status, subresource="status")
@@ -210,7 +210,7 @@ def test_only_a_new_spec_is_refused(api: Api, webhook: Webhook) -> None:
 
 def test_a_rule_may_follow_its_detector_at_once(api: Api, webhook: Webhook) -> None:
     api.create(detector())
-    with webhook.asked():
+    with webhook.requested():
         for number in range(10):
             stream = {"name": f"s{number}", "key": f"s{number}/${{client:*}}", "encoding": "json"}
             api.patch("Detector", "intersection-a", [{"op": "add", "path": "/spec/streams/-", "value": stream}])
@@ -227,7 +227,7 @@ def test_a_detectors_pod_is_tried_by_a_dry_run(api: Api, processes: Processes, t
         terms = [{"matchExpressions": [{"key": "site", "operator": operator}]}]
         return {"nodeAffinity": {"requiredDuringSchedulingIgnoredDuringExecution": {"nodeSelectorTerms": terms}}}
 
-    with webhook.asked():
+    with webhook.requested():
         for pod, parts in (
             ({"affinity": placed("Near")}, r"spec\.pod: .*nodeAffinity.*operator: Invalid value: \"?Near"),
             ({"securityContext": {"fsGroop": 7}}, r"spec\.pod: .*fsGroop"),
@@ -242,7 +242,7 @@ def test_a_detectors_pod_is_tried_by_a_dry_run(api: Api, processes: Processes, t
 def test_a_manager_that_is_away_or_hangs_prevents_nothing(api: Api, processes: Processes, tmp_path: Path) -> None:
     webhook = Webhook(processes, api, tmp_path / "certificates", patience=TIMEOUT)
     api.create(template())
-    with webhook.asked():
+    with webhook.requested():
         os.kill(webhook.manager.pid, signal.SIGSTOP)
         api.patch("ApplicationTemplate", "app", {"spec": {"manifests": [config({}, name="hanging")]}})
         os.kill(webhook.manager.pid, signal.SIGCONT)
@@ -251,12 +251,12 @@ def test_a_manager_that_is_away_or_hangs_prevents_nothing(api: Api, processes: P
         api.patch("ApplicationTemplate", "app", {"spec": {"manifests": [config({}, name="away")]}})
         webhook.manager.start()
         webhook.wait_answering()
-        assert told(api, "ApplicationTemplate", "app")["reason"] == "TemplateInvalid"
+        assert reported(api, "ApplicationTemplate", "app")["reason"] == "TemplateInvalid"
         assert webhook.manager.terminate() == 0
 
 
 def test_a_renewed_certificate_is_shown_and_one_that_cannot_be_used_is_not(api: Api, webhook: Webhook) -> None:
-    with webhook.asked():
+    with webhook.requested():
         key = webhook.folder / "tls.key"
         old = key.read_bytes()
         key.write_text("no key")
@@ -271,14 +271,14 @@ def test_a_renewed_certificate_is_shown_and_one_that_cannot_be_used_is_not(api: 
 @contextmanager
 def listener(folder: Path) -> Iterator[tuple[int, Path, list[Object]]]:
     """An HTTPS server that allows everything: its port, its authority's file, and what it is asked."""
-    asked: list[Object] = []
+    requested: list[Object] = []
 
     class Handler(http.server.BaseHTTPRequestHandler):
         protocol_version = "HTTP/1.1"
 
         def do_POST(self) -> None:
             request = json.loads(self.rfile.read(int(self.headers["Content-Length"])))["request"]
-            asked.append(request)
+            requested.append(request)
             answer = {"apiVersion": "admission.k8s.io/v1", "kind": "AdmissionReview"}
             body = json.dumps({**answer, "response": {"uid": request["uid"], "allowed": True}}).encode()
             self.send_response(200)
@@ -297,7 +297,7 @@ def listener(folder: Path) -> Iterator[tuple[int, Path, list[Object]]]:
     thread = threading.Thread(target=server.serve_forever)
     thread.start()
     try:
-        yield server.server_port, authority.ca, asked
+        yield server.server_port, authority.ca, requested
     finally:
         server.shutdown()
         thread.join()
@@ -308,13 +308,15 @@ def test_tasks_instances_statuses_and_deletions_are_never_asked_about(
     api: Api, processes: Processes, namespace: str, tmp_path: Path
 ) -> None:
     start_manager(processes, namespace)
-    with listener(tmp_path) as (port, authority, asked):
+    with listener(tmp_path) as (port, authority, requested):
         url = f"https://127.0.0.1:{port}"
         name = f"wayside-{namespace}"
         options = ("--ca-bundle", str(authority), "--namespace", namespace, "--name", name)
         api.apply(printed("webhooks", "--url", url, *options))
         try:
-            wait_until(lambda: api.apply(template()) and bool(asked), bool, what="the API server asks about templates")
+            wait_until(
+                lambda: api.apply(template()) and bool(requested), bool, what="the API server asks about templates"
+            )
             api.create(task("north"))
             (made,) = api.wait_list("ApplicationInstance", lambda found: len(found) == 1, what="an instance is made")
             end(api, "north")
@@ -322,12 +324,12 @@ def test_tasks_instances_statuses_and_deletions_are_never_asked_about(
             api.create(detector())
             api.create(rule())
             for kind, of in (("ApplicationTemplate", "app"), ("Detector", "intersection-a"), ("EventRule", "close")):
-                told(api, kind, of)
+                reported(api, kind, of)
                 api.delete(kind, of)
             api.delete("ApplicationTask", "north")
         finally:
             api.delete("ValidatingWebhookConfiguration", name)
-    found = {(each["kind"]["kind"], each["operation"], each.get("subResource", "")) for each in asked}
+    found = {(each["kind"]["kind"], each["operation"], each.get("subResource", "")) for each in requested}
     assert {each[0] for each in found} == {"ApplicationTemplate", "Detector", "EventRule"}
     assert {each[1:] for each in found} <= {("CREATE", ""), ("UPDATE", "")}
 
@@ -347,10 +349,10 @@ def test_a_standby_answers_as_well(api: Api, processes: Processes, namespace: st
     active = start_manager(processes, namespace)
     holder = holds_lease(api)
     webhook = Webhook(processes, api, tmp_path / "certificates")
-    with webhook.asked():
+    with webhook.requested():
         with pytest.raises(ApiError, match="distence"):
             api.create(rule(when="distence < 150"))
         api.create(rule())
     assert active.alive
     assert holds_lease(api) == holder
-    assert told(api, "EventRule", "close")["reason"] == "NotSelected"
+    assert reported(api, "EventRule", "close")["reason"] == "NotSelected"

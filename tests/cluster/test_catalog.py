@@ -58,8 +58,10 @@ def test_a_rule_that_cannot_be_read_is_told_and_the_others_are_listed(
     answer = catalog(control_plane.kubeconfig, namespace, "--only", "incidence=Rare", "--format", "json")
     assert answer.returncode == 0, answer.stderr
     assert [each["name"] for each in json.loads(answer.stdout)["rules"]] == ["battery"]
-    told, summary = answer.stderr.splitlines()
-    assert told.startswith("left out, because it cannot be read: EventRule broken: spec.actions[0].deploy.parameters")
+    reported, summary = answer.stderr.splitlines()
+    assert reported.startswith(
+        "left out, because it cannot be read: EventRule broken: spec.actions[0].deploy.parameters"
+    )
     assert summary == "1 of 1 rules"
 
 

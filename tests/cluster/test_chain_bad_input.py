@@ -115,14 +115,14 @@ def test_json_of_the_wrong_shape_harms_nobody_else(chain: Chain) -> None:
         )
 
 
-def harms_nobody(chain: Chain, vehicles: Vehicles, bad: Callable[[], bytes], *said: str) -> None:
+def harms_nobody(chain: Chain, vehicles: Vehicles, bad: Callable[[], bytes], *logged: str) -> None:
     """One of another pair sends only bad poses for a while: that is said, and the pair's own episode holds too."""
     running = chain.start()
     with unharmed(chain, vehicles, running):
         vehicles.place(VANS, NEAR)
         deployed = chain.wait_deployed(VANS)
         vehicles.instead("van1", bad)
-        for line in said:
+        for line in logged:
             running.wait_for_output(line)
         vehicles.place(BUSES, NEAR)  # once theirs is there, the bad poses have been evaluated many times
         chain.wait_deployed(BUSES)
@@ -173,9 +173,9 @@ def test_rules_that_do_not_compile_are_refused_and_the_others_run(chain: Chain) 
     running = chain.start()
     with Vehicles(chain.endpoint) as vehicles, unharmed(chain, vehicles, running):
         chain.apply(*(bad for bad, _ in BAD_RULES.values()))
-        for name, (_, said) in BAD_RULES.items():
-            running.wait_for_output(f"EventRule {name} is refused: {said}")
-            assert re.search(said, chain.wait_condition("EventRule", name, "Accepted", "False")["message"])
+        for name, (_, logged) in BAD_RULES.items():
+            running.wait_for_output(f"EventRule {name} is refused: {logged}")
+            assert re.search(logged, chain.wait_condition("EventRule", name, "Accepted", "False")["message"])
         assert chain.wait_condition("EventRule", "close", "Accepted", "True")
         vehicles.place(VANS, NEAR)
         chain.wait_deployed(VANS)
@@ -192,8 +192,8 @@ def test_detector_check_tells_where_each_rule_is_wrong(tmp_path: Path) -> None:
     checked = command("check", ".", folder=tmp_path)
     assert checked.returncode == 1
     assert len(checked.stderr.splitlines()) == len(BAD_RULES), checked.stderr
-    for name, (_, said) in BAD_RULES.items():
-        assert re.search(rf"^{name}\.yaml:\d+:\d+: {said}", checked.stderr, re.MULTILINE), checked.stderr
+    for name, (_, logged) in BAD_RULES.items():
+        assert re.search(rf"^{name}\.yaml:\d+:\d+: {logged}", checked.stderr, re.MULTILINE), checked.stderr
 
 
 def test_a_rule_for_a_template_that_is_not_there_says_so_on_its_task(chain: Chain) -> None:
@@ -203,9 +203,9 @@ def test_a_rule_for_a_template_that_is_not_there_says_so_on_its_task(chain: Chai
     with Vehicles(chain.endpoint) as vehicles, unharmed(chain, vehicles, running):
         vehicles.place(VANS, NEAR)
         chain.wait_deployed(VANS)
-        told = refusal(chain, "bad")
-        assert told["reason"] == "TemplateNotFound"
-        assert "recordr" in told["message"]
+        reported = refusal(chain, "bad")
+        assert reported["reason"] == "TemplateNotFound"
+        assert "recordr" in reported["message"]
         assert len(chain.api.list("Deployment")) == 2
 
 
@@ -228,7 +228,7 @@ def refusal(chain: Chain, of_rule: str) -> Object:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "logged"),
     [
         (["run"], "give either --detector FILE and --rules FILE, or --name NAME"),
         (["run", "--name", HOLDER, "--rules", "rules.yaml"], "--rules requires --detector"),
@@ -238,10 +238,10 @@ def refusal(chain: Chain, of_rule: str) -> Object:
     ],
     ids=["nothing", "both", "no-detector", "no-recording", "command"],
 )
-def test_bad_usage_is_one_line_and_exit_code_2(tmp_path: Path, arguments: list[str], said: str) -> None:
+def test_bad_usage_is_one_line_and_exit_code_2(tmp_path: Path, arguments: list[str], logged: str) -> None:
     done = command(*arguments, folder=tmp_path)
     assert done.returncode == 2
-    assert said in done.stderr
+    assert logged in done.stderr
     assert len(done.stderr.splitlines()) == 1, done.stderr
     assert not done.stdout
 

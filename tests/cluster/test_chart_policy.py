@@ -111,7 +111,7 @@ def wait_in_force(api: Api, probe: Api) -> None:
         api.delete("ApplicationTask", "probe")
         return ""
 
-    wait_until(refused, lambda said: "the verb hold" in said, what="the policy is in force")
+    wait_until(refused, lambda logged: "the verb hold" in logged, what="the policy is in force")
 
 
 def refuses(what: str, act: Callable[[], object]) -> None:

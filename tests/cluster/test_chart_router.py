@@ -131,12 +131,12 @@ def test_each_client_does_what_it_may_and_nothing_else(connect: Connect) -> None
     assert set(at_town) <= {"vehicles/car1/pose", "wide vehicles/car1/pose"}, "what is asked for widely is not more"
     assert set(at_anna) == {"wayside/events/town/rule"}
 
-    def told(session: zenoh.Session) -> list[str]:
+    def reported(session: zenoh.Session) -> list[str]:
         replies = session.get("wayside/detectors/*/status", timeout=1.0)
         return [reply.ok.payload.to_string() for reply in replies if reply.ok is not None]
 
-    wait_for(lambda: told(anna) == ["fine"])
-    assert told(car) == []
+    wait_for(lambda: reported(anna) == ["fine"])
+    assert reported(car) == []
 
 
 EVENT, STATUS = "wayside/events/town/r/s", "wayside/detectors/town/status"

@@ -106,7 +106,7 @@ def test_charts_come_from_a_repository_and_from_a_registry_and_are_kept(
     manager = start_manager(processes, namespace, *options)
     ours = [write_chart(tmp_path / "mine", name) for name in ("first", "second")]
     with (
-        repository(tools, tmp_path / "web", ours[0]) as (url, asked),
+        repository(tools, tmp_path / "web", ours[0]) as (url, requested),
         registry(tools, tmp_path / "oci", ours[1]) as oci,
     ):
         api.create(template("web", {"chart": "first", "version": "1.0.0", "repository": url}))
@@ -114,7 +114,7 @@ def test_charts_come_from_a_repository_and_from_a_registry_and_are_kept(
         for name in ("web", "oci"):
             api.create(demand(name, name, "car1"))
             wait_for_image(api, name)
-        assert any(each.endswith("first-1.0.0.tgz") for each in asked)
+        assert any(each.endswith("first-1.0.0.tgz") for each in requested)
     # Both are gone now; what was fetched is still here, also after a restart.
     manager.restart()
     manager.wait_for_output("watching")
@@ -126,7 +126,7 @@ def test_charts_come_from_a_repository_and_from_a_registry_and_are_kept(
 
 
 @pytest.mark.parametrize(
-    ("files", "said"),
+    ("files", "logged"),
     [
         ({"templates/hook.yaml": HOOK}, "Job app-migrate in templates/hook.yaml is a hook (pre-install)"),
         ({"crds/things.yaml": CRD}, "is a CRD, which is cluster-wide"),
@@ -137,12 +137,12 @@ def test_charts_come_from_a_repository_and_from_a_registry_and_are_kept(
     ids=["hook", "crd", "random", "error", "kind"],
 )
 def test_a_chart_that_cannot_be_used_is_refused_in_words_and_corrected_it_runs(
-    api: Api, manager: Process, charts: Path, files: dict[str, str], said: str
+    api: Api, manager: Process, charts: Path, files: dict[str, str], logged: str
 ) -> None:
     wrong = write_chart(charts, "wrong", {**APPLICATION, **files})
     api.create(template("app", {"chart": str(wrong)}))
     api.create(demand("one", "app", "car1"))
-    assert said in wait_for_refusal(api, "app", "RenderFailed")
+    assert logged in wait_for_refusal(api, "app", "RenderFailed")
     assert api.find("Deployment", "app") is None
     right = {"spec": {"helm": {"chart": str(write_chart(charts, "right"))}}}
     api.patch("ApplicationTemplate", "app", right)

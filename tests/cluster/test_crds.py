@@ -283,5 +283,5 @@ def _fields(path: str, schema: dict[str, Any]) -> Iterator[tuple[str, dict[str, 
 
 def test_kubectl_applies_the_files_as_they_are(control_plane: ControlPlane) -> None:
     """It reads YAML in its own way: a lone y is a boolean to it."""
-    told = control_plane.kubectl("apply", "--server-side", "--force-conflicts", "--dry-run=server", "-f", str(CRDS))
-    assert len(told.splitlines()) == len(KINDS)
+    reported = control_plane.kubectl("apply", "--server-side", "--force-conflicts", "--dry-run=server", "-f", str(CRDS))
+    assert len(reported.splitlines()) == len(KINDS)

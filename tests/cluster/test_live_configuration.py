@@ -84,7 +84,7 @@ def wait_until_told(api: Api, *sources: str) -> Object:
     return pod
 
 
-class Told:
+class Reported:
     """What comes on a key, as sources; None for a deletion."""
 
     def __init__(self, session: zenoh.Session, key: str) -> None:
@@ -107,7 +107,7 @@ def _sources_of(sample: zenoh.Sample) -> list[str]:
     return sources_in(json.loads(sample.payload.to_bytes())["sources.yaml"])
 
 
-def asked(session: zenoh.Session, key: str) -> list[list[str]]:
+def requested(session: zenoh.Session, key: str) -> list[list[str]]:
     """What a late joiner gets who asks on the key."""
     return [_sources_of(reply.ok) for reply in session.get(key) if reply.ok is not None]
 
@@ -118,8 +118,8 @@ def test_a_change_touches_the_pods_and_not_their_template(api: Api, manager: Pro
     pod = wait_for_pod(api)
     deployment = api.get("Deployment", "fusion")
     api.create(vehicle("car2"))
-    told = wait_until_told(api, "car1", "car2")
-    assert told["metadata"]["uid"] == pod["metadata"]["uid"]
+    reported = wait_until_told(api, "car1", "car2")
+    assert reported["metadata"]["uid"] == pod["metadata"]["uid"]
     now = api.get("Deployment", "fusion")
     assert now["spec"] == deployment["spec"]
     assert now["metadata"]["generation"] == deployment["metadata"]["generation"]
@@ -159,19 +159,19 @@ def test_zenoh_has_each_change_and_answers_who_comes_late(
     api: Api, namespace: str, network: zenoh.Session, manager: Process
 ) -> None:
     key = f"wayside/instances/{namespace}/fusion/configuration"
-    told = Told(network, key)
+    reported = Reported(network, key)
     api.create(template())
     api.create(vehicle("car1"))
-    told.wait_for(["car1"])
+    reported.wait_for(["car1"])
     api.create(vehicle("car2"))
-    told.wait_for(["car1", "car2"])
-    assert asked(network, key) == [["car1", "car2"]]
-    assert asked(network, "wayside/instances/*/fusion/**") == [["car1", "car2"]]
-    assert asked(network, f"wayside/instances/{namespace}/other/configuration") == []
+    reported.wait_for(["car1", "car2"])
+    assert requested(network, key) == [["car1", "car2"]]
+    assert requested(network, "wayside/instances/*/fusion/**") == [["car1", "car2"]]
+    assert requested(network, f"wayside/instances/{namespace}/other/configuration") == []
     for each in ("car1", "car2"):
         end(api, each)
-    told.wait_for(None)
-    assert asked(network, key) == []
+    reported.wait_for(None)
+    assert requested(network, key) == []
 
 
 def test_a_killed_manager_comes_back_and_answers_again(
@@ -180,11 +180,13 @@ def test_a_killed_manager_comes_back_and_answers_again(
     key = f"wayside/instances/{namespace}/fusion/configuration"
     api.create(template())
     api.create(vehicle("car1"))
-    wait_until(lambda: asked(network, key), lambda found: found == [["car1"]], what="there is an answer")
+    wait_until(lambda: requested(network, key), lambda found: found == [["car1"]], what="there is an answer")
     manager.kill9()
     api.create(vehicle("car2"))
     manager.restart()
-    wait_until(lambda: asked(network, key), lambda found: found == [["car1", "car2"]], what="there is an answer again")
+    wait_until(
+        lambda: requested(network, key), lambda found: found == [["car1", "car2"]], what="there is an answer again"
+    )
     wait_until_told(api, "car1", "car2")
 
 
@@ -197,10 +199,12 @@ def test_zenoh_may_come_late_and_go(api: Api, namespace: str, endpoint: str, man
     for number in (2, 3):
         with router(listen__endpoints=[endpoint]) as session:
             cars = [f"car{each}" for each in range(1, number)]
-            wait_until(lambda: asked(session, key), lambda found, cars=cars: found == [cars], what="there is an answer")
-            told = Told(session, key)
+            wait_until(
+                lambda: requested(session, key), lambda found, cars=cars: found == [cars], what="there is an answer"
+            )
+            reported = Reported(session, key)
             api.create(vehicle(f"car{number}"))
-            told.wait_for([*cars, f"car{number}"])
+            reported.wait_for([*cars, f"car{number}"])
     assert manager.terminate(patience=15) == 0
 
 

@@ -86,7 +86,7 @@ def test_explain_goes_from_the_event_over_merged_values_to_the_pods(
     )
     wait_settled(api)
     pods = api.wait_list("Pod", lambda found: len(found) == 1, what="the pod exists")
-    told = wait_until(
+    reported = wait_until(
         lambda: explain(control_plane, api, "one").stdout,
         lambda text: f"Deployment {NORTH} has 0 of 1 pods available" in text,
         what="the manager has written what belongs to the instance",
@@ -100,7 +100,7 @@ def test_explain_goes_from_the_event_over_merged_values_to_the_pods(
         "9 of two is it",
         f"{pods[0]['metadata']['name']} Pending: not ready yet",
     ):
-        assert line in told
+        assert line in reported
     as_json = json.loads(explain(control_plane, api, f"appinst/{NORTH}", "-o", "json").stdout)
     assert [each["name"] for each in as_json["tasks"]] == ["one", "two"]
     assert as_json["instance"]["phase"] == "Applied"
@@ -113,9 +113,9 @@ def test_what_cannot_be_explained_is_one_line_with_the_remedy(control_plane: Con
     assert "there is no ApplicationTask or ApplicationInstance 'nothing'" in failed.stderr
     assert len(failed.stderr.splitlines()) == 1
     api.create(task("waits", of="missing"))
-    told = explain(control_plane, api, "waits").stdout
-    assert "template missing: does not exist" in told
-    assert "the manager has not processed its current generation" in told
+    reported = explain(control_plane, api, "waits").stdout
+    assert "template missing: does not exist" in reported
+    assert "the manager has not processed its current generation" in reported
 
 
 def test_explain_knows_who_has_no_place_and_what_stands_in_for_whom(

@@ -48,11 +48,11 @@ def wait_told(api: Api, kind: str, name: str, type_: str, parts: list[str]) -> O
     What is said first may be another thing, e.g. of a task that the manager hears of before its template.
     """
 
-    def says(raw: Object) -> bool:
-        told = condition(raw, type_)
-        return told.get("status") == "False" and all(part in told["message"] for part in parts)
+    def shows(raw: Object) -> bool:
+        reported = condition(raw, type_)
+        return reported.get("status") == "False" and all(part in reported["message"] for part in parts)
 
-    return condition(api.wait_for(kind, name, says, what=f"{type_} of {kind} {name} is False and says {parts}"), type_)
+    return condition(api.wait_for(kind, name, shows, what=f"{type_} of {kind} {name} is False and says {parts}"), type_)
 
 
 def changed(container: Object) -> Object:

@@ -61,10 +61,10 @@ def close_vehicles() -> Object:
     }
 
 
-def says(api: Api, status: str, reason: str) -> Object:
+def shows(api: Api, status: str, reason: str) -> Object:
     def holds(raw: Object) -> bool:
-        said = condition(raw, "Running")
-        return (said.get("status"), said.get("reason")) == (status, reason)
+        logged = condition(raw, "Running")
+        return (logged.get("status"), logged.get("reason")) == (status, reason)
 
     found = api.wait_for("Detector", HOLDER, holds, what=f"Running is {status}, {reason}")
     return condition(found, "Running")
@@ -126,8 +126,8 @@ def test_an_object_of_somebody_else_with_copied_labels_neither_disturbs_nor_is_t
     for seconds in ("30s", "20s"):
         api.patch("Detector", HOLDER, {"spec": {"clientTimeout": seconds}})
         is_made(api)
-    told = says(api, "False", "NotReady")
-    assert "not the detector's" not in told["message"]
+    reported = shows(api, "False", "NotReady")
+    assert "not the detector's" not in reported["message"]
     api.patch("Detector", HOLDER, {"spec": {"mode": None}})
     for kind in KINDS:
         api.wait_gone(kind, NAME)
@@ -141,14 +141,14 @@ def test_its_objects_come_change_and_go_with_it(api: Api, processes: Processes, 
     start_manager(processes, namespace, *RUNS)
     api.create(detector(mode="Standalone"))
     is_made(api)
-    says(api, "True", "Running")
+    shows(api, "True", "Running")
     first = api.get("Deployment", NAME)
 
     api.patch("Detector", HOLDER, {"spec": {"clientTimeout": "30s", "state": {"path": "/state"}}})
     is_made(api)
     generation = api.get("Deployment", NAME)["metadata"]["generation"]
     assert generation > first["metadata"]["generation"]
-    says(api, "True", "Running")
+    shows(api, "True", "Running")
     changed = api.patch("Detector", HOLDER, {"spec": {"clientTimeout": "20s"}})
     api.wait_for(
         "Detector",
@@ -179,23 +179,23 @@ def test_the_status_says_why_it_does_not_run(api: Api, processes: Processes, nam
     foreign = api.create(other)
     manager = start_manager(processes, namespace)
     api.create(detector(mode="Standalone"))
-    assert "--detector-image" in says(api, "False", "NotRun")["message"]
+    assert "--detector-image" in shows(api, "False", "NotRun")["message"]
     assert api.find("Deployment", NAME) is None
     manager.terminate()
 
     start_manager(processes, namespace, *RUNS)
-    assert f"ServiceAccount {NAME} exists already" in says(api, "False", "ObjectExists")["message"]
+    assert f"ServiceAccount {NAME} exists already" in shows(api, "False", "ObjectExists")["message"]
     assert api.get("ServiceAccount", NAME)["metadata"]["uid"] == foreign["metadata"]["uid"]
     assert api.find("Deployment", NAME) is None
     api.delete("ServiceAccount", NAME)
     is_made(api)
-    says(api, "False", "NotReady")
+    shows(api, "False", "NotReady")
     (pod,) = api.wait_list("Pod", lambda found: len(found) == 1, what="its pod is made")
     waiting = {"waiting": {"reason": "ErrImagePull", "message": "not found"}}
     state = {"name": "detector", "image": "wayside:1", "imageID": "", "ready": False, "restartCount": 0}
     status = {"phase": "Pending", "containerStatuses": [{**state, "state": waiting}]}
     api.patch("Pod", pod["metadata"]["name"], {"status": status}, subresource="status")
-    assert "cannot pull image wayside:1: not found" in says(api, "False", "ImagePullFailed")["message"]
+    assert "cannot pull image wayside:1: not found" in shows(api, "False", "ImagePullFailed")["message"]
 
 
 def test_the_pod_passes_the_restricted_standard(
@@ -226,7 +226,7 @@ def test_the_manager_runs_it_with_the_rights_that_are_printed(
     manager = start_manager(processes, namespace, *RUNS, *ALLOWED, kubeconfig=account)
     api.create(detector(mode="Standalone"))
     is_made(api)
-    says(api, "True", "Running")
+    shows(api, "True", "Running")
     api.patch("Detector", HOLDER, {"spec": {"mode": None}})
     for kind in KINDS:
         api.wait_gone(kind, NAME)
@@ -274,11 +274,11 @@ def test_a_detector_needs_all_the_rights_that_its_role_gives_and_no_more(
             "Lease", f"wayside-{HOLDER}", lambda raw: raw["spec"]["renewTime"] != renewed, what="its Lease is renewed"
         )
         assert running.terminate() == 0
-        asked = set(used(proxy.seen, namespace))
-    assert asked <= granted(roles)
+        requested = set(used(proxy.seen, namespace))
+    assert requested <= granted(roles)
     # `hold` is asked of the API server by the chart's policy; a task is read and deleted after a crash within a write.
     seldom = {("applicationtasks", "get"), ("applicationtasks", "delete"), ("detectors", "hold")}
-    assert {(resource, verb) for _, resource, verb in granted(roles) - asked} <= seldom
+    assert {(resource, verb) for _, resource, verb in granted(roles) - requested} <= seldom
     assert "orbidden" not in running.output()
 
 

@@ -69,8 +69,8 @@ def test_what_runs_stays_as_it_is_and_the_template_says_why(api: Api, namespace:
     api.create(bad)
     message = condition(applied(api, north, "ExpressionLimit"), "Applied")["message"]
     assert "rendering this instance took more than 0.5 s of CPU time" in message
-    said = accepted(api, "bomb", "False")
-    assert f"rendering instance {north} took more than 0.5 s of CPU time and was stopped: simplify" in said
+    logged = accepted(api, "bomb", "False")
+    assert f"rendering instance {north} took more than 0.5 s of CPU time and was stopped: simplify" in logged
     now = api.get("ConfigMap", f"{north}-config")
     assert (now["metadata"]["uid"], now["data"]) == (before["metadata"]["uid"], before["data"])
 
@@ -162,7 +162,7 @@ def test_admission_refuses_a_template_that_takes_too_long_with_its_own_defaults(
     }
     made = template("bomb", parameters=parameters, manifests=[config({"n": f"n=${{{BOMB}}}"}, name="n")])
     del made["spec"]["key"]
-    said = r"spec: to judge it takes more than 0\.5 s of CPU time and was ended"
-    with webhook.asked(), pytest.raises(ApiError, match=said):
+    logged = r"spec: to judge it takes more than 0\.5 s of CPU time and was ended"
+    with webhook.requested(), pytest.raises(ApiError, match=logged):
         api.apply(made, dry_run=dry_run)
     assert api.find("ApplicationTemplate", "bomb") is None

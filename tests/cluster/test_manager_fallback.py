@@ -21,14 +21,14 @@ def wait_accepted(api: Api, name: str, reason: str) -> Object:
     )
 
 
-def wait_condition(api: Api, instance: str, type_: str, status: str, says: str = "") -> Object:
+def wait_condition(api: Api, instance: str, type_: str, status: str, shows: str = "") -> Object:
     """Wait for the condition, whose message may follow its status, and both the task's; return it."""
 
     def holds(raw: Object) -> bool:
         found = condition(raw, type_)
-        return found.get("status") == status and says in found["message"]
+        return found.get("status") == status and shows in found["message"]
 
-    found = api.wait_for("ApplicationInstance", instance, holds, what=f"{type_} of {instance} is {status}, {says}")
+    found = api.wait_for("ApplicationInstance", instance, holds, what=f"{type_} of {instance} is {status}, {shows}")
     return condition(found, type_)
 
 
@@ -41,13 +41,13 @@ def test_what_is_not_ready_in_time_says_so(api: Api, processes: Processes, names
     start_manager(processes, namespace)
     api.create(template(lifecycle=IN_TIME))
     api.create(task("north"))
-    told = api.wait_for(
+    reported = api.wait_for(
         "ApplicationTask",
         "north",
         lambda raw: condition(raw, "Ready").get("reason") == "ReadyTimeout",
         what="the task says that its application was not ready in time",
     )
-    assert f"instance {FULL} was not ready for 2s" in told["status"]["message"]
+    assert f"instance {FULL} was not ready for 2s" in reported["status"]["message"]
     api.wait_for(
         "ApplicationInstance",
         FULL,

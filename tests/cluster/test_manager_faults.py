@@ -149,13 +149,13 @@ def test_an_object_of_somebody_else_is_left_alone(api: Api, manager: Process) ->
     api.create(task("north"))
     api.create(task("south"))
     there(api, SOUTH)
-    told = api.wait_for(
+    reported = api.wait_for(
         "ApplicationInstance",
         NORTH,
         lambda raw: condition(raw, "Applied").get("reason") == "ObjectExists",
         what="the instance says what stands in its way",
     )
-    message = condition(told, "Applied")["message"]
+    message = condition(reported, "Applied")["message"]
     assert f"Deployment {NORTH} exists already" in message
     assert "delete or rename it" in message
     pending = api.wait_for(
@@ -210,13 +210,13 @@ def test_a_template_that_breaks_leaves_what_runs_as_it_was(api: Api, manager: Pr
     wait_settled(api)
     before = {key: value for key, value in quiet(api).items() if key[0] in ("Deployment", "ConfigMap")}
     api.patch("ApplicationTemplate", "app", {"spec": {"manifests": [deployment("app:${parameters.version}")]}})
-    told = api.wait_for(
+    reported = api.wait_for(
         "ApplicationInstance",
         NORTH,
         lambda raw: condition(raw, "Applied").get("reason") == "RenderFailed",
         what="the instance says what is wrong",
     )
-    assert "`parameters.version` does not exist" in condition(told, "Applied")["message"]
+    assert "`parameters.version` does not exist" in condition(reported, "Applied")["message"]
     wait_settled(api)
     after = quiet(api)
     assert {key: after[key] for key in before} == before

@@ -29,10 +29,10 @@ def test_a_union_that_is_too_large_stops_its_own_instance_and_no_other(api: Api,
     for name, count in (("large", 40), ("larger", 50)):
         api.create(task(name, region="north", sources=sources(name[-1], count)))
     instance = api.wait_for("ApplicationInstance", NORTH, too_large, what="the instance says why it stays as it is")
-    told = condition(instance, "Applied")
-    assert told["reason"] == "ParametersTooLarge"
-    assert "task larger gives 50" in told["message"]
-    assert told["message"].index("task larger") < told["message"].index("task large gives")
+    reported = condition(instance, "Applied")
+    assert reported["reason"] == "ParametersTooLarge"
+    assert "task larger gives 50" in reported["message"]
+    assert reported["message"].index("task larger") < reported["message"].index("task large gives")
     waiting = api.wait_for("ApplicationTask", "larger", too_large, what="so does the task")
     assert waiting["status"]["phase"] == "Pending"
 

@@ -165,10 +165,10 @@ def test_an_object_beyond_the_quota_is_said_and_made_once_there_is_room(
     api.create(task("low"))
     wait_task(api, "low", "Active")
     api.create(task("high"))
-    told = beyond_the_quota(api, "high")
-    assert told["status"]["phase"] == "Pending"
-    assert f"Deployment {HIGH}" in told["status"]["message"]
-    assert "raise the ResourceQuota" in told["status"]["message"]
+    reported = beyond_the_quota(api, "high")
+    assert reported["status"]["phase"] == "Pending"
+    assert f"Deployment {HIGH}" in reported["status"]["message"]
+    assert "raise the ResourceQuota" in reported["status"]["message"]
     wait_instance(
         api,
         HIGH,
@@ -191,9 +191,9 @@ def test_an_instance_beyond_the_quota_is_told_to_its_tasks(api: Api, processes: 
     api.create(task("low"))
     wait_task(api, "low", "Active")
     api.create(task("high"))
-    told = beyond_the_quota(api, "high")
-    assert f"instance {HIGH} cannot be made" in told["status"]["message"]
-    assert told["status"]["phase"] == "Pending"
+    reported = beyond_the_quota(api, "high")
+    assert f"instance {HIGH} cannot be made" in reported["status"]["message"]
+    assert reported["status"]["phase"] == "Pending"
     raise_quota(api, {"count/applicationinstances.wayside.dev": "2"})
     wait_task(api, "high", "Active")
     wait_settled(api)
@@ -205,13 +205,13 @@ def test_pods_beyond_the_quota_are_told_to_the_tasks(api: Api, processes: Proces
     start_manager(processes, namespace)
     api.create(template())
     api.create(task("low"))
-    told = api.wait_for(
+    reported = api.wait_for(
         "ApplicationTask",
         "low",
         lambda raw: condition(raw, "Ready").get("reason") == "QuotaExceeded",
         what="the task's Ready says that pods are beyond the quota",
     )
-    assert "pods are refused: forbidden: exceeded quota: few" in told["status"]["message"]
+    assert "pods are refused: forbidden: exceeded quota: few" in reported["status"]["message"]
     wait_instance(
         api,
         LOW,
@@ -233,13 +233,13 @@ def test_what_a_limit_range_refuses_is_told_as_well(api: Api, processes: Process
     }
     api.create(template(manifests=[claim]))
     api.create(task("low"))
-    told = api.wait_for(
+    reported = api.wait_for(
         "ApplicationInstance",
         LOW,
         lambda raw: condition(raw, "Applied").get("reason") == "AdmissionRefused",
         what="the instance says that the claim is not admitted",
     )
-    assert "maximum storage usage per PersistentVolumeClaim is 1Gi" in told["status"]["message"]
+    assert "maximum storage usage per PersistentVolumeClaim is 1Gi" in reported["status"]["message"]
     api.patch("LimitRange", "small", {"spec": {"limits": [{**most, "max": {"storage": "2Gi"}}]}})
     api.wait_for("PersistentVolumeClaim", LOW, lambda raw: True, what="the claim is made")
 
@@ -270,15 +270,15 @@ def test_pods_that_only_events_tell_are_refused_are_said_and_made_once_there_is_
     start_manager(processes, namespace)
     api.create(template(manifests=[workload(kind)]))
     api.create(task("low"))
-    told = beyond_the_quota(api, "low")
-    assert told["status"]["phase"] == "Active"
-    said = wait_instance(
+    reported = beyond_the_quota(api, "low")
+    assert reported["status"]["phase"] == "Active"
+    logged = wait_instance(
         api,
         LOW,
         lambda raw: condition(raw, "Ready").get("reason") == "QuotaExceeded",
         "says that of its pods too",
     )
-    ready = condition(said, "Ready")
+    ready = condition(logged, "Ready")
     assert ready["status"] == "False"
     assert 'pods "' not in ready["message"]  # the name is another one each time
     raise_quota(api, {"pods": "2"})

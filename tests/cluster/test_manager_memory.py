@@ -63,11 +63,11 @@ def test_parameters_and_templates_that_are_too_large_are_refused_with_their_size
     api.create(template())
     large = template("large", configuration={f"data{index}.txt": "x" * 60_000 for index in range(5)})
     api.create(large)
-    told = api.wait_for(
+    reported = api.wait_for(
         "ApplicationTemplate", "large", lambda raw: bool(condition(raw, "Accepted")), what="it has a status"
     )
-    assert condition(told, "Accepted")["status"] == "False"
-    assert "more than the 262144" in condition(told, "Accepted")["message"]
+    assert condition(reported, "Accepted")["status"] == "False"
+    assert "more than the 262144" in condition(reported, "Accepted")["message"]
     api.create(task("parameters", **{f"p{index}": "x" * 60_000 for index in range(3)}))
     refused = api.wait_for(
         "ApplicationTask", "parameters", lambda raw: bool(condition(raw, "Accepted")), what="it has a status"

@@ -40,13 +40,13 @@ def test_the_younger_one_waits_until_the_older_one_is_gone(
             name = instance_name("app", f"t{number}")
             api.wait_for("Deployment", name, lambda _: True, what="the first one serves the task")
         wait_settled(api)
-        told = api.wait_for(
+        reported = api.wait_for(
             "ApplicationTemplate",
             "app",
             lambda raw: raw["status"].get("manager", {}).get("lease", "").endswith("/application-manager"),
             what="its status names the older one",
         )
-        assert condition(told, "Accepted")["status"] == "True"
+        assert condition(reported, "Accepted")["status"] == "True"
         assert statuses(second) <= ATTEMPTS
         assert statuses(first) <= 2 * ATTEMPTS
         assert not [each for each in second.writes() if "/applicationinstances" in each.path]

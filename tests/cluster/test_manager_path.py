@@ -177,7 +177,7 @@ def test_events_tell_the_story_once(api: Api, manager: Process) -> None:
     api.create({**task("wrong"), "spec": {"templateName": "nowhere"}})
     api.wait_for("Deployment", NORTH, lambda _: True, what="the Deployment exists")
 
-    def told() -> list[tuple[str, str, str]]:
+    def reported() -> list[tuple[str, str, str]]:
         return sorted(
             (each["regarding"]["kind"], each["regarding"]["name"], each["reason"])
             for each in api.list("Event.events.k8s.io")
@@ -189,9 +189,9 @@ def test_events_tell_the_story_once(api: Api, manager: Process) -> None:
         ("ApplicationTask", "wrong", "Refused"),
         ("ApplicationTemplate", "app", "Accepted"),
     ]
-    wait_until(told, lambda found: found == expected, what="the Events are there")
+    wait_until(reported, lambda found: found == expected, what="the Events are there")
     manager.restart()
     manager.wait_for_output("watching")
     wait_settled(api)
     assert only_instance(api)["status"]["phase"] == "Applied"
-    assert told() == expected
+    assert reported() == expected

@@ -96,8 +96,8 @@ def test_the_node_that_a_task_names_gets_the_application_and_one_that_is_not_the
     wait_bound(api, "north", nodes[0])
     api.create(task("west", node="rsu-9"))
     named = "fits no node: nodeSelector: no node has the label kubernetes.io/hostname=rsu-9"
-    told = wait_told(api, "west", named, "no node fits the pod")
-    assert nodes[0] in told["status"]["message"]  # what there is instead
+    reported = wait_told(api, "west", named, "no node fits the pod")
+    assert nodes[0] in reported["status"]["message"]  # what there is instead
     api.wait_for(
         "ApplicationInstance",
         instance_name("app", "west"),

@@ -97,8 +97,8 @@ def may(account: Api, namespace: str, group: str, resource: str, verb: str, name
     about = {"group": group, "resource": resource, "verb": verb, "name": name, "namespace": namespace}
     api_version = "authorization.k8s.io/v1"
     kind = "SelfSubjectAccessReview"
-    asked = {"apiVersion": api_version, "kind": kind, "metadata": {}, "spec": {"resourceAttributes": about}}
-    return bool(account.create(asked)["status"]["allowed"])
+    requested = {"apiVersion": api_version, "kind": kind, "metadata": {}, "spec": {"resourceAttributes": about}}
+    return bool(account.create(requested)["status"]["allowed"])
 
 
 def each_verb_is_missed(api: Api, whole: list[Object], lacks: Callable[[], list[Verb]]) -> None:
@@ -203,14 +203,14 @@ def test_a_whole_life_needs_all_that_is_printed_and_nothing_more(
     watches = [each.path for each in proxy.seen if "/leases?" in each.path and "watch=true" in each.path]
     assert watches
     assert {tuple(parse_qs(urlsplit(each).query)["labelSelector"]) for each in watches} == {(HOLDER_LEASE_LABEL,)}
-    asked = set(used(proxy.seen, namespace))
-    for group, resource, verb in [*asked]:
+    requested = set(used(proxy.seen, namespace))
+    for group, resource, verb in [*requested]:
         if verb == "patch" and resource in ("applicationinstances", "deployments", "configmaps"):
-            asked.add((group, resource, "create"))  # an apply of what is not there yet needs both
+            requested.add((group, resource, "create"))  # an apply of what is not there yet needs both
     never = {("coordination.k8s.io", "leases", "get")} if "/leases/wayside-" not in str(proxy.seen) else set()
     instance_after_a_failure = {("wayside.dev", "applicationinstances", "get")}
-    assert granted(manifests) - asked - never <= instance_after_a_failure
-    assert asked <= granted(manifests)
+    assert granted(manifests) - requested - never <= instance_after_a_failure
+    assert requested <= granted(manifests)
 
 
 @pytest.mark.own_control_plane
@@ -235,8 +235,8 @@ def test_where_it_looks_after_all_namespaces_it_writes_in_those_that_are_granted
             api.wait_for("Deployment", name, lambda _: True, what="the detector has its rights and its pod")
             wait_settled(api)
             manager.wait_for_output(f"namespace {other.namespace} is not granted to this manager")
-            asked = list(used(proxy.seen, other.namespace))
-            assert {verb for _, _, verb in asked} <= {"get", "list"}, "nothing is even tried there"
+            requested = list(used(proxy.seen, other.namespace))
+            assert {verb for _, _, verb in requested} <= {"get", "list"}, "nothing is even tried there"
             assert other.find("ApplicationInstance", NORTH) is None
 
             what_it_cannot_do(Api(account, namespace), Api(account, other.namespace), api.get("Role", name))
@@ -325,8 +325,10 @@ def test_what_nothing_works_without_ends_the_start_with_one_line(
     environment = {"KUBECONFIG": str(account)}
     manager = processes.start("application-manager", "run", "--namespace", namespace, *ALLOWED, environment=environment)
     assert manager.wait() == 2
-    said = f"its service account cannot watch applicationtasks of wayside.dev in namespace {namespace}, so nothing can"
-    assert said in manager.output()
+    logged = (
+        f"its service account cannot watch applicationtasks of wayside.dev in namespace {namespace}, so nothing can"
+    )
+    assert logged in manager.output()
     assert "apply the output of `application-manager rbac`" in manager.output()
 
 
@@ -342,13 +344,13 @@ def test_what_only_some_need_is_said_at_the_start_and_where_it_shows(
     api.create(template(manifests=[deployment(), config({"a": "b"})]))
     api.create(task("north"))
     api.create(task("south", of="other"))
-    told = api.wait_for(
+    reported = api.wait_for(
         "ApplicationInstance",
         NORTH,
         lambda raw: condition(raw, "Applied").get("reason") == "ApplyRefused",
         what="the instance says what lacks",
     )
-    message = condition(told, "Applied")["message"]
+    message = condition(reported, "Applied")["message"]
     assert 'cannot patch resource "configmaps"' in message
     assert "apply the output of `application-manager rbac`" in message
     api.wait_for("Deployment", instance_name("other", "south"), lambda _: True, what="others are served")

@@ -51,7 +51,7 @@ def test_why_its_pods_do_not_run_is_said_of_task_and_instance_until_they_do(api:
     api.create(task("north"))
     pod = its_pod(api)
 
-    def said(reason: str, text: str) -> None:
+    def logged(reason: str, text: str) -> None:
         wait_ready_says(api, "ApplicationTask", "north", reason=reason, text=text)
         wait_ready_says(api, "ApplicationInstance", NORTH, reason=reason, text=text)
 
@@ -62,15 +62,15 @@ def test_why_its_pods_do_not_run_is_said_of_task_and_instance_until_they_do(api:
         "message": "0/3 nodes are free",
     }
     kubelet_says(api, pod, conditions=[unscheduled])
-    said("Unschedulable", "no node fits the pod: 0/3 nodes are free")
+    logged("Unschedulable", "no node fits the pod: 0/3 nodes are free")
     kubelet_says(
         api, pod, conditions=[unscheduled | {"status": "True"}], containerStatuses=waiting("ErrImagePull", "not found")
     )
-    said("ImagePullFailed", "cannot pull image registry.example/app:9: not found")
+    logged("ImagePullFailed", "cannot pull image registry.example/app:9: not found")
     ended = {"exitCode": 137, "reason": "OOMKilled"}
     crashed = container({"waiting": {"reason": "CrashLoopBackOff"}}, lastState={"terminated": ended}, restartCount=2)
     kubelet_says(api, pod, containerStatuses=crashed)
-    said("CrashLoop", "container main crashes: it ended with exit code 137, killed for exceeding its memory limit")
+    logged("CrashLoop", "container main crashes: it ended with exit code 137, killed for exceeding its memory limit")
 
     api.patch("Pod", pod, {"status": running(api.get("Pod", pod))}, subresource="status")
     wait_ready_says(api, "ApplicationTask", "north", status="True", reason="Ready", text="is ready")

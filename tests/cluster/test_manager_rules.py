@@ -45,10 +45,10 @@ def test_a_rule_follows_its_detectors_and_what_is_wrong_is_told(api: Api, proces
     )
     api.patch("EventRule", name, {"spec": {"when": "distence < 150"}})
     refused = api.wait_for("EventRule", name, lambda raw: judged(raw) == "RuleInvalid", what="it is refused")
-    told = condition(refused, "Accepted")
-    assert told["observedGeneration"] == refused["metadata"]["generation"]
+    reported = condition(refused, "Accepted")
+    assert reported["observedGeneration"] == refused["metadata"]["generation"]
     for part in ("spec.when", "line 1, column 1", "distence", "distance"):
-        assert part in told["message"]
+        assert part in reported["message"]
     api.delete("EventRule", name)
     api.wait_for(
         "Detector", "intersection-a", lambda raw: raw.get("status", {}).get("rules") == 0, what="it is counted no more"

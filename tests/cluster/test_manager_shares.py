@@ -40,14 +40,18 @@ def test_a_flood_in_one_namespace_delays_neither_what_another_applies_nor_its_st
     before = [each for each in many if _is_ours(each) and _version(each) < _version(one)]
     assert len(before) < AHEAD
 
-    told = small.wait_for("ApplicationTask", "refused-000", lambda raw: "status" in raw, what="the task has a status")
+    reported = small.wait_for(
+        "ApplicationTask", "refused-000", lambda raw: "status" in raw, what="the task has a status"
+    )
     others = api.wait_list(
         "ApplicationTask",
         lambda found: all("status" in each for each in found if each["metadata"]["name"].startswith("refused")),
         what="all tasks that are refused have a status",
     )
     ahead = [
-        each for each in others if each["metadata"]["name"].startswith("refused") and _version(each) < _version(told)
+        each
+        for each in others
+        if each["metadata"]["name"].startswith("refused") and _version(each) < _version(reported)
     ]
     assert len(ahead) < AHEAD
 
@@ -77,9 +81,9 @@ def test_a_holder_gets_what_the_administrator_allows_it_and_people_are_not_bound
     urgent, stopping = task("urgent", holder="det"), task("stopping", holder="det", region="first")
     api.create({**urgent, "spec": {**urgent["spec"], "priority": 11}})
     api.create({**stopping, "spec": {**stopping["spec"], "operation": "Suspend"}})
-    for name, told in (("urgent", "spec.priority: 11 is above 10"), ("stopping", "spec.operation: Suspend")):
+    for name, reported in (("urgent", "spec.priority: 11 is above 10"), ("stopping", "spec.operation: Suspend")):
         _wait_accepted(api, name, "NotAllowed")
-        assert told in api.get("ApplicationTask", name)["status"]["message"]
+        assert reported in api.get("ApplicationTask", name)["status"]["message"]
     api.create(task("first", holder="det"))  # what is refused takes nothing of the budget
     _wait_accepted(api, "first", "Accepted")
     api.create(task("second", holder="det"))

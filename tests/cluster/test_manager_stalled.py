@@ -37,10 +37,10 @@ def test_a_manager_whose_event_loop_hangs_ends_and_another_takes_over(
     wait_settled(api)
     os.kill(hanging.pid, signal.SIGUSR1)
     assert hanging.wait() == STALLED
-    said = hanging.output()
-    assert "CRITICAL watchdog: the event loop has not run for" in said
-    assert "ending this manager, to be restarted" in said
-    assert "in hang" in said, "and where it hangs"
+    logged = hanging.output()
+    assert "CRITICAL watchdog: the event loop has not run for" in logged
+    assert "ending this manager, to be restarted" in logged
+    assert "in hang" in logged, "and where it hangs"
     standby.wait_for_output("active: holds the Lease")
     api.create(task("south"))
     wait_settled(api)

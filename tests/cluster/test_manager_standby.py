@@ -129,7 +129,7 @@ def test_one_that_stood_still_writes_nothing_when_it_goes_on(api: Api, pair: Pai
     api.wait_list("Deployment", lambda found: not found, what="nothing runs that nobody demands")
     wait_settled(api)
     wait_until(
-        lambda: get(pair.ports[0], "/readyz")[1], lambda said: said.startswith("ok, standby: "), what="a standby"
+        lambda: get(pair.ports[0], "/readyz")[1], lambda logged: logged.startswith("ok, standby: "), what="a standby"
     )
     pair.never_both()
     # And it can take over in turn, with what it has seen meanwhile.
@@ -167,8 +167,8 @@ def test_who_is_active_shows(api: Api, pair: Pair) -> None:
     holder = api.get("Lease", LEASE)["spec"]["holderIdentity"]
     assert [scraped(port)["active",] for port in pair.ports] == [1, 0]
     wait_until(lambda: get(pair.ports[0], "/readyz"), lambda found: found == (200, "ok\n"), what="one is active")
-    said = (200, f"ok, standby: {holder} is active\n")
-    wait_until(lambda: get(pair.ports[1], "/readyz"), lambda found: found == said, what="the other stands by")
+    logged = (200, f"ok, standby: {holder} is active\n")
+    wait_until(lambda: get(pair.ports[1], "/readyz"), lambda found: found == logged, what="the other stands by")
 
 
 def test_a_manager_that_ends_releases_the_lease(api: Api, processes: Processes, namespace: str) -> None:

@@ -78,9 +78,9 @@ def test_an_api_server_that_refuses_everything_for_a_while_is_waited_for(
         for index in range(20):
             api.create(task(f"t{index}"))
         wait_until(lambda: [each for each in proxy.seen if each.refused], lambda found: len(found) > 3, what="refused")
-        asked = [each for each in proxy.seen if each.at > began and each.refused]
+        requested = [each for each in proxy.seen if each.at > began and each.refused]
         proxy.refuse = lambda method, path: None
-        assert len(asked) < 200, "it does not storm"
+        assert len(requested) < 200, "it does not storm"
         api.wait_list("Deployment", lambda found: len(found) == 21, what="all is served in the end")
         wait_settled(api)
         assert manager.alive

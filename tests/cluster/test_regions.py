@@ -178,12 +178,12 @@ def wait_seen_twice(folder: Path, endpoint: str) -> None:
     file = folder / "detectors.yaml"
     file.write_text((EXAMPLE / "detectors.yaml").read_text().replace("tcp/zenoh:7447", endpoint))
 
-    def asked() -> Total:
+    def requested() -> Total:
         words = ("status", "--all", "--detector", str(file), "--timeout", str(PATIENCE), "--json")
         return msgspec.json.decode(programs.run("detector", *words, check=True).stdout, type=Total)
 
     found = wait_until(
-        asked,
+        requested,
         lambda it: (it.shared_clients, [each.open for each in it.rules], it.demand_count) == (["car-1"], [2], 2),
         what="two detectors see the vehicle, its episode and its demand",
     )

@@ -112,14 +112,14 @@ def test_the_deployments_over_time_are_those_that_the_positions_call_for(
     detector.wait_for_output("Detector town runs with 1 rules")
     observer = Observer(api)
     with observer.watching():
-        said = re.search(r"stamps from (\d+) ns, at most (\d+) ms late$", drive(endpoint).strip())
-        assert said is not None
+        logged = re.search(r"stamps from (\d+) ns, at most (\d+) ms late$", drive(endpoint).strip())
+        assert logged is not None
         api.wait_list("Deployment", lambda found: not found, what="all applications are gone")
     assert detector.terminate() == 0
 
     judge = episodes(simulate(SEED, DURATION), DURATION)
     assert len(judge) >= 4
-    seen = Moments(observer.seen, start_ns=int(said[1]), late_s=int(said[2]) / 1000)
+    seen = Moments(observer.seen, start_ns=int(logged[1]), late_s=int(logged[2]) / 1000)
     assert_recorders(seen, recorders(judge, LINGER))
     assert_fusions(seen, fusions(judge, LINGER))
     tasks = api.wait_list(

@@ -46,10 +46,10 @@ def webhook(api: Api, processes: Processes, tmp_path: Path, accounts: None) -> W
 
 
 @pytest.fixture
-def asked(webhook: Webhook, api: Api) -> Iterator[Webhook]:
+def requested(webhook: Webhook, api: Api) -> Iterator[Webhook]:
     """The API server asks about pods; a Detector is there for the account `vehicle`."""
     api.create(sidecar_detector("vehicle"))
-    with webhook.asked():
+    with webhook.requested():
         wait_injecting(api)
         yield webhook
 
@@ -78,14 +78,14 @@ def injected(
 
 
 def test_a_pod_that_asks_gets_the_detector_once_and_as_the_command_prints_it(
-    api: Api, asked: Webhook, namespace: str, control_plane: ControlPlane
+    api: Api, requested: Webhook, namespace: str, control_plane: ControlPlane
 ) -> None:
     made = api.create(pod())
     (mine,) = sidecars(made)
     assert (mine["restartPolicy"], mine["image"]) == ("Always", IMAGE)
 
-    code, text, said = injected(control_plane, namespace, given=json.dumps(pod("by-hand")))
-    assert (code, said) == (0, "")
+    code, text, logged = injected(control_plane, namespace, given=json.dumps(pod("by-hand")))
+    assert (code, logged) == (0, "")
     by_hand = api.create(yaml.safe_load(text))
     for field in ("initContainers", "volumes"):
         assert without_token(by_hand["spec"][field]) == without_token(made["spec"][field])
@@ -118,7 +118,7 @@ def test_a_second_webhook_that_is_asked_about_the_same_pod_adds_nothing(
     other = copy.deepcopy(webhook.injection)
     other["metadata"]["name"] += "-again"
     other["webhooks"][0]["name"] = "again.wayside.dev"
-    with webhook.asked():
+    with webhook.requested():
         api.apply(other)
         try:
 
@@ -142,7 +142,7 @@ def asked_about_pods(port: int) -> int:
     return sum(int(float(each.split()[-1])) for each in lines if each.startswith(name) and 'kind="Pod"' in each)
 
 
-def test_a_deployments_pods_get_it_however_they_are_made(api: Api, asked: Webhook) -> None:
+def test_a_deployments_pods_get_it_however_they_are_made(api: Api, requested: Webhook) -> None:
     template = pod()
     api.create(
         {
@@ -160,7 +160,7 @@ def test_a_deployments_pods_get_it_however_they_are_made(api: Api, asked: Webhoo
     assert not api.get("Deployment", "cars")["spec"]["template"]["spec"].get("initContainers")
 
 
-def test_a_pod_that_cannot_have_it_is_made_and_its_event_says_why(api: Api, asked: Webhook) -> None:
+def test_a_pod_that_cannot_have_it_is_made_and_its_event_says_why(api: Api, requested: Webhook) -> None:
     lost = pod("lost")
     lost["metadata"]["labels"] = {"wayside.dev/detector": "nowhere"}
     for each in (lost, pod("foreign", account="other")):
@@ -179,7 +179,7 @@ def test_a_pod_that_cannot_have_it_is_made_and_its_event_says_why(api: Api, aske
     event_of(api, "late", "is of mode Standalone: give it mode Sidecar")
 
 
-def test_a_detector_that_was_applied_a_moment_before_its_pod_is_found(api: Api, asked: Webhook) -> None:
+def test_a_detector_that_was_applied_a_moment_before_its_pod_is_found(api: Api, requested: Webhook) -> None:
     for number in range(5):
         name = f"town-{number}"
         fresh = sidecar_detector("vehicle")
@@ -195,7 +195,7 @@ def test_a_manager_that_hangs_or_is_gone_keeps_no_pod_from_being_made(
 ) -> None:
     api.create(sidecar_detector("vehicle"))
     webhook = Webhook(processes, api, tmp_path / "certificates", patience=2, options=RUNS)
-    with webhook.asked():
+    with webhook.requested():
         wait_injecting(api)
         os.kill(webhook.manager.pid, signal.SIGSTOP)
         assert not sidecars(api.create(pod("while-it-hangs")))
@@ -230,11 +230,11 @@ def test_what_the_command_cannot_do_is_said_and_the_rest_is_printed(
         pod("foreign", account="other"),
         {"apiVersion": "v1", "kind": "ConfigMap", "metadata": {"name": "c"}},
     ]
-    code, text, said = injected(control_plane, namespace, file, given=yaml.safe_dump_all(documents))
+    code, text, logged = injected(control_plane, namespace, file, given=yaml.safe_dump_all(documents))
     nightly, foreign, config = yaml.safe_load_all(text)
     assert len(sidecars(nightly["spec"]["jobTemplate"]["spec"]["template"])) == 1
     assert [foreign, config] == documents[1:]
     why = f"spec.serviceAccountName: serviceAccountNames of Detector {HOLDER} has only vehicle, not other: add it"
-    assert (code, said) == (1, f"Pod foreign: {why}\n")
-    code, _, said = injected(control_plane, namespace, given=yaml.safe_dump(pod()))
-    assert (code, "has no Detector 'town' that can be read: create it" in said) == (1, True)
+    assert (code, logged) == (1, f"Pod foreign: {why}\n")
+    code, _, logged = injected(control_plane, namespace, given=yaml.safe_dump(pod()))
+    assert (code, "has no Detector 'town' that can be read: create it" in logged) == (1, True)

@@ -144,16 +144,16 @@ def test_a_refusal_and_what_never_became_ready_are_failures_of_their_traces(
     chain: Chain, receiver: Receiver, api: Api, processes: Processes
 ) -> None:
     start_manager(processes, chain.namespace)
-    bears = {"wayside.dev/traceparent": f"00-{7:032x}-{7:016x}-01"}
+    has = {"wayside.dev/traceparent": f"00-{7:032x}-{7:016x}-01"}
     one = {"apiVersion": "wayside.dev/v1alpha1", "kind": "ApplicationTask"}
-    waits = {**one, "metadata": {"name": "waits", "annotations": bears}}
+    waits = {**one, "metadata": {"name": "waits", "annotations": has}}
     api.create({**waits, "spec": {"templateName": "recorder", "parameters": {"vehicles": ["a", "b"]}}})
     wait_spans(receiver, "apply")
     end(api, "waits")
     unready = wait_spans(receiver, "ready")["ready"]
     assert unready.error is not None
     assert unready.error.startswith("NotReady: ")
-    wrong = {**one, "metadata": {"name": "wrong", "annotations": bears}}
+    wrong = {**one, "metadata": {"name": "wrong", "annotations": has}}
     api.create({**wrong, "spec": {"templateName": "recorder", "parameters": {"vehicles": "a"}}})
     refused = wait_spans(receiver, "refused")["refused"]
     assert refused.error is not None
@@ -181,8 +181,8 @@ def test_an_endpoint_that_is_away_holds_nobody_up_and_what_it_costs_is_counted(
     endpoint = {"OTEL_EXPORTER_OTLP_ENDPOINT": f"http://127.0.0.1:{nobody}", "OTEL_EXPORTER_OTLP_TIMEOUT": "1"}
     processes.environment |= {**endpoint, "OTEL_BSP_SCHEDULE_DELAY": "100"}
     manager = start_manager(processes, chain.namespace, "--metrics-port", str(of_manager))
-    told = ["--metrics-port", str(of_detector), "--output", str(chain.folder)]
-    program = processes.start("detector", "run", "--name", HOLDER, "--namespace", chain.namespace, *told)
+    reported = ["--metrics-port", str(of_detector), "--output", str(chain.folder)]
+    program = processes.start("detector", "run", "--name", HOLDER, "--namespace", chain.namespace, *reported)
     with Vehicles(chain.endpoint) as vehicles:
         vehicles.place(CARS, NEAR)
         chain.wait_condition("ApplicationTask", chain.wait_task(CARS)["metadata"]["name"], "Ready", "True")

@@ -77,7 +77,7 @@ class Webhook:
         return made
 
     @contextmanager
-    def asked(self) -> Iterator[None]:
+    def requested(self) -> Iterator[None]:
         """Have the API server ask the manager during the block."""
         applied = [self.configuration, *([self.injection] if self._sidecars else [])]
         for each in applied:

@@ -54,11 +54,11 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
 def pods_told(node: Node, namespace: str) -> str:
     """What there is to know about the pods of a namespace, for a message."""
     kubectl = partial(node.plane.kubectl, "--namespace", namespace)
-    told = [kubectl("get", "pods,deployments", "-o", "wide"), kubectl("get", "events")]
+    reported = [kubectl("get", "pods,deployments", "-o", "wide"), kubectl("get", "events")]
     for pod in node.api(namespace).list("Pod"):
         with suppress(RuntimeError):  # it may have no container yet
-            told.append(f"--- {pod['metadata']['name']}\n{kubectl('logs', pod['metadata']['name'], '--tail=30')}")
-    return "\n".join(told)
+            reported.append(f"--- {pod['metadata']['name']}\n{kubectl('logs', pod['metadata']['name'], '--tail=30')}")
+    return "\n".join(reported)
 
 
 @pytest.fixture(scope="session")

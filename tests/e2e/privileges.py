@@ -22,8 +22,8 @@ def why_no_node() -> str | None:
     except FileNotFoundError as error:
         return f"a real node needs {error.filename}: install util-linux"
     if done.returncode:
-        said = " ".join(done.stderr.split())
-        return f"a real node needs namespaces, mounts and interfaces: run this in a privileged container: {said}"
+        logged = " ".join(done.stderr.split())
+        return f"a real node needs namespaces, mounts and interfaces: run this in a privileged container: {logged}"
     for root in cgroup_roots():
         tried = root / f"wayside-try-{os.getpid()}"
         try:

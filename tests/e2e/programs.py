@@ -99,9 +99,11 @@ def install(console: Console) -> None:
 
 
 def _install(missing: Sequence[str], console: Console) -> None:
-    told = f"the node needs {', '.join(missing)}: apt-get install {' '.join(missing)} as root, or your system's own way"
+    reported = (
+        f"the node needs {', '.join(missing)}: apt-get install {' '.join(missing)} as root, or your system's own way"
+    )
     if os.geteuid() != 0 or shutil.which("apt-get") is None:
-        raise ProgramsUnavailableError(told)
+        raise ProgramsUnavailableError(reported)
     console.print(f"installing {', '.join(missing)} with apt-get", highlight=False)
     environment = os.environ | {"DEBIAN_FRONTEND": "noninteractive"}
     for command in (["update"], ["install", "--yes", "--no-install-recommends", *missing]):
@@ -110,7 +112,7 @@ def _install(missing: Sequence[str], console: Console) -> None:
         )
         if done.returncode:
             output = (done.stdout + done.stderr)[-3000:]
-            raise ProgramsUnavailableError(f"{told}\n`apt-get {' '.join(command)}` failed:\n{output}")
+            raise ProgramsUnavailableError(f"{reported}\n`apt-get {' '.join(command)}` failed:\n{output}")
 
 
 def main() -> int:

@@ -29,7 +29,7 @@ from tests.e2e.released import (
     vehicle,
     wait_installed,
 )
-from tests.e2e.test_cooperative_recording import TELL, applications, ready, wait_pods
+from tests.e2e.test_cooperative_recording import REPORT, applications, ready, wait_pods
 from tests.e2e.wayside_in_cluster import EXAMPLE, example_documents
 from tests.helm.wayside_chart import CHART, Helm
 
@@ -95,7 +95,7 @@ def test_the_example_from_nothing_by_mutual_tls_through_an_upgrade_until_nothing
     with pytest.raises(ApiError, match=r"not declared|there"):
         api.create(WRONG)
 
-    example = [each for each in example_documents(image, ["python3", "-c", TELL]) if each["kind"] != "Detector"]
+    example = [each for each in example_documents(image, ["python3", "-c", REPORT]) if each["kind"] != "Detector"]
     for document in example:
         api.apply(document)
     one, other = (Standing(vehicle(outside(node, api), authority.ca, authority.sign(name))) for name in (first, second))
@@ -104,9 +104,11 @@ def test_the_example_from_nothing_by_mutual_tls_through_an_upgrade_until_nothing
         other.put(second, 100)
         (recorder,) = wait_pods(api, "scene-recorder", ready, "the recorder of the two runs")
         (fusion,) = wait_pods(api, "scene-fusion", ready, "the fusion of their scene runs")
-        assert f"--key=vehicles/{first}/** --key=vehicles/{second}/** --output=/recording" in said(node, recorder)
-        told = wait_until(lambda: said(node, fusion), lambda text: first in text, what="it is told its configuration")
-        assert told.count(first) == 1, "once"
+        assert f"--key=vehicles/{first}/** --key=vehicles/{second}/** --output=/recording" in logged(node, recorder)
+        reported = wait_until(
+            lambda: logged(node, fusion), lambda text: first in text, what="it is told its configuration"
+        )
+        assert reported.count(first) == 1, "once"
 
         running = lives([*applications(api, "scene-recorder"), *applications(api, "scene-fusion")])
         serving = lives([*of(api, DETECTOR), *of(api, ROUTER)])
@@ -137,7 +139,7 @@ def test_the_example_from_nothing_by_mutual_tls_through_an_upgrade_until_nothing
     assert {name for _, _, name in left} == CRD_NAMES, "the CRDs are kept"
 
 
-def said(node: Node, pod: Object) -> str:
+def logged(node: Node, pod: Object) -> str:
     """What the pod has written; it waits until that is something."""
     metadata = pod["metadata"]
     log = ("--namespace", metadata["namespace"], "logs", metadata["name"])

@@ -53,8 +53,8 @@ def test_a_vehicle_with_a_certificate_has_an_application_run_and_others_do_not_g
 
         wait_until(is_ready, bool, timeout=PATIENCE, what="the application that the vehicle's speed asks for is ready")
         assert api.find("Deployment", "watch") is not None
-        asked = [task["spec"]["requester"]["subjects"] for task in api.list("ApplicationTask")]
-        assert {name for subjects in asked for name in subjects} == {"car1"}
+        requested = [task["spec"]["requester"]["subjects"] for task in api.list("ApplicationTask")]
+        assert {name for subjects in requested for name in subjects} == {"car1"}
 
         def is_gone() -> bool:
             car.put("vehicles/car1/speed", b'{"value": 10}')
@@ -68,12 +68,16 @@ def test_a_vehicle_with_a_certificate_has_an_application_run_and_others_do_not_g
             pass
 
     with vehicle(endpoint, authority.ca, authority.sign("unknown")):
-        for told in (
+        for reported in (
             "peer sent no certificates",
             "invalid peer certificate: UnknownIssuer",
             "did not match any configured ACL subject",
         ):
-            wait_until(lambda: log_of(api, ROUTER), lambda log, told=told: told in log, what=f"the log says: {told}")
+            wait_until(
+                lambda: log_of(api, ROUTER),
+                lambda log, reported=reported: reported in log,
+                what=f"the log says: {reported}",
+            )
 
 
 def log_of(api: Api, deployment: str) -> str:

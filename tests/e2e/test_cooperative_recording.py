@@ -18,7 +18,7 @@ from cooperative_recording.standing import Standing
 from cooperative_recording.vehicles import LIDAR_VEHICLES
 
 PATIENCE = 300.0
-TELL = """
+REPORT = """
 import pathlib, sys, time
 print("#", *sys.argv[1:], flush=True)
 paths = [pathlib.Path(a.split("=", 1)[1]) for a in sys.argv if a.startswith("--configuration=")]
@@ -50,7 +50,7 @@ def test_applications_really_run_while_vehicles_are_close_follow_who_joins_and_a
     node: Node, api: Api, image: str
 ) -> None:
     first, second, third = (vehicle.name for vehicle in LIDAR_VEHICLES[:3])
-    apply_example(api, image, ["python3", "-c", TELL])
+    apply_example(api, image, ["python3", "-c", REPORT])
     port = run_town(api, image)
     with Standing([f"tcp/{node.address}:{port}"], wait_s=PATIENCE) as vehicles:
         vehicles.put(first, 0)
@@ -59,17 +59,17 @@ def test_applications_really_run_while_vehicles_are_close_follow_who_joins_and_a
         (recorder,) = wait_pods(api, "scene-recorder", ready, "the recorder of the two runs")
         (fusion,) = wait_pods(api, "scene-fusion", ready, "the fusion of their scene runs")
 
-        def said(pod: str) -> str:
+        def logged(pod: str) -> str:
             log = ("--namespace", api.namespace, "logs", pod)
             return wait_until(lambda: node.plane.kubectl(*log), bool, what=f"pod {pod} has written")
 
         def configurations() -> list[list[str]]:
             """The sources that the fusion has been told, one after the other."""
-            documents = yaml.safe_load_all(said(fusion["metadata"]["name"]))
+            documents = yaml.safe_load_all(logged(fusion["metadata"]["name"]))
             return [yaml.safe_load(str(each["sources"])) for each in documents if each]
 
-        told = said(recorder["metadata"]["name"])
-        assert f"--key=vehicles/{first}/** --key=vehicles/{second}/** --output=/recording" in told
+        reported = logged(recorder["metadata"]["name"])
+        assert f"--key=vehicles/{first}/** --key=vehicles/{second}/** --output=/recording" in reported
         # What it writes comes in parts: the heading, then the configuration.
         written = wait_until(
             configurations,

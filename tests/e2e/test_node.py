@@ -36,8 +36,8 @@ server.serve_forever()
 
 
 def test_a_deployment_of_our_image_runs_and_logs_and_exec_work(node: Node, api: Api, image: str) -> None:
-    told = "print('it runs', flush=True); import time; time.sleep(10**6)"
-    api.apply(deployment("app", image, ("python3", "-c", told)))
+    reported = "print('it runs', flush=True); import time; time.sleep(10**6)"
+    api.apply(deployment("app", image, ("python3", "-c", reported)))
     pod = wait_available(api, "app")["metadata"]["name"]
 
     logged = wait_until(
@@ -118,16 +118,16 @@ def test_the_api_server_reaches_a_webhook_on_a_pod(node: Node, api: Api, image: 
     try:
 
         def refusal() -> str:
-            asked = {"apiVersion": "v1", "kind": "ConfigMap", "metadata": {"name": "asked"}}
+            requested = {"apiVersion": "v1", "kind": "ConfigMap", "metadata": {"name": "asked"}}
             try:
-                api.create(asked)
+                api.create(requested)
             except ApiError as error:
                 return error.message
             api.delete("ConfigMap", "asked")  # the API server has not read the webhook's configuration yet
             return ""
 
-        said = wait_until(refusal, lambda said: "the pod says no" in said, what="the webhook is asked")
-        assert "hook.wayside.test" in said
+        output = wait_until(refusal, lambda output: "the pod says no" in output, what="the webhook is asked")
+        assert "hook.wayside.test" in output
     finally:
         api.delete(kind, api.namespace)
 

@@ -17,7 +17,7 @@ from tests.helm.wayside_chart import CHART, Helm
 from wayside.process.beginning import ENDED
 
 DETECTOR = "on-board"
-ASKS = {"wayside.dev/detector": DETECTOR}
+RETRIES = {"wayside.dev/detector": DETECTOR}
 DRIVE = f"""
 import json, signal, sys, time, zenoh
 signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
@@ -102,7 +102,7 @@ def asking(api: Api, image: str, helm: Helm) -> None:
         timeout=PATIENCE,
         what="the accounts have their rights",
     )
-    probe = {"apiVersion": "v1", "kind": "Pod", "metadata": {"name": "probe", "labels": ASKS}}
+    probe = {"apiVersion": "v1", "kind": "Pod", "metadata": {"name": "probe", "labels": RETRIES}}
     wait_until(
         lambda: api.apply(probe | {"spec": pod_spec(image, WAIT)}, dry_run=True)["spec"].get("initContainers"),
         bool,
@@ -114,7 +114,7 @@ def asking(api: Api, image: str, helm: Helm) -> None:
 def test_a_pods_detector_sees_its_data_and_what_it_demands_goes_with_the_pod(
     api: Api, image: str, asking: None
 ) -> None:
-    pod = {"apiVersion": "v1", "kind": "Pod", "metadata": {"name": "car", "labels": ASKS}}
+    pod = {"apiVersion": "v1", "kind": "Pod", "metadata": {"name": "car", "labels": RETRIES}}
     api.create(pod | {"spec": pod_spec(image, DRIVE)})
     api.patch("Namespace", api.namespace, {"metadata": {"labels": {"pod-security.kubernetes.io/enforce": None}}})
     (task,) = api.wait_list(
@@ -129,8 +129,8 @@ def test_a_pods_detector_sees_its_data_and_what_it_demands_goes_with_the_pod(
     wait_available(api, application)
     running = api.get("Pod", "car")
     assert sidecar_of(running)["restartCount"] == 0
-    said = "it runs in 1 of 1 pods with its label"
-    api.wait_for("Detector", DETECTOR, lambda raw: condition(raw, "Running")["message"] == said, what=said)
+    logged = "it runs in 1 of 1 pods with its label"
+    api.wait_for("Detector", DETECTOR, lambda raw: condition(raw, "Running")["message"] == logged, what=logged)
 
     api.delete("Pod", "car")
     api.wait_gone("Pod", "car", timeout=PATIENCE)
@@ -142,7 +142,7 @@ def test_a_pods_detector_sees_its_data_and_what_it_demands_goes_with_the_pod(
 
 
 def test_a_job_with_a_detector_completes(api: Api, image: str, asking: None) -> None:
-    template = {"metadata": {"labels": ASKS}, "spec": pod_spec(image, "print('done')")}
+    template = {"metadata": {"labels": RETRIES}, "spec": pod_spec(image, "print('done')")}
     template["spec"]["restartPolicy"] = "Never"
     job = {"apiVersion": "batch/v1", "kind": "Job", "metadata": {"name": "nightly"}}
     api.create(job | {"spec": {"template": template}})

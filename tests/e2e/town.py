@@ -71,12 +71,12 @@ class NodeTown(Town):
         def holds(pods: Objects) -> bool:
             return len(pods) == 1 and is_ready(pods[0]) and restarts_of(pods[0]) == restarts
 
-        return wait_until(lambda: self.pods(pair), holds, timeout=PATIENCE, what=what, diagnose=self.told)[0]
+        return wait_until(lambda: self.pods(pair), holds, timeout=PATIENCE, what=what, diagnose=self.reported)[0]
 
     def wait_no_pods(self, pair: Pair) -> None:
         """Wait until no pod of the pair's application is left."""
         what = f"no pod of {pair} is left"
-        wait_until(lambda: self.pods(pair), lambda pods: not pods, timeout=PATIENCE, what=what, diagnose=self.told)
+        wait_until(lambda: self.pods(pair), lambda pods: not pods, timeout=PATIENCE, what=what, diagnose=self.reported)
 
     def programs(self) -> Objects:
         """The pods of the manager and the detector, also those that are ending."""
@@ -89,7 +89,7 @@ class NodeTown(Town):
             return len(pods) == 2 and all(is_ready(pod) and restarts_of(pod) == restarts for pod in pods)
 
         what = f"both programs are ready after {restarts} restarts"
-        wait_until(self.programs, holds, timeout=PATIENCE, what=what, diagnose=self.told)
+        wait_until(self.programs, holds, timeout=PATIENCE, what=what, diagnose=self.reported)
 
     def metrics(self, labels: str = DETECTOR) -> Mapping[str, float]:
         """What the program in the pod with these labels measures, by name with labels, as it stands in `/metrics`."""
@@ -109,7 +109,7 @@ class NodeTown(Town):
         """Vehicles outside the cluster."""
         return Vehicles(self.endpoint)
 
-    def told(self) -> str:
+    def reported(self) -> str:
         """The ends of the programs' logs, for messages."""
         try:
             names = [pod["metadata"]["name"] for pod in self.programs()]

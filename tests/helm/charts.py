@@ -98,16 +98,16 @@ def repository(tools: Tools, folder: Path, *charts: Path) -> Iterator[tuple[str,
     for chart in charts:
         helm(tools, folder.parent / "home", "package", str(chart), "--destination", str(folder))
     helm(tools, folder.parent / "home", "repo", "index", str(folder))
-    asked: list[str] = []
+    requested: list[str] = []
 
     class Handler(SimpleHTTPRequestHandler):
         def log_message(self, *_: object) -> None:
-            asked.append(self.path)
+            requested.append(self.path)
 
     with ThreadingHTTPServer(("127.0.0.1", 0), partial(Handler, directory=str(folder))) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         try:
-            yield f"http://127.0.0.1:{server.server_port}", asked
+            yield f"http://127.0.0.1:{server.server_port}", requested
         finally:
             server.shutdown()
 

@@ -29,7 +29,7 @@ _PYTEST = (
     *("--hypothesis-seed=0", "--hypothesis-profile=unshrunk"),
 )
 _PASSED, _FAILED = 0, 1
-"""Exit codes of pytest. All others say that it could not run the tests."""
+"""Exit codes of pytest. All others mean that it could not run the tests."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +109,7 @@ def _copy(to: Path) -> Path:
 
 
 def _tests_pass(chosen: Iterable[Mutant], copy: Path) -> bool:
-    """Whether the tests pass without a change: otherwise a failure would say nothing."""
+    """Whether the tests pass without a change: otherwise a failure would mean nothing."""
     done = _run(sorted({test for each in chosen for test in each.tests}), copy)
     if done.returncode != _PASSED:
         print(f"the tests do not pass as they are:\n{done.stdout[-4000:]}", file=sys.stderr)

@@ -30,14 +30,14 @@ class Counting(Plugin[CountingParameters]):
         newest = queries.newest(clients[0] if clients else None, self.parameters.stream)
         if newest is None:
             return None
-        told = newest.message["v"]
-        if told == self.parameters.raise_at:
-            raise ValueError(f"{told:g} is not to be borne")
-        while told == self.parameters.hang_at:
+        reported = newest.message["v"]
+        if reported == self.parameters.raise_at:
+            raise ValueError(f"{reported:g} is not to be borne")
+        while reported == self.parameters.hang_at:
             time.sleep(0.01)
-        if told == self.parameters.exit_at:
+        if reported == self.parameters.exit_at:
             os._exit(3)
-        return {"count": self.count, "clients": list(clients), "v": told}
+        return {"count": self.count, "clients": list(clients), "v": reported}
 
 
 class Strange(Plugin[CountingParameters]):

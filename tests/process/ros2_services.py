@@ -69,9 +69,9 @@ class Node:
                 self.calls.append((name, given))
                 self._changed.notify_all()
             if served is not None:
-                told = bytes(store.serialize_cdr(store.types[answer](**served), answer))
+                reported = bytes(store.serialize_cdr(store.types[answer](**served), answer))
                 here = key if "*" not in key else str(query.key_expr)
-                query.reply(here, told, attachment=attachment)
+                query.reply(here, reported, attachment=attachment)
 
         self._queryables.append(self._session.declare_queryable(key, reply, complete=not self._bridged))
 

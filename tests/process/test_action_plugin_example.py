@@ -61,7 +61,7 @@ def test_it_writes_its_lines_and_its_outcomes_are_told_and_counted(
     (tmp_path / "rules.yaml").write_text((EXAMPLE / "rules.yaml").read_text())
     process.start()
     try:
-        told = process.vehicle.declare_subscriber("wayside/actions/**", zenoh.handlers.FifoChannel(16))
+        reported = process.vehicle.declare_subscriber("wayside/actions/**", zenoh.handlers.FifoChannel(16))
         process.send("car1", {"v": 25})
         process.status_when(lambda status: status.rules[0].open == 1)
         process.send("car1", {"v": 5})
@@ -72,7 +72,7 @@ def test_it_writes_its_lines_and_its_outcomes_are_told_and_counted(
         [action] = status.actions
         assert (action.rule, action.action, action.kind, action.failed) == ("fast", "log", "logbook", 0)
         assert (action.samples, action.files, action.last_file) == (2, 1, "logbook.jsonl")
-        follow_up = await_sample(told)
+        follow_up = await_sample(reported)
         document = json.loads(follow_up.payload.to_bytes())
         assert str(follow_up.key_expr) == f"wayside/actions/{status.holder}/fast/{document['data']['episode']}/log"
         assert document["type"] == "dev.wayside.action.done"
@@ -82,9 +82,9 @@ def test_it_writes_its_lines_and_its_outcomes_are_told_and_counted(
         process.stop()
 
 
-def await_sample(told: zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]]) -> zenoh.Sample:
+def await_sample(reported: zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]]) -> zenoh.Sample:
     end = time.monotonic() + PATIENCE
-    while (sample := told.try_recv()) is None:
+    while (sample := reported.try_recv()) is None:
         assert time.monotonic() < end
         time.sleep(0.01)
     return sample

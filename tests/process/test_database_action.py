@@ -33,16 +33,16 @@ def test_an_episode_becomes_a_scenario_with_each_sample_once(desk: MakeDesk, dat
     assert outcome.state is OutcomeState.DONE, outcome
     assert outcome.samples == 2500
     assert numbers(database) == [float(each) for each in range(2500)]
-    told = scenario(database)
-    assert told["complete"] is True
-    assert told["state"] == "Complete"
-    assert told["rule"] == "brake"
-    assert told["metadata"] == {"driver": "Ada"}
-    assert told["classification"] == {"incidence": ["Rare"]}
-    assert told["values"] == {"speed": 12.5}
-    assert told["messages"] == {SPEEDS: 2500}
-    assert told["onsetTime"] == START
-    kind = database["ScenarioTypes"].find_one({"_id": told["type"]})
+    reported = scenario(database)
+    assert reported["complete"] is True
+    assert reported["state"] == "Complete"
+    assert reported["rule"] == "brake"
+    assert reported["metadata"] == {"driver": "Ada"}
+    assert reported["classification"] == {"incidence": ["Rare"]}
+    assert reported["values"] == {"speed": 12.5}
+    assert reported["messages"] == {SPEEDS: 2500}
+    assert reported["onsetTime"] == START
+    kind = database["ScenarioTypes"].find_one({"_id": reported["type"]})
     assert (kind["rule"], kind["description"]) == ("brake", "Hard braking.")
     assert json.loads(kind["spec"])["when"] == "true"
     client = database["ConnectedClients"].find_one({"_id": "car1"})
@@ -53,11 +53,11 @@ def test_an_episode_becomes_a_scenario_with_each_sample_once(desk: MakeDesk, dat
 def test_with_renew_after_an_episode_becomes_one_scenario_after_the_other(desk: MakeDesk, database: Any) -> None:
     keep = desk(streams=[a_stream("speed"), a_stream("map", latched=True)], renew_after="3s")
     episode = keep.begin()
-    said = EpisodeSample("car1", "map", "vehicles/car1/map", START - 10**12, START - 10**12, b'{"v": -1}')
-    later = said._replace(time=START + 7 * 10**9, received=START + 7 * 10**9, payload=b'{"v": -2}')
+    logged = EpisodeSample("car1", "map", "vehicles/car1/map", START - 10**12, START - 10**12, b'{"v": -1}')
+    later = logged._replace(time=START + 7 * 10**9, received=START + 7 * 10**9, payload=b'{"v": -2}')
     samples = speeds(1000)
     for first in range(0, 1000, 130):
-        keep.take(episode, [*([] if first else [said]), *samples[first : first + 130]])
+        keep.take(episode, [*([] if first else [logged]), *samples[first : first + 130]])
         if first == 650:
             keep.take(episode, [later])
     keep.finish(episode)
@@ -114,8 +114,8 @@ def test_a_scenario_is_not_complete_while_it_lasts_nor_where_something_is_missin
     assert outcome.missing == 3
     assert "the detector ends" in outcome.message
     assert (scenario(database)["state"], scenario(database)["complete"]) == ("Open", False)
-    told = scenario(database, "e2.keep")
-    assert (told["state"], told["complete"], told["missing"], told["cut"]) == (
+    reported = scenario(database, "e2.keep")
+    assert (reported["state"], reported["complete"], reported["missing"], reported["cut"]) == (
         "Incomplete",
         False,
         3,
@@ -211,20 +211,20 @@ def test_credentials_are_in_no_error_log_or_outcome(
     caplog.set_level(logging.DEBUG)
     monkeypatch.setenv("TEST_MONGODB_URI", uri)
     keep = Desk({"uriVariable": "TEST_MONGODB_URI"}, name)
-    said = ""
+    logged = ""
     try:
         episode = keep.begin()
         keep.take(episode, speeds(3))
         keep.finish(episode)
         wait_until(lambda: keep.action._store is not None and keep.action._store.away != "")
     except ActionError as error:
-        said = f"{error!r} {error.__cause__!r} {error.__context__!r} {error}"
-        assert "spec.database" in said
+        logged = f"{error!r} {error.__cause__!r} {error.__context__!r} {error}"
+        assert "spec.database" in logged
     keep.close()
-    said += "".join(map(str, keep.outcomes.values())) + caplog.text + str(keep.losses)
-    assert said
+    logged += "".join(map(str, keep.outcomes.values())) + caplog.text + str(keep.losses)
+    assert logged
     for piece in (SECRET, "s3cr3t", "p@ss", "ss%20word"):
-        assert piece not in said
+        assert piece not in logged
 
 
 def test_the_redactor_takes_out_every_form_of_the_password() -> None:

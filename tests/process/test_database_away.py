@@ -68,10 +68,10 @@ class Detecting(Process):
     def recorded(self) -> dict[str, list[tuple[str, float]]]:
         """Keys and numbers of what the recordings have, by episode."""
         found = {}
-        for told in self.folder.glob("recordings/*/[!.]*/recording.json"):
-            messages = [each for file in mcap_files(told.parent) for each in read_with_mcap(file)]
+        for reported in self.folder.glob("recordings/*/[!.]*/recording.json"):
+            messages = [each for file in mcap_files(reported.parent) for each in read_with_mcap(file)]
             numbers = [(each.topic.lstrip("/"), float(json.loads(each.payload)["n"])) for each in messages]
-            found[json.loads(told.read_text())["episode"]] = sorted(numbers)
+            found[json.loads(reported.read_text())["episode"]] = sorted(numbers)
         return found
 
     def stored(self) -> dict[str, list[tuple[str, float]]]:
@@ -155,7 +155,7 @@ def test_a_minute_without_the_database_costs_neither_events_nor_recordings_and_e
         missing += len(wanted) - len(found)
     assert missing > 0
 
-    def told() -> dict[str, float]:
+    def reported() -> dict[str, float]:
         return {key[1]: value for key, value in tight.metrics().items() if key[0] == "action_missing_total"}
 
-    wait_until(lambda: told() == {"bag": 0, "keep": missing}, PATIENCE)  # told once the database has the last of it
+    wait_until(lambda: reported() == {"bag": 0, "keep": missing}, PATIENCE)  # told once the database has the last of it

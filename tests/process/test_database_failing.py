@@ -65,8 +65,8 @@ def test_a_full_spool_drops_what_is_new_counts_it_and_keeps_earlier_scenarios_wh
     assert len(there) + keep.losses.total() == 10_000
     assert len(set(there)) == len(there)
     assert numbers(database) == list(range(500))
-    told = scenario(database, "e2.keep")
-    assert (told["complete"], told["missing"]) == (False, outcome.missing)
+    reported = scenario(database, "e2.keep")
+    assert (reported["complete"], reported["missing"]) == (False, outcome.missing)
 
 
 def test_what_waited_when_the_detector_ended_is_written_by_the_next_run(
@@ -107,8 +107,8 @@ def test_a_document_that_the_server_refuses_costs_its_scenarios_completeness_and
     assert numbers(database) == list(range(40))
     assert numbers(database, "e2.keep") == [each for each in range(40) if each != 20]
     assert keep.losses.total() == 1
-    told = scenario(database, "e2.keep")
-    assert (told["complete"], told["rejected"]) == (False, True)
+    reported = scenario(database, "e2.keep")
+    assert (reported["complete"], reported["rejected"]) == (False, True)
 
 
 def test_a_server_that_hangs_holds_up_nothing_but_the_queue(
@@ -171,11 +171,11 @@ def test_open_episodes_say_that_the_database_is_away(desk: MakeDesk, way: Way) -
     episode = keep.begin()
     way.cut()
 
-    def told(away: bool) -> bool:
+    def reported(away: bool) -> bool:
         keep.take(episode, speeds(1000))
         last = keep.last()
         return last is not None and last.message.startswith("the database is unavailable") is away
 
-    wait_until(lambda: told(True))
+    wait_until(lambda: reported(True))
     way.restore()
-    wait_until(lambda: told(False))
+    wait_until(lambda: reported(False))

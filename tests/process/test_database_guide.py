@@ -44,8 +44,8 @@ def test_the_examples_are_accepted(tmp_path: Path) -> None:
 def test_a_rule_whose_detector_has_no_database_is_refused_with_its_place(tmp_path: Path) -> None:
     without = {**DETECTOR, "spec": {"streams": DETECTOR["spec"]["streams"]}}
     (problem,) = checked(tmp_path, without, RECORD_ALL)
-    said = r"all\.yaml:\d+:\d+: spec\.actions\[0\]\.database: Detector d has no spec\.database: add it"
-    assert re.search(said, problem)
+    logged = r"all\.yaml:\d+:\d+: spec\.actions\[0\]\.database: Detector d has no spec\.database: add it"
+    assert re.search(logged, problem)
 
 
 def test_a_rule_that_wants_files_needs_a_place_for_them(tmp_path: Path) -> None:
@@ -56,7 +56,7 @@ def test_a_rule_that_wants_files_needs_a_place_for_them(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("fields", "said"),
+    ("fields", "logged"),
     [
         ({"metadata": {"who": "${nobody}"}}, "nobody"),
         ({"metadata": {"who": "${client"}}, "who"),
@@ -66,15 +66,15 @@ def test_a_rule_that_wants_files_needs_a_place_for_them(tmp_path: Path) -> None:
         ({"before": "1h"}, "reach back further"),
     ],
 )
-def test_what_is_wrong_in_an_action_is_said_with_its_place(tmp_path: Path, fields: dict[str, Any], said: str) -> None:
+def test_what_is_wrong_in_an_action_is_said_with_its_place(tmp_path: Path, fields: dict[str, Any], logged: str) -> None:
     action = {"name": "keep", "database": fields}
     problem, *_ = checked(tmp_path, DETECTOR, {**RECORD_ALL, "spec": {**RECORD_ALL["spec"], "actions": [action]}})
     assert re.search(r"all\.yaml:\d+:\d+: .*spec\.actions\[0\]\.database", problem)
-    assert said in problem
+    assert logged in problem
 
 
 @pytest.mark.parametrize(
-    ("database", "said"),
+    ("database", "logged"),
     [
         ({}, "uriSecretName, uriVariable and uriFile"),
         ({"uriVariable": "A", "uriFile": "b"}, "uriSecretName, uriVariable and uriFile"),
@@ -82,14 +82,14 @@ def test_what_is_wrong_in_an_action_is_said_with_its_place(tmp_path: Path, field
     ],
 )
 def test_what_is_wrong_in_the_detectors_database_is_said_with_its_place(
-    tmp_path: Path, database: dict[str, Any], said: str
+    tmp_path: Path, database: dict[str, Any], logged: str
 ) -> None:
     (tmp_path / "d.yaml").write_text(
         yaml.safe_dump({**a_detector().to_json(), "spec": {**a_detector().to_json()["spec"], "database": database}})
     )
-    with pytest.raises(DocumentError, match=said) as told:
+    with pytest.raises(DocumentError, match=logged) as reported:
         load_documents([tmp_path / "d.yaml"])
-    assert "d.yaml:" in str(told.value)
+    assert "d.yaml:" in str(reported.value)
 
 
 def as_json(rule: dict[str, Any], database: str) -> EventRule:

@@ -88,16 +88,16 @@ def has(faulty: Faulty, page: str, code: int, text: str) -> Callable[[], bool]:
 
 
 @pytest.mark.parametrize(
-    ("fault", "says"),
+    ("fault", "shows"),
     [("stall-evaluation", "the last evaluation was"), ("stall-loop", "the event loop has been blocked for")],
 )
-def test_what_stands_still_is_not_live_and_live_again_once_it_goes_on(faulty: Faulty, fault: str, says: str) -> None:
+def test_what_stands_still_is_not_live_and_live_again_once_it_goes_on(faulty: Faulty, fault: str, shows: str) -> None:
     faulty.write(ALWAYS, streams=(a_stream("speed"),))
     faulty.start()
     wait_for(has(faulty, "/readyz", 200, "the last evaluation"))
     (faulty.folder / fault).touch()
-    wait_for(has(faulty, "/healthz", 503, says))
-    wait_for(has(faulty, "/readyz", 503, says))
+    wait_for(has(faulty, "/healthz", 503, shows))
+    wait_for(has(faulty, "/readyz", 503, shows))
     (faulty.folder / fault).unlink()
     wait_for(has(faulty, "/healthz", 200, "the last evaluation"))
 

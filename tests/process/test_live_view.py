@@ -80,8 +80,8 @@ class Viewer:
         except TimeoutError:
             return
         if isinstance(message, str):
-            told = json.loads(message)
-            for channel in told.get("channels", ()) if told["op"] == "advertise" else ():
+            reported = json.loads(message)
+            for channel in reported.get("channels", ()) if reported["op"] == "advertise" else ():
                 self.channels[channel["topic"]] = channel
             return
         opcode, subscription, stamp = struct.unpack_from("<BIQ", message)

@@ -141,27 +141,27 @@ def watching(endpoint: str, arrivals: Arrivals) -> Iterator[Network]:
 
 
 def test_tokens_are_followed_over_the_network(endpoint: str, arrivals: Arrivals, watching: Network) -> None:
-    def tell(*told: tuple[str, Token]) -> list[tuple[str, str, bytes]]:
-        return [(LIVELINESS, f"alive/{client}", token.value) for client, token in told]
+    def report(*reported: tuple[str, Token]) -> list[tuple[str, str, bytes]]:
+        return [(LIVELINESS, f"alive/{client}", token.value) for client, token in reported]
 
     with router(listen__endpoints=[endpoint]):
         car1, car2 = vehicle(endpoint), vehicle(endpoint)
         kept = car1.liveliness().declare_token("alive/car1")  # a token that nothing refers to is withdrawn
         token = car2.liveliness().declare_token("alive/car2")
-        arrivals.wait_for(lambda seen: sorted(seen) == tell(("car1", Token.DECLARED), ("car2", Token.DECLARED)))
+        arrivals.wait_for(lambda seen: sorted(seen) == report(("car1", Token.DECLARED), ("car2", Token.DECLARED)))
         arrivals.seen.clear()
         token.undeclare()
-        arrivals.wait_for(lambda seen: seen == tell(("car2", Token.DROPPED)))
-    arrivals.wait_for(lambda seen: seen[1:] == tell(("car1", Token.UNSURE)))
+        arrivals.wait_for(lambda seen: seen == report(("car2", Token.DROPPED)))
+    arrivals.wait_for(lambda seen: seen[1:] == report(("car1", Token.UNSURE)))
     with router(listen__endpoints=[endpoint]):
-        arrivals.wait_for(lambda seen: seen[2:] == tell(("car1", Token.DECLARED)))
+        arrivals.wait_for(lambda seen: seen[2:] == report(("car1", Token.DECLARED)))
         car1.close()
-        arrivals.wait_for(lambda seen: seen[3:] == tell(("car1", Token.DROPPED)))
+        arrivals.wait_for(lambda seen: seen[3:] == report(("car1", Token.DROPPED)))
         car3 = vehicle(endpoint)
         last = car3.liveliness().declare_token("alive/car3")
-        arrivals.wait_for(lambda seen: seen[4:] == tell(("car3", Token.DECLARED)))
+        arrivals.wait_for(lambda seen: seen[4:] == report(("car3", Token.DECLARED)))
         watching.close()
-        arrivals.wait_for(lambda seen: seen[5:] == tell(("car3", Token.UNSURE)))
+        arrivals.wait_for(lambda seen: seen[5:] == report(("car3", Token.UNSURE)))
         car2.close()
         car3.close()
     del kept, last

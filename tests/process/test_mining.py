@@ -53,10 +53,10 @@ def command(folder: Path, output: str, *options: str, rules: str = "rules.yaml",
 
 def mine(folder: Path, output: str, *options: str, **more: Any) -> str:
     """Runs it here, with processes of its own; what it prints."""
-    said = io.StringIO()
-    with contextlib.chdir(folder), contextlib.redirect_stderr(said):
+    logged = io.StringIO()
+    with contextlib.chdir(folder), contextlib.redirect_stderr(logged):
         commandline.run(app, "detector", (), command(folder, output, *options, **more)[3:])
-    return said.getvalue()
+    return logged.getvalue()
 
 
 def files(dataset: Path) -> dict[str, bytes]:
@@ -68,7 +68,7 @@ def files(dataset: Path) -> dict[str, bytes]:
     }
 
 
-def asked(folder: Path, question: str) -> list[tuple[Any, ...]]:
+def requested(folder: Path, question: str) -> list[tuple[Any, ...]]:
     """What DuckDB answers in that folder."""
     with duckdb.connect() as database:
         table = database.sql(re.sub("'(?=[a-z0-9]+/)", f"'{folder}/", question)).to_arrow_table()
@@ -89,28 +89,30 @@ def test_episodes_are_those_of_a_replay_of_each_recording(fleet: Path, monkeypat
     names = pq.read_schema(fleet / "replayed/episodes.parquet").names
     columns = ", ".join(f'"{name}"' for name in names if name != "episode")  # the holder differs
     order = "ORDER BY recording, rule, start_time, subject"
-    expected = asked(fleet, f"SELECT {columns} FROM 'replayed/episodes.parquet' {order}")
-    found = asked(fleet, f"SELECT {columns} FROM 'out/episodes/*/*.parquet' WHERE recording LIKE '%car-%' {order}")
+    expected = requested(fleet, f"SELECT {columns} FROM 'replayed/episodes.parquet' {order}")
+    found = requested(fleet, f"SELECT {columns} FROM 'out/episodes/*/*.parquet' WHERE recording LIKE '%car-%' {order}")
     assert len(expected) > 100
     assert found == expected
-    assert asked(fleet, "SELECT count(DISTINCT episode), count(*) FROM 'out/episodes/*/*.parquet'") == [
-        (len(asked(fleet, "FROM 'out/episodes/*/*.parquet'")),) * 2
+    assert requested(fleet, "SELECT count(DISTINCT episode), count(*) FROM 'out/episodes/*/*.parquet'") == [
+        (len(requested(fleet, "FROM 'out/episodes/*/*.parquet'")),) * 2
     ]
 
 
 def test_the_question_of_the_guide_is_answered(fleet: Path) -> None:
     guide = (Path(__file__).parents[2] / "docs/mining.md").read_text()
     (question,) = re.findall(r"```sql\n(.*?);\n```", guide, re.DOTALL)
-    rows = asked(fleet, question)
+    rows = requested(fleet, question)
     assert [name for name, *_ in rows] == [name for name, _, _ in sorted(rows, key=lambda row: (-row[1], row[0]))]
-    ((fast, longest),) = asked(fleet, "SELECT count(*), max(\"speed.max\") FROM 'out/episodes/rule=too-fast/*.parquet'")
-    ((hours,),) = asked(fleet, "SELECT sum(duration) / 3600 FROM 'out/recordings.parquet'")
+    ((fast, longest),) = requested(
+        fleet, "SELECT count(*), max(\"speed.max\") FROM 'out/episodes/rule=too-fast/*.parquet'"
+    )
+    ((hours,),) = requested(fleet, "SELECT sum(duration) / 3600 FROM 'out/recordings.parquet'")
     assert sum(row[1] for row in rows) == pytest.approx(fast / hours, rel=0.01)
     assert max(row[2] for row in rows) == round(longest, 1)
 
 
 def test_broken_recordings_are_set_apart_with_their_reason(fleet: Path) -> None:
-    found = asked(fleet, "SELECT recording, kind, message FROM 'out/errors.parquet'")
+    found = requested(fleet, "SELECT recording, kind, message FROM 'out/errors.parquet'")
     assert [(name, kind) for name, kind, _ in found] == [
         ("drives/broken-000-drive.mcap", "unreadable"),
         ("drives/broken-001-drive.jsonl", "unreadable"),
@@ -119,8 +121,8 @@ def test_broken_recordings_are_set_apart_with_their_reason(fleet: Path) -> None:
     assert "is not a recording that Wayside can read" in found[0][2]
     assert "broken-001-drive.jsonl:" in found[1][2]
     assert re.search(r"the recording is cut \(.*\): [1-9]\d* messages", found[2][2])
-    assert asked(fleet, "SELECT count(*) FROM 'out/recordings.parquet' WHERE samples > 0") == [(RECORDINGS + 1,)]
-    assert asked(fleet, "SELECT count(*), sum(samples) > 0 FROM 'out/streams.parquet'") == [(RECORDINGS + 1, True)]
+    assert requested(fleet, "SELECT count(*) FROM 'out/recordings.parquet' WHERE samples > 0") == [(RECORDINGS + 1,)]
+    assert requested(fleet, "SELECT count(*), sum(samples) > 0 FROM 'out/streams.parquet'") == [(RECORDINGS + 1, True)]
 
 
 def test_one_process_and_shares_give_the_same_bytes(fleet: Path) -> None:
@@ -158,11 +160,11 @@ def test_a_second_run_does_nothing_and_a_changed_rule_runs_alone(fleet: Path) ->
 def test_a_long_recording_is_cut_for_the_rules_for_which_that_is_exact(fleet: Path) -> None:
     (fleet / "long").mkdir()
     write_mcap(fleet / "long" / "drive.mcap", 7, 600.0, cars=2)
-    said = mine(fleet, "cut", "--processes", "2", drives="long")
-    assert "long/drive.mcap: cut into 3 pieces, uncut for close (pairs)" in said
+    logged = mine(fleet, "cut", "--processes", "2", drives="long")
+    assert "long/drive.mcap: cut into 3 pieces, uncut for close (pairs)" in logged
     assert "pieces" not in mine(fleet, "uncut", "--processes", "1", drives="long")
     assert files(fleet / "cut") == files(fleet / "uncut")
-    ((episodes,),) = asked(fleet, "SELECT count(*) FROM 'cut/episodes/*/*.parquet'")
+    ((episodes,),) = requested(fleet, "SELECT count(*) FROM 'cut/episodes/*/*.parquet'")
     assert episodes > 200
 
 
@@ -172,7 +174,7 @@ def test_clips_are_linked_from_the_episodes_and_the_report(fleet: Path) -> None:
     (fleet / "record.yaml").write_text(HARSH.rstrip() + action)
     drive = "drives/car-000-drive.mcap"
     mine(fleet, "clips", "--record", rules="record.yaml", drives=drive)
-    found = asked(fleet, "SELECT episode, clips FROM 'clips/episodes/*/*.parquet'")
+    found = requested(fleet, "SELECT episode, clips FROM 'clips/episodes/*/*.parquet'")
     page = (fleet / "clips" / "report.html").read_text()
     assert len(found) > 3
     for episode, (clip,) in found:
@@ -182,7 +184,7 @@ def test_clips_are_linked_from_the_episodes_and_the_report(fleet: Path) -> None:
     changed = (fleet / "record.yaml").read_text().replace("cooldown: 2s", "cooldown: 60s")
     (fleet / "record.yaml").write_text(changed)
     mine(fleet, "clips", "--record", rules="record.yaml", drives=drive)
-    kept = asked(fleet, "SELECT clips FROM 'clips/episodes/*/*.parquet'")
+    kept = requested(fleet, "SELECT clips FROM 'clips/episodes/*/*.parquet'")
     assert 0 < len(kept) < len(found)
     assert {clip for (of_one,) in kept for clip in of_one} == {
         str(path.parent.relative_to(fleet / "clips")) for path in (fleet / "clips" / "clips").rglob("recording.json")
@@ -194,8 +196,8 @@ def test_a_worker_that_is_killed_changes_nothing(fleet: Path) -> None:
     mined = fleet / "killed" / ".cache" / "mined"
     wait_until(lambda: mined.is_dir() and [*map(str, mined.iterdir())], bool, what="a recording is mined")
     os.kill(workers_of(run.pid)[0], signal.SIGKILL)
-    _, said = run.communicate(timeout=300)
-    assert f"{RECORDINGS + BROKEN} mined now" in said
+    _, logged = run.communicate(timeout=300)
+    assert f"{RECORDINGS + BROKEN} mined now" in logged
     assert files(fleet / "killed") == files(fleet / "out")
 
 
@@ -221,7 +223,7 @@ def end_once(path: str) -> int:
 
 def test_recordings_behind_urls_are_mined_as_those_on_disk(fleet: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     columns = 'subject, start_time, end_time, reason, rule, "speed.max"'
-    expected = asked(fleet, f"SELECT {columns} FROM 'out/episodes/*/*.parquet' ORDER BY ALL")
+    expected = requested(fleet, f"SELECT {columns} FROM 'out/episodes/*/*.parquet' ORDER BY ALL")
     drives = [*sorted((fleet / "drives").iterdir())]
     with s3.running() as environment:
         for name, value in environment.items():
@@ -230,8 +232,8 @@ def test_recordings_behind_urls_are_mined_as_those_on_disk(fleet: Path, monkeypa
             s3.put(environment, f"2026/{path.name}", path.read_bytes())
         url = f"s3://{s3.BUCKET}/2026"
         assert f"{len(drives)} mined now" in mine(fleet, "s3", drives=f"{url}/*")
-        assert asked(fleet, f"SELECT {columns} FROM 's3/episodes/*/*.parquet' ORDER BY ALL") == expected
-        names = [row[0] for row in asked(fleet, "SELECT recording FROM 's3/recordings.parquet'")]
+        assert requested(fleet, f"SELECT {columns} FROM 's3/episodes/*/*.parquet' ORDER BY ALL") == expected
+        names = [row[0] for row in requested(fleet, "SELECT recording FROM 's3/recordings.parquet'")]
         assert names == [f"{url}/{path.name}" for path in drives]
         assert "nothing was left to do" in mine(fleet, "s3", drives=url)
         s3.put(environment, f"2026/{drives[0].name}", drives[-1].read_bytes())
@@ -241,7 +243,7 @@ def test_recordings_behind_urls_are_mined_as_those_on_disk(fleet: Path, monkeypa
         (fleet / "list.txt").open("a").write(f"{address}/drives/none.mcap\n")
         assert "none.mcap: it is not there" in mine(fleet, "http", drives="@list.txt")
         assert "nothing was left to do" in mine(fleet, "http", drives=f"{address}/drives/")
-    assert asked(fleet, f"SELECT {columns} FROM 'http/episodes/*/*.parquet' ORDER BY ALL") == expected
+    assert requested(fleet, f"SELECT {columns} FROM 'http/episodes/*/*.parquet' ORDER BY ALL") == expected
 
 
 @contextlib.contextmanager

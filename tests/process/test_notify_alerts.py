@@ -79,14 +79,14 @@ def test_an_alert_is_repeated_with_a_later_end_while_its_episode_lasts(there: En
 
 
 def test_many_alerts_share_a_request(there: Endpoint) -> None:
-    told = threading.Event()
-    there.behaviour = holds(told, answers(200))
+    reported = threading.Event()
+    there.behaviour = holds(reported, answers(200))
     desk = a_desk(notify(there))
     desk.action.started(open_of(an_episode("e0")))
     there.received(1)
     for number in range(1, 50):
         desk.action.started(open_of(an_episode(f"e{number}", f"car{number}")))
-    told.set()
+    reported.set()
     desk.outcome("e49", OutcomeState.RUNNING)
     assert len(posted(there, 2)) == 1 + 49
     desk.end()
@@ -154,9 +154,9 @@ def test_at_the_end_what_is_over_is_told_and_what_fires_is_left_to_the_next_star
     desk.action.ended(an_episode("over"))
     there.behaviour = answers(200)
     desk.end()
-    told = {alert["labels"]["episode"]: alert for alert in json.loads(there.requests[-1].body)}
-    assert told["over"]["endsAt"] == "2026-01-01T00:00:05.000000000Z"
-    assert parse_time(told["open"]["endsAt"]) > parse_time(told["over"]["endsAt"])
+    reported = {alert["labels"]["episode"]: alert for alert in json.loads(there.requests[-1].body)}
+    assert reported["over"]["endsAt"] == "2026-01-01T00:00:05.000000000Z"
+    assert parse_time(reported["open"]["endsAt"]) > parse_time(reported["over"]["endsAt"])
     assert "had not ended" in desk.outcome("open").message
     assert len(there.requests) == 2
 

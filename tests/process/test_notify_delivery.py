@@ -77,12 +77,12 @@ def test_the_cloudevents_sdk_reads_what_arrives(there: Endpoint, mode: str) -> N
     desk.end()
 
 
-@pytest.mark.parametrize(("wanted", "told"), [(["Started"], ["e1.started"]), (["Ended"], ["e1.ended"])])
-def test_only_the_wanted_events_are_told(there: Endpoint, wanted: list[str], told: list[str]) -> None:
+@pytest.mark.parametrize(("wanted", "reported"), [(["Started"], ["e1.started"]), (["Ended"], ["e1.ended"])])
+def test_only_the_wanted_events_are_told(there: Endpoint, wanted: list[str], reported: list[str]) -> None:
     desk = a_desk({"http": http(there), "events": wanted})
     desk.run(an_episode())
     desk.outcome("e1")
-    assert ids(there.requests) == told
+    assert ids(there.requests) == reported
     desk.end()
 
 
@@ -147,9 +147,9 @@ def test_the_end_is_told_after_the_start(there: Endpoint) -> None:
     there.received(3)
     there.behaviour = answers(200)
     desk.outcome("e1")
-    told = ids(there.requests)
-    assert told[-1] == "e1.ended"
-    assert set(told[:-1]) == {"e1.started"}
+    reported = ids(there.requests)
+    assert reported[-1] == "e1.ended"
+    assert set(reported[:-1]) == {"e1.started"}
     desk.end()
 
 

@@ -130,11 +130,11 @@ def test_what_did_not_run_is_the_same_when_it_is_told_beforehand() -> None:
         live.take(until=7)
         wait_for_it(host, live, 7)
         live.take(until=14)
-        told = host.outages.take_changes()
-    assert [(each["call"], each["running"]) for each in told][:2] == [(1, False), (2, True)]
-    assert len(told) == 4
+        reported = host.outages.take_changes()
+    assert [(each["call"], each["running"]) for each in reported][:2] == [(1, False), (2, True)]
+    assert len(reported) == 4
     again = [arrival(0.5, "a", {"v": 1}), *some_arrivals(), arrival(7.5, "a", {"v": 1})]
-    with closing(ProcessHost(Outages(lambda: told), wait=True, patience=PATIENT)) as host:
+    with closing(ProcessHost(Outages(lambda: reported), wait=True, patience=PATIENT)) as host:
         replayed = PluginDrive(a_detector(), rule, host=host)
         for each, until in ((again[:1], 1), (again[1:-1], 7), (again[-1:], 14)):
             replayed.take(*each, until=until)

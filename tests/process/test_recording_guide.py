@@ -62,8 +62,8 @@ def until_evaluated(process: Process, speed: float) -> None:
     end, seen = time.monotonic() + PATIENCE, []
     while seen != [speed]:
         assert time.monotonic() < end, seen
-        asked = {"rule": "threshold", "subject": "car1", "wait": "30"}
-        (answer,) = query_detectors(process.network, process.name, "status", asked, PATIENCE)
+        requested = {"rule": "threshold", "subject": "car1", "wait": "30"}
+        (answer,) = query_detectors(process.network, process.name, "status", requested, PATIENCE)
         explanation = read_status(answer.payload).explanation
         assert explanation is not None
         seen = [each.values.get("speed") for each in explanation.subjects]

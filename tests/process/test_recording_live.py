@@ -194,11 +194,11 @@ def test_overlapping_episodes_have_exactly_their_samples_in_recordings_and_in_th
     assert {(each.key, each.payload) for each in arrivals} == set(sent)
     compared = 0
     for bag in bags:
-        told = json.loads((bag / "recording.json").read_text())
-        assert "cut" not in told, told
-        begin = parse_time(told["onsetTime"]) - int(BEFORE * 1e9)
-        end = parse_time(told["endTime"]) + int(AFTER * 1e9)
-        (client,) = told["subjects"]
+        reported = json.loads((bag / "recording.json").read_text())
+        assert "cut" not in reported, reported
+        begin = parse_time(reported["onsetTime"]) - int(BEFORE * 1e9)
+        end = parse_time(reported["endTime"]) + int(AFTER * 1e9)
+        (client,) = reported["subjects"]
         window = []
         for each in arrivals:
             at = each.received if clock == "Wall" else sent[each.key, each.payload]
@@ -207,7 +207,7 @@ def test_overlapping_episodes_have_exactly_their_samples_in_recordings_and_in_th
         found = [each for file in mcap_files(bag) for each in read_with_mcap(file)]
         assert sorted(found) == sorted(window)
         assert sorted(read_with_rosbags(bag)) == sorted(each for each in window if each.topic.endswith("points"))
-        in_the_database = stored(process, database, scenarios[told["episode"]])
+        in_the_database = stored(process, database, scenarios[reported["episode"]])
         assert sorted(in_the_database) == sorted(as_stored(each) for each in window)
         compared += len(window)
     assert compared > 6 * 100
@@ -216,8 +216,8 @@ def test_overlapping_episodes_have_exactly_their_samples_in_recordings_and_in_th
 
 def contents(recording: Path) -> tuple[Any, list[Recorded]]:
     """What a recording says of itself, and its messages."""
-    told = json.loads((recording / "recording.json").read_text())
-    return told, sorted(each for file in mcap_files(recording) for each in read_with_mcap(file))
+    reported = json.loads((recording / "recording.json").read_text())
+    return reported, sorted(each for file in mcap_files(recording) for each in read_with_mcap(file))
 
 
 def clips_of(process: Process) -> dict[str, tuple[Any, list[Recorded]]]:

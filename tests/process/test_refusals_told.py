@@ -115,14 +115,14 @@ def test_a_foreign_key_is_told_with_the_name_of_the_certificate(guarded: Guarded
         car.put("vehicles/car1/pose", "own")
         car.put("vehicles/car2/pose", "foreign")
 
-        def told(what: str, key: str) -> bool:
+        def reported(what: str, key: str) -> bool:
             return any(
                 "CertCommonName(car1)" in line and f"{what} to Put (ingress) on {key}" in line
                 for line in guarded.log.splitlines()
             )
 
-        wait_for(lambda: told("is unauthorized", "vehicles/car2/pose"))
-        wait_for(lambda: told("is authorized", "vehicles/car1/pose"))
+        wait_for(lambda: reported("is unauthorized", "vehicles/car2/pose"))
+        wait_for(lambda: reported("is authorized", "vehicles/car1/pose"))
 
 
 def test_the_guide_gives_the_filter_that_is_tested() -> None:

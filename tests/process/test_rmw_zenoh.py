@@ -212,7 +212,7 @@ def test_the_same_detector_gives_the_same_events_live_and_from_a_bag_of_topics(
 
 
 @pytest.mark.parametrize(
-    ("key", "told"),
+    ("key", "reported"),
     [
         ("0/chatter/std_msgs::msg::dds_::String_/RIHS01_df66", ("chatter", "std_msgs/msg/String")),
         ("42/a/b/c/nav_msgs::msg::dds_::Odometry_/TypeHashNotSupported", ("a/b/c", "nav_msgs/msg/Odometry")),
@@ -220,8 +220,8 @@ def test_the_same_detector_gives_the_same_events_live_and_from_a_bag_of_topics(
         ("0/add/example::srv::dds_::Add_Request_/h", ("add", "example/srv/Add_Request")),
     ],
 )
-def test_a_key_tells_topic_and_type(key: str, told: tuple[str, str]) -> None:
-    assert split(key) == told
+def test_a_key_tells_topic_and_type(key: str, reported: tuple[str, str]) -> None:
+    assert split(key) == reported
 
 
 @pytest.mark.parametrize("key", ["", "0", "0/a/b", "x/chatter/std_msgs::msg::dds_::String_/h", "0/chatter/String/h"])
@@ -238,8 +238,8 @@ def test_the_number_and_the_publisher_are_read(number: int, gid: bytes, named: b
 @given(st.binary(max_size=90))
 def test_other_attachments_have_no_number_or_some_number(noise: bytes) -> None:
     for raw in (noise, b"\x0fsequence_number" + noise):
-        told = numbered(raw)
-        assert told is None or (len(told[0]) == 16 and -(2**63) <= told[1] < 2**63)
+        reported = numbered(raw)
+        assert reported is None or (len(reported[0]) == 16 and -(2**63) <= reported[1] < 2**63)
 
 
 @given(st.lists(st.integers(1, 40), min_size=1))

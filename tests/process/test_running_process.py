@@ -57,9 +57,9 @@ def test_status_and_metrics_are_what_was_sent(process: Process) -> None:
     (answer,) = query_detectors(
         process.network, "d", "status", {"rule": "fast", "subject": "car2", "wait": "30"}, PATIENCE
     )
-    told = read_status(answer.payload).explanation
-    assert told is not None
-    assert [(each.subject, each.when, each.values) for each in told.subjects] == [("car2", False, {"v": 1.0})]
+    reported = read_status(answer.payload).explanation
+    assert reported is not None
+    assert [(each.subject, each.when, each.values) for each in reported.subjects] == [("car2", False, {"v": 1.0})]
     with pytest.raises(NoAnswerError, match="detector d has no rule slow; it has fast"):
         query_detectors(process.network, "d", "status", {"rule": "slow"}, PATIENCE)
     assert metrics["rule_episodes_open", "fast"] == 1
@@ -110,8 +110,8 @@ def test_rules_and_streams_change_without_losing_buffer_or_episodes(process: Pro
     process.send("car2", {"v": 1})
     still = process.status_when(lambda s: s.streams[0].samples == 2)
     assert [rule.open for rule in still.rules] == [1, 1]
-    told = [f"{event['data']['rule']} {event['type'].rsplit('.', 1)[-1]}" for event in process.events_when(2)]
-    assert told == ["fast started", "slow started"]
+    reported = [f"{event['data']['rule']} {event['type'].rsplit('.', 1)[-1]}" for event in process.events_when(2)]
+    assert reported == ["fast started", "slow started"]
 
 
 def test_a_detector_that_is_stopped_evaluates_the_last_lateness_and_so_does_the_replay_of_its_intake(

@@ -96,13 +96,13 @@ def test_a_protocol_that_is_not_spoken_and_a_missing_extra_are_said(
 def test_spans_arrive_with_their_ids_times_links_and_failures(monkeypatch: pytest.MonkeyPatch) -> None:
     with Receiver() as receiver:
         monkeypatch.setenv("OTEL_EXPORTER_OTLP_ENDPOINT", receiver.endpoint)
-        told = tracing("of-a-test")
-        assert told is not None
+        reported = tracing("of-a-test")
+        assert reported is not None
         root, other = episode_context("one"), episode_context("two")
-        assert told.emit(Span("episode", 10, 90, context=root, attributes={"subjects": ["a", "b"]})) == root
-        made = told.emit(Span("apply", 20, 30, parent=root, links=[other], error="no such kind"))
+        assert reported.emit(Span("episode", 10, 90, context=root, attributes={"subjects": ["a", "b"]})) == root
+        made = reported.emit(Span("apply", 20, 30, parent=root, links=[other], error="no such kind"))
         assert made.trace_id == root.trace_id
-        told.close()
+        reported.close()
         first, second = receiver.spans()
     assert (first.service, first.name, first.start, first.end) == ("of-a-test", "episode", 10, 90)
     assert (first.traceparent, first.parent, first.error) == (str(root), "", None)
@@ -115,10 +115,10 @@ def test_the_service_may_be_named_otherwise(monkeypatch: pytest.MonkeyPatch) -> 
     with Receiver() as receiver:
         monkeypatch.setenv("OTEL_EXPORTER_OTLP_ENDPOINT", receiver.endpoint)
         monkeypatch.setenv("OTEL_RESOURCE_ATTRIBUTES", "site=north,service.name=ours")
-        told = tracing("theirs")
-        assert told is not None
-        told.emit(Span("episode", 10, 90))
-        told.close()
+        reported = tracing("theirs")
+        assert reported is not None
+        reported.emit(Span("episode", 10, 90))
+        reported.close()
         assert [each.service for each in receiver.spans()] == ["ours"]
 
 
@@ -128,16 +128,16 @@ def test_what_finds_the_queue_full_is_dropped_and_counted_and_the_rest_arrives(m
     with Receiver() as receiver:
         monkeypatch.setenv("OTEL_EXPORTER_OTLP_ENDPOINT", receiver.endpoint)
         receiver.hold()
-        told = tracing("x")
-        assert told is not None
-        told.emit(Span("first", 1, 2))
-        assert receiver.asked.wait(60)
+        reported = tracing("x")
+        assert reported is not None
+        reported.emit(Span("first", 1, 2))
+        assert receiver.requested.wait(60)
         for number in range(50):
-            told.emit(Span(f"later {number}", 3, 4))
-        assert told.dropped == 50 - 8
+            reported.emit(Span(f"later {number}", 3, 4))
+        assert reported.dropped == 50 - 8
         receiver.release()
-        told.close()
-    assert told.failed == 0
+        reported.close()
+    assert reported.failed == 0
     assert len(receiver.spans()) == 1 + 8
 
 
@@ -145,11 +145,11 @@ def test_an_endpoint_that_is_away_costs_its_spans_and_they_are_counted(monkeypat
     (port,) = free_ports(1)
     monkeypatch.setenv("OTEL_EXPORTER_OTLP_ENDPOINT", f"http://127.0.0.1:{port}")
     monkeypatch.setenv("OTEL_EXPORTER_OTLP_TIMEOUT", "0.1")
-    told = tracing("x")
-    assert told is not None
-    told.emit(Span("lost", 1, 2))
-    told.close()
-    assert told.failed == 1
+    reported = tracing("x")
+    assert reported is not None
+    reported.emit(Span("lost", 1, 2))
+    reported.close()
+    assert reported.failed == 1
 
 
 def test_events_and_what_actions_are_told_bear_the_trace_of_their_episode(monkeypatch: pytest.MonkeyPatch) -> None:

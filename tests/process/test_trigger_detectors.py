@@ -135,7 +135,7 @@ def fast(name: str = "rsu", **trigger: Any) -> EventRule:
     )
 
 
-def asked(endpoint: str, request: RecordingRequest, name: str = "rsu") -> RecordingReport:
+def requested(endpoint: str, request: RecordingRequest, name: str = "rsu") -> RecordingReport:
     with open_session(Zenoh(mode=ZenohMode.CLIENT, connect=[endpoint])) as session:
         for reply in session.get(status_key(name, "recordings"), payload=write_request(request), timeout=PATIENCE):
             if reply.ok is not None:
@@ -167,8 +167,8 @@ def test_another_detector_records_what_led_to_the_episode_and_the_episode(rsu: P
     rsu.status_when(lambda status: status.streams[0].samples == 40)
     town.send("car1", {"v": 1})
     status = town.status_when(lambda status: bool(status.actions and status.actions[0].done == 1))
-    (told,) = status.actions
-    assert (told.samples, told.files, told.failed, told.running) == (40, 1, 0, 0)
+    (reported,) = status.actions
+    assert (reported.samples, reported.files, reported.failed, reported.running) == (40, 1, 0, 0)
     (folder,) = rsu.folders()
     assert rsu.recorded(folder) == [("/vehicles/car1/pose", {"n": number}) for number in range(40)]
     (report,) = listed(town.endpoint)
@@ -179,45 +179,45 @@ def test_another_detector_records_what_led_to_the_episode_and_the_episode(rsu: P
 def test_a_start_and_a_stop_may_come_twice_and_in_any_order(unhurt: Peer) -> None:
     start = RecordingRequest(do="start", id="x", streams=["pose"])
     stop = RecordingRequest(do="stop", id="x")
-    assert asked(unhurt.endpoint, start).state is Progress.RECORDING
-    again = asked(unhurt.endpoint, start)
+    assert requested(unhurt.endpoint, start).state is Progress.RECORDING
+    again = requested(unhurt.endpoint, start)
     assert again.state is Progress.RECORDING
-    assert asked(unhurt.endpoint, stop).state in (Progress.ENDING, Progress.DONE)
-    wait_for(lambda: asked(unhurt.endpoint, RecordingRequest(id="x")).state is Progress.DONE, PATIENCE)
-    assert asked(unhurt.endpoint, stop).state is Progress.DONE
-    assert asked(unhurt.endpoint, start).state is Progress.DONE
+    assert requested(unhurt.endpoint, stop).state in (Progress.ENDING, Progress.DONE)
+    wait_for(lambda: requested(unhurt.endpoint, RecordingRequest(id="x")).state is Progress.DONE, PATIENCE)
+    assert requested(unhurt.endpoint, stop).state is Progress.DONE
+    assert requested(unhurt.endpoint, start).state is Progress.DONE
     assert [each.id for each in listed(unhurt.endpoint)].count("x") == 1
-    assert len(asked(unhurt.endpoint, stop).files) == 1
+    assert len(requested(unhurt.endpoint, stop).files) == 1
 
     late = RecordingRequest(do="stop", id="y")
-    assert asked(unhurt.endpoint, late).state is Progress.UNKNOWN
-    begun = asked(unhurt.endpoint, RecordingRequest(do="start", id="y"))
+    assert requested(unhurt.endpoint, late).state is Progress.UNKNOWN
+    begun = requested(unhurt.endpoint, RecordingRequest(do="start", id="y"))
     assert (begun.state, begun.message) == (Progress.UNKNOWN, "it was stopped before it was started")
 
 
 def test_a_recording_whose_stop_never_comes_ends_by_itself(unhurt: Peer) -> None:
     request = RecordingRequest(do="start", id="long", maximum_duration=PositiveDuration("1s"))
-    report = asked(unhurt.endpoint, request)
+    report = requested(unhurt.endpoint, request)
     assert report.state is Progress.RECORDING
-    wait_for(lambda: asked(unhurt.endpoint, RecordingRequest(id="long")).state is Progress.DONE, PATIENCE)
-    done = asked(unhurt.endpoint, RecordingRequest(id="long"))
+    wait_for(lambda: requested(unhurt.endpoint, RecordingRequest(id="long")).state is Progress.DONE, PATIENCE)
+    done = requested(unhurt.endpoint, RecordingRequest(id="long"))
     assert (done.message, done.until) == ("ended by its maximumDuration", report.until)
 
 
 def test_what_is_not_allowed_is_refused(rsu: Peer, town: Peer) -> None:
-    refused = asked(rsu.endpoint, RecordingRequest(do="start", id="x", streams=["poes"]))
+    refused = requested(rsu.endpoint, RecordingRequest(do="start", id="x", streams=["poes"]))
     assert (refused.state, refused.message) == (
         Progress.REFUSED,
         "stream poes may not be recorded here; permitted are pose, speed",
     )
-    refused = asked(rsu.endpoint, RecordingRequest(do="start", id="x"), "town")
+    refused = requested(rsu.endpoint, RecordingRequest(do="start", id="x"), "town")
     assert refused.message.startswith("this detector accepts no recording requests")
     for number in range(8):
-        assert asked(rsu.endpoint, RecordingRequest(do="start", id=f"x{number}")).state is Progress.RECORDING
-    full = asked(rsu.endpoint, RecordingRequest(do="start", id="x8"))
+        assert requested(rsu.endpoint, RecordingRequest(do="start", id=f"x{number}")).state is Progress.RECORDING
+    full = requested(rsu.endpoint, RecordingRequest(do="start", id="x8"))
     assert full.message == "8 recordings are in progress, the maximum (recordings.onRequest.maximumRecordings)"
     with pytest.raises(ValueError, match="start: give the id of the recording"):
-        asked(rsu.endpoint, RecordingRequest(do="start"))
+        requested(rsu.endpoint, RecordingRequest(do="start"))
 
 
 def test_a_killed_requester_comes_back_and_stops_what_it_started(rsu: Peer, town: Peer) -> None:
@@ -290,11 +290,11 @@ def test_people_ask_for_recordings_by_commands(unhurt: Peer) -> None:
     begun = command("recordings", "start", "mine", "--stream", "pose", "--name", "rsu", "--json")
     assert json.loads(begun.stdout)["state"] == "Recording"
     assert command("recordings", "stop", "mine", "--name", "rsu").exit_code == 0
-    wait_for(lambda: asked(unhurt.endpoint, RecordingRequest(id="mine")).state is Progress.DONE, PATIENCE)
-    told = command("recordings", "status").stdout
-    assert "rsu" in told
-    assert "mine" in told
-    assert "Done" in told
+    wait_for(lambda: requested(unhurt.endpoint, RecordingRequest(id="mine")).state is Progress.DONE, PATIENCE)
+    reported = command("recordings", "status").stdout
+    assert "rsu" in reported
+    assert "mine" in reported
+    assert "Done" in reported
     refused = command("recordings", "start", "other", "--stream", "poes", "--name", "rsu")
     assert refused.exit_code == 1
     assert "stream poes may not be recorded here" in refused.stdout
@@ -309,9 +309,9 @@ def test_an_order_of_a_stranger_is_not_believed(unhurt: Peer) -> None:
     request = RecordingRequest(
         do="start", id="stranger", event={"subject": "../../../x", "data": {"classification": 3}}
     )
-    assert asked(unhurt.endpoint, request).state is Progress.RECORDING
-    asked(unhurt.endpoint, RecordingRequest(do="stop", id="stranger", after=Duration("0s")))
-    wait_for(lambda: asked(unhurt.endpoint, RecordingRequest(id="stranger")).state is Progress.DONE, PATIENCE)
-    (file,) = asked(unhurt.endpoint, RecordingRequest(id="stranger")).files
+    assert requested(unhurt.endpoint, request).state is Progress.RECORDING
+    requested(unhurt.endpoint, RecordingRequest(do="stop", id="stranger", after=Duration("0s")))
+    wait_for(lambda: requested(unhurt.endpoint, RecordingRequest(id="stranger")).state is Progress.DONE, PATIENCE)
+    (file,) = requested(unhurt.endpoint, RecordingRequest(id="stranger")).files
     assert "~fleet" in file
     assert ".." not in file

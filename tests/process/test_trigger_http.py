@@ -242,12 +242,12 @@ def test_one_dead_endpoint_costs_one_attempt_at_a_time() -> None:
 
 
 @pytest.mark.parametrize(
-    ("fields", "told"),
+    ("fields", "reported"),
     [
         ({}, "give start, stop or both"),
         ({"start": {"url": "https://${client}/x"}}, "must not contain"),
     ],
 )
-def test_what_makes_no_sense_is_refused(fields: dict[str, Any], told: str) -> None:
-    with pytest.raises(ValueError, match=told):
+def test_what_makes_no_sense_is_refused(fields: dict[str, Any], reported: str) -> None:
+    with pytest.raises(ValueError, match=reported):
         api.TriggerAction.model_validate({"http": fields})

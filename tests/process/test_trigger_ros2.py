@@ -146,8 +146,8 @@ def test_what_is_wrong_with_a_call_is_told_with_its_place(tmp_path: Path) -> Non
     ]
     documents[2]["metadata"]["name"] = "second"
     (tmp_path / "all.yaml").write_text(yaml.safe_dump_all(documents, sort_keys=False))
-    told = [str(problem) for problem in check_documents(load_documents([tmp_path / "all.yaml"]))]
-    assert [text.split("all.yaml:", 1)[1].split(" ", 1)[1] for text in told] == [
+    reported = [str(problem) for problem in check_documents(load_documents([tmp_path / "all.yaml"]))]
+    assert [text.split("all.yaml:", 1)[1].split(" ", 1)[1] for text in reported] == [
         "spec.actions[0].trigger.ros2.start.type: unknown service type my/srv/Own: give its .srv file as definition",
         "spec.actions[0].trigger.ros2.stop.request: request.data is 3, but must be of type bool",
         "spec.actions[0].trigger.ros2.start.definition: the definition of my/srv/Own has 0 lines of ---: there must "
@@ -156,7 +156,7 @@ def test_what_is_wrong_with_a_call_is_told_with_its_place(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    ("ros2", "told"),
+    ("ros2", "reported"),
     [
         ({"layout": "Plain"}, "give start, stop or both"),
         (
@@ -165,6 +165,6 @@ def test_what_is_wrong_with_a_call_is_told_with_its_place(tmp_path: Path) -> Non
         ),
     ],
 )
-def test_what_makes_no_sense_is_refused(ros2: dict[str, Any], told: str) -> None:
-    with pytest.raises(ValueError, match=told):
+def test_what_makes_no_sense_is_refused(ros2: dict[str, Any], reported: str) -> None:
+    with pytest.raises(ValueError, match=reported):
         fast(**ros2)

@@ -14,7 +14,7 @@ from tests.reference.world import SECOND, Sample, World
 
 
 @dataclass(frozen=True)
-class Told:
+class Reported:
     """An event. Times are nanoseconds; `reason` is empty where it is a start."""
 
     rule: str
@@ -82,7 +82,7 @@ class Rule:
 
 
 @dataclass(frozen=True)
-class Whom:
+class Selection:
     """Those that a rule is evaluated for: who belongs to one of the clients, and the subjects that wake."""
 
     clients: set[str]
@@ -104,7 +104,7 @@ class Reference:
         self.ticked = False
         self.waiting: list[Sample] = []
         self.starts: list[Start] = []
-        self.told: list[Told] = []
+        self.reported: list[Reported] = []
         self.keep_starts = keep_starts
         signals = [signal for spec in rules.values() for signal in spec.get("signals", [])]
         over_rules = [
@@ -210,29 +210,33 @@ class Reference:
                 continue
             if rule.on_sample is not None:
                 clients = {client for stream, client in sampled if stream == rule.on_sample}
-                self._evaluate(rule, Whom(clients, rule.waking(self.now, self.world.timeout)), lose=regular)
+                self._evaluate(rule, Selection(clients, rule.waking(self.now, self.world.timeout)), lose=regular)
             elif self.now % rule.every == 0:
                 self._evaluate(rule, None, lose=True)
 
-    def _evaluate(self, rule: Rule, whom: Whom | None, *, lose: bool) -> None:
+    def _evaluate(self, rule: Rule, selection: Selection | None, *, lose: bool) -> None:
         timeout = self.world.timeout
         found: dict[Subject, tuple[Seen | Break, dict[str, Any]]] = {}
         if lose:
             for subject in rule.history:
                 if any(client not in self.world.known for client in subject[0]):
                     found[subject] = (Break(self.now, lost=True), {})
-        if whom is None or whom.clients or whom.subjects:
+        if selection is None or selection.clients or selection.subjects:
             for client in self.world.known:
                 rule.looked.setdefault(client, []).append(self.now)
             for look in looks(rule.spec, self.world, self.now, lambda client: self._view(rule, client)):
-                if whom is None or look.subject in whom.subjects or whom.clients & {*(look.subject[0] or whom.clients)}:
+                if (
+                    selection is None
+                    or look.subject in selection.subjects
+                    or selection.clients & {*(look.subject[0] or selection.clients)}
+                ):
                     names = (*look.names, *(signal["name"] for signal in rule.derived))
                     seen = replace(look, names=names)
                     if look.near is True or rule.in_progress(look.subject, timeout):
                         evaluations = rule.evaluations.setdefault(look.subject, Evaluations())
                         seen = evaluations.look(rule.derived, seen, self.now, self.keep_starts)
                     found[look.subject] = (self._seen(rule, seen), seen.values)
-        told: list[tuple[Told, tuple[str, ...]]] = []
+        reported: list[tuple[Reported, tuple[str, ...]]] = []
         for subject, (seen, known) in found.items():
             before = rule.episodes(subject, timeout)
             rule.history.setdefault(subject, []).append(seen)
@@ -241,12 +245,14 @@ class Reference:
             if after and subject in rule.evaluations:
                 values = known | rule.evaluations[subject].statistics(rule.derived, after[-1].start, self.now)
             if len(after) > len(before):
-                told.append((Told(rule.name, text(subject), self.now, after[-1].onset, "", values), subject[0]))
+                reported.append((Reported(rule.name, text(subject), self.now, after[-1].onset, "", values), subject[0]))
             elif after and before and after[-1].end != before[-1].end:
                 last = after[-1]
-                told.append((Told(rule.name, text(subject), self.now, last.onset, last.reason, values), subject[0]))
-        for event, clients in sorted(told, key=lambda each: each[0].subject):
-            self.told.append(event)
+                reported.append(
+                    (Reported(rule.name, text(subject), self.now, last.onset, last.reason, values), subject[0])
+                )
+        for event, clients in sorted(reported, key=lambda each: each[0].subject):
+            self.reported.append(event)
             if not event.reason:
                 message = {"subject": event.subject, "subjects": list(clients), "values": event.values}
                 self.starts.append(Start(rule.name, self.now, clients or None, message))

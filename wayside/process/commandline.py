@@ -28,7 +28,9 @@ LogFormatOption = Annotated[
 ]
 MetricsCertificates = Annotated[
     Path | None,
-    typer.Option(help="With --metrics-port: serve by TLS, with tls.crt and tls.key of this folder, also renewed."),
+    typer.Option(
+        help="With --metrics-port: serve with TLS, with tls.crt and tls.key from this folder; renewed files are loaded."
+    ),
 ]
 CheckedFiles = Annotated[list[Path] | None, typer.Argument(help="YAML files or folders.")]
 IgnoredFindings = Annotated[

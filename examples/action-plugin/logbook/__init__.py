@@ -46,7 +46,7 @@ class Logbook(Action[LogbookParameters]):
         self.counts[episode.id] += len(samples)
 
     def completed(self, episode: Episode, completion: Completion) -> None:
-        """Write the line, and say so."""
+        """Write the line, and report it."""
         count = self.counts.pop(episode.id)
         line = json.dumps(
             {

@@ -1,7 +1,7 @@
 """What the applications should do, computed from the simulated positions alone.
 
 This is the judge of the whole chain, so it shares nothing with it: no engine, no rules, no merging, only geometry and
-interval arithmetic. Times are seconds into the drive, exact crossings of the thresholds; whoever compares allows for
+interval arithmetic. Times are seconds into the drive, exact crossings of the thresholds; comparisons must allow for
 the rule's evaluation period and for the time that starting and stopping take.
 """
 

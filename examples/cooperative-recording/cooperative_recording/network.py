@@ -126,7 +126,7 @@ def lanes() -> dict[Lane, Segment]:
 
 @cache
 def choices(lane: Lane) -> tuple[tuple[Lane, bool], ...]:
-    """The lanes that one can take at a lane's end, in a fixed order, and whether each goes on straight. No U-turns."""
+    """The lanes that follow a lane's end, in a fixed order, and whether each is straight ahead. No U-turns."""
     here = lanes()[lane]
     onward = []
     for follower, segment in sorted(lanes().items()):

@@ -11,7 +11,7 @@ from cooperative_recording.messages import POINTS_TYPE, POSE_TYPE, TYPESTORE, me
 from cooperative_recording.vehicles import Drive
 
 START_NS = int(datetime(2026, 1, 1, tzinfo=UTC).timestamp()) * 10**9
-"""What a recording's second 0 is called in its stamps unless told otherwise."""
+"""The default stamp of a recording's second 0."""
 
 
 def record(drive: Drive, path: Path, duration_s: float, start_ns: int = START_NS) -> int:

@@ -21,7 +21,7 @@ class StopAndGoParameters(PluginParameters):
     going: MetresPerSecond = 3.0
     """Above this speed it is going again."""
     over: Seconds = 60.0
-    """So long a stop is remembered."""
+    """How long a stop is remembered."""
 
 
 class StopAndGo(Plugin[StopAndGoParameters]):

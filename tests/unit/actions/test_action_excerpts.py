@@ -51,18 +51,18 @@ RULE = fast(an_action(before="1s", after="700ms"), an_action("all", clients="All
 
 
 def run(engine: Engine, batches: Sequence[Sequence[Arrival]], until: float) -> list[Consequence]:
-    told: list[Consequence] = []
+    reported: list[Consequence] = []
     for batch in batches:
         engine.advance(batch, batch[-1].received)
-        told += engine.consequences.take(engine.now)
+        reported += engine.consequences.take(engine.now)
     engine.advance((), at(until))
-    return told + engine.consequences.take(engine.now)
+    return reported + engine.consequences.take(engine.now)
 
 
-def collected(told: Sequence[Consequence], run: Run) -> list[tuple[str, str, int, bytes]]:
+def collected(reported: Sequence[Consequence], run: Run) -> list[tuple[str, str, int, bytes]]:
     return [
         (sample.client, sample.stream, sample.time, sample.payload)
-        for each in told
+        for each in reported
         if isinstance(each, Sampled) and each.run == run
         for sample in each.samples
     ]
@@ -115,12 +115,12 @@ def test_each_sample_of_a_window_is_told_once_and_no_other(
     edges = sorted({0, *(cut for cut in cuts if cut < len(arrivals)), len(arrivals)})
     batches = [arrivals[first:last] for first, last in pairwise(edges) if last > first]
     engine = an_engine(DATA if on_data else WALL, RULE)
-    told = run(engine, batches, 12.0)
+    reported = run(engine, batches, 12.0)
     assert engine.consequences.running.keys() == {
-        each.run for each in told if isinstance(each, Begun) and not completed(told, each.run)
+        each.run for each in reported if isinstance(each, Begun) and not completed(reported, each.run)
     }
-    begun = [each for each in told if isinstance(each, Begun)]
-    ends = {each.run: each.event.end_time for each in told if isinstance(each, Over)}
+    begun = [each for each in reported if isinstance(each, Begun)]
+    ends = {each.run: each.event.end_time for each in reported if isinstance(each, Over)}
     for each in begun:
         end = ends.get(each.run)
         expected = [
@@ -130,7 +130,7 @@ def test_each_sample_of_a_window_is_told_once_and_no_other(
             for time in [sample.received if not on_data else round(json.loads(sample.payload)["t"] * 1e6) * 1000]
             if in_window(each, client, stream, time, end) and time <= engine.now
         ]
-        assert sorted(collected(told, each.run)) == sorted(expected)
+        assert sorted(collected(reported, each.run)) == sorted(expected)
 
 
 def in_window(begun: Begun, client: str, stream: str, time: int, end: int | None) -> bool:
@@ -140,12 +140,12 @@ def in_window(begun: Begun, client: str, stream: str, time: int, end: int | None
     return client in begun.event.subjects and begun.event.onset_time - 10**9 < time <= until + 700_000_000
 
 
-def completed(told: Sequence[Consequence], run: Run) -> bool:
-    return any(isinstance(each, Completed) and each.run == run for each in told)
+def completed(reported: Sequence[Consequence], run: Run) -> bool:
+    return any(isinstance(each, Completed) and each.run == run for each in reported)
 
 
-def order(told: Sequence[Consequence]) -> list[str]:
-    return [type(each).__name__ for each in told]
+def order(reported: Sequence[Consequence]) -> list[str]:
+    return [type(each).__name__ for each in reported]
 
 
 def speeds(*values: tuple[float, float]) -> list[list[Arrival]]:
@@ -157,8 +157,8 @@ PLAIN = a_detector(a_stream("speed"), a_stream("map", latched=True), buffer=BUFF
 
 def test_a_run_is_told_in_order_and_completed_once_time_has_passed_its_window() -> None:
     engine = an_engine(PLAIN, fast(an_action(before="1s", after="1s")))
-    told = run(engine, speeds((0.55, 0.0), (1.05, 1.0), (2.05, 0.0), (2.55, 0.0)), 3.0)
-    assert order(told) == ["Begun", "Sampled", "Over", "Sampled"]
+    reported = run(engine, speeds((0.55, 0.0), (1.05, 1.0), (2.05, 0.0), (2.55, 0.0)), 3.0)
+    assert order(reported) == ["Begun", "Sampled", "Over", "Sampled"]
     engine.advance((), at(3.1))
     assert order(engine.consequences.take(engine.now)) == ["Completed"]
     assert not engine.consequences.running
@@ -168,8 +168,8 @@ def test_a_run_is_told_in_order_and_completed_once_time_has_passed_its_window() 
 def test_what_was_latched_comes_with_the_window_however_old_it_is() -> None:
     engine = an_engine(PLAIN, fast(an_action(streams=["speed"], before="500ms")))
     first = [arrival(0.5, "car1", {"m": 1}, "map"), arrival(0.6, "car2", {"m": 2}, "map")]
-    told = run(engine, [first, *speeds((9.05, 1.0))], 9.2)
-    [sampled] = [each for each in told if isinstance(each, Sampled)]
+    reported = run(engine, [first, *speeds((9.05, 1.0))], 9.2)
+    [sampled] = [each for each in reported if isinstance(each, Sampled)]
     assert [(sample.stream, sample.client) for sample in sampled.samples] == [("map", "car1"), ("speed", "car1")]
 
 
@@ -178,8 +178,8 @@ def test_what_a_cap_pushes_out_in_between_is_told_all_the_same() -> None:
     engine = an_engine(tight, fast(an_action()))
     engine.advance([arrival(0.05, "car1", {"v": 1})], at(0.2))
     engine.advance([arrival(0.2 + each / 1000, "car1", {"v": 1}) for each in range(1, 50)], at(0.3))
-    told = engine.consequences.take(engine.now)
-    assert sum(len(each.samples) for each in told if isinstance(each, Sampled)) == 49
+    reported = engine.consequences.take(engine.now)
+    assert sum(len(each.samples) for each in reported if isinstance(each, Sampled)) == 49
 
 
 def test_a_dry_run_tells_nobody() -> None:
@@ -190,18 +190,18 @@ def test_a_dry_run_tells_nobody() -> None:
 def test_the_end_of_the_detector_cuts_what_is_open() -> None:
     engine = an_engine(PLAIN, fast(an_action()))
     run(engine, speeds((0.05, 1.0)), 1.0)
-    told = engine.consequences.cut(engine.now, "it stops")
-    assert [each for each in told if isinstance(each, Completed)] == told[-1:]
-    assert told[-1].cut == "it stops"
+    reported = engine.consequences.cut(engine.now, "it stops")
+    assert [each for each in reported if isinstance(each, Completed)] == reported[-1:]
+    assert reported[-1].cut == "it stops"
 
 
 def test_open_episodes_go_over_to_actions_that_change() -> None:
     engine = an_engine(PLAIN, fast(an_action("a"), an_action("b")))
     run(engine, speeds((0.05, 1.0)), 1.0)
     engine.set_rules(compiled(PLAIN, fast(an_action("b"), an_action("c"))))
-    told = engine.consequences.take(engine.now)
-    assert [(each.run.action, each.cut) for each in told if isinstance(each, Completed)] == [("a", REPLACED)]
-    assert [(each.run.action, each.resumed) for each in told if isinstance(each, Begun)] == [("c", True)]
+    reported = engine.consequences.take(engine.now)
+    assert [(each.run.action, each.cut) for each in reported if isinstance(each, Completed)] == [("a", REPLACED)]
+    assert [(each.run.action, each.resumed) for each in reported if isinstance(each, Begun)] == [("c", True)]
 
 
 def test_an_action_that_is_the_same_with_other_parameters_is_another() -> None:
@@ -216,14 +216,14 @@ def test_a_changed_rule_ends_its_episodes_and_their_windows_go_on() -> None:
     engine = an_engine(PLAIN, fast(an_action(after="1s")))
     run(engine, speeds((0.05, 1.0)), 1.0)
     engine.set_rules([])
-    told = run(engine, speeds((1.5, 1.0), (2.5, 1.0)), 3.0)
-    assert order(told) == ["Over", "Sampled", "Completed"]
-    assert [len(each.samples) for each in told if isinstance(each, Sampled)] == [1]
+    reported = run(engine, speeds((1.5, 1.0), (2.5, 1.0)), 3.0)
+    assert order(reported) == ["Over", "Sampled", "Completed"]
+    assert [len(each.samples) for each in reported if isinstance(each, Sampled)] == [1]
 
 
 def test_what_comes_when_its_window_is_complete_is_counted() -> None:
     engine = an_engine(DATA, fast(an_action(streams=["speed"], before="1s")))
-    told = run(
+    reported = run(
         engine,
         [
             [message(0.05, "car1", "speed", 1.0)],
@@ -233,7 +233,7 @@ def test_what_comes_when_its_window_is_complete_is_counted() -> None:
         ],
         4.0,
     )
-    assert order(told)[-1] == "Completed"
+    assert order(reported)[-1] == "Completed"
     assert engine.consequences.too_late == 1, "the second of them is in no window"
     run(engine, [[message(20.0, "car1", "speed", 0.0)]], 21.0)
     assert all(lane.came is None for lane in engine.buffer), "nobody waits for late ones any more"

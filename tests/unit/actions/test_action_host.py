@@ -39,11 +39,11 @@ class Recorded(Action[ActionParameters]):
     """Notes what it is told."""
 
     Parameters = ActionParameters
-    told: ClassVar[list[str]] = []
+    reported: ClassVar[list[str]] = []
     after: ClassVar[Callable[[str, Episode], None]] = staticmethod(lambda what, episode: None)
 
     def note(self, what: str, episode: Episode) -> None:
-        self.told.append(f"{self.setting.action} {what} {episode.subject}")
+        self.reported.append(f"{self.setting.action} {what} {episode.subject}")
         type(self).after(what, episode)
 
     def started(self, episode: Episode) -> None:
@@ -61,7 +61,7 @@ class Recorded(Action[ActionParameters]):
         self.setting.report(episode, Outcome(OutcomeState.DONE, missing=completion.missing))
 
     def close(self) -> None:
-        self.told.append(f"{self.setting.action} closed")
+        self.reported.append(f"{self.setting.action} closed")
 
 
 class Raises(Recorded):
@@ -121,7 +121,7 @@ KINDS = {
 def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     entries = [EntryPoint(name, f"{__name__}:{kind.__name__}", "wayside.actions") for name, kind in KINDS.items()]
     monkeypatch.setattr("detector.plugins.entrypoints.entry_points", lambda group: entries)
-    Recorded.told.clear()
+    Recorded.reported.clear()
     SLOW.clear()
     before = threading.enumerate()
     yield
@@ -162,7 +162,7 @@ class Site:
     def when(self, true: Callable[[], bool]) -> None:
         end = time.monotonic() + 60
         while not true():
-            assert time.monotonic() < end, (Recorded.told, self.host.outcomes.tallies(), self.host.outcomes.lost())
+            assert time.monotonic() < end, (Recorded.reported, self.host.outcomes.tallies(), self.host.outcomes.lost())
             time.sleep(0.005)
 
 
@@ -187,7 +187,7 @@ def test_an_action_is_told_of_an_episode_in_order_and_closed_at_last() -> None:
     site = Site(fast(a="recorded"))
     one_episode(site)
     site.host.close()
-    assert Recorded.told == [
+    assert Recorded.reported == [
         "a started car1",
         "a 1 samples car1",
         "a ended Until car1",
@@ -206,7 +206,7 @@ def test_what_one_raises_fails_that_episode_and_no_other() -> None:
     tally = site.tally("a")
     assert (tally.done, tally.failed, tally.running, tally.last_failure) == (1, 1, 0, "the ink is dry")
     assert site.tally("b").done == 2
-    assert [text for text in Recorded.told if text.startswith("a") and "car1" in text] == ["a started car1"]
+    assert [text for text in Recorded.reported if text.startswith("a") and "car1" in text] == ["a started car1"]
 
 
 def test_one_that_cannot_be_made_fails_its_episodes_with_the_reason() -> None:
@@ -228,7 +228,7 @@ def test_one_that_hangs_holds_up_nobody_and_what_finds_its_queue_full_is_counted
     site.when(lambda: site.tally("a").done == 1)
     [lost] = [each for each in site.host.outcomes.lost() if each.which.action == "a"]
     assert lost.what == "samples left out because the action is too slow"
-    counted = sum(int(text.split()[1]) for text in Recorded.told if text.startswith("a ") and "samples" in text)
+    counted = sum(int(text.split()[1]) for text in Recorded.reported if text.startswith("a ") and "samples" in text)
     assert site.tally("a").missing == lost.count == 42 - counted > 0
     site.host.close()
 
@@ -245,10 +245,10 @@ def test_one_that_hangs_at_the_end_is_left_behind() -> None:
 def test_one_that_is_replaced_completes_what_it_has_and_the_new_one_goes_on() -> None:
     site = Site(fast(a="recorded"))
     site.take((0.05, "car1", 1.0), until=0.5)
-    site.when(lambda: "a 1 samples car1" in Recorded.told)
+    site.when(lambda: "a 1 samples car1" in Recorded.reported)
     site.follow(fast(b="recorded"))
-    site.when(lambda: "b started car1" in Recorded.told and "a closed" in Recorded.told)
-    assert "a completed the action was changed or removed car1" in Recorded.told
+    site.when(lambda: "b started car1" in Recorded.reported and "a closed" in Recorded.reported)
+    assert "a completed the action was changed or removed car1" in Recorded.reported
     site.host.close()
 
 

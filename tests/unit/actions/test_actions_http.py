@@ -101,7 +101,7 @@ def test_redirects_are_not_followed() -> None:
 
 
 @pytest.mark.parametrize(
-    ("behaviour", "told"),
+    ("behaviour", "reported"),
     [
         (sends(b""), "closed the connection without a response"),
         (sends(b"SSH-2.0-OpenSSH_9.2\r\n"), "is not HTTP"),
@@ -109,8 +109,8 @@ def test_redirects_are_not_followed() -> None:
         (sends(b"HTTP/1.1 200 OK\r\nX: " + b"a" * 100_000 + b"\r\n\r\n"), "is not HTTP"),
     ],
 )
-def test_what_is_no_answer_is_told(behaviour: Behaviour, told: str) -> None:
-    with endpoint(behaviour) as there, pytest.raises(HttpError, match=told):
+def test_what_is_no_answer_is_told(behaviour: Behaviour, reported: str) -> None:
+    with endpoint(behaviour) as there, pytest.raises(HttpError, match=reported):
         send(client(), there.url)
 
 
@@ -226,7 +226,7 @@ def test_retry_after_is_understood_in_both_forms(text: str, seconds: float) -> N
 
 
 @pytest.mark.parametrize(
-    ("header", "told"),
+    ("header", "reported"),
     [
         ({"name": "X"}, "exactly one of value, variable and secret"),
         ({"name": "X", "value": "a", "variable": "WAYSIDE_A"}, "exactly one of value, variable and secret"),
@@ -237,6 +237,6 @@ def test_retry_after_is_understood_in_both_forms(text: str, seconds: float) -> N
         ({"name": "X", "secretKeyRef": {"name": "s", "key": "../other/key"}}, "pattern"),
     ],
 )
-def test_headers_that_cannot_be_are_refused(header: dict[str, Any], told: str) -> None:
-    with pytest.raises(ValidationError, match=re.escape(told)):
+def test_headers_that_cannot_be_are_refused(header: dict[str, Any], reported: str) -> None:
+    with pytest.raises(ValidationError, match=re.escape(reported)):
         HttpHeader.model_validate(header)

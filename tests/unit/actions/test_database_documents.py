@@ -251,10 +251,10 @@ def test_point_clouds_become_pcd_with_all_their_fields(*, big: bool, padding: in
     file = pcd(message)
     assert file is not None
     head, _, data = file.partition(b"DATA binary\n")
-    said = dict(line.split(" ", 1) for line in head.decode().splitlines() if not line.startswith("#"))
-    assert said["FIELDS"].split() == ["x", "y", "z", "_", "ring", "_"]
-    assert (said["WIDTH"], said["HEIGHT"], said["POINTS"]) == ("3", "2", "6")
-    sizes, counts = said["SIZE"].split(), said["COUNT"].split()
+    logged = dict(line.split(" ", 1) for line in head.decode().splitlines() if not line.startswith("#"))
+    assert logged["FIELDS"].split() == ["x", "y", "z", "_", "ring", "_"]
+    assert (logged["WIDTH"], logged["HEIGHT"], logged["POINTS"]) == ("3", "2", "6")
+    sizes, counts = logged["SIZE"].split(), logged["COUNT"].split()
     assert sum(int(size) * int(count) for size, count in zip(sizes, counts, strict=True)) == 20
     read = np.frombuffer(data, points.dtype).reshape(2, 3)
     for name in points.dtype.names or ():

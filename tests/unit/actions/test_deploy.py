@@ -252,17 +252,17 @@ MOVES = st.lists(
 def test_only_the_newest_demands_count_however_they_came(moves: list[dict[str, int]], pauses: int) -> None:
     """Each move is a full set: subjects, and a parameter that may have changed. A demand that ended does not return."""
     sets: list[dict[str, Demand]] = []
-    told: dict[str, int] = {}
+    reported: dict[str, int] = {}
     for number, move in enumerate(moves):
         present = {subject: demand(subject, parameters={"level": float(level)}) for subject, level in move.items()}
         gone = {each.name for each in (sets[-1].values() if sets else [])} - {each.name for each in present.values()}
-        told |= {name: number for name in gone if name not in told}
-        sets.append(by_name(*(each for each in present.values() if each.name not in told)))
+        reported |= {name: number for name in gone if name not in reported}
+        sets.append(by_name(*(each for each in present.values() if each.name not in reported)))
 
     async def drive(folder: Path) -> None:
         async with reconciling(folder) as reconciler:
             for number, demands in enumerate(sets):
-                reconciler.update(demands, {name: end for name, end in told.items() if end <= number})
+                reconciler.update(demands, {name: end for name, end in reported.items() if end <= number})
                 for _ in range(pauses):
                     await asyncio.sleep(0.002)
             await eventually(lambda: reconciler.looks > 0, "it has looked")
@@ -273,7 +273,7 @@ def test_only_the_newest_demands_count_however_they_came(moves: list[dict[str, i
         live = {name: task["spec"]["parameters"] for name, task in found.items() if "endTime" not in task["spec"]}
         assert live == {name: each.parameters for name, each in sets[-1].items()}
         ended = {name: task["spec"]["endTime"] for name, task in found.items() if "endTime" in task["spec"]}
-        assert ended == {name: format_time(told[name]) for name in ended}
+        assert ended == {name: format_time(reported[name]) for name in ended}
 
 
 def test_tasks_of_a_replay_go_into_one_file_in_the_order_of_their_starts(tmp_path: Path) -> None:

@@ -40,7 +40,7 @@ def test_the_built_in_action_asks_for_what_the_rule_has() -> None:
 
 
 @pytest.mark.parametrize(
-    ("notify", "told"),
+    ("notify", "reported"),
     [
         (
             "{zenoh: {key: a}, title: '${clint}'}",
@@ -63,8 +63,8 @@ def test_the_built_in_action_asks_for_what_the_rule_has() -> None:
         ("{zenoh: {key: a}, rate: {messages: 0}}", "spec.actions[0].notify.rate.messages"),
     ],
 )
-def test_what_is_wrong_is_told_with_its_place(tmp_path: Path, notify: str, told: str) -> None:
+def test_what_is_wrong_is_told_with_its_place(tmp_path: Path, notify: str, reported: str) -> None:
     found = problems(tmp_path, HEAD + SIGNAL + notify + "\n")
     assert len(found) == 1, found
     assert found[0].startswith("r.yaml:9:")
-    assert told in found[0]
+    assert reported in found[0]

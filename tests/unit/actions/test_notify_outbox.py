@@ -41,10 +41,10 @@ def message(episode: str, what: str = "started") -> OutboxMessage:
     st.lists(st.sampled_from([DELIVERED, AGAIN, REFUSED, AWAY]), max_size=60),
 )
 def test_each_message_is_settled_once_and_each_episode_in_order(
-    told: list[tuple[str, bool]], answers: list[Delivery]
+    reported: list[tuple[str, bool]], answers: list[Delivery]
 ) -> None:
     box, now = Outbox(100, 3600.0), 0.0
-    waiting = [message(episode, "started" if start else "ended") for episode, start in told]
+    waiting = [message(episode, "started" if start else "ended") for episode, start in reported]
     assert all(map(box.add, waiting))
     settled: list[OutboxMessage] = []
     for answer in [*answers, *([DELIVERED] * len(waiting))]:
@@ -133,7 +133,7 @@ def test_the_budget_is_never_exceeded_in_any_stretch_of_its_time(messages: int, 
 
 @given(st.lists(st.tuples(st.sampled_from(["", "A1", "B7"]), st.integers(0, 3)), max_size=30), st.integers(1, 10))
 def test_every_event_is_in_one_group_with_its_like_and_waits_no_longer_than_it_must(
-    told: list[tuple[str, int]], most: int
+    reported: list[tuple[str, int]], most: int
 ) -> None:
     groups, now = Groups(["road"], 5.0, most), 0.0
     begun: dict[str, float] = {}
@@ -145,7 +145,7 @@ def test_every_event_is_in_one_group_with_its_like_and_waits_no_longer_than_it_m
             assert now - begun[closed[0].episode] <= 5.0
             seen.extend(each.episode for each in closed)
 
-    for number, (road, pause) in enumerate(told):
+    for number, (road, pause) in enumerate(reported):
         arrival = now + pause
         while (due := groups.next_due()) is not None and due <= arrival:
             now = due

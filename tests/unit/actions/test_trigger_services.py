@@ -47,7 +47,7 @@ def test_a_definition_may_use_messages_of_the_detector() -> None:
 
 
 @pytest.mark.parametrize(
-    ("definition", "request_", "told"),
+    ("definition", "request_", "reported"),
     [
         ("int8 x\n---\n", {"x": 300}, "request.x is 300, but int8 goes from -128 to 127"),
         ("int8 x\n---\n", {"y": 3}, "request.y is not a field of a/srv/B_Request: its fields are x"),
@@ -61,8 +61,10 @@ def test_a_definition_may_use_messages_of_the_detector() -> None:
         (None, {}, "unknown service type a/srv/B: give its .srv file as definition"),
     ],
 )
-def test_what_does_not_fit_is_told_with_its_place(definition: str | None, request_: dict[str, Any], told: str) -> None:
-    with pytest.raises(ServiceError, match=told):
+def test_what_does_not_fit_is_told_with_its_place(
+    definition: str | None, request_: dict[str, Any], reported: str
+) -> None:
+    with pytest.raises(ServiceError, match=reported):
         service("a/srv/B", definition, standard()).request(request_)
 
 

@@ -185,7 +185,7 @@ def test_metrics_by_tls_are_probed_by_tls_and_their_secret_is_not_among_those_of
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "logged"),
     [
         (["--detector-metrics-secret", "a"], "have no effect without --detector-image"),
         (["--detector-env", "A=b"], "have no effect without --detector-image"),
@@ -193,14 +193,14 @@ def test_metrics_by_tls_are_probed_by_tls_and_their_secret_is_not_among_those_of
         (["--detector-image", "a", "--detector-env", "POD_NAME=b"], "POD_NAME is set automatically in each pod"),
     ],
 )
-def test_options_for_the_pods_that_make_no_sense_are_refused(options: list[str], said: str) -> None:
+def test_options_for_the_pods_that_make_no_sense_are_refused(options: list[str], logged: str) -> None:
     refused = CliRunner().invoke(app, ["run", *options])
     assert refused.exit_code == 2
-    assert said in " ".join(refused.stderr.replace("│", " ").split())
+    assert logged in " ".join(refused.stderr.replace("│", " ").split())
 
 
 @pytest.mark.parametrize(
-    ("spec", "said"),
+    ("spec", "logged"),
     [
         ({"state": {"path": "state"}}, "state.path: 'state' cannot be a volume path"),
         ({"recordings": {"path": "/"}}, "recordings.path: '/' cannot be a volume path"),
@@ -232,10 +232,10 @@ def test_options_for_the_pods_that_make_no_sense_are_refused(options: list[str],
         ),
     ],
 )
-def test_what_is_no_pod_is_refused(spec: dict[str, Any], said: str) -> None:
+def test_what_is_no_pod_is_refused(spec: dict[str, Any], logged: str) -> None:
     with pytest.raises(ValidationError, match="Detector") as refused:
         detector(**spec)
-    assert said in str(refused.value)
+    assert logged in str(refused.value)
 
 
 def test_without_a_mode_folders_are_the_machines() -> None:
@@ -285,13 +285,13 @@ def test_it_runs_when_its_pod_is_ready_and_else_it_is_said_why() -> None:
 
 
 def test_the_condition_goes_with_the_mode() -> None:
-    said = detector_status(detector(), [], NOW, NOT_RUN)
-    condition = find(said.conditions, "Running")
+    logged = detector_status(detector(), [], NOW, NOT_RUN)
+    condition = find(logged.conditions, "Running")
     assert condition is not None
     assert "--detector-image" in condition.message
-    without = detector(mode=None).model_copy(update={"status": said})
+    without = detector(mode=None).model_copy(update={"status": logged})
     assert find(detector_status(without, [], NOW).conditions, "Running") is None
-    unknown_yet = detector().model_copy(update={"status": said})
+    unknown_yet = detector().model_copy(update={"status": logged})
     assert find(detector_status(unknown_yet, [], NOW).conditions, "Running") == condition
 
 

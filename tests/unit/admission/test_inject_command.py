@@ -104,10 +104,10 @@ def error(*arguments: str) -> str:
     """What is said on stderr by the program; exit code 2."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("KUBECONFIG", "/nonexistent")
-        told: list[str] = []
-        patch.setattr("builtins.print", lambda *words, **_: told.append(" ".join(map(str, words))))
+        reported: list[str] = []
+        patch.setattr("builtins.print", lambda *words, **_: reported.append(" ".join(map(str, words))))
         assert commandline.run(app, "application-manager", EXPECTED, ["inject", *arguments]) == 2
-    return "\n".join(told)
+    return "\n".join(reported)
 
 
 def test_what_cannot_be_used_is_said_with_its_place_and_the_remedy(detector: Path, tmp_path: Path) -> None:
@@ -120,5 +120,5 @@ def test_what_cannot_be_used_is_said_with_its_place_and_the_remedy(detector: Pat
     broken.write_text("- a\n")
     assert "contains a document that is not a manifest" in error("-f", str(broken))
     detector.write_text(DETECTOR.replace("mode: Sidecar", "mode: Passenger"))
-    said = error("-f", str(pod), "-f", str(detector), *IMAGE)
-    assert "Detector town: spec.mode" in said
+    logged = error("-f", str(pod), "-f", str(detector), *IMAGE)
+    assert "Detector town: spec.mode" in logged

@@ -31,7 +31,7 @@ WRONG = Findings(("spec.when: is wrong",), ("it is early",))
 def question(
     operation: str = "CREATE", new: Any = None, old: Any = None, kind: str = "EventRule", **more: Any
 ) -> dict[str, Any]:
-    asked = {
+    requested = {
         "uid": "u1",
         "kind": {"group": "wayside.dev", "version": "v1alpha1", "kind": kind},
         "namespace": "site",
@@ -41,7 +41,7 @@ def question(
         "oldObject": old,
         **more,
     }
-    return {"apiVersion": "admission.k8s.io/v1", "kind": "AdmissionReview", "request": asked}
+    return {"apiVersion": "admission.k8s.io/v1", "kind": "AdmissionReview", "request": requested}
 
 
 def answered(review: dict[str, Any], findings: Findings = WRONG) -> dict[str, Any]:
@@ -110,10 +110,12 @@ def test_warnings_are_few_short_lines_whatever_is_in_them(texts: list[str]) -> N
     assert all(len(each) <= LONGEST and each.isprintable() for each in warnings)
 
 
-@pytest.mark.parametrize("asked", [None, [], {}, {"apiVersion": "admission.k8s.io/v1"}, question() | {"request": {}}])
-def test_what_is_no_review_is_said_to_be_none(asked: Any) -> None:
+@pytest.mark.parametrize(
+    "requested", [None, [], {}, {"apiVersion": "admission.k8s.io/v1"}, question() | {"request": {}}]
+)
+def test_what_is_no_review_is_said_to_be_none(requested: Any) -> None:
     with pytest.raises(ReviewError, match="only the API server may call this path"):
-        read(asked)
+        read(requested)
 
 
 def test_of_a_kind_that_is_not_looked_at_nothing_is_kept() -> None:
@@ -128,9 +130,9 @@ def test_the_configuration_asks_about_three_kinds_and_stands_in_nobodys_way() ->
     service = {"namespace": "wayside", "name": "manager", "port": 8443, "path": "/admission"}
     assert webhook["clientConfig"] == {"service": service, "caBundle": "UEVN"}
     assert (webhook["failurePolicy"], webhook["sideEffects"], webhook["timeoutSeconds"]) == ("Ignore", "None", 5)
-    (asked,) = webhook["rules"]
-    assert asked["resources"] == ["applicationtemplates", "detectors", "eventrules"]
-    assert asked["operations"] == ["CREATE", "UPDATE"]
+    (requested,) = webhook["rules"]
+    assert requested["resources"] == ["applicationtemplates", "detectors", "eventrules"]
+    assert requested["operations"] == ["CREATE", "UPDATE"]
     assert webhook["namespaceSelector"]["matchExpressions"][0]["values"] == ["a", "b"]
 
 
@@ -180,9 +182,9 @@ def reviewed(
         }
         client = Cluster(*live)
         admission = Admission(cache, client, resources, cache.store.put, Measures(), InProcess(), namespaces)
-        asked = question("CREATE" if old is None else "UPDATE", new.to_json(), old and old.to_json(), new.kind)
+        requested = question("CREATE" if old is None else "UPDATE", new.to_json(), old and old.to_json(), new.kind)
         try:
-            return await admission.review(asked)
+            return await admission.review(requested)
         finally:
             await client.close()
 

@@ -162,8 +162,8 @@ def test_it_holds_for_its_pod_with_a_token_of_its_own_under_the_restricted_stand
     assert mine["command"] == [
         "detector", "run", "--name=town", "--metrics-port=9464", "--as-pod", "--namespace=$(POD_NAMESPACE)",
     ]  # fmt: skip
-    told = {each["name"]: each["valueFrom"]["fieldRef"]["fieldPath"] for each in mine["env"]}
-    assert told == {"POD_NAME": "metadata.name", "POD_UID": "metadata.uid", "POD_NAMESPACE": "metadata.namespace"}
+    reported = {each["name"]: each["valueFrom"]["fieldRef"]["fieldPath"] for each in mine["env"]}
+    assert reported == {"POD_NAME": "metadata.name", "POD_UID": "metadata.uid", "POD_NAMESPACE": "metadata.namespace"}
     (token,) = (each["name"] for each in mine["volumeMounts"] if each["mountPath"] == TOKEN)
     (volume,) = (each for each in made["spec"]["volumes"] if each["name"] == token)
     assert volume["projected"]["sources"][0]["serviceAccountToken"]["path"] == "token"
@@ -195,8 +195,8 @@ def test_its_folders_secrets_and_resources_are_as_of_a_standalone_detectors_pod(
 
 def test_the_guides_pod_gets_the_guides_detector() -> None:
     section = guide("detectors").partition("## As a sidecar")[2]
-    of, asked = yaml.safe_load_all(yaml_blocks(section)[0])
-    found = injection(asked["metadata"], asked["spec"], "default", Detector.model_validate(of), DEFAULTS)
+    of, requested = yaml.safe_load_all(yaml_blocks(section)[0])
+    found = injection(requested["metadata"], requested["spec"], "default", Detector.model_validate(of), DEFAULTS)
     assert found.why_not is None
     assert found.addition is not None
 
@@ -221,7 +221,7 @@ def test_in_the_nodes_network_it_takes_no_port() -> None:
 
 
 @pytest.mark.parametrize(
-    ("asked", "of", "said"),
+    ("requested", "of", "logged"),
     [
         (pod(), None, "namespace site has no valid Detector 'town'"),
         (pod(), detector(mode="Standalone", serviceAccountNames=None), "is of mode Standalone: give it mode Sidecar"),
@@ -234,8 +234,8 @@ def test_in_the_nodes_network_it_takes_no_port() -> None:
         (pod() | {"metadata": {"labels": LABELS, "annotations": MIRROR}}, detector(), "static"),
     ],
 )  # fmt: skip
-def test_why_a_pod_goes_without_is_said_with_the_remedy(asked: Json, of: Detector | None, said: str) -> None:
-    assert said in why_not(asked, of)
+def test_why_a_pod_goes_without_is_said_with_the_remedy(requested: Json, of: Detector | None, logged: str) -> None:
+    assert logged in why_not(requested, of)
 
 
 def test_a_detector_that_is_not_accepted_comes_into_no_pod() -> None:
@@ -266,15 +266,15 @@ def review(one: Json, **more: Any) -> Json:
 
 
 def test_the_answer_always_allows_with_a_patch_or_a_warning() -> None:
-    asked = read_pod(review(pod()))
-    response = answer_pod(asked, injection(asked.pod["metadata"], asked.pod["spec"], "site", detector(), DEFAULTS))[
-        "response"
-    ]
+    requested = read_pod(review(pod()))
+    response = answer_pod(
+        requested, injection(requested.pod["metadata"], requested.pod["spec"], "site", detector(), DEFAULTS)
+    )["response"]
     assert (response["uid"], response["allowed"], response["patchType"]) == ("q", True, "JSONPatch")
     assert applied(pod(), json.loads(base64.b64decode(response["patch"]))) == injected(pod(), detector())
-    response = answer_pod(asked, injection(asked.pod["metadata"], asked.pod["spec"], "site", None, DEFAULTS))[
-        "response"
-    ]
+    response = answer_pod(
+        requested, injection(requested.pod["metadata"], requested.pod["spec"], "site", None, DEFAULTS)
+    )["response"]
     assert (response["allowed"], "patch" in response) == (True, False)
     assert "created without a detector: label wayside.dev/detector" in response["warnings"][0]
 
@@ -321,15 +321,15 @@ def state(one: Json, **how: Any) -> Json:
 def test_the_condition_says_in_how_many_pods_it_runs_and_what_keeps_it_from_running() -> None:
     of = detector()
     runs = state(injected(pod(), of), state={"running": {}}, ready=True)
-    said = carried(of, [runs, pod()])
-    assert (said.holds, said.message) == (
+    logged = carried(of, [runs, pod()])
+    assert (logged.holds, logged.message) == (
         True,
         "it runs in 1 of 2 pods with its label; 1 were created without it: their Events give the reason",
     )
     waiting = {"waiting": {"reason": "ErrImagePull", "message": "not found"}}
-    said = carried(of, [runs, state(injected(pod(), of), state=waiting)])
-    assert (said.holds, said.reason) == (False, "ImagePullFailed")
-    assert said.message == "it runs in 1 of 2 pods with its label: cannot pull image wayside:1: not found"
+    logged = carried(of, [runs, state(injected(pod(), of), state=waiting)])
+    assert (logged.holds, logged.reason) == (False, "ImagePullFailed")
+    assert logged.message == "it runs in 1 of 2 pods with its label: cannot pull image wayside:1: not found"
     broken = runs | {"status": runs["status"] | {"containerStatuses": [{"name": "main", "state": waiting}]}}
     assert carried(of, [broken]).holds
     assert [each["spec"]["initContainers"][0]["name"] for each in sidecar_pods([broken, pod()])] == [CONTAINER]
@@ -340,13 +340,13 @@ def test_pods_that_are_over_are_no_trouble() -> None:
     of, killed = detector(), {"terminated": {"exitCode": 137}}
     one = state(injected(pod(restartPolicy="OnFailure"), of), state=killed)
     over = one | {"status": one["status"] | {"containerStatuses": [{"name": "main", "state": killed}]}}
-    said = carried(of, [over, one | {"metadata": one["metadata"] | {"deletionTimestamp": "2026-01-01T00:00:00Z"}}])
-    assert (said.holds, said.message) == (True, "it runs in 0 of 0 pods with its label")
+    logged = carried(of, [over, one | {"metadata": one["metadata"] | {"deletionTimestamp": "2026-01-01T00:00:00Z"}}])
+    assert (logged.holds, logged.message) == (True, "it runs in 0 of 0 pods with its label")
     assert carried(of, [one]).reason == "CrashLoop"
 
 
 @pytest.mark.parametrize(
-    ("spec", "said"),
+    ("spec", "logged"),
     [
         ({"mode": "Standalone"}, "serviceAccountNames has no effect without mode Sidecar"),
         ({"mode": None}, "serviceAccountNames has no effect without mode Sidecar"),
@@ -364,7 +364,7 @@ def test_pods_that_are_over_are_no_trouble() -> None:
         ({"pod": {"resources": {"requests": {"a.b/gpu": "1"}}}}, "requests.a.b/gpu: 1 must equal limits"),
     ],
 )
-def test_what_makes_no_sense_is_refused_by_its_field(spec: Json, said: str) -> None:
+def test_what_makes_no_sense_is_refused_by_its_field(spec: Json, logged: str) -> None:
     with pytest.raises(ValidationError) as refused:
         detector(**spec)
-    assert said in str(refused.value)
+    assert logged in str(refused.value)

@@ -64,12 +64,12 @@ def failures(measures: Measures) -> str:
 def test_a_question_is_answered_and_what_is_none_is_not(folder: Path) -> None:
     measures = Measures()
 
-    async def review(asked: Any) -> dict[str, Any]:
-        if asked == "a defect":
+    async def review(requested: Any) -> dict[str, Any]:
+        if requested == "a defect":
             raise KeyError("spec")
-        if not isinstance(asked, dict):
+        if not isinstance(requested, dict):
             raise ReviewError("is no AdmissionReview")
-        return {"response": asked}
+        return {"response": requested}
 
     async def scenario(ask: Ask) -> None:
         assert await ask(b'{"a": 1}') == (200, '{"response":{"a":1}}')
@@ -89,7 +89,7 @@ def test_a_question_is_answered_and_what_is_none_is_not(folder: Path) -> None:
 def test_nothing_is_answered_before_everything_is_known(folder: Path) -> None:
     known: list[bool] = []
 
-    async def review(asked: Any) -> dict[str, Any]:
+    async def review(requested: Any) -> dict[str, Any]:
         return {}
 
     async def scenario(ask: Ask) -> None:
@@ -104,19 +104,19 @@ def test_those_beyond_the_limit_are_sent_away_at_once(folder: Path) -> None:
     all_there, go_on = asyncio.Event(), asyncio.Event()
     waiting: list[Any] = []
 
-    async def review(asked: Any) -> dict[str, Any]:
-        waiting.append(asked)
+    async def review(requested: Any) -> dict[str, Any]:
+        waiting.append(requested)
         if len(waiting) == AT_ONCE:
             all_there.set()
         await go_on.wait()
         return {}
 
     async def scenario(ask: Ask) -> None:
-        asked = [asyncio.create_task(ask()) for _ in range(AT_ONCE)]  # type: ignore[arg-type]
+        requested = [asyncio.create_task(ask()) for _ in range(AT_ONCE)]  # type: ignore[arg-type]
         await all_there.wait()
         assert (await ask())[0] == 503
         go_on.set()
-        assert {status for status, _ in await asyncio.gather(*asked)} == {200}
+        assert {status for status, _ in await asyncio.gather(*requested)} == {200}
         assert (await ask())[0] == 200
 
     served(folder, Desk(review, lambda: True, Measures()), scenario)
@@ -161,7 +161,7 @@ def test_files_that_cannot_be_used_are_said_at_the_start(folder: Path, spoil: Ca
 
 
 def test_a_port_that_is_taken_is_said(folder: Path) -> None:
-    async def review(asked: Any) -> dict[str, Any]:
+    async def review(requested: Any) -> dict[str, Any]:
         return {}
 
     desk = Desk(review, lambda: True, Measures())
@@ -199,17 +199,20 @@ def test_check_says_where_in_the_files_what_would_be_refused_is(
         "  key: ${parameters.regoin}\n  parameters: {region: {type: string}}\n  manifests:\n    -\n" + indented + "\n"
         "---\napiVersion: wayside.dev/v1alpha1\nkind: EventRule\nmetadata: {name: fast}\nspec: {when: 'true'}\n"
     )
-    code, _, said = command("check", str(file))
+    code, _, logged = command("check", str(file))
     assert code == 1
-    assert f"{file}:5:8: ApplicationTemplate app: spec.key" in said
-    assert "[invalid-template]" in said
-    assert "regoin" in said
-    assert "warning: " in said
-    assert "no valid Detector in namespace default selects the rule" in said
+    assert f"{file}:5:8: ApplicationTemplate app: spec.key" in logged
+    assert "[invalid-template]" in logged
+    assert "regoin" in logged
+    assert "warning: " in logged
+    assert "no valid Detector in namespace default selects the rule" in logged
     file.write_text(file.read_text().replace("regoin", "region"))
-    code, _, said = command("check", str(file))
-    assert (code, said.splitlines()[-1]) == (0, "checked 2: nothing would be refused")
-    assert [line.rpartition(" ")[2] for line in said.splitlines()[:-1]] == ["[failing-example]", "[rule-not-selected]"]
+    code, _, logged = command("check", str(file))
+    assert (code, logged.splitlines()[-1]) == (0, "checked 2: nothing would be refused")
+    assert [line.rpartition(" ")[2] for line in logged.splitlines()[:-1]] == [
+        "[failing-example]",
+        "[rule-not-selected]",
+    ]
     alone = (0, "", "checked 2: nothing would be refused\n")
     ignoring = ("--ignore", "rule-not-selected", "--ignore", "failing-example")
     assert command("check", str(file), *ignoring) == alone
@@ -225,8 +228,8 @@ def test_check_finds_nothing_that_would_be_refused_in_the_examples(
     folders = sorted({str(each.parent) for each in Path("examples").rglob("template*.yaml")})
     assert folders
     for folder in folders:
-        code, _, said = command("check", folder)
-        assert code == 0, said
+        code, _, logged = command("check", folder)
+        assert code == 0, logged
 
 
 @pytest.mark.parametrize(
@@ -242,6 +245,6 @@ def test_check_finds_nothing_that_would_be_refused_in_the_examples(
 def test_bad_usage_is_one_line_with_the_remedy(
     command: Callable[..., tuple[int, str, str]], arguments: list[str], part: str
 ) -> None:
-    code, out, said = command(*arguments)
-    assert (code, out, said.count("\n")) == (2, "", 1)
-    assert part in said
+    code, out, logged = command(*arguments)
+    assert (code, out, logged.count("\n")) == (2, "", 1)
+    assert part in logged

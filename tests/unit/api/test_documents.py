@@ -248,7 +248,7 @@ fields = st.sampled_from(
 )
 
 
-def told(file: Path) -> tuple[Problem, ...]:
+def reported(file: Path) -> tuple[Problem, ...]:
     """The problems of a file; none where it is read. Nothing but DocumentError may be raised."""
     try:
         load_documents([file])
@@ -265,7 +265,7 @@ def test_whatever_a_file_holds_it_is_read_or_its_problems_are_told(
     raw = {"apiVersion": "wayside.dev/v1alpha1", "kind": "EventRule", "metadata": {"name": "r"}, "spec": spec}
     file = tmp_path_factory.mktemp("any") / "f.yaml"
     file.write_text(json.dumps(raw) if as_json else yaml.safe_dump(raw, allow_unicode=True), encoding="utf-8")
-    assert all(problem.line > 0 and problem.message for problem in told(file))
+    assert all(problem.line > 0 and problem.message for problem in reported(file))
 
 
 @settings(max_examples=200, deadline=None)
@@ -273,4 +273,4 @@ def test_whatever_a_file_holds_it_is_read_or_its_problems_are_told(
 def test_whatever_a_line_holds_nothing_else_is_raised(tmp_path_factory: pytest.TempPathFactory, line: str) -> None:
     file = tmp_path_factory.mktemp("any") / "f.yaml"
     file.write_text(HEAD + "  when: " + line + "\n", encoding="utf-8")
-    assert all(problem.line > 0 and problem.message for problem in told(file))
+    assert all(problem.line > 0 and problem.message for problem in reported(file))

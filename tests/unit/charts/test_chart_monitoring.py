@@ -61,9 +61,9 @@ def exported() -> set[str]:
 
 
 def test_alerts_and_dashboard_ask_only_for_what_the_programs_export() -> None:
-    asked = {name for each in expressions() for name in NAME.findall(each)}
-    assert len(asked) > 20
-    assert asked - exported() == set()
+    requested = {name for each in expressions() for name in NAME.findall(each)}
+    assert len(requested) > 20
+    assert requested - exported() == set()
 
 
 def test_every_panel_is_within_what_is_chosen() -> None:

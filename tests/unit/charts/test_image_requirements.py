@@ -32,8 +32,11 @@ PINS = {"requirements.txt": pins("requirements.txt"), "requirements-full.txt": p
 
 @pytest.mark.parametrize(("file", "extras"), [("requirements.txt", EXTRAS), ("requirements-full.txt", FULL)])
 def test_the_image_has_what_the_programs_ask_for(file: str, extras: tuple[str, ...]) -> None:
-    asked = [*PROJECT["dependencies"], *(each for extra in extras for each in PROJECT["optional-dependencies"][extra])]
-    for requirement in map(Requirement, asked):
+    requested = [
+        *PROJECT["dependencies"],
+        *(each for extra in extras for each in PROJECT["optional-dependencies"][extra]),
+    ]
+    for requirement in map(Requirement, requested):
         name = canonicalize_name(requirement.name)
         assert name in PINS[file], "run `make requirements`"
         assert requirement.specifier.contains(PINS[file][name][0]), "run `make requirements`"

@@ -79,7 +79,7 @@ def test_the_command_prints_what_the_table_says() -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "logged"),
     [
         (["--account", "manager"], "write NAMESPACE/NAME"),
         (["--allowed-kinds", "rbac.authorization.k8s.io/v1/Role"], "can never be allowed"),
@@ -88,10 +88,10 @@ def test_the_command_prints_what_the_table_says() -> None:
         (["--namespace", "a", "--grant", "b"], "remove it, or --namespace"),
     ],
 )
-def test_what_cannot_be_is_refused(arguments: list[str], said: str) -> None:
+def test_what_cannot_be_is_refused(arguments: list[str], logged: str) -> None:
     done = CliRunner().invoke(app, ["rbac", *arguments])
     assert done.exit_code == 2
-    assert said in " ".join(done.output.replace("│", " ").split())
+    assert logged in " ".join(done.output.replace("│", " ").split())
 
 
 def test_a_kind_that_nobody_knows_is_looked_up_in_a_cluster(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -104,8 +104,8 @@ def test_a_kind_that_nobody_knows_is_looked_up_in_a_cluster(monkeypatch: pytest.
 def test_what_is_lacking_is_said_with_its_purpose_and_the_remedy(caplog: pytest.LogCaptureFixture) -> None:
     needed = {(each.resource, each.vital): each for each in rights({DEPLOYMENT: "deployments"})}
     report_missing([(needed["deployments", False], "patch", "a")])
-    (said,) = caplog.messages
-    assert said == (
+    (logged,) = caplog.messages
+    assert logged == (
         "its service account cannot patch deployments of apps in namespace a, so no Deployment of a template is "
         "created, changed or deleted: apply the output of `application-manager rbac`"
     )

@@ -81,15 +81,15 @@ def test_of_one_dimension_either_value_will_do_and_of_several_all_must() -> None
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "shows"),
     [
         ("purpose=Safety", "unknown dimension 'purpose'; the dimensions are overarchingPurpose, typeOfParticipants"),
         ("incidence=Often", "incidence has no value 'Often'; its values are Frequent, Common, Rare, Unexpected"),
         ("incidence", "incidence has no value ''; its values are Frequent"),
     ],
 )
-def test_what_the_scheme_does_not_have_is_refused_with_what_it_has(text: str, says: str) -> None:
-    with pytest.raises(ChoiceError, match=says):
+def test_what_the_scheme_does_not_have_is_refused_with_what_it_has(text: str, shows: str) -> None:
+    with pytest.raises(ChoiceError, match=shows):
         choose([text])
 
 
@@ -176,12 +176,12 @@ def run(*arguments: str) -> int:
 
 def test_the_command_prints_a_table_of_all_values(rules: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(str(rules)) == 0
-    told = capsys.readouterr()
-    lines = [line.rstrip() for line in told.out.splitlines()]
+    reported = capsys.readouterr()
+    lines = [line.rstrip() for line in reported.out.splitlines()]
     assert lines[0].split() == ["DIMENSION", "VALUE", "RULES"]
     assert sum(line.endswith("rare                    battery") for line in lines) == 1
     assert lines[-1] == "without classification: plain"
-    assert told.err == "3 of 3 rules\n"
+    assert reported.err == "3 of 3 rules\n"
 
 
 def test_the_command_writes_json_for_other_programs(rules: Path, tmp_path: Path) -> None:
@@ -200,7 +200,7 @@ def test_the_command_writes_json_for_other_programs(rules: Path, tmp_path: Path)
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "shows"),
     [
         ([], "give files or folders with EventRules, or --cluster"),
         (["x.yaml", "--cluster"], "give files or folders with EventRules, or --cluster"),
@@ -210,11 +210,11 @@ def test_the_command_writes_json_for_other_programs(rules: Path, tmp_path: Path)
         (["x.yaml", "--format", "pdf"], "'pdf' is not one of"),
     ],
 )
-def test_wrong_usage_is_one_line(arguments: list[str], says: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_usage_is_one_line(arguments: list[str], shows: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(*arguments) == 2
-    told = capsys.readouterr().err
-    assert says in told
-    assert told.count("\n") == 1
+    reported = capsys.readouterr().err
+    assert shows in reported
+    assert reported.count("\n") == 1
 
 
 def test_without_an_api_server_it_is_said_what_else_this_command_can_do(
@@ -222,7 +222,7 @@ def test_without_an_api_server_it_is_said_what_else_this_command_can_do(
 ) -> None:
     monkeypatch.setenv("KUBECONFIG", str(tmp_path / "nowhere"))
     assert run("--cluster") == 2
-    told = capsys.readouterr().err
-    assert "there is no such file" in told
-    assert "give either files or folders with EventRules, or --cluster" in told
-    assert "--detector" not in told
+    reported = capsys.readouterr().err
+    assert "there is no such file" in reported
+    assert "give either files or folders with EventRules, or --cluster" in reported
+    assert "--detector" not in reported

@@ -59,11 +59,11 @@ DRY = {"database": {"streams": ["speed"], "dryRun": True}}
 TRIGGER = {"trigger": {"detector": {"name": "other"}}}
 CALL = {"trigger": {"http": {"start": {"url": "http://h/x"}}}}
 ALERT = {"notify": {"alertmanager": {"url": "http://h"}}}
-TELL = {"notify": {"zenoh": {"key": "k"}}}
+REPORT = {"notify": {"zenoh": {"key": "k"}}}
 LATER = {"notify": {"zenoh": {"key": "k"}, "grouping": {"wait": "5s"}}}
 
 
-def told(classification: dict[str, list[str]], *others: Any, **spec: Any) -> list[str]:
+def reported(classification: dict[str, list[str]], *others: Any, **spec: Any) -> list[str]:
     """The warnings of a rule with signal v and condition v > 1, unless it says otherwise."""
     full = {"signals": [SPEED], "when": "v > 1", **spec}
     rule = a_rule("r", classification=classification, **full)
@@ -76,12 +76,12 @@ class Way(NamedTuple):
 
     given: dict[str, list[str]]
     spec: dict[str, Any]
-    says: str
+    shows: str
     right: dict[str, list[str]]
 
 
-def way(dimension: str, value: str, says: str, right: str, **spec: Any) -> Way:
-    return Way({dimension: value.split()}, spec, f"spec.classification.{dimension}{says}", {dimension: right.split()})
+def way(dimension: str, value: str, shows: str, right: str, **spec: Any) -> Way:
+    return Way({dimension: value.split()}, spec, f"spec.classification.{dimension}{shows}", {dimension: right.split()})
 
 
 NOW = [SPEED]
@@ -148,7 +148,7 @@ WAYS = [
     way("typeOfAction", "DataCollection", ": spec.actions[1].notify raises an alert: add Notification (the action inf",
         "DataCollection Notification", actions=act(RECORD, ALERT)),
     way("typeOfAction", "DataCollection", ": spec.actions[0].notify sends a notification: add Reconfiguration",
-        "Reconfiguration", actions=act(TELL)),
+        "Reconfiguration", actions=act(REPORT)),
     way("typeOfAction", "DataCollection Deployment", "[1]: Deployment (the action starts software that was not running)"
         " contradicts the rule: no action of the rule does that (spec.actions[0].record): remove it, or add the action",
         "DataCollection", actions=act(RECORD)),
@@ -158,16 +158,16 @@ WAYS = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("given_way", WAYS, ids=lambda each: each.says.removeprefix("spec.classification.")[:60])
+@pytest.mark.parametrize("given_way", WAYS, ids=lambda each: each.shows.removeprefix("spec.classification.")[:60])
 def test_a_contradiction_is_told_and_what_fits_is_not(given_way: Way) -> None:
-    warnings = told(given_way.given, **given_way.spec)
-    assert any(warning.startswith(given_way.says) for warning in warnings), warnings
-    assert told(given_way.right, **given_way.spec) == []
-    assert told({}, **given_way.spec) == []
+    warnings = reported(given_way.given, **given_way.spec)
+    assert any(warning.startswith(given_way.shows) for warning in warnings), warnings
+    assert reported(given_way.right, **given_way.spec) == []
+    assert reported({}, **given_way.spec) == []
 
 
 def test_there_is_a_rule_for_each_entry_of_the_table() -> None:
-    assert {given_way.says.split(".")[2].split(":")[0].split("[")[0] for given_way in WAYS} == {
+    assert {given_way.shows.split(".")[2].split(":")[0].split("[")[0] for given_way in WAYS} == {
         dimension.name for dimension in SCHEME if dimension.values in {each.dimension for each in CONTRADICTIONS}
     }
 
@@ -185,18 +185,18 @@ RIGHT: dict[str, tuple[str, str, dict[str, Any]]] = {
         {"signals": [{"name": "age", "stream": "speed", "aggregate": "Age"}], "when": "age > 7"},
     ),
     "one of several fits": ("observationPeriod", "Immediate LongTerm", {}),
-    "the first action counts": ("timeSensitivity", "Immediate", {"actions": act(LATER, TELL)}),
+    "the first action counts": ("timeSensitivity", "Immediate", {"actions": act(LATER, REPORT)}),
     "on each sample": ("timeSensitivity", "Immediate", {"evaluation": {"onSample": "speed"}}),
     "messages of all kinds": (
         "typeOfParticipants", "Vehicle", {"signals": [{"name": "v", "stream": "any-its", "value": "msg.v"}]}
     ),
-    "a report, as in Table 2": ("typeOfAction", "Notification", {"actions": act(RECORD, TELL)}),
-    "told to reconfigure": ("typeOfAction", "Reconfiguration", {"actions": act(TELL)}),
-    "nothing is written": ("typeOfAction", "Notification", {"actions": act(DRY, TELL)}),
+    "a report, as in Table 2": ("typeOfAction", "Notification", {"actions": act(RECORD, REPORT)}),
+    "told to reconfigure": ("typeOfAction", "Reconfiguration", {"actions": act(REPORT)}),
+    "nothing is written": ("typeOfAction", "Notification", {"actions": act(DRY, REPORT)}),
     "a call may do anything": ("typeOfAction", "Reconfiguration", {"actions": act(CALL)}),
     "somebody else acts on the events": ("typeOfAction", "Deployment", {}),
     "what is launched records": ("typeOfAction", "Deployment DataCollection", {"actions": act(DEPLOY)}),
-    "not all actions record": ("actingEntity", "External", {"actions": act(RECORD, TELL)}),
+    "not all actions record": ("actingEntity", "External", {"actions": act(RECORD, REPORT)}),
     "a plugin may have learnt": ("detectionAlgorithm", "LearningBased", {"signals": [PLUGIN], "when": "p"}),
     "what it looks at was learnt": ("detectionAlgorithm", "RuleBased LearningBased", {}),
     "the model decides nothing": ("detectionAlgorithm", "RuleBased", {"signals": [SPEED, a_model()]}),
@@ -207,7 +207,7 @@ RIGHT: dict[str, tuple[str, str, dict[str, Any]]] = {
 @pytest.mark.parametrize("case", RIGHT)
 def test_what_may_be_right_is_not_warned_of(case: str) -> None:
     dimension, values, spec = RIGHT[case]
-    assert told({dimension: values.split()}, **spec) == []
+    assert reported({dimension: values.split()}, **spec) == []
 
 
 def test_what_a_named_rule_looks_at_counts_as_well() -> None:
@@ -216,11 +216,11 @@ def test_what_a_named_rule_looks_at_counts_as_well() -> None:
         "when": "starts > 2",
     }
     other = a_rule("other", signals=[over("40m"), a_model({"name": "x", "signals": ["m"]})], when="risk > 0.5")
-    (period,) = told({"observationPeriod": ["ShortTerm"]}, other, **spec)
+    (period,) = reported({"observationPeriod": ["ShortTerm"]}, other, **spec)
     assert "it looks back 70m (spec.signals[0].over: 30m and spec.signals[0].over: 40m of the rule other)" in period
-    (learnt,) = told({"detectionAlgorithm": ["RuleBased"]}, other, **spec)
+    (learnt,) = reported({"detectionAlgorithm": ["RuleBased"]}, other, **spec)
     assert "spec.signals[1].model of the rule other is a learnt model" in learnt
-    assert told({"observationPeriod": ["LongTerm"], "detectionAlgorithm": ["LearningBased"]}, other, **spec) == []
+    assert reported({"observationPeriod": ["LongTerm"], "detectionAlgorithm": ["LearningBased"]}, other, **spec) == []
 
 
 def test_a_models_window_counts_and_one_of_samples_may_be_any_time() -> None:
@@ -229,10 +229,10 @@ def test_a_models_window_counts_and_one_of_samples_may_be_any_time() -> None:
             "signals": [SPEED, a_model({"name": "x", "window": {"signals": ["v"], **window}})], "when": "risk > 0.5"
         }  # fmt: skip
 
-    (warning,) = told({"observationPeriod": ["Immediate"]}, **model(over="5s", samples=10))
+    (warning,) = reported({"observationPeriod": ["Immediate"]}, **model(over="5s", samples=10))
     assert "it looks back 5s (spec.signals[1].model: 5s): write ShortTerm" in warning
     for value in ("Immediate", "ShortTerm", "LongTerm"):
-        assert told({"observationPeriod": [value]}, **model(last=10)) == []
+        assert reported({"observationPeriod": [value]}, **model(last=10)) == []
 
 
 PAPER = {
@@ -247,7 +247,7 @@ PAPER = {
 def test_the_papers_own_classifications_do_not_contradict_rules_that_do_what_it_says(table: str) -> None:
     text, actions = PAPER[table]
     values = {each.name: part.split() for each, part in zip(SCHEME, text.split("|"), strict=True)}
-    assert told(values, signals=[over("10s")], when="m > 1", actions=actions) == []
+    assert reported(values, signals=[over("10s")], when="m > 1", actions=actions) == []
 
 
 @given(

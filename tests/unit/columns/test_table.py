@@ -136,12 +136,12 @@ class TableMachine(RuleBasedStateMachine):
 
     @invariant()
     def find_gives_the_place_after_the_last_row_up_to_a_time(self) -> None:
-        asked = sorted({*self._times()})
+        requested = sorted({*self._times()})
         clients = np.arange(len(self.rows))
-        found = self.table.find(np.array(asked, np.int64), clients) - self.table.first[clients][:, None]
+        found = self.table.find(np.array(requested, np.int64), clients) - self.table.first[clients][:, None]
         for client, rows in enumerate(self.rows):
             times = [each.received for each in rows]
-            assert found[client].tolist() == [bisect_right(times, time) for time in asked]
+            assert found[client].tolist() == [bisect_right(times, time) for time in requested]
 
     def _times(self) -> Iterator[int]:
         """At, before and after rows, as far back as ticks and their windows reach."""

@@ -21,11 +21,11 @@ def test_bad_usage_is_one_line_that_names_program_and_help(
 ) -> None:
     for arguments in (incomplete, [*incomplete, "--debug"], ["--debug", *incomplete]):
         assert commandline.run(app, "program", (), arguments) == 2
-        told = capsys.readouterr().err
-        assert told.startswith("program: ")
-        assert lacks in told
-        assert told.endswith(f"see program {incomplete[0]} --help\n")
-        assert told.count("\n") == 1
+        reported = capsys.readouterr().err
+        assert reported.startswith("program: ")
+        assert lacks in reported
+        assert reported.endswith(f"see program {incomplete[0]} --help\n")
+        assert reported.count("\n") == 1
 
 
 def failing(error: Exception) -> typer.Typer:
@@ -41,22 +41,22 @@ def failing(error: Exception) -> typer.Typer:
     return app
 
 
-def told(error: Exception, capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+def reported(error: Exception, capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     assert commandline.run(failing(error), "program", (ValueError,), ["run", *arguments]) == 2
     return capsys.readouterr().err
 
 
 def test_an_expected_error_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
-    assert told(ValueError("no cluster"), capsys) == "program: no cluster\n"
+    assert reported(ValueError("no cluster"), capsys) == "program: no cluster\n"
 
 
 def test_errors_of_tasks_side_by_side_are_a_line_each(capsys: pytest.CaptureFixture[str]) -> None:
     group = ExceptionGroup("tasks", [ValueError("a"), ExceptionGroup("more", [ValueError("b")])])
-    assert told(group, capsys) == "program: a\nprogram: b\n"
+    assert reported(group, capsys) == "program: a\nprogram: b\n"
 
 
 def test_with_debug_and_for_defects_the_trace_is_kept(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(ValueError, match="no cluster"):
-        told(ValueError("no cluster"), capsys, "--debug")
+        reported(ValueError("no cluster"), capsys, "--debug")
     with pytest.raises(KeyError):
-        told(KeyError("a defect"), capsys)
+        reported(KeyError("a defect"), capsys)

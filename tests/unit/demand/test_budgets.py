@@ -45,28 +45,28 @@ def expected(live: set[str]) -> set[str]:
 
 @given(st.lists(st.tuples(st.sampled_from(("enter", "leave")), st.sampled_from(NAMES)), max_size=40))
 def test_the_oldest_are_within_and_every_change_is_reported(steps: list[Step]) -> None:
-    book = BudgetIndex(POLICY)
+    index = BudgetIndex(POLICY)
     live: set[str] = set()
     for step, name in steps:
         before = expected(live)
         one = made(name)
         if step == "enter":
             live.add(name)
-            moved = book.enter(one)
+            moved = index.enter(one)
         else:
             live.discard(name)
-            moved = book.leave((one.namespace, name))
-        within = {each for each in live if book.verdict((one.namespace, each)) is None}
+            moved = index.leave((one.namespace, name))
+        within = {each for each in live if index.verdict((one.namespace, each)) is None}
         assert within == expected(live)
         assert {each for _, each in moved} >= {each for each in before ^ within if each != name}
         assert len(moved) <= 3  # looks at the task that two budgets move in opposite directions, too
 
 
 def test_one_beyond_them_waits_and_says_for_what() -> None:
-    book = BudgetIndex(POLICY)
+    index = BudgetIndex(POLICY)
     for name in ("t2", "t1", "t0"):
-        book.enter(made(name))
-    verdict = book.verdict((made("t0").namespace, "t0"))
+        index.enter(made(name))
+    verdict = index.verdict((made("t0").namespace, "t0"))
     assert verdict is not None
     assert verdict.standing is Standing.WAITING
     assert "a1 may have 2 unfinished tasks" in verdict.message

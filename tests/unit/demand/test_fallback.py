@@ -110,7 +110,7 @@ def test_it_changes_only_after_a_whole_timeout_in_the_other_state(series: list[t
     of, app, status = template(**FULL), runs(), ApplicationInstanceStatus()
     now, ready_since, previous = NOW, NOW, False
     timed_out: list[Condition] = []
-    said = []
+    logged = []
     for is_ready, seconds in series:
         if is_ready != previous:
             previous, ready_since = is_ready, now
@@ -118,11 +118,11 @@ def test_it_changes_only_after_a_whole_timeout_in_the_other_state(series: list[t
         for _ in range(seconds):
             seen = status.model_copy(update={"conditions": [ready, *timed_out]})
             beyond = bool(overdue(app.model_copy(update={"status": seen}), of, now)[0])
-            said.append((beyond, is_ready, now - ready_since))
+            logged.append((beyond, is_ready, now - ready_since))
             if beyond or timed_out:
                 timed_out = [condition("TimedOut", beyond, NOW)]
             now += 1
-    for (before, _, _), (after, is_ready, lasts) in pairwise(said):
+    for (before, _, _), (after, is_ready, lasts) in pairwise(logged):
         if before != after:
             assert lasts >= 60
             assert is_ready == before  # it recovers while it is ready, and is overdue while it is not
@@ -175,7 +175,7 @@ def test_own_tasks_of_the_fallback_and_those_that_turn_to_it_share_it() -> None:
 
 
 @pytest.mark.parametrize(
-    ("other", "says"),
+    ("other", "shows"),
     [
         ([], "there is no ApplicationTemplate 'lite': create it"),
         (
@@ -185,10 +185,10 @@ def test_own_tasks_of_the_fallback_and_those_that_turn_to_it_share_it() -> None:
         ([template("lite", parameters={"region": {"type": "string", "enum": ["south"]}})], "spec.parameters.region"),
     ],
 )
-def test_where_the_fallback_cannot_serve_the_task_says_why_and_stays(other: Any, says: str) -> None:
+def test_where_the_fallback_cannot_serve_the_task_says_why_and_stays(other: Any, shows: str) -> None:
     verdict = of(wants(), templates=[template(**FULL), *other]).verdicts["a"]
     assert (verdict.standing, verdict.reason, verdict.instance) == (Standing.COUNTS, "FallbackFailed", NORTH)
-    assert says in verdict.message
+    assert shows in verdict.message
 
 
 def test_nothing_turns_where_nobody_demands_it_or_it_is_suspended_or_its_holder_is_lost() -> None:

@@ -35,30 +35,30 @@ def lease(renewed: str, duration: int = 3, **metadata: Any) -> dict[str, Any]:
 
 
 def test_a_lease_is_as_old_as_we_have_seen_it_unchanged() -> None:
-    book = LeaseIndex()
-    assert book.observe(KEY, lease("2020-01-01T00:00:00Z"), 10.0) is False
-    book.observe(KEY, lease("2020-01-01T00:00:00Z"), 12.0)
-    assert book.view(KEY, 12.0) == LeaseView(2.0, 3.0, renewed=False)
-    assert book.observe(KEY, lease("2020-01-01T00:00:01Z"), 13.0) is True
-    book.observe(KEY, lease("2020-01-01T00:00:01Z"), 14.5)
-    assert book.view(KEY, 14.5) == LeaseView(1.5, 3.0, renewed=True)
+    index = LeaseIndex()
+    assert index.observe(KEY, lease("2020-01-01T00:00:00Z"), 10.0) is False
+    index.observe(KEY, lease("2020-01-01T00:00:00Z"), 12.0)
+    assert index.view(KEY, 12.0) == LeaseView(2.0, 3.0, renewed=False)
+    assert index.observe(KEY, lease("2020-01-01T00:00:01Z"), 13.0) is True
+    index.observe(KEY, lease("2020-01-01T00:00:01Z"), 14.5)
+    assert index.view(KEY, 14.5) == LeaseView(1.5, 3.0, renewed=True)
 
 
 def test_time_in_which_nobody_looked_says_nothing() -> None:
-    book = LeaseIndex()
-    book.observe(KEY, lease("a"), 0.0)
-    assert book.view(KEY, 100.0).unchanged == 0.0
-    assert not book.due(KEY, 2.9)
-    assert book.due(KEY, 3.0)
+    index = LeaseIndex()
+    index.observe(KEY, lease("a"), 0.0)
+    assert index.view(KEY, 100.0).unchanged == 0.0
+    assert not index.due(KEY, 2.9)
+    assert index.due(KEY, 3.0)
 
 
 def test_the_longer_a_lease_is_overdue_the_rarer_it_is_looked_at() -> None:
-    book = LeaseIndex()
-    book.observe(KEY, lease("a"), 0.0)
+    index = LeaseIndex()
+    index.observe(KEY, lease("a"), 0.0)
     looks = []
     for at in range(3, 200):
-        if book.due(KEY, float(at)):
-            book.observe(KEY, lease("a"), float(at))
+        if index.due(KEY, float(at)):
+            index.observe(KEY, lease("a"), float(at))
             looks.append(at)
     pauses = [later - earlier for earlier, later in itertools.pairwise(looks)]
     assert looks[0] == 3
@@ -68,53 +68,53 @@ def test_the_longer_a_lease_is_overdue_the_rarer_it_is_looked_at() -> None:
 
 
 def test_seeing_the_same_again_is_no_renewal() -> None:
-    book = LeaseIndex()
-    book.observe(KEY, lease("a"), 0.0)
-    assert book.observe(KEY, lease("a", resourceVersion="9", labels={"x": "y"}), 6.0) is False
-    assert book.view(KEY, 6.0).unchanged == 6.0
+    index = LeaseIndex()
+    index.observe(KEY, lease("a"), 0.0)
+    assert index.observe(KEY, lease("a", resourceVersion="9", labels={"x": "y"}), 6.0) is False
+    assert index.view(KEY, 6.0).unchanged == 6.0
 
 
 def test_a_lease_that_vanishes_is_no_renewal_but_one_that_appears_is() -> None:
-    book = LeaseIndex()
-    book.observe(KEY, lease("a"), 0.0)
-    assert book.observe(KEY, None, 4.0) is False
-    book.observe(KEY, None, 5.0)
-    assert book.view(KEY, 5.0).unchanged == 5.0
-    assert book.observe(KEY, lease("a"), 6.0) is True
-    assert book.view(KEY, 6.0).unchanged == 0.0
+    index = LeaseIndex()
+    index.observe(KEY, lease("a"), 0.0)
+    assert index.observe(KEY, None, 4.0) is False
+    index.observe(KEY, None, 5.0)
+    assert index.view(KEY, 5.0).unchanged == 5.0
+    assert index.observe(KEY, lease("a"), 6.0) is True
+    assert index.view(KEY, 6.0).unchanged == 0.0
 
 
 def test_the_first_look_at_a_lease_is_no_sign_of_life_though_somebody_asked_before() -> None:
-    book = LeaseIndex()
-    assert book.view(KEY, 1.0).unchanged == 0.0
-    assert not book.seen(KEY)
-    assert book.due(KEY, 1.0)
-    assert book.observe(KEY, lease("a"), 2.0) is False
-    assert book.seen(KEY)
-    assert book.view(KEY, 2.0) == LeaseView(0.0, 3.0, renewed=False)
-    assert book.observe(KEY, lease("b"), 4.0) is True
+    index = LeaseIndex()
+    assert index.view(KEY, 1.0).unchanged == 0.0
+    assert not index.seen(KEY)
+    assert index.due(KEY, 1.0)
+    assert index.observe(KEY, lease("a"), 2.0) is False
+    assert index.seen(KEY)
+    assert index.view(KEY, 2.0) == LeaseView(0.0, 3.0, renewed=False)
+    assert index.observe(KEY, lease("b"), 4.0) is True
 
 
 def test_a_lease_that_was_looked_for_and_appears_is_a_sign_of_life() -> None:
-    book = LeaseIndex()
-    book.view(KEY, 1.0)
-    book.observe(KEY, None, 2.0)
-    assert book.observe(KEY, lease("a"), 3.0) is True
-    assert book.view(KEY, 3.0).renewed
+    index = LeaseIndex()
+    index.view(KEY, 1.0)
+    index.observe(KEY, None, 2.0)
+    assert index.observe(KEY, lease("a"), 3.0) is True
+    assert index.view(KEY, 3.0).renewed
 
 
 def test_a_holder_without_a_lease_counts_from_when_we_first_heard_of_it() -> None:
-    book = LeaseIndex()
-    assert book.view(KEY, 7.0) == LeaseView(0.0, DEFAULT_DURATION, renewed=False)
-    book.observe(KEY, None, 9.0)
-    assert book.view(KEY, 9.0).unchanged == 2.0
+    index = LeaseIndex()
+    assert index.view(KEY, 7.0) == LeaseView(0.0, DEFAULT_DURATION, renewed=False)
+    index.observe(KEY, None, 9.0)
+    assert index.view(KEY, 9.0).unchanged == 2.0
 
 
 def test_what_concerns_nobody_is_forgotten() -> None:
-    book = LeaseIndex()
-    book.observe(KEY, lease("a"), 0.0)
-    book.forget_except([])
-    assert book.view(KEY, 8.0).unchanged == 0.0
+    index = LeaseIndex()
+    index.observe(KEY, lease("a"), 0.0)
+    index.forget_except([])
+    assert index.view(KEY, 8.0).unchanged == 0.0
 
 
 def test_an_outage_does_not_count() -> None:
@@ -146,13 +146,13 @@ def test_a_lease_that_cannot_be_read_does_not_keep_the_others_from_being_read() 
     for holder in holders:
         wanted = task(holder, of=holder, holder=holder)
         cache.claims.note(("site", holder), Entry(wanted.to_json(), wanted), template(holder))
-    asked: list[tuple[str, str]] = []
+    requested: list[tuple[str, str]] = []
 
     async def read() -> None:
         client = _OneUnreadable(Configuration(), "test", field_manager="test")
-        await LeaseWatch(cache, client, LEASES, (), asked.append).read_due()
+        await LeaseWatch(cache, client, LEASES, (), requested.append).read_due()
         await client.close()
 
     asyncio.run(read())
-    assert sorted(asked) == [("site", "a"), ("site", "c")]
+    assert sorted(requested) == [("site", "a"), ("site", "c")]
     assert [holder for holder in holders if cache.leases.due(("site", holder), 0.0)] == ["bad"]

@@ -39,10 +39,10 @@ class Answers:
 
     def __init__(self) -> None:
         self.found: object | None = None
-        self.asked = 0
+        self.requested = 0
 
     def answer(self, **_: object) -> object | None:
-        self.asked += 1
+        self.requested += 1
         return self.found
 
 
@@ -54,7 +54,7 @@ def test_a_key_that_only_reads_parameters_is_worked_out_at_once_and_all_else_els
     for key in ("${parameters.region}", "lane-${ parameters.region }", "fixed"):
         answers = Answers()
         book_of(answers).note(NAME, Entry({}, task()), template(key))
-        assert not answers.asked
+        assert not answers.requested
     for made in (
         template("${parameters.region + 'x'}"),
         template("${[parameters.region].filter(x, x.matches('a'))[0]}"),
@@ -62,58 +62,58 @@ def test_a_key_that_only_reads_parameters_is_worked_out_at_once_and_all_else_els
     ):
         answers = Answers()
         book_of(answers).note(NAME, Entry({}, task()), made)
-        assert answers.asked
+        assert answers.requested
 
 
 def test_a_task_keeps_the_claim_that_it_had_until_the_new_one_is_known() -> None:
     answers = Answers()
-    book, made = book_of(answers), template(pattern="^[a-z]+$")
+    index, made = book_of(answers), template(pattern="^[a-z]+$")
     first = claim_or_verdict(made, task())
     assert isinstance(first, Claim)
-    assert book.note(NAME, Entry({}, task()), made) == set()
-    assert book.pending(OF)
+    assert index.note(NAME, Entry({}, task()), made) == set()
+    assert index.pending(OF)
     answers.found = first
-    assert book.note(NAME, Entry({}, task()), made) == {("site", first.instance)}
-    assert not book.pending(OF)
+    assert index.note(NAME, Entry({}, task()), made) == {("site", first.instance)}
+    assert not index.pending(OF)
     answers.found = None
-    book.note(NAME, Entry({}, task()), made)
-    assert book.claim(NAME) == first
-    assert book.pending(OF)
-    book.note(NAME, Entry({}, task(ended=True)), made)
-    verdict = book.verdict(NAME)
+    index.note(NAME, Entry({}, task()), made)
+    assert index.claim(NAME) == first
+    assert index.pending(OF)
+    index.note(NAME, Entry({}, task(ended=True)), made)
+    verdict = index.verdict(NAME)
     assert verdict is not None
-    assert (verdict.standing, book.claim(NAME), book.pending(OF)) == (Standing.FINISHED, None, False)
+    assert (verdict.standing, index.claim(NAME), index.pending(OF)) == (Standing.FINISHED, None, False)
 
 
 def test_a_template_is_unsettled_until_all_tasks_that_were_there_are_known() -> None:
     answers = Answers()
     settled: list[tuple[str, str]] = []
-    book, made = book_of(answers), template(pattern="^[a-z]+$")
-    book.settled = settled.append
-    book.note(NAME, Entry({}, task()), made)
-    book.note(("site", "b"), Entry({}, task("south")), made)
-    book.begin()
-    book.note(("site", "later"), Entry({}, task("west")), made)
-    assert book.unsettled(OF)
+    index, made = book_of(answers), template(pattern="^[a-z]+$")
+    index.settled = settled.append
+    index.note(NAME, Entry({}, task()), made)
+    index.note(("site", "b"), Entry({}, task("south")), made)
+    index.begin()
+    index.note(("site", "later"), Entry({}, task("west")), made)
+    assert index.unsettled(OF)
     answers.found = claim_or_verdict(made, task())
-    book.note(NAME, Entry({}, task()), made)
-    assert book.unsettled(OF)
-    book.forget(("site", "b"))
-    assert (book.unsettled(OF), settled) == (False, [OF])
-    assert book.pending(OF)  # the later one, which nothing can run for yet
+    index.note(NAME, Entry({}, task()), made)
+    assert index.unsettled(OF)
+    index.forget(("site", "b"))
+    assert (index.unsettled(OF), settled) == (False, [OF])
+    assert index.pending(OF)  # the later one, which nothing can run for yet
 
 
 def test_a_claim_that_takes_too_much_is_refused_and_settles_nothing() -> None:
     answers = Answers()
-    book, made = book_of(answers), template(pattern="^[a-z]+$")
-    book.note(NAME, Entry({}, task()), made)
-    book.begin()
+    index, made = book_of(answers), template(pattern="^[a-z]+$")
+    index.note(NAME, Entry({}, task()), made)
+    index.begin()
     answers.found = Exceeded("takes more than 2 s of CPU time and was ended")
-    book.note(NAME, Entry({}, task()), made)
-    verdict = book.verdict(NAME)
+    index.note(NAME, Entry({}, task()), made)
+    verdict = index.verdict(NAME)
     assert isinstance(verdict, Verdict)
     assert (verdict.standing, verdict.reason) == (Standing.REFUSED, Refused.EXPRESSION_LIMIT)
     assert "against template app takes more than 2 s" in verdict.message
-    assert book.unsettled(OF)
-    book.note(NAME, Entry({}, task(ended=True)), made)
-    assert not book.unsettled(OF)
+    assert index.unsettled(OF)
+    index.note(NAME, Entry({}, task(ended=True)), made)
+    assert not index.unsettled(OF)

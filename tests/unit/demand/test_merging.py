@@ -38,8 +38,8 @@ def parameter(strategy: str, **more: Any) -> Parameter:
     return Parameter.model_validate({"type": KINDS[strategy][0], "merge": strategy, **more})
 
 
-def merged(declared: Parameter, *said: Any) -> Any:
-    contributions = [Contribution(f"t{index}", {"p": value}) for index, value in enumerate(said)]
+def merged(declared: Parameter, *logged: Any) -> Any:
+    contributions = [Contribution(f"t{index}", {"p": value}) for index, value in enumerate(logged)]
     return merge({"p": declared}, contributions).parameters.get("p")
 
 
@@ -49,17 +49,17 @@ def merged(declared: Parameter, *said: Any) -> Any:
 @pytest.mark.parametrize("strategy", sorted(KINDS))
 @given(data=st.data(), source=st.randoms())
 def test_the_order_does_not_matter(strategy: str, data: st.DataObject, source: random.Random) -> None:
-    said = data.draw(st.lists(KINDS[strategy][1], min_size=1, max_size=5))
-    shuffled = list(said)
+    logged = data.draw(st.lists(KINDS[strategy][1], min_size=1, max_size=5))
+    shuffled = list(logged)
     source.shuffle(shuffled)
-    assert merged(parameter(strategy), *said) == merged(parameter(strategy), *shuffled)
+    assert merged(parameter(strategy), *logged) == merged(parameter(strategy), *shuffled)
 
 
 @pytest.mark.parametrize("strategy", IDEMPOTENT)
 @given(data=st.data())
 def test_a_value_said_twice_is_as_said_once(strategy: str, data: st.DataObject) -> None:
-    said = data.draw(st.lists(KINDS[strategy][1], min_size=1, max_size=5))
-    assert merged(parameter(strategy), *said, said[0]) == merged(parameter(strategy), *said)
+    logged = data.draw(st.lists(KINDS[strategy][1], min_size=1, max_size=5))
+    assert merged(parameter(strategy), *logged, logged[0]) == merged(parameter(strategy), *logged)
 
 
 @pytest.mark.parametrize("strategy", IDEMPOTENT)
@@ -90,11 +90,11 @@ def test_a_sum_is_exact_and_is_an_integer_where_it_can_be() -> None:
 
 
 @given(st.lists(st.integers(0, 9), min_size=1, max_size=6), st.integers(9, 30))
-def test_a_sum_is_held_at_the_maximum_and_it_is_said(said: list[int], maximum: int) -> None:
+def test_a_sum_is_held_at_the_maximum_and_it_is_said(logged: list[int], maximum: int) -> None:
     declared = {"p": parameter("Sum", minimum=0, maximum=maximum)}
-    result = merge(declared, [Contribution(str(index), {"p": value}) for index, value in enumerate(said)])
-    assert result.parameters["p"] == min(sum(said), maximum)
-    assert bool(result.capped) == (sum(said) > maximum)
+    result = merge(declared, [Contribution(str(index), {"p": value}) for index, value in enumerate(logged)])
+    assert result.parameters["p"] == min(sum(logged), maximum)
+    assert bool(result.capped) == (sum(logged) > maximum)
 
 
 def test_the_instance_says_that_a_sum_is_capped_and_when_it_is_no_more() -> None:
@@ -109,8 +109,8 @@ def test_the_instance_says_that_a_sum_is_capped_and_when_it_is_no_more() -> None
         applied = Aspect("Applied", True, "Applied")
         status = instance_status(here, decision, applied, applied, [], None, NOW)
         here = here.model_copy(update={"status": status})
-        said = {each.type: (each.status, each.message) for each in status.conditions}.get("Capped")
-        return (decision.parameters or {}).get("rate"), said
+        logged = {each.type: (each.status, each.message) for each in status.conditions}.get("Capped")
+        return (decision.parameters or {}).get("rate"), logged
 
     assert after(20) == (20, None)
     assert after(20, 40) == (50, ("True", "rate: the sum of 2 values, 60, is capped at the maximum of 50"))
@@ -118,15 +118,15 @@ def test_the_instance_says_that_a_sum_is_capped_and_when_it_is_no_more() -> None
 
 
 @given(st.lists(st.tuples(st.sampled_from(["x", "y"]), NUMBERS), min_size=1, max_size=5))
-def test_where_all_must_agree_those_that_take_part_do(said: list[tuple[str, Any]]) -> None:
+def test_where_all_must_agree_those_that_take_part_do(logged: list[tuple[str, Any]]) -> None:
     declared = {
         "same": Parameter.model_validate({"type": "string"}),
         "max": Parameter.model_validate({"type": "number", "merge": "Max"}),
     }
-    contributions = [Contribution(str(i), {"same": same, "max": number}) for i, (same, number) in enumerate(said)]
+    contributions = [Contribution(str(i), {"same": same, "max": number}) for i, (same, number) in enumerate(logged)]
     result = merge(declared, contributions)
     taking_part = [each for each in contributions if each.task not in result.conflicts]
-    assert {each.parameters["same"] for each in taking_part} == {said[0][0]} == {result.parameters["same"]}
+    assert {each.parameters["same"] for each in taking_part} == {logged[0][0]} == {result.parameters["same"]}
     assert result.parameters["max"] == max(each.parameters["max"] for each in taking_part)
 
 

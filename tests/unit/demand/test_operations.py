@@ -256,8 +256,8 @@ def tasks(draw: st.DrawFn) -> list[ApplicationTask]:
             case "Deploy":
                 found.append(task(f"t{index}", {**where, **draw(parameters)}, **more))
             case "Reconfigure":
-                said = draw(parameters) or {"load": 1}
-                found.append(change(f"t{index}", {**said, **(where if draw(st.booleans()) else {})}, **more))
+                logged = draw(parameters) or {"load": 1}
+                found.append(change(f"t{index}", {**logged, **(where if draw(st.booleans()) else {})}, **more))
             case _:
                 found.append(stop(f"t{index}", where if draw(st.booleans()) else {}, **more))
     return found

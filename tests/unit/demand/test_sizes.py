@@ -27,8 +27,8 @@ def test_all_parameters_together_have_a_bound_too() -> None:
 
 def test_the_largest_contributors_come_first_and_the_others_are_counted() -> None:
     given = [Contribution(f"t{size}", {"a": text(size)}) for size in (10, 40, 30, 20, 50)]
-    said = too_large({"a": text(70_000)}, [*given, Contribution("other", {"b": text(90_000)})])
+    logged = too_large({"a": text(70_000)}, [*given, Contribution("other", {"b": text(90_000)})])
     assert (
         "(task t50 gives 50 bytes, task t40 gives 40 bytes, task t30 gives 30 bytes and 2 more tasks with smaller"
-        in said
+        in logged
     )

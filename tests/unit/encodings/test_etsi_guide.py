@@ -21,17 +21,17 @@ def rows(header: str) -> list[list[str]]:
 
 
 def test_the_table_of_units_is_the_codes() -> None:
-    told = {
+    reported = {
         name: (unit, Fraction(step), {int(null)} if null else set())
         for unit, step, types, null in rows("unit")
         for name in re.sub(r" \(.*?\)", "", types).split(", ")
     }
-    assert told == {name: (unit.symbol or "1", unit.step, set(unit.null)) for name, unit in UNITS.items()}
+    assert reported == {name: (unit.symbol or "1", unit.step, set(unit.null)) for name, unit in UNITS.items()}
 
 
 def test_the_table_of_messages_is_the_codes() -> None:
-    told = {name.strip("`"): int(number) for name, number, *_ in rows("type")}
-    assert told == {PREFIX + kind.name: kind.number for kind in KINDS}
+    reported = {name.strip("`"): int(number) for name, number, *_ in rows("type")}
+    assert reported == {PREFIX + kind.name: kind.number for kind in KINDS}
 
 
 def test_the_example_is_accepted(tmp_path: Path) -> None:

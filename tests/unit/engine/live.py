@@ -22,7 +22,7 @@ class Recording:
 
     def __init__(self) -> None:
         self.records: list[Arrival | Control] = []
-        self.said: list[Event] = []
+        self.logged: list[Event] = []
 
     def arrivals(self, arrivals: Sequence[Arrival]) -> None:
         self.records += arrivals
@@ -39,7 +39,7 @@ class Recording:
         self.records.append(Control(time, dict(document)))
 
     def events(self, events: Sequence[Event]) -> None:
-        self.said += events
+        self.logged += events
 
 
 class Live:

@@ -24,8 +24,8 @@ from tests.driving import (
     compiled,
     lines,
     place,
+    reported,
     speed,
-    told,
 )
 from tests.unit.engine.rules import near, speeding
 from wayside.api import Detector
@@ -50,7 +50,7 @@ def test_ticks_hours_before_the_next_sample_see_the_ones_before() -> None:
     detector = a_detector(a_stream("speed", staleAfter="Never"), clientTimeout="48h")
     engine = an_engine(detector, speeding(evaluation={"every": "10s"}))
     events = engine.advance([speed(1, 20), speed(12 * 3600, 5)], at(12 * 3600))
-    assert told(events) == ["r car started 10", "r car Until 43200"]
+    assert reported(events) == ["r car started 10", "r car Until 43200"]
 
 
 def test_windows_do_not_reach_across_a_gap() -> None:
@@ -59,19 +59,19 @@ def test_windows_do_not_reach_across_a_gap() -> None:
         a_detector(clientTimeout="1m"), a_rule(signals=[fastest], when="speed > 10", evaluation=SECONDLY)
     )
     events = engine.advance([speed(0.5, 20)], at(2)) + engine.gap(at(3))
-    assert told(events + engine.advance([speed(3.5, 5)], at(6))) == ["r car started 1", "r car Until 4"]
+    assert reported(events + engine.advance([speed(3.5, 5)], at(6))) == ["r car started 1", "r car Until 4"]
 
 
 def test_a_stream_that_is_exactly_as_old_as_its_limit_is_not_stale() -> None:
     detector = a_detector(a_stream("speed", staleAfter="1s"))
     events = an_engine(detector, speeding(evaluation=SECONDLY, **{"for": "1s"})).advance([speed(1, 20)], at(2))
-    assert told(events) == ["r car started 2"]
+    assert reported(events) == ["r car started 2"]
 
 
 def test_a_condition_that_columns_cannot_take_sees_the_sign_of_zero() -> None:
     rule = a_rule(signals=[SPEED], when="[speed].exists(x, 1.0 / x < 0.0)", evaluation=SECONDLY)
     events = an_engine(a_detector(), rule).advance([speed(0.5, 0.0), speed(1.5, -0.0), speed(2.5, 0.0)], at(4))
-    assert told(events) == ["r car started 2", "r car Until 3"]
+    assert reported(events) == ["r car started 2", "r car Until 3"]
 
 
 def test_what_a_cap_pushes_out_is_gone_and_nothing_else() -> None:
@@ -83,7 +83,7 @@ def test_what_a_cap_pushes_out_is_gone_and_nothing_else() -> None:
     rule = a_rule(signals=[count], when="n > 2", evaluation={"every": "500ms"})
     arrivals = [arrival(number / 10, "car", {"v": 1, "pad": "x" * 900}) for number in range(1, 9)]
     engine = an_engine(detector, rule)
-    assert told(engine.advance(arrivals, at(12))) == ["r car started 0.5", "r car Until 3"]
+    assert reported(engine.advance(arrivals, at(12))) == ["r car started 0.5", "r car Until 3"]
     assert engine.buffer.evicted > 0
     assert in_one_go(detector, [rule], arrivals, 12) == one_by_one(detector, [rule], arrivals, 12)
 
@@ -258,4 +258,4 @@ def test_pairs_go_on_when_other_rules_change() -> None:
         other = near(f"other{number}", evaluation=SECONDLY)
         engine.set_rules(compiled(detector, rule, other))
         engine.advance([speed(number + 1.5, 5)], at(number + 2))
-    assert told(engine.advance([speed(4.5, 20)], at(5))) == ["near car+zz started 5"]
+    assert reported(engine.advance([speed(4.5, 20)], at(5))) == ["near car+zz started 5"]

@@ -80,11 +80,11 @@ def test_when_time_steps_back_what_was_latched_holds_since_then() -> None:
 
 def test_samples_that_are_equal_to_the_byte_and_of_one_time_are_so_many_samples() -> None:
     lane = LatchedLane("car", "map", 10, None, 2, topic=by_key)
-    said = arrival(1, "car", {}, "map")
+    logged = arrival(1, "car", {}, "map")
     for _ in range(3):
-        lane.insert(replace(said))
+        lane.insert(replace(logged))
     assert (len(lane.samples), lane.evicted) == (2, 1)
-    assert lane.expire(at(60)) == lane.bytes == len(said.payload) + SAMPLE_OVERHEAD
+    assert lane.expire(at(60)) == lane.bytes == len(logged.payload) + SAMPLE_OVERHEAD
 
 
 @given(st.lists(st.integers(0, 30)), st.integers(1, 5))

@@ -9,8 +9,8 @@ from tests.unit.engine.rules import near, speeding
 
 def test_an_episode_tells_when_its_condition_began_to_hold_and_when_it_started_and_ended() -> None:
     drive = Drive(a_detector(), speeding(**{"for": "2s"}, cooldown="3s", description="fast"))
-    told = drive.take(*(speed(n + 0.5, 20 if n in (1, 2, 3, 5, 6, 7, 8, 9) else 5) for n in range(12)), until=12)
-    assert told == ["r car started 4", "r car Until 5", "r car started 10", "r car Until 11"]
+    reported = drive.take(*(speed(n + 0.5, 20 if n in (1, 2, 3, 5, 6, 7, 8, 9) else 5) for n in range(12)), until=12)
+    assert reported == ["r car started 4", "r car Until 5", "r car started 10", "r car Until 11"]
     first, last, second, _ = drive.events
     assert (first.onset_time, first.start_time, first.end_time) == (at(2), at(4), None)
     assert (last.onset_time, last.start_time, last.end_time) == (at(2), at(4), at(5))
@@ -38,8 +38,8 @@ def test_a_condition_may_use_the_clients_name_labels_and_streams() -> None:
     drive = Drive(detector, rule)
     assert drive.take(speed(0.5, 0, "car"), place(0.5, "rsu", 0), until=1) == []  # no sample on speed
     assert drive.take(speed(1.5, 0, "rsu"), until=2) == ["r rsu started 2"]
-    told = drive.take(*(place(2 + n, "rsu", 0) for n in range(35)), until=36)
-    assert told == ["r rsu OutOfScope 7"]  # speed is stale, the client is not lost
+    reported = drive.take(*(place(2 + n, "rsu", 0) for n in range(35)), until=36)
+    assert reported == ["r rsu OutOfScope 7"]  # speed is stale, the client is not lost
 
 
 def test_a_pair_is_looked_at_once_with_the_smaller_name_first() -> None:
@@ -76,11 +76,11 @@ def test_where_turning_false_ends_a_pairs_episode_as_out_of_scope() -> None:
 def test_a_position_that_is_unknown_for_no_longer_than_for_does_not_begin_the_onset_anew() -> None:
     detector = a_detector(a_stream("pose", staleAfter="1s"))
     drive = Drive(detector, near(**{"for": "3s"}))
-    told = drive.take(
+    reported = drive.take(
         *sorted(each for t in (0.5, 4.5) for each in (place(t, "a", 0), place(t, "b", 100))),
         until=5,
     )
-    assert told == ["near a+b started 5"]
+    assert reported == ["near a+b started 5"]
     assert drive.events[0].onset_time == at(1)
 
 
@@ -88,23 +88,23 @@ def test_a_pair_in_three_dimensions() -> None:
     position = {**POSITION, "z": "msg.z"}
     rule = near(scope={"pairs": {"position": position, "within": 5}}, when="distance == 3.0")
     drive = Drive(a_detector(), rule)
-    told = drive.take(
+    reported = drive.take(
         arrival(0.5, "a", {"x": 1, "y": 2, "z": 2}, "pose"),
         arrival(0.5, "b", {"x": 0, "y": 0, "z": 0}, "pose"),
         until=1,
     )
-    assert told == ["near a+b started 1"]
+    assert reported == ["near a+b started 1"]
 
 
 def test_events_of_a_tick_come_by_rule_and_then_by_subject_whatever_the_order_of_arrival() -> None:
     rules = [speeding("b"), speeding("a", until="speed < 5"), near("ab")]
     drive = Drive(a_detector(), *rules)
-    told = drive.take(
+    reported = drive.take(
         *(speed(0.1 + n / 100, 20, client) for n, client in enumerate(("z", "a", "m"))),
         *(place(0.5 + n / 100, client, 0) for n, client in enumerate(("z", "m", "a"))),
         until=1,
     )
-    assert told == [
+    assert reported == [
         *("a a started 1", "a m started 1", "a z started 1"),
         *("ab a+m started 1", "ab a+z started 1", "ab m+z started 1"),
         *("b a started 1", "b m started 1", "b z started 1"),
@@ -114,15 +114,15 @@ def test_events_of_a_tick_come_by_rule_and_then_by_subject_whatever_the_order_of
 def test_lost_starting_and_ending_subjects_of_one_tick_come_in_order() -> None:
     drive = Drive(a_detector(clientTimeout="3s"), speeding())
     drive.take(*(speed(0.5, 20, client) for client in ("b", "d")), until=1)
-    told = drive.take(speed(3.9, 1, "d"), speed(3.9, 20, "c"), speed(3.9, 20, "a"), until=4)
-    assert told == ["r a started 4", "r b ClientLost 4", "r c started 4", "r d Until 4"]
+    reported = drive.take(speed(3.9, 1, "d"), speed(3.9, 20, "c"), speed(3.9, 20, "a"), until=4)
+    assert reported == ["r a started 4", "r b ClientLost 4", "r c started 4", "r d Until 4"]
 
 
 def test_a_client_gone_longer_than_the_timeout_ends_its_episodes_and_pairs() -> None:
     detector = a_detector(clientTimeout="5s")
     drive = Drive(detector, speeding(), near(), speeding("calm", when="speed > 90"))
-    told = drive.take(*sorted([speed(1, 20, "a"), place(1, "a", 0), place(1, "b", 9)]), until=1)
-    assert told == ["near a+b started 1", "r a started 1"]
+    reported = drive.take(*sorted([speed(1, 20, "a"), place(1, "a", 0), place(1, "b", 9)]), until=1)
+    assert reported == ["near a+b started 1", "r a started 1"]
     assert drive.take(*(place(2 + n, "b", 9) for n in range(5)), until=6) == []  # exactly the timeout is not longer
     assert drive.take(place(6.5, "b", 9), until=7) == ["near a+b ClientLost 7", "r a ClientLost 7"]
     assert list(drive.engine.clients) == ["b"]
@@ -144,10 +144,10 @@ def test_a_latched_sample_of_a_lost_client_is_there_when_it_returns() -> None:
 
 def test_an_episode_whose_condition_stays_unknown_ends_as_unknown() -> None:
     detector = a_detector(a_stream("pose"), a_stream("speed", staleAfter="2s"))
-    told = {}
+    reported = {}
     for timeout in ({"unknownTimeout": "4s"}, {}):
         drive = Drive(detector, speeding(**timeout))
         alive = [place(n + 0.1, "car", 0) for n in range(50)]
-        told[len(timeout)] = drive.take(*sorted([speed(0.5, 20), *alive]), until=50)
-    assert told[1] == ["r car started 1", "r car Unknown 7"]  # stale from 3 on
-    assert told[0] == ["r car started 1", "r car Unknown 33"]  # by default, the Detector's clientTimeout
+        reported[len(timeout)] = drive.take(*sorted([speed(0.5, 20), *alive]), until=50)
+    assert reported[1] == ["r car started 1", "r car Unknown 7"]  # stale from 3 on
+    assert reported[0] == ["r car started 1", "r car Unknown 33"]  # by default, the Detector's clientTimeout

@@ -67,7 +67,7 @@ def test_changed_actions_are_applied_to_open_episodes_with_what_was_seen_at_thei
     before = drive.engine.demands()
     assert demanded(drive) == {"same": ("app", {"fast": 20}), "gone": ("app", {}), "changed": ("old", {})}
     version = drive.engine.demands_version
-    told = change(
+    reported = change(
         drive,
         speeding(
             actions=[
@@ -77,7 +77,7 @@ def test_changed_actions_are_applied_to_open_episodes_with_what_was_seen_at_thei
             ]
         ),
     )
-    assert told == []
+    assert reported == []
     assert drive.engine.demands_version != version
     assert demanded(drive) == {
         "same": ("app", {"fast": 20}),

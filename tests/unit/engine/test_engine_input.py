@@ -113,8 +113,8 @@ def test_coordinates_that_are_no_numbers_are_unknown(x: float, y: float) -> None
     rule = a_rule(scope={"pairs": {"position": position, "within": 1e6}}, when="distance >= 0")
     drive = Drive(detector, rule)
     placed = {"a": pose_stamped(0.0, 0.0), "b": pose_stamped(x, y), "c": pose_stamped(3.0, 4.0)}
-    told = drive.take(*(arrival(0.5, client, cdr(message), "pose") for client, message in placed.items()), until=1)
-    assert told == ["r a+c started 1"]
+    reported = drive.take(*(arrival(0.5, client, cdr(message), "pose") for client, message in placed.items()), until=1)
+    assert reported == ["r a+c started 1"]
     assert drive.events[0].values["distance"] == 5
     assert drive.engine.counters.rules["r"].unknowns == 1
 
@@ -182,13 +182,13 @@ def test_made_up_clients_beyond_the_limit_are_dropped_and_the_known_ones_stay(
 ) -> None:
     monkeypatch.setattr(ingest, "MAXIMUM_CLIENTS", 3)
     drive = Drive(a_detector(clock=clock, clientTimeout="5s", lateness="100ms"), *RULES)
-    told = drive.take(
+    reported = drive.take(
         *(arrival(0.1 + n / 100, f"made{n}" if n else "car", {"v": 1}) for n in range(10)),
         arrival(0.5, "car", {"v": 20}),
         arrival(1.5, "car", {"v": 20}),
         until=1.5,
     )
-    assert told == ["fast car started 1"]
+    assert reported == ["fast car started 1"]
     assert len(drive.engine.clients) == 3
     assert drive.engine.counters.crowded == {"speed": 7}
     drive.take(*(arrival(2 + n / 2, "car", {"v": 20}) for n in range(12)), arrival(8, "new", {"v": 1}), until=8)
@@ -244,8 +244,8 @@ FAST = a_rule(signals=[{"name": "v", "stream": "speed", "value": "msg.v"}], when
 def test_json_that_is_broken_where_no_rule_reads_it_is_no_message_at_all(rest: bytes) -> None:
     drive = Drive(a_detector(), FAST)
     whole, broken = b'{"v": 20, "w": 1}', b'{"v": 20, "w": ' + rest + b"}"
-    told = drive.take(arrival(0.5, "car", whole), arrival(0.5, "bus", broken), until=1)
-    assert told == ["r car started 1"]
+    reported = drive.take(arrival(0.5, "car", whole), arrival(0.5, "bus", broken), until=1)
+    assert reported == ["r car started 1"]
     assert drive.engine.counters.undecodable == {"speed": 1}
 
 

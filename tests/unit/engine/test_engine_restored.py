@@ -143,6 +143,6 @@ def test_the_two_tasks_of_one_episode_restore_one_episode() -> None:
 def test_of_two_episodes_of_one_subject_the_second_is_no_episode() -> None:
     first, second = held_by(RECORD), held_by(RECORD, episode="zzz", start_time=at(-5))
     drive = Drive(a_detector(), RECORD)
-    told = drive.engine.restore([second, first], at(0))
-    assert [(event.episode, event.reason) for event in told] == [("zzz", "RuleChanged")]
+    reported = drive.engine.restore([second, first], at(0))
+    assert [(event.episode, event.reason) for event in reported] == [("zzz", "RuleChanged")]
     assert list(drive.engine.demands().values()) == [first]

@@ -201,8 +201,8 @@ def test_time_that_really_jumped_holds_once_two_clients_agree() -> None:
     assert timeline(drive).dropped_ahead == 1
     drive.take(sent(500.3, "c"), sent(900.1, "a"), sent(900.2, "b"), until=0)
     assert "c" in drive.engine.clients  # it waited for its tick, which the second jump took away
-    told = drive.take(*(sent(900.3 + n / 5, client) for n in range(6) for client in ("a", "b")), until=0)
-    assert told == []  # open since before the jump, and the windows have filled again
+    reported = drive.take(*(sent(900.3 + n / 5, client) for n in range(6) for client in ("a", "b")), until=0)
+    assert reported == []  # open since before the jump, and the windows have filled again
     assert [event.subject for event in drive.events] == ["a", "b"]
 
 
@@ -276,8 +276,8 @@ def test_after_a_gap_windows_are_empty_and_open_episodes_hold() -> None:
     drive.take(arrival(2.5, "car", {}), until=2.9)
     assert drive.note(drive.engine.gap(at(60.5))) == []
     assert drive.engine.now == at(60.5)
-    told = drive.take(arrival(60.9, "car", {}), arrival(62, "car", {}), until=63.5)
-    assert told == []  # r holds; p's onset was forgotten
+    reported = drive.take(arrival(60.9, "car", {}), arrival(62, "car", {}), until=63.5)
+    assert reported == []  # r holds; p's onset was forgotten
     assert drive.take(arrival(63.9, "car", {}), until=65) == ["p car started 64"]
     assert drive.engine.demands() == {}
     assert drive.take(until=66) == ["p car Until 66", "r car Until 66"]

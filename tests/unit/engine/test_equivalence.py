@@ -19,7 +19,7 @@ from detector.engine.engine import Engine
 from detector.engine.episodes.events import Event
 from detector.engine.samples.sample import Arrival, DecodeError
 from tests.driving import START, a_detector, a_rule, a_stream, compiled
-from tests.reference.detector import Reference, Told
+from tests.reference.detector import Reference, Reported
 from tests.reference.places import located
 from tests.reference.signals import tell_places
 from tests.reference.world import SECOND, Sample, World, listed
@@ -116,7 +116,7 @@ def payload_of(time: int, message: Message) -> bytes:
     return whole[:-1] if message.message is BROKEN else whole
 
 
-def by_the_reference(scene: Scene) -> list[Told]:
+def by_the_reference(scene: Scene) -> list[Reported]:
     tell_places(PLACES, POSITION)
     counts, sizes = _given({"speed": scene.count}), _given({"pose": scene.pose_bytes})
     world = World(TIMEOUT, dict.fromkeys(STREAMS, KEPT), STREAMS, counts, sizes, scene.all_bytes, items=LISTS)
@@ -143,7 +143,7 @@ def by_the_reference(scene: Scene) -> list[Told]:
     if not scene.data:
         reference.advance(END)
     reference.finish()
-    return reference.told
+    return reference.reported
 
 
 def rounded(value: Any) -> Any:
@@ -157,9 +157,9 @@ def rounded(value: Any) -> Any:
     return value
 
 
-def plainly(events: list[Event]) -> list[Told]:
+def plainly(events: list[Event]) -> list[Reported]:
     return [
-        Told(
+        Reported(
             event.rule,
             event.subject,
             event.start_time if event.end_time is None else event.end_time,
@@ -198,6 +198,6 @@ _RETURNING = Scene(
 def test_the_engine_does_what_the_reference_says(scene: Scene, cut: int) -> None:
     rules = [a_rule(name, **spec) for name, spec in scene.rules.items()]
     assert dependency_problems(rules) == {}
-    told = by_the_reference(scene)
-    expected = [Told(t.rule, t.subject, t.time, t.onset, t.reason, rounded(t.values)) for t in told]
+    reported = by_the_reference(scene)
+    expected = [Reported(t.rule, t.subject, t.time, t.onset, t.reason, rounded(t.values)) for t in reported]
     assert repr(plainly(by_the_engine(scene, cut))) == repr(expected)  # so that the sign of zero counts

@@ -42,8 +42,8 @@ def fast(name: str = "r", **spec: Any) -> Any:
 
 def test_with_on_sample_a_rule_is_evaluated_at_the_time_of_each_sample() -> None:
     drive = Drive(a_detector(), fast())
-    told = drive.take(speed(0.25, 5), place(0.26, "car", 1), speed(0.3, 20), speed(0.7, 5), until=2)
-    assert told == ["r car started 0.3", "r car Until 0.7"]
+    reported = drive.take(speed(0.25, 5), place(0.26, "car", 1), speed(0.3, 20), speed(0.7, 5), until=2)
+    assert reported == ["r car started 0.3", "r car Until 0.7"]
     assert drive.engine.counters.rule("r").evaluations == 3
 
 
@@ -62,14 +62,14 @@ def test_a_for_that_is_over_wakes_a_rule_with_on_sample() -> None:
 
 def test_a_cooldown_that_is_over_wakes_a_rule_with_on_sample() -> None:
     drive = Drive(a_detector(), fast(cooldown="3s", until="speed > 30"))
-    told = drive.take(speed(0.3, 20), speed(0.5, 40), speed(0.6, 20), until=6)
-    assert told == ["r car started 0.3", "r car Until 0.5", "r car started 3.5"]
+    reported = drive.take(speed(0.3, 20), speed(0.5, 40), speed(0.6, 20), until=6)
+    assert reported == ["r car started 0.3", "r car Until 0.5", "r car started 3.5"]
 
 
 def test_an_unknown_timeout_that_is_over_wakes_a_rule_with_on_sample() -> None:
     drive = Drive(a_detector(), fast(unknownTimeout="2s"))
-    told = drive.take(speed(0.3, 20), speed(0.5, 20), arrival(1.2, "car", {}), until=6)
-    assert told == ["r car started 0.3", "r car Unknown 3.2"]
+    reported = drive.take(speed(0.3, 20), speed(0.5, 20), arrival(1.2, "car", {}), until=6)
+    assert reported == ["r car started 0.3", "r car Unknown 3.2"]
 
 
 def test_a_lost_client_ends_the_episodes_of_a_rule_with_on_sample() -> None:
@@ -79,8 +79,8 @@ def test_a_lost_client_ends_the_episodes_of_a_rule_with_on_sample() -> None:
 
 def test_who_is_lost_and_who_wakes_at_one_tick_are_told_in_order_of_the_subjects() -> None:
     drive = Drive(a_detector(clientTimeout="4s"), fast(unknownTimeout="2s"))
-    told = drive.take(speed(0.1, 20, "b"), speed(0.2, 20, "a"), arrival(3, "a", {}), until=5)
-    assert told[2:] == ["r a Unknown 5", "r b ClientLost 5"]
+    reported = drive.take(speed(0.1, 20, "b"), speed(0.2, 20, "a"), arrival(3, "a", {}), until=5)
+    assert reported[2:] == ["r a Unknown 5", "r b ClientLost 5"]
 
 
 def test_a_subject_that_was_lost_when_its_time_was_over_is_not_looked_at_with_the_samples_of_others() -> None:
@@ -97,8 +97,8 @@ def test_with_on_sample_all_pairs_of_the_samples_client_are_evaluated_and_no_oth
     rule = a_rule("near", scope=scope, when="distance < 50", evaluation={"onSample": "pose"})
     drive = Drive(a_detector(), rule)
     places = [place(0.1, "a", 0), place(0.2, "b", 10), place(0.3, "c", 20)]
-    told = drive.take(*places, until=0.9)
-    assert told == ["near a+b started 0.2", "near a+c started 0.3", "near b+c started 0.3"]
+    reported = drive.take(*places, until=0.9)
+    assert reported == ["near a+b started 0.2", "near a+c started 0.3", "near b+c started 0.3"]
 
 
 def test_with_clock_data_a_sample_is_evaluated_at_its_stamp_once_lateness_has_passed() -> None:
@@ -166,8 +166,8 @@ def test_more_episodes_than_a_client_may_start_within_an_hour_are_left_out_and_c
     blinks = [
         speed(n + 0.5, 20 if n % 2 else 5, client) for n in range(8) for client in ("a", "b") if client == "a" or n < 3
     ]
-    told = drive.take(*blinks, speed(3600.5, 5, "a"), speed(3601.5, 20, "a"), until=3602)
-    assert [each for each in told if "started" in each] == [
+    reported = drive.take(*blinks, speed(3600.5, 5, "a"), speed(3601.5, 20, "a"), until=3602)
+    assert [each for each in reported if "started" in each] == [
         "r a started 2",
         "r b started 2",
         "r a started 4",
@@ -236,13 +236,13 @@ def test_the_replay_of_pauses_questions_and_left_out_evaluations_gives_the_same_
             live.evaluator.pause_rule("p", n == 10).result(10)
         assert [each.subject for each in live.evaluator.ask("q").result(10)] == ["a", "b"]
     recording = live.stop()
-    assert {event.rule for event in recording.said} == {"r", "q", "p"}
+    assert {event.rule for event in recording.logged} == {"r", "q", "p"}
     levels = [
         each.document["level"] for each in recording.records if isinstance(each, Control) and each.kind == "level"
     ]
     assert levels == [1, 2, 3, 2]  # three at once while it was slow; one taken back after ten seconds of calm
     assert live.engine.counters.rule("r").skipped > 0
-    assert lines(replay_intake(recording.records, None, None).events) == lines(recording.said)
+    assert lines(replay_intake(recording.records, None, None).events) == lines(recording.logged)
 
 
 @pytest.mark.parametrize(
@@ -270,5 +270,5 @@ def test_a_sample_that_rules_are_evaluated_with_is_looked_at_at_once(monkeypatch
     live = Live(a_detector(), [fast(evaluation={"onSample": "speed"})])
     live.now += SECOND // 4
     live.put([("vehicles/a/speed", b'{"v": 20}')])
-    wait_for(lambda: bool(live.recording.said))
-    assert [event.subject for event in live.stop().said] == ["a"]
+    wait_for(lambda: bool(live.recording.logged))
+    assert [event.subject for event in live.stop().logged] == ["a"]

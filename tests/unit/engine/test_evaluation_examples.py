@@ -31,7 +31,7 @@ def test_count_sequence_escalation_and_absence() -> None:
     rules = [EventRule.model_validate(each) for each in documents("Rules over rules")]
     assert dependency_problems(rules) == {}
     drive = Drive(detector(), *rules)
-    told = drive.take(
+    reported = drive.take(
         *sorted(
             series("speed", "990999090990000000000000")
             + series("yaw-rate", "000020020000000000000000")
@@ -39,22 +39,22 @@ def test_count_sequence_escalation_and_absence() -> None:
         ),
         until=24,
     )
-    started = {each for each in told if "started" in each}
+    started = {each for each in reported if "started" in each}
     assert {each for each in started if each.startswith(("braking-", "swerved", "stopping", "no-"))} == {
         "braking-often car started 9",
         "swerved-after-braking car started 5",
         "swerved-after-braking car started 8",
         "stopping-lasts car started 22",
         "no-hazard-lights car started 6",
-    }, told
+    }, reported
 
 
 def test_the_ways_to_evaluate() -> None:
     rules = [EventRule.model_validate(each) for each in documents("When a rule is evaluated")]
     drive = Drive(detector(), *rules)
     samples = [arrival(seconds, "car", {"v": v}, "speed") for seconds, v in ((0.05, 5), (0.25, 40), (0.95, 5))]
-    told = drive.take(*samples, until=1)
-    assert told == [
+    reported = drive.take(*samples, until=1)
+    assert reported == [
         "every-100-ms car started 0.3",
         "each-sample car started 0.55",
         "each-sample car Until 0.95",

@@ -31,7 +31,7 @@ from tests.driving import (
     arrival,
     at,
     lines,
-    told,
+    reported,
 )
 from tests.unit.engine.live import Live, Recording
 from wayside.api import Detector
@@ -93,7 +93,7 @@ def test_two_clients_on_a_common_time_grid_that_always_move_together_never_part(
     ]
     outcome = replayed(tmp_path_factory.mktemp("grid"), detector_of(clock, *streams), rules, *recordings)
     assert outcome.samples == 96
-    assert told(outcome.events) == ["together a+b started 0.1"]
+    assert reported(outcome.events) == ["together a+b started 0.1"]
 
 
 @pytest.mark.parametrize("clock", CLOCKS)
@@ -109,7 +109,7 @@ def test_a_tick_sees_all_samples_of_its_time_and_each_subject_is_evaluated_once(
     ]
     recording = [line(10, "car", "speed", v=1), line(10, "car", "speed", v=2), line(10, "car", "speed", v=3)]
     outcome = replayed(tmp_path, detector_of(clock), rules, recording)
-    assert told(outcome.events) == ["sample car started 1", "tick car started 1"]
+    assert reported(outcome.events) == ["sample car started 1", "tick car started 1"]
     assert [event.values for event in outcome.events] == [{"n": 3.0, "v": 3.0}] * 2
 
 
@@ -190,11 +190,11 @@ def received(detector: Detector, rules: Sequence[Any], sent: Sequence[tuple[int,
 def test_with_clock_data_the_last_lateness_is_evaluated_at_the_end_live_as_in_a_replay(tmp_path: Path) -> None:
     detector = detector_of(LATE)
     recording = received(detector, BRIEF, SENT)
-    assert told(recording.said) == EXPECTED
-    assert lines(replay_intake(recording.records, None, None).events) == lines(recording.said)
+    assert reported(recording.logged) == EXPECTED
+    assert lines(replay_intake(recording.records, None, None).events) == lines(recording.logged)
     recorded = [line(step, "car", "speed", v=value) for step, value in SENT]
     outcome = replayed(tmp_path, detector, BRIEF, recorded)
-    assert lines(outcome.events) == lines(recording.said)
+    assert lines(outcome.events) == lines(recording.logged)
     assert outcome.end == START + 18 * STEP
 
 
@@ -236,7 +236,7 @@ def replayed_before(detector: Detector, rules: Sequence[Any], *records: Arrival 
 
 
 def recorded_before(detector: Detector, rules: Sequence[Any], *records: Arrival | Control) -> list[str]:
-    return told(replayed_before(detector, rules, *records))
+    return reported(replayed_before(detector, rules, *records))
 
 
 def stamped(step: int, value: float) -> Arrival:

@@ -55,9 +55,9 @@ def test_a_use_case_is_told_with_its_picture_and_files(ran: Ran) -> None:
 def test_its_files_are_accepted_without_a_word(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     files = sorted(map(str, folder_of(name).glob("*.yaml")))
     assert commandline.run(cli.app, "detector", (), ["check", *files]) == 0
-    said = capsys.readouterr()
-    assert said.out == ""
-    assert "nothing wrong" in said.err
+    logged = capsys.readouterr()
+    assert logged.out == ""
+    assert "nothing wrong" in logged.err
 
 
 def test_the_guide_tells_of_all_of_them() -> None:
@@ -111,9 +111,9 @@ def test_the_command_says_what_differs_with_its_exit_code(
         return main()
 
     assert command("no-such") == 2
-    said = capsys.readouterr()
-    assert said.out == ""
-    assert "no such use case: no-such" in said.err
+    logged = capsys.readouterr()
+    assert logged.out == ""
+    assert "no such use case: no-such" in logged.err
     assert command("battery-health", "--output", str(tmp_path)) == 0
     assert "as it must be" in capsys.readouterr().out
     assert (tmp_path / "battery-health" / "events.jsonl").is_file()

@@ -15,8 +15,8 @@ from tests.guides import ROOT
 FILE = ROOT / "examples" / "live-configuration" / "follow.py"
 
 
-def pod(volume: dict[str, Any], *, told: str = "", **more: Any) -> dict[str, Any]:
-    metadata = {"name": "pod", "uid": "u", "annotations": {ANNOTATION: told} if told else {}}
+def pod(volume: dict[str, Any], *, reported: str = "", **more: Any) -> dict[str, Any]:
+    metadata = {"name": "pod", "uid": "u", "annotations": {ANNOTATION: reported} if reported else {}}
     return {"kind": "Pod", "metadata": metadata, "spec": {"volumes": [{"name": "v", **volume}]}, **more}
 
 
@@ -28,8 +28,8 @@ PROJECTED = {"projected": {"sources": [{"secret": {"name": "s"}}, DIRECT]}}
 def test_a_pod_that_mounts_the_configuration_is_behind_until_it_is_told(volume: dict[str, Any]) -> None:
     content = fingerprint({"a": "b"})
     assert list(behind([pod(volume)], "app", content)) == [("pod", "u")]
-    assert list(behind([pod(volume, told="other")], "app", content)) == [("pod", "u")]
-    assert list(behind([pod(volume, told=content)], "app", content)) == []
+    assert list(behind([pod(volume, reported="other")], "app", content)) == [("pod", "u")]
+    assert list(behind([pod(volume, reported=content)], "app", content)) == []
 
 
 def test_pods_that_do_not_mount_it_or_are_over_are_left_alone() -> None:

@@ -156,7 +156,7 @@ def test_while_a_stream_is_stale_nothing_is_known() -> None:
 
 
 @pytest.mark.parametrize(
-    ("parameters", "told"),
+    ("parameters", "reported"),
     [
         ({}, "is missing"),
         ({"objects": {"stream": "radar"}}, "no stream radar"),
@@ -165,6 +165,6 @@ def test_while_a_stream_is_stale_nothing_is_known() -> None:
         ({"objects": {"stream": "camera"}, "of": "c"}, "'a' or 'b'"),
     ],
 )
-def test_parameters_that_make_no_sense_are_refused(parameters: dict[str, Any], told: str) -> None:
-    with pytest.raises(PluginError, match=told):
+def test_parameters_that_make_no_sense_are_refused(parameters: dict[str, Any], reported: str) -> None:
+    with pytest.raises(PluginError, match=reported):
         prepare_plugin("unmatched-objects", parameters, ["camera", "lidar"])

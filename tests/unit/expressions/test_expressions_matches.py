@@ -35,7 +35,7 @@ def test_a_literal_pattern_matches_as_ever_and_a_long_text_has_no_answer(source:
 
 
 @pytest.mark.parametrize(
-    ("source", "said"),
+    ("source", "logged"),
     [
         ("s.matches(s)", "line 1, column 3: the pattern of `matches` is no literal text"),
         ("true || s.matches(msg.pattern)", "line 1, column 11: the pattern of `matches` is no literal text"),
@@ -44,10 +44,10 @@ def test_a_literal_pattern_matches_as_ever_and_a_long_text_has_no_answer(source:
         ('s.matches("([ab]*a[ab]{50}){30}z")', "more than the 1000 of `matches`"),
     ],
 )  # fmt: skip
-def test_a_pattern_that_is_no_literal_or_too_large_does_not_compile(source: str, said: str) -> None:
+def test_a_pattern_that_is_no_literal_or_too_large_does_not_compile(source: str, logged: str) -> None:
     with pytest.raises(ExpressionError) as refused:
         ENVIRONMENT.compile(source)
-    assert said in str(refused.value)
+    assert logged in str(refused.value)
 
 
 @pytest.mark.parametrize(

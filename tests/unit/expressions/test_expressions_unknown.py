@@ -19,10 +19,10 @@ def evaluate(source: str, **values: object) -> object:
 
 
 def reasons(source: str, **values: object) -> list[Reason]:
-    told: list[Reason] = []
-    result = ENVIRONMENT.compile(source).evaluate_or_unknown(values, lambda reason, _: told.append(reason))
+    reported: list[Reason] = []
+    result = ENVIRONMENT.compile(source).evaluate_or_unknown(values, lambda reason, _: reported.append(reason))
     assert result is UNKNOWN
-    return told
+    return reported
 
 
 def conjunction(a: Truth, b: Truth) -> Truth:
@@ -164,16 +164,16 @@ def test_a_fault_of_the_expression_is_told_from_an_absent_input(source: str, val
 
 def test_a_boolean_that_turns_out_to_be_none_is_a_fault() -> None:
     expression = ENVIRONMENT.compile("p", result=CelType.BOOL)
-    told: list[tuple[Reason, str]] = []
-    assert expression.evaluate_or_unknown({"p": 3}, lambda *why: told.append(why)) is UNKNOWN
-    assert told == [(Reason.ERROR, "must be a boolean, is a number")]
+    reported: list[tuple[Reason, str]] = []
+    assert expression.evaluate_or_unknown({"p": 3}, lambda *why: reported.append(why)) is UNKNOWN
+    assert reported == [(Reason.ERROR, "must be a boolean, is a number")]
     assert expression.evaluate_or_unknown({"p": True}) is True
 
 
 def test_nothing_is_told_of_what_is_known() -> None:
-    told: list[object] = []
-    assert ENVIRONMENT.compile("d < 3 || p").evaluate_or_unknown({"d": 1.0}, lambda *why: told.append(why)) is True
-    assert told == []
+    reported: list[object] = []
+    assert ENVIRONMENT.compile("d < 3 || p").evaluate_or_unknown({"d": 1.0}, lambda *why: reported.append(why)) is True
+    assert reported == []
 
 
 def test_unknown_has_no_truth_and_only_one_instance() -> None:

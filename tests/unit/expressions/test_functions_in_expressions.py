@@ -26,10 +26,10 @@ def evaluate(source: str, **values: object) -> object:
 
 
 def why_unknown(source: str, **values: object) -> tuple[Reason, str]:
-    told: list[tuple[Reason, str]] = []
-    result = ENVIRONMENT.compile(source).evaluate_or_unknown(values, lambda *reason: told.append(reason))
+    reported: list[tuple[Reason, str]] = []
+    result = ENVIRONMENT.compile(source).evaluate_or_unknown(values, lambda *reason: reported.append(reason))
     assert result is UNKNOWN
-    (reason,) = told
+    (reason,) = reported
     return reason
 
 
@@ -164,12 +164,12 @@ likely = st.lists(st.tuples(numbers, numbers).map(list) | places, max_size=5) | 
 @given(st.sampled_from(calls()), st.lists(likely, min_size=5, max_size=5))
 def test_whatever_the_arguments_are_there_is_a_value_or_a_reason(call: tuple[str, int], arguments: list[Any]) -> None:
     source, count = call
-    told: list[str] = []
+    reported: list[str] = []
     result = ARGUMENTS.compile(source).evaluate_or_unknown(
-        {"args": arguments[:count]}, lambda reason, text: told.append(text)
+        {"args": arguments[:count]}, lambda reason, text: reported.append(text)
     )
-    assert (result is UNKNOWN) == (len(told) == 1)
-    assert not any("Error" in text or "Traceback" in text for text in told), told
+    assert (result is UNKNOWN) == (len(reported) == 1)
+    assert not any("Error" in text or "Traceback" in text for text in reported), reported
     if result is not UNKNOWN:
         assert isinstance(result, float | bool | str | list)
 

@@ -51,11 +51,11 @@ def test_what_cannot_be_used_is_told_with_file_reason_and_remedy(
     monkeypatch.setenv("KUBECONFIG", str(file))
     with pytest.raises(ConfigurationError) as caught:
         asyncio.run(load_configuration())
-    told = str(caught.value)
-    assert told.startswith(f"kubeconfig {file}: ")
-    assert reason in told
-    assert "set KUBECONFIG to a kubeconfig file" in told
-    assert "\n" not in told
+    reported = str(caught.value)
+    assert reported.startswith(f"kubeconfig {file}: ")
+    assert reason in reported
+    assert "set KUBECONFIG to a kubeconfig file" in reported
+    assert "\n" not in reported
 
 
 def test_without_any_file_the_default_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -273,7 +273,7 @@ async def test_a_queue_yields_to_the_one_before_it_in_the_same_namespace_alone()
     done: list[tuple[str, str]] = []
     both = asyncio.Event()
 
-    async def say(key: tuple[str, str]) -> None:
+    async def report(key: tuple[str, str]) -> None:
         done.append(key)
         if len(done) == 2:
             both.set()
@@ -283,7 +283,7 @@ async def test_a_queue_yields_to_the_one_before_it_in_the_same_namespace_alone()
 
     first = WorkQueue("first", never, 1)
     first.add(("loud", "waits"))
-    queue = WorkQueue("q", say, 1, first)
+    queue = WorkQueue("q", report, 1, first)
     queue.add(("loud", "a"))
     queue.add(("quiet", "b"))
     working = asyncio.create_task(queue.run())

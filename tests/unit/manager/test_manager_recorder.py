@@ -19,14 +19,14 @@ class Refusing:
     """An API server that takes no Event."""
 
     def __init__(self) -> None:
-        self.asked = 0
+        self.requested = 0
 
     async def create(self, *_: Any) -> None:
-        self.asked += 1
+        self.requested += 1
         raise ApiError(403, "events are forbidden")
 
 
-def say(events: Recorder, first: int, count: int) -> None:
+def report(events: Recorder, first: int, count: int) -> None:
     for each in range(first, first + count):
         about = task(f"t{each}")
         about = about.model_copy(update={"metadata": about.metadata.model_copy(update={"uid": f"u{each}"})})
@@ -48,7 +48,7 @@ def test_namespaces_take_turns() -> None:
     events = Recorder(cast("Client", server))
 
     async def flood() -> None:
-        say(events, 0, 100)
+        report(events, 0, 100)
         one = task("one")
         quiet = one.metadata.model_copy(update={"namespace": "quiet", "uid": "quiet"})
         events.event(one.model_copy(update={"metadata": quiet}), Reason.ACCEPTED, "counts", NOW)
@@ -69,13 +69,13 @@ def test_thousands_that_do_not_fit_are_two_lines_with_their_count(caplog: pytest
     events = Recorder(cast("Client", server))
 
     async def flood() -> None:
-        say(events, 0, 3135)
+        report(events, 0, 3135)
         events.finish()
         await events.run()
 
     with caplog.at_level(logging.WARNING):
         asyncio.run(flood())
-    assert server.asked == 1000
+    assert server.requested == 1000
     first, last = lines(caplog)
     assert first.startswith("dropped 2136 Events since the last report; the last one: Accepted about t0: ")
     assert last.startswith("dropped 999 Events since the last report; the last one: Accepted about t999: ")
@@ -89,7 +89,7 @@ def test_what_is_dropped_later_is_reported_when_its_time_has_come_though_no_furt
 
     async def trickle() -> None:
         running = asyncio.create_task(events.run())
-        say(events, 0, 5)
+        report(events, 0, 5)
         while len(lines(caplog)) < 2:  # noqa: ASYNC110  a log has no event to wait for
             await asyncio.sleep(0.01)
         running.cancel()

@@ -11,7 +11,7 @@ from wayside.kubernetes.errors import ApiError, Unreachable
 from wayside.kubernetes.repeating import until_answered
 
 
-def asked(*failures: Exception) -> str:
+def requested(*failures: Exception) -> str:
     """The answer of what fails in these ways first."""
     left = list(failures)
 
@@ -33,7 +33,7 @@ def test_an_api_server_that_is_away_or_overloaded_is_waited_for_and_it_is_said_o
         ApiError(429, "too many requests"),
         ApiError(500, "etcd"),
     ]
-    assert asked(*failures) == "answer"
+    assert requested(*failures) == "answer"
     assert [record.getMessage() for record in caplog.records] == [
         "GET /apis: refused; retrying until the API server responds",
         "the API server responds",
@@ -43,10 +43,10 @@ def test_an_api_server_that_is_away_or_overloaded_is_waited_for_and_it_is_said_o
 @pytest.mark.parametrize("code", [401, 403, 400])
 def test_what_waiting_cannot_change_is_told_at_once(code: int) -> None:
     with pytest.raises(ApiError, match="no"):
-        asked(ApiError(code, "no"))
+        requested(ApiError(code, "no"))
 
 
 def test_an_answer_at_once_is_not_commented(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
-    assert asked() == "answer"
+    assert requested() == "answer"
     assert caplog.records == []

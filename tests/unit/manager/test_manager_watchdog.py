@@ -18,11 +18,11 @@ from wayside.kubernetes.workqueue import WorkQueue
 
 def ended_by(stall: watchdog.Stall, *, hangs: bool = False, silent: float = 3600.0) -> str | None:
     """Why the watchdog ends a loop, which `hangs` until then, if it does."""
-    said: list[str] = []
+    logged: list[str] = []
     called = threading.Event()
 
     def end(reason: str) -> None:
-        said.append(reason)
+        logged.append(reason)
         called.set()
 
     async def scenario() -> None:
@@ -32,7 +32,7 @@ def ended_by(stall: watchdog.Stall, *, hangs: bool = False, silent: float = 3600
             await asyncio.to_thread(called.wait, 60 if hangs or stall() else 0.3)
 
     asyncio.run(scenario())
-    return said[0] if said else None
+    return logged[0] if logged else None
 
 
 def test_an_event_loop_that_hangs_is_ended() -> None:

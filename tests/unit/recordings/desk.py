@@ -18,7 +18,7 @@ from tests.unit.recordings.test_recordings import write_lines
 
 class Ran(NamedTuple):
     code: int
-    said: str
+    logged: str
     events: list[dict[str, Any]]
 
 

@@ -136,10 +136,10 @@ def test_a_bag_that_is_cut_is_read_up_to_there(
     for size in range(100, len(raw), len(raw) // 40):
         cut = tmp_path / "cut.bag"
         cut.write_bytes(raw[:size])
-        told: list[Cut] = []
-        read = list(messages_in([cut], on_cut=told.append))
+        reported: list[Cut] = []
+        read = list(messages_in([cut], on_cut=reported.append))
         assert read == whole[: len(read)]
-        assert [(each.path, each.messages) for each in told] == [(cut, len(read))]
+        assert [(each.path, each.messages) for each in reported] == [(cut, len(read))]
         counts.append(len(read))
     assert counts == sorted(counts)
     assert len(set(counts)) > 5  # chunk by chunk, or message by message

@@ -17,7 +17,7 @@ from detector.replay.latched import recorded_arrivals
 from detector.replay.recorded_types import with_recorded_types
 from detector.replay.replaying import replay_arrivals
 from detector.replay.routing import Router
-from tests.driving import a_detector, a_rule, at, told
+from tests.driving import a_detector, a_rule, at, reported
 from tests.recorded import messages_in
 from tests.ros_messages import cdr, odometry
 
@@ -92,7 +92,7 @@ def test_a_recording_of_another_program_replays(recording: Path, clock: str) -> 
     rule = a_rule("crowd", signals=[{"name": "n", "stream": "obstacles", "value": "size(msg.obstacles)"}], when="n > 2")
     completed = with_recorded_types(a_detector(STREAM, clock=clock, lateness="0ms"), [recording])
     arrivals = recorded_arrivals([recording], Router(completed.spec.streams), completed)
-    events = told(replay_arrivals(arrivals, completed, [rule]).events)
+    events = reported(replay_arrivals(arrivals, completed, [rule]).events)
     assert events == ["crowd car started 4"]
 
 

@@ -115,11 +115,11 @@ def test_a_capture_that_is_cut_is_read_up_to_there(write: object, tmp_path: Path
     counts = set()
     for size in range(30, len(raw)):
         path.write_bytes(raw[:size])
-        told: list[Cut] = []
-        messages = list(messages_in([path], on_cut=told.append))
+        reported: list[Cut] = []
+        messages = list(messages_in([path], on_cut=reported.append))
         assert messages == whole[: len(messages)]
-        assert all(cut.messages == len(messages) for cut in told)
-        counts.add((len(messages), len(told)))
+        assert all(cut.messages == len(messages) for cut in reported)
+        counts.add((len(messages), len(reported)))
     # Between two packets nothing shows that there were more.
     assert {(0, 1), (1, 1), (2, 1)} <= counts <= {(0, 0), (0, 1), (1, 0), (1, 1), (2, 0), (2, 1)}
 
@@ -150,7 +150,7 @@ def test_a_capture_is_replayed(clock: str, start: int, desk: Desk) -> None:
     (desk.folder / "capture.pcapng").write_bytes(pcapng(frames))
     desk.write(a_detector(CAM_STREAM, clock=clock), FAST)
     ran = desk.replay("capture.pcapng")
-    assert ran.code == 0, ran.said
+    assert ran.code == 0, ran.logged
     (event,) = ran.events
     assert event["subject"] == "its-7"
     assert event["data"]["startTime"] == f"2026-01-01T00:00:0{start}.000000000Z"

@@ -155,7 +155,7 @@ def test_a_payload_that_is_no_message_is_counted_by_its_stream(recording: Path) 
 
 
 def test_a_file_that_does_not_define_its_messages_is_an_error(tmp_path: Path) -> None:
-    for schema, said in ((None, "with no schema"), (b"\x00nonsense", "the definition of lab.Track")):
+    for schema, logged in ((None, "with no schema"), (b"\x00nonsense", "the definition of lab.Track")):
         path = tmp_path / "drive.mcap"
         with path.open("wb") as file:
             writer = PlainWriter(file)
@@ -164,7 +164,7 @@ def test_a_file_that_does_not_define_its_messages_is_an_error(tmp_path: Path) ->
             channel = writer.register_channel("/vehicles/car/track", "protobuf", number)
             writer.add_message(channel, 1, b"", 1)
             writer.finish()  # type: ignore[no-untyped-call]
-        with pytest.raises(RecordingError, match=said):
+        with pytest.raises(RecordingError, match=logged):
             list(messages_in([path]))
 
 

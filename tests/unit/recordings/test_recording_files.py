@@ -184,8 +184,12 @@ def test_name_folder_and_metadata_tell_of_the_episode(tmp_path: Path) -> None:
         "reason": "Until",
         "samples": "1",
     }
-    told = json.loads((folder / "recording.json").read_text())
-    assert (told["subjects"], told["reason"], told["metadata"]) == (["car1", "car2"], "Until", episode.rendered)
+    reported = json.loads((folder / "recording.json").read_text())
+    assert (reported["subjects"], reported["reason"], reported["metadata"]) == (
+        ["car1", "car2"],
+        "Until",
+        episode.rendered,
+    )
     bag = yaml.safe_load((folder / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
     assert bag["custom_data"]["endTime"] == "2026-01-01T00:00:02.000000000Z"
     assert bag["message_count"] == 1

@@ -112,14 +112,14 @@ def test_a_replay_cuts_the_windows_of_record_actions_from_the_recording(desk: De
     path = desk.drive("drive.jsonl", *((time, value) for time, value in speeds.items()))
     for _ in range(2):  # clips of the replay before are replaced
         ran = desk.replay(path, options=["--record"])
-        assert (ran.code, len(ran.events)) == (0, 3), ran.said
-        assert "2 clips: out" in ran.said
-        assert "1 of 2 clips of action bag, EventRule fast, are not whole: the recording ended" in ran.said
+        assert (ran.code, len(ran.events)) == (0, 3), ran.logged
+        assert "2 clips: out" in ran.logged
+        assert "1 of 2 clips of action bag, EventRule fast, are not whole: the recording ended" in ran.logged
         whole, cut = sorted((desk.folder / "out" / "clips" / "fast").iterdir())
         assert cut.name.endswith("_cut")
-    told = json.loads((whole / "recording.json").read_text())
-    assert (told["episode"], told["reason"]) == (ran.events[0]["data"]["episode"], "Until")
-    onset, end = (parse_time(told[name]) for name in ("onsetTime", "endTime"))
+    reported = json.loads((whole / "recording.json").read_text())
+    assert (reported["episode"], reported["reason"]) == (ran.events[0]["data"]["episode"], "Until")
+    onset, end = (parse_time(reported[name]) for name in ("onsetTime", "endTime"))
     files = mcap_files(whole)
     assert len(files) > 1
     found = [json.loads(each.payload)["n"] for file in files for each in read_with_mcap(file)]

@@ -201,11 +201,11 @@ def test_a_cut_sqlite_bag_is_an_error_that_names_it(tmp_path: Path, share: float
 
 def read_up_to_a_cut(path: Path, written: list[Message]) -> int:
     """How many messages are read: those written first, in the order of their times."""
-    told: list[Cut] = []
-    read = list(messages_in([path], on_cut=told.append))
+    reported: list[Cut] = []
+    read = list(messages_in([path], on_cut=reported.append))
     assert read == sorted(written[: len(read)], key=lambda message: message.time)
-    assert told or len(read) == len(written)  # where only the index is missing, nothing is
-    for cut in told:
+    assert reported or len(read) == len(written)  # where only the index is missing, nothing is
+    for cut in reported:
         assert cut.messages == len(read)
         assert f"{len(read)} messages are read up to there" in str(cut)
     return len(read)
@@ -244,9 +244,9 @@ def test_an_mcap_file_whose_last_bytes_were_never_written_is_read_up_to_them(tmp
 def test_an_mcap_file_without_an_index_that_was_closed_is_whole(tmp_path: Path) -> None:
     none = IndexType.NONE
     path = write_mcap(tmp_path / "drive.mcap", MESSAGES, chunk_size=500, index_types=none, use_statistics=False)
-    told: list[Cut] = []
-    assert list(messages_in([path], on_cut=told.append)) == MESSAGES
-    assert told == []
+    reported: list[Cut] = []
+    assert list(messages_in([path], on_cut=reported.append)) == MESSAGES
+    assert reported == []
 
 
 def test_an_mcap_file_that_is_damaged_inside_is_an_error_with_the_remedy(tmp_path: Path) -> None:
@@ -264,9 +264,9 @@ def test_a_rosbag2_whose_recorder_was_killed_is_read_up_to_there(tmp_path: Path,
     path = write_bag(tmp_path / "drive", MESSAGES * 20)
     (file,) = path.glob("*.mcap")
     damage(file, share)
-    told: list[Cut] = []
-    read = list(messages_in([path], on_cut=told.append))
-    assert [(cut.path, cut.messages) for cut in told] == [(file, len(read))]
+    reported: list[Cut] = []
+    read = list(messages_in([path], on_cut=reported.append))
+    assert [(cut.path, cut.messages) for cut in reported] == [(file, len(read))]
     (path / "metadata.yaml").unlink()  # it is written when the recorder ends
     assert recordings_of([path]) == [(file,)]
     assert list(messages_in([file])) == read
@@ -277,12 +277,12 @@ def test_a_last_line_that_was_not_written_to_its_end_is_a_cut(tmp_path: Path) ->
     whole = path.read_bytes()
     for size in range(len(whole) // 2, len(whole) - 1):
         path.write_bytes(whole[:size])
-        told: list[Cut] = []
-        read = list(messages_in([path], on_cut=told.append))
+        reported: list[Cut] = []
+        read = list(messages_in([path], on_cut=reported.append))
         lines, rest = whole[:size].count(b"\n"), whole[:size].rpartition(b"\n")[2]
         complete = rest.endswith(b"}") or not rest
         assert [message.time for message in read] == list(range(lines + (bool(rest) and complete)))
-        assert [cut.messages for cut in told] == ([] if complete else [len(read)])
+        assert [cut.messages for cut in reported] == ([] if complete else [len(read)])
 
 
 def stream(name: str, key: str, type_name: str | None = POSE_TYPE) -> Stream:

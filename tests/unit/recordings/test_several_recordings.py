@@ -44,12 +44,12 @@ def test_simulated_recordings_that_all_begin_at_the_same_time_do_not_mix(desk: D
     for run in range(3):
         desk.drive(f"run_{run}.jsonl", (0.5, {"v": 20 if run == 1 else 1}), (4.0, {"v": 1}))
     ran = desk.replay("run_0.jsonl", "run_1.jsonl", "run_2.jsonl")
-    assert "3 recordings, 6 samples, 1 episode started, 1 ended, 0 tasks" in ran.said
+    assert "3 recordings, 6 samples, 1 episode started, 1 ended, 0 tasks" in ran.logged
     desk.write(a_detector(a_stream("speed")), a_rule("fast", **FAST, actions=[a_deploy("help")]))
     desk.drive("run_2.jsonl", (0.5, {"v": 20}), (4.0, {"v": 1}))
     alone, _ = desk.replay("run_1.jsonl").events
     ran = desk.replay("run_1.jsonl", "run_2.jsonl")
-    assert "2 recordings, 4 samples, 2 episodes started, 2 ended, 2 tasks" in ran.said
+    assert "2 recordings, 4 samples, 2 episodes started, 2 ended, 2 tasks" in ran.logged
     assert [event["recording"] for event in ran.events] == ["run_1.jsonl"] * 2 + ["run_2.jsonl"] * 2
     assert len({event["id"] for event in ran.events}) == 4
     assert ran.events[0]["id"] == alone["id"]
@@ -57,7 +57,7 @@ def test_simulated_recordings_that_all_begin_at_the_same_time_do_not_mix(desk: D
     assert len({task["metadata"]["name"] for task in tasks}) == len(tasks) == 2
     assert {task["spec"]["requester"]["holder"] for task in tasks} == {"d", "d.2"}
     mixed = desk.replay("run_0.jsonl", "run_1.jsonl", "run_2.jsonl", options=["--as-one"])
-    assert "recordings" not in mixed.said
+    assert "recordings" not in mixed.logged
 
 
 def test_the_files_of_a_numbered_split_are_one_recording(desk: Desk) -> None:
@@ -66,12 +66,12 @@ def test_the_files_of_a_numbered_split_are_one_recording(desk: Desk) -> None:
     for given in (["drive_9.jsonl", "drive_10.jsonl"], ["drive_10.jsonl", "drive_9.jsonl"], ["drive_*.jsonl"], ["."]):
         ran = desk.replay(*given)
         assert [event["type"].rpartition(".")[2] for event in ran.events] == ["started", "ended"], given
-        assert "recordings" not in ran.said
+        assert "recordings" not in ran.logged
     # Numbered alike, but an hour apart: two drives.
     desk.drive("drive_10.jsonl", *((time + 3600, {"v": 1}) for time in (0.0, 3.0)))
     ran = desk.replay("drive_*.jsonl")
     assert [event["type"].rpartition(".")[2] for event in ran.events] == ["started"]
-    assert "2 recordings" in ran.said
+    assert "2 recordings" in ran.logged
 
 
 def test_the_files_of_one_rosbag2_folder_are_one_recording(tmp_path: Path) -> None:
@@ -80,8 +80,8 @@ def test_the_files_of_one_rosbag2_folder_are_one_recording(tmp_path: Path) -> No
     first, second, other = MESSAGES[:3], MESSAGES[3:], MESSAGES
     for name, messages in (("drive_0.mcap", first), ("late.mcap", second), ("other.mcap", other)):
         write_mcap(bag / name, messages)
-    told = {"rosbag2_bagfile_information": {"relative_file_paths": ["drive_0.mcap", "late.mcap"]}}
-    (bag / "metadata.yaml").write_text(yaml.safe_dump(told))
+    reported = {"rosbag2_bagfile_information": {"relative_file_paths": ["drive_0.mcap", "late.mcap"]}}
+    (bag / "metadata.yaml").write_text(yaml.safe_dump(reported))
     files = [bag / "late.mcap", bag / "other.mcap", bag / "drive_0.mcap"]
     assert recordings_of(files) == [(files[2], files[0]), (files[1],)]
     assert recordings_of(files, as_one=True) == [tuple(files)]
@@ -140,11 +140,11 @@ def test_a_cut_recording_is_replayed_with_a_warning_and_a_count(desk: Desk) -> N
     ran = desk.replay(path)
     assert (ran.code, len(ran.events)) == (0, 1)
     cut = "drive.jsonl: the recording is cut (line 3 has no end): 2 messages are read up to there\n"
-    assert f"warning: {path.parent}/{cut}" in ran.said
+    assert f"warning: {path.parent}/{cut}" in ran.logged
     checked = desk.run("check", "detector.yaml", "rules.yaml", "--recording", str(path))
-    assert f"{cut.rstrip()} [cut-recording]" in checked.said
+    assert f"{cut.rstrip()} [cut-recording]" in checked.logged
     desk.drive("other.jsonl", (0.5, {"v": 20}))
-    assert f"\nwarning: {cut}" in f"\n{desk.replay('drive.jsonl', 'other.jsonl').said}"
+    assert f"\nwarning: {cut}" in f"\n{desk.replay('drive.jsonl', 'other.jsonl').logged}"
 
 
 def test_rules_are_compared_over_all_recordings(desk: Desk) -> None:
@@ -187,16 +187,16 @@ def test_what_cannot_be_read_is_an_error_and_the_others_are_replayed(desk: Desk)
     ran = desk.replay(*given)
     assert ran.code == 1
     assert [event["recording"] for event in ran.events] == ["a_0.jsonl", "z.jsonl"]
-    assert "error: a_1.jsonl:1: " in ran.said
-    assert "error: empty.mcap: the file is empty" in ran.said
+    assert "error: a_1.jsonl:1: " in ran.logged
+    assert "error: empty.mcap: the file is empty" in ran.logged
     ran = desk.run("check", "detector.yaml", "rules.yaml", *(word for each in given for word in ("--recording", each)))
     assert ran.code == 1
-    assert "error: empty.mcap: the file is empty" in ran.said
-    assert ran.said.count(" [unreadable-recording]") == 2
+    assert "error: empty.mcap: the file is empty" in ran.logged
+    assert ran.logged.count(" [unreadable-recording]") == 2
     ran = desk.replay("a_1.jsonl", "empty.mcap")
     assert ran.code == 2
-    assert "detector: a_1.jsonl:1: " in ran.said
-    assert "detector: empty.mcap: the file is empty" in ran.said
+    assert "detector: a_1.jsonl:1: " in ran.logged
+    assert "detector: empty.mcap: the file is empty" in ran.logged
 
 
 def test_a_recording_that_does_not_fit_a_stream_is_named(desk: Desk) -> None:
@@ -204,21 +204,21 @@ def test_a_recording_that_does_not_fit_a_stream_is_named(desk: Desk) -> None:
     write_mcap(desk.folder / "b.mcap", [MESSAGES[0]._replace(key="vehicles/car/speed")])
     ran = desk.replay("a.jsonl", "b.mcap")
     assert (ran.code, len(ran.events)) == (1, 1)
-    assert "b.mcap: vehicles/car/speed is recorded as cdr, but streams[speed].encoding is json" in ran.said
+    assert "b.mcap: vehicles/car/speed is recorded as cdr, but streams[speed].encoding is json" in ran.logged
 
 
 def test_a_recording_without_messages_is_named(desk: Desk) -> None:
     (desk.folder / "e.jsonl").touch()
     (desk.folder / "tiny8.mcap").write_bytes(write_mcap(desk.folder / "whole.mcap", MESSAGES).read_bytes()[:8])
-    for name, said in (
+    for name, logged in (
         ("e.jsonl", "e.jsonl holds no message\n"),
         ("tiny8.mcap", "tiny8.mcap holds no message: it is cut (it ends without a footer)\n"),
     ):
         ran = desk.replay(name)
-        assert (ran.code, ran.said) == (2, f"detector: {said}")
+        assert (ran.code, ran.logged) == (2, f"detector: {logged}")
     desk.drive("a.jsonl", *LEFT_OPEN)
     ran = desk.replay("a.jsonl", "e.jsonl")
-    assert (ran.code, "e.jsonl: it holds no message" in ran.said) == (0, True)
+    assert (ran.code, "e.jsonl: it holds no message" in ran.logged) == (0, True)
 
 
 def an_intake_file(path: Path) -> None:
@@ -236,9 +236,9 @@ def test_an_intake_file_in_a_folder_is_replayed_alone(desk: Desk) -> None:
     an_intake_file(desk.folder / "fold" / "in.mcap")
     for given in ("fold/in.mcap", "fold", "fold/*.mcap"):
         ran = desk.run("replay", given, "--output", "out")
-        assert (ran.code, [event["source"] for event in ran.events]) == (0, ["/detectors/h"]), ran.said
+        assert (ran.code, [event["source"] for event in ran.events]) == (0, ["/detectors/h"]), ran.logged
         ran = desk.run("check", "detector.yaml", "rules.yaml", "--recording", given)
-        assert ran.code == 0, ran.said
+        assert ran.code == 0, ran.logged
 
 
 def test_an_intake_file_beside_other_recordings_is_refused_by_name(desk: Desk) -> None:
@@ -248,5 +248,5 @@ def test_an_intake_file_beside_other_recordings_is_refused_by_name(desk: Desk) -
     for given in (["a.jsonl", "fold/in.mcap"], ["fold"], ["fold/in.mcap", "a.jsonl"]):
         named = [option for each in given for option in ("--recording", each)]
         for ran in (desk.replay(*given), desk.run("check", "detector.yaml", "rules.yaml", *named)):
-            assert (ran.code, ran.said) == (2, "detector: fold/in.mcap is an intake file: replay it alone\n")
+            assert (ran.code, ran.logged) == (2, "detector: fold/in.mcap is an intake file: replay it alone\n")
     assert not (desk.folder / "out").exists()

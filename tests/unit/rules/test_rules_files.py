@@ -101,6 +101,6 @@ def test_a_client_that_is_no_name_is_told_what_a_name_is(write: Write) -> None:
     stream = {"name": "cam", "key": "all/cams", "encoding": "json", "client": "a b"}
     with pytest.raises(
         DocumentError, match=r"must be a name of up to 63 letters, .* or a template such as its-"
-    ) as told:
+    ) as reported:
         load_rules(write("d.yaml", detector(streams=[stream])), [])
-    assert "given: 'a b'" in str(told.value)
+    assert "given: 'a b'" in str(reported.value)

@@ -32,8 +32,8 @@ def speeds(values: str, client: str = "car", start: float = 0.5) -> list[Any]:
 def test_a_count_of_starts_within_a_time_starts_a_rule_at_the_very_tick() -> None:
     often = a_rule("a-often", signals=[count("braking", "5s")], when="it >= 2")
     drive = Drive(a_detector(), often, braking())
-    told = drive.take(*speeds("50505555555"), until=11)
-    assert told == [
+    reported = drive.take(*speeds("50505555555"), until=11)
+    assert reported == [
         "braking car started 2",
         "braking car Until 3",
         "braking car started 4",
@@ -75,8 +75,8 @@ def test_the_absence_of_a_follow_up_within_a_time() -> None:
         when="stops > 0 && stopped >= 3 && moved >= stopped",
     )
     drive = Drive(a_detector(), absence, moved, braking())
-    told = drive.take(*speeds("055905555559"), until=12)
-    assert [each for each in told if each.startswith("stuck")] == ["stuck car started 8", "stuck car Until 12"]
+    reported = drive.take(*speeds("055905555559"), until=12)
+    assert [each for each in reported if each.startswith("stuck")] == ["stuck car started 8", "stuck car Until 12"]
 
 
 def test_escalation_while_an_episode_is_open_and_how_it_began() -> None:
@@ -86,16 +86,16 @@ def test_escalation_while_an_episode_is_open_and_how_it_began() -> None:
         when="it && speed < before",
     )
     drive = Drive(a_detector(), worse, braking("slow", when="speed < 5"))
-    told = drive.take(*speeds("943229"), until=6)
-    assert told == ["slow car started 2", "worse car started 3", "slow car Until 6", "worse car Until 6"]
+    reported = drive.take(*speeds("943229"), until=6)
+    assert reported == ["slow car started 2", "worse car started 3", "slow car Until 6", "worse car Until 6"]
     assert drive.events[1].values == {"it": True, "before": 4, "speed": 3}
 
 
 def test_where_picks_starts_by_what_they_were() -> None:
     hard = a_rule("hard", signals=[count("slow", "10s", where="msg.values.speed < 2")], when="it > 0")
     drive = Drive(a_detector(), hard, braking("slow", when="speed < 5"))
-    told = drive.take(*speeds("939919"), until=6)
-    assert [each for each in told if each.startswith("hard")] == ["hard car started 5"]
+    reported = drive.take(*speeds("939919"), until=6)
+    assert [each for each in reported if each.startswith("hard")] == ["hard car started 5"]
 
 
 def test_an_episode_of_a_pair_is_one_of_both_its_clients() -> None:
@@ -124,16 +124,16 @@ def test_a_dependency_that_changes_its_meaning_begins_with_no_starts() -> None:
     top = a_rule("top", signals=[count("braking", "10s")], when="it > 0")
     drive = Drive(detector, top, braking())
     assert drive.take(*speeds("0"), until=1) == ["braking car started 1", "top car started 1"]
-    told = drive.note(drive.engine.set_rules(compiled(detector, top, braking(when="speed < 0.5"))))
-    assert told == ["braking car RuleChanged 1"]
+    reported = drive.note(drive.engine.set_rules(compiled(detector, top, braking(when="speed < 0.5"))))
+    assert reported == ["braking car RuleChanged 1"]
     assert drive.take(*speeds("9", start=1.5), until=2) == ["top car Until 2"]
 
 
 def test_starts_keep_nobody_alive_and_are_forgotten_with_the_client() -> None:
     top = a_rule("top", signals=[count("braking", "1h")], when="it > 0")
     drive = Drive(a_detector(clientTimeout="5s"), top, braking())
-    told = drive.take(*speeds("0"), *speeds("9", start=20.5), until=21)
-    assert told == [
+    reported = drive.take(*speeds("0"), *speeds("9", start=20.5), until=21)
+    assert reported == [
         "braking car started 1",
         "top car started 1",
         "braking car ClientLost 6",
@@ -174,9 +174,9 @@ def test_a_circle_is_told_with_its_way_and_an_unknown_rule_with_the_nearest() ->
         a_rule("f", signals=[count("brakin", "1s")], when="it > 0"),
         a_rule("braking", when="true"),
     ]
-    told = {name: [str(problem) for problem in problems] for name, problems in dependency_problems(rules).items()}
+    reported = {name: [str(problem) for problem in problems] for name, problems in dependency_problems(rules).items()}
     circle = "rules must not depend on each other in a cycle: {}; remove one of these signals"
-    assert told == {
+    assert reported == {
         "a": ["spec.signals[0].ruleName: " + circle.format("a → b → c → a")],
         "b": ["spec.signals[1].ruleName: " + circle.format("b → c → a → b")],
         "c": ["spec.signals[0].ruleName: " + circle.format("c → a → b → c")],
@@ -188,10 +188,10 @@ def test_a_circle_is_told_with_its_way_and_an_unknown_rule_with_the_nearest() ->
 
 
 def test_a_rule_over_an_unknown_one_is_refused_until_that_one_is_there() -> None:
-    book, top = RuleIndex(), a_rule("top", signals=[count("braking", "1s")], when="it > 0")
-    good, refused = book.compile([top], a_detector(), {})
+    index, top = RuleIndex(), a_rule("top", signals=[count("braking", "1s")], when="it > 0")
+    good, refused = index.compile([top], a_detector(), {})
     assert (good, len(refused)) == ([], 1)
-    good, refused = book.compile([top, braking()], a_detector(), {})
+    good, refused = index.compile([top, braking()], a_detector(), {})
     assert ([rule.name for rule in good], refused) == (["top", "braking"], [])
 
 
@@ -246,11 +246,11 @@ def test_an_end_by_loss_counts_for_the_other_client_of_a_pair_alone() -> None:
     lost = [over("near", "reason", samples="Ends", value="msg.reason")]
     alone = a_rule("alone", signals=lost, when="reason == 'ClientLost'", evaluation={"every": "500ms"})
     drive = Drive(a_detector(clientTimeout="3s"), near, alone)
-    told = drive.take(*(place(n / 2, "a", 0) for n in range(1, 20)), until=0)
-    told = drive.take(
+    reported = drive.take(*(place(n / 2, "a", 0) for n in range(1, 20)), until=0)
+    reported = drive.take(
         place(9.6, "a", 0), place(9.7, "b", 1), *(place(n / 2, "a", 0) for n in range(20, 30)), until=14.9
     )
-    assert told == ["near a+b started 10", "near a+b ClientLost 13", "alone a started 13"]
+    assert reported == ["near a+b started 10", "near a+b ClientLost 13", "alone a started 13"]
     assert drive.take(place(15, "a", 0), place(15, "b", 30), until=16) == []
 
 

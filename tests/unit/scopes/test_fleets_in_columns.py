@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.driving import SPEED, a_detector, a_rule, an_engine, arrival, at, told
+from tests.driving import SPEED, a_detector, a_rule, an_engine, arrival, at, reported
 
 ARRIVALS = [arrival(0.1, "a", {"v": 20}), arrival(0.2, "b", {}), arrival(0.3, "c", {"v": 1})]
 
@@ -36,7 +36,7 @@ def test_loops_over_members_with_one_unknown(condition: str, expected: bool | No
     ]
     events = an_engine(a_detector(), *rules).advance(ARRIVALS, at(1))
     happened = {True: ["it ~fleet started 1"], False: ["not ~fleet started 1"], None: []}
-    assert told(events) == happened[expected]
+    assert reported(events) == happened[expected]
 
 
 def test_only_those_that_are_surely_members_count() -> None:
@@ -47,8 +47,8 @@ def test_only_those_that_are_surely_members_count() -> None:
         evaluation={"every": "1s"},
     )
     engine = an_engine(a_detector(), rule)
-    assert told(engine.advance(ARRIVALS, at(1))) == ["r ~fleet started 1"]
-    assert told(engine.advance([arrival(1.5, "b", {"v": 11})], at(2))) == ["r ~fleet Until 2"]
+    assert reported(engine.advance(ARRIVALS, at(1))) == ["r ~fleet started 1"]
+    assert reported(engine.advance([arrival(1.5, "b", {"v": 11})], at(2))) == ["r ~fleet Until 2"]
     assert engine.counters.rules["r"].absences  # that b was no member for want of a value
 
 
@@ -56,8 +56,8 @@ def test_loops_look_at_members_alone() -> None:
     fast = "members.exists(m, m.speed > 10)"
     rule = a_rule(scope={"fleet": {"members": "client != 'a'"}}, signals=[SPEED], when=fast, evaluation={"every": "1s"})
     engine = an_engine(a_detector(), rule)
-    assert told(engine.advance(ARRIVALS, at(1))) == []
-    assert told(engine.advance([arrival(1.5, "b", {"v": 11})], at(2))) == ["r ~fleet started 2"]
+    assert reported(engine.advance(ARRIVALS, at(1))) == []
+    assert reported(engine.advance([arrival(1.5, "b", {"v": 11})], at(2))) == ["r ~fleet started 2"]
 
 
 def test_a_fleet_of_nobody_is_looked_at_as_well() -> None:
@@ -66,5 +66,5 @@ def test_a_fleet_of_nobody_is_looked_at_as_well() -> None:
         evaluation={"every": "1s"},
     )  # fmt: skip
     engine = an_engine(a_detector(clientTimeout="1s"), rule)
-    assert told(engine.advance([], at(2))) == ["r ~fleet started 1"]
-    assert told(engine.advance([arrival(2.5, "a", {"v": 1})], at(5))) == ["r ~fleet Until 3", "r ~fleet started 4"]
+    assert reported(engine.advance([], at(2))) == ["r ~fleet started 1"]
+    assert reported(engine.advance([arrival(2.5, "a", {"v": 1})], at(5))) == ["r ~fleet Until 3", "r ~fleet started 4"]

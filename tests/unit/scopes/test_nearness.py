@@ -42,13 +42,13 @@ def search(position: CompiledPosition, places: Mapping[str, Point], role: tuple[
     )
 
 
-def obvious(asked: Search, within: float, maximum: int) -> Near:
-    first = asked.points.keys() if asked.first is None else asked.first
-    second = asked.points.keys() if asked.second is None else asked.second
+def obvious(requested: Search, within: float, maximum: int) -> Near:
+    first = requested.points.keys() if requested.first is None else requested.first
+    second = requested.points.keys() if requested.second is None else requested.second
     near = sorted(
-        (asked.distance(a, b), a, b)
-        for a, b in permutations(asked.points, 2)
-        if a in first and b in second and (asked.first is not None or a < b) and asked.distance(a, b) <= within
+        (requested.distance(a, b), a, b)
+        for a, b in permutations(requested.points, 2)
+        if a in first and b in second and (requested.first is not None or a < b) and requested.distance(a, b) <= within
     )
     return Near([(a, b) for _, a, b in near[:maximum]], max(0, len(near) - maximum))
 
@@ -58,8 +58,8 @@ def obvious(asked: Search, within: float, maximum: int) -> Near:
 def test_the_pairs_within_reach_are_those_that_comparing_all_finds(
     placed: list[Point], within: float, role: tuple[int, int] | None
 ) -> None:
-    asked = search(FLAT, {f"car{index}": place for index, place in enumerate(placed)}, role)
-    found, expected = near_pairs(asked, within, 10_000), obvious(asked, within, 10_000)
+    requested = search(FLAT, {f"car{index}": place for index, place in enumerate(placed)}, role)
+    found, expected = near_pairs(requested, within, 10_000), obvious(requested, within, 10_000)
     assert sorted(found.pairs) == sorted(expected.pairs)
     assert found.left_out == 0
 
@@ -69,8 +69,8 @@ def test_the_pairs_within_reach_are_those_that_comparing_all_finds(
 def test_on_the_earth_neither_the_poles_nor_the_antimeridian_part_a_pair(
     placed: list[Point], within: float, role: tuple[int, int] | None
 ) -> None:
-    asked = search(EARTH, {f"car{index}": place for index, place in enumerate(placed)}, role)
-    assert sorted(near_pairs(asked, within, 10_000).pairs) == sorted(obvious(asked, within, 10_000).pairs)
+    requested = search(EARTH, {f"car{index}": place for index, place in enumerate(placed)}, role)
+    assert sorted(near_pairs(requested, within, 10_000).pairs) == sorted(obvious(requested, within, 10_000).pairs)
 
 
 # Of very many pairs, those whose distances differ by less than a nanometre count as equally far.
@@ -86,8 +86,8 @@ MICROMETRES = st.floats(0, 100).map(lambda metres: round(metres, 6))
 def test_of_too_many_pairs_the_nearest_are_looked_at_and_then_those_first_by_name(
     placed: list[Point], maximum: int, role: tuple[int, int] | None
 ) -> None:
-    asked = search(FLAT, {f"car{index:02}": place for index, place in enumerate(placed)}, role)
-    found, expected = near_pairs(asked, 50.0, maximum), obvious(asked, 50.0, maximum)
+    requested = search(FLAT, {f"car{index:02}": place for index, place in enumerate(placed)}, role)
+    found, expected = near_pairs(requested, 50.0, maximum), obvious(requested, 50.0, maximum)
     assert sorted(found.pairs) == sorted(expected.pairs)
     assert found.left_out == expected.left_out
 
@@ -117,9 +117,9 @@ def test_a_pair_whose_distance_is_exactly_within_is_found_on_the_earth_however_m
         f"car{index}": (latitude + spread * random.random(), longitude + spread * random.random())
         for index in range(40)
     }
-    asked = search(EARTH, places)  # type: ignore[arg-type]
-    within = asked.distance("car3", "car7")
-    assert sorted(near_pairs(asked, within, 10_000).pairs) == sorted(obvious(asked, within, 10_000).pairs)
+    requested = search(EARTH, places)  # type: ignore[arg-type]
+    within = requested.distance("car3", "car7")
+    assert sorted(near_pairs(requested, within, 10_000).pairs) == sorted(obvious(requested, within, 10_000).pairs)
 
 
 @given(degrees, degrees)

@@ -50,11 +50,11 @@ def test_a_role_that_is_lost_ends_the_episode_and_one_that_is_unknown_starts_non
     detector = a_detector(a_stream("pose"), a_stream("speed", staleAfter="2s"), clients=ROLES)
     rule = pairs(scope={"a": {"where": "'speed' in streams"}, "b": {"where": "labels.role == 'bus'"}})
     drive = Drive(detector, rule)
-    told = drive.take(
+    reported = drive.take(
         *sorted([speed(0.5, 1, "car1"), *(place(n + 0.5, c, 0) for n in range(5) for c in ("car1", "bus1", "new"))]),
         until=5,
     )
-    assert told == ["p car1+bus1 started 1", "p car1+bus1 OutOfScope 3"]
+    assert reported == ["p car1+bus1 started 1", "p car1+bus1 OutOfScope 3"]
     assert any("role" in message for message in drive.engine.counters.rules["p"].absences)
 
 
@@ -130,7 +130,7 @@ def north(seconds: float, client: str, latitude: Any, longitude: Any) -> Any:
 def test_positions_on_the_earth_work_across_the_antimeridian_and_over_the_pole() -> None:
     rule = pairs(scope={"position": EARTH, "within": 30}, when="distance < 25.0")
     drive = Drive(a_detector(), rule)
-    told = drive.take(
+    reported = drive.take(
         north(0.1, "a", 0, 179.9999),
         north(0.2, "b", 0, -179.9999),
         north(0.3, "c", 89.9999, 0),
@@ -138,7 +138,7 @@ def test_positions_on_the_earth_work_across_the_antimeridian_and_over_the_pole()
         north(0.5, "e", 0, 179.9990),
         until=1,
     )
-    assert told == ["p a+b started 1", "p c+d started 1"]
+    assert reported == ["p a+b started 1", "p c+d started 1"]
     assert drive.events[0].values["distance"] == pytest.approx(22.264, abs=1e-3)
     assert drive.events[0].values["a"]["position"] == {"latitude": 0, "longitude": 179.9999}
 
@@ -160,8 +160,8 @@ def test_pairs_beyond_the_maximum_are_left_out_and_counted_while_open_ones_are_a
     ]
     assert drive.engine.counters.rules["p"].crowded_pairs == 4
     assert drive.take(place(1.5, "a", 2), place(1.6, "d", 3), until=2) == ["p a+d started 2"]
-    told = drive.take(place(2.5, "b", 900), until=3)
-    assert told == ["p a+b Until 3", "p b+c Until 3", "p c+d started 3"]
+    reported = drive.take(place(2.5, "b", 900), until=3)
+    assert reported == ["p a+b Until 3", "p b+c Until 3", "p c+d started 3"]
 
 
 # The fleet
@@ -247,8 +247,8 @@ def test_signals_may_read_the_element_and_are_then_computed_for_each() -> None:
     rule = a_rule(each=SITES, signals=[beyond, there, since, SPEED], when="beyond > 0.0", until="since > 2.0")
     drive = Drive(a_detector(), rule)
     places = (0, 130, 140, 600, 0, 0, 0)
-    told = drive.take(*sorted([*(place(n + 0.5, "car", x) for n, x in enumerate(places)), speed(0.6, 5)]), until=7)
-    assert told == ["r car~north started 2", "r car~south started 4", "r car~north Until 6", "r car~south Until 6"]
+    reported = drive.take(*sorted([*(place(n + 0.5, "car", x) for n, x in enumerate(places)), speed(0.6, 5)]), until=7)
+    assert reported == ["r car~north started 2", "r car~south started 4", "r car~north Until 6", "r car~south Until 6"]
     north, south = (event.values for event in drive.events[:2])
     assert north == {"beyond": 10, "there": 1, "since": 0.5, "speed": 5}
     assert south == {"beyond": 100, "there": 1, "since": 0.5, "speed": 5}
@@ -278,7 +278,7 @@ def test_elements_in_every_scope_and_its_conditions() -> None:
     clients = [{"name": name, "labels": {"site": name[0]}} for name in ("n1", "n2", "s1")]
     each = {"as": "site", "of": [{"name": "n"}, {"name": "s"}]}
     here = [place(0.5, name["name"], 0) for name in clients]
-    told = {}
+    reported = {}
     for scope in (
         {"client": {"where": "labels.site == site.name"}},
         {"pairs": {"position": POSITION, "within": 9, "where": "a.labels.site == site.name"}},
@@ -288,8 +288,8 @@ def test_elements_in_every_scope_and_its_conditions() -> None:
         when = "size(members) == 1" if "fleet" in scope else "true"
         drive = Drive(a_detector(clients=clients), a_rule(scope=scope, each=each, when=when))
         drive.take(*here, until=1)
-        told[str(scope)] = [event.subject for event in drive.events]
-    assert list(told.values()) == [
+        reported[str(scope)] = [event.subject for event in drive.events]
+    assert list(reported.values()) == [
         ["n1~n", "n2~n", "s1~s"],
         ["n1+n2~n", "n1+s1~n", "n2+s1~n"],
         ["n1+n2~n", "n1+s1~n", "n2+n1~n", "n2+s1~n", "s1+n1~s", "s1+n2~s"],
@@ -327,5 +327,5 @@ def test_a_signal_over_another_rule_may_pick_the_episodes_of_its_own_element() -
     }
     again = a_rule("again", each=SITES, signals=[starts], when="starts >= 2.0")
     drive = Drive(a_detector(), passed, again)
-    told = drive.take(*(place(n + 0.5, "car", x) for n, x in enumerate((130, 0, 130, 600))), until=4)
-    assert [each for each in told if each.startswith("again")] == ["again car~north started 3"]
+    reported = drive.take(*(place(n + 0.5, "car", x) for n, x in enumerate((130, 0, 130, 600))), until=4)
+    assert [each for each in reported if each.startswith("again")] == ["again car~north started 3"]

@@ -60,8 +60,8 @@ def test_three_buses_that_are_fast() -> None:
 
 def test_a_site_that_a_car_passes() -> None:
     drive = Drive(a_detector(*STREAMS), a_rule(**EXAMPLES["Each"]))
-    told = drive.take(*(arrival(n + 0.5, "car", {"x": 100 * n}, "pose") for n in range(7)), until=7)
-    assert told == ["r car~north started 2", "r car~north Until 3", "r car~south started 6", "r car~south Until 7"]
+    reported = drive.take(*(arrival(n + 0.5, "car", {"x": 100 * n}, "pose") for n in range(7)), until=7)
+    assert reported == ["r car~north started 2", "r car~north Until 3", "r car~south started 6", "r car~south Until 7"]
     assert not drive.engine.demands()
 
 

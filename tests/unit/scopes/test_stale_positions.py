@@ -172,8 +172,8 @@ def test_a_position_older_than_max_age_is_unknown(
     for after, known in ((last, True), ((last or 0) + 0.1, False)) if last is not None else ((9.0, True),):
         drive = Drive(a_detector(a_stream("pose", **stream)), near(**position))
         arrivals = [*places("b", (1.0, 50)), *places("a", (1.0, 0), (0.95 + (after or 0), 50))]
-        told = drive.take(*sorted(arrivals), until=1 + (after or 0))
-        assert bool(told) is known, (after, told)
+        reported = drive.take(*sorted(arrivals), until=1 + (after or 0))
+        assert bool(reported) is known, (after, reported)
 
 
 def test_by_default_a_signal_is_unknown_after_five_seconds_of_silence_or_when_its_client_is_lost() -> None:
@@ -181,8 +181,8 @@ def test_by_default_a_signal_is_unknown_after_five_seconds_of_silence_or_when_it
     for timeout, last in (("30s", 5), ("2s", 2)):
         rule = a_rule("r", scope={"fleet": {"members": "v > 1"}}, signals=[speed], when="size(members) == 0")
         drive = Drive(a_detector(a_stream("speed"), clientTimeout=timeout), rule)
-        told = drive.take(arrival(0.001, "car", {"v": 3}), arrival(1, "car", {"v": 3}), until=20)
-        assert told == [f"r ~fleet started {2 + last}"]
+        reported = drive.take(arrival(0.001, "car", {"v": 3}), arrival(1, "car", {"v": 3}), until=20)
+        assert reported == [f"r ~fleet started {2 + last}"]
 
 
 def left_behind(tmp_path: Path, stay: float, **stream: Any) -> list[str]:
@@ -222,9 +222,9 @@ def test_check_and_replay_warn_of_old_samples(
         (["check", "--strict", detector, rules, "--recording", drive], 1),
     ):
         assert ran(monkeypatch, *arguments) == code
-        said = capsys.readouterr().err
-        assert warning in said
-        assert remedy in said.replace(" [old-samples]", "")
+        logged = capsys.readouterr().err
+        assert warning in logged
+        assert remedy in logged.replace(" [old-samples]", "")
     left_behind(tmp_path, stay=5.0, staleAfter="300ms")
     assert ran(monkeypatch, "check", "--strict", detector, rules, "--recording", drive) == 0
     assert "warning" not in capsys.readouterr().err
@@ -237,9 +237,9 @@ def test_a_stream_that_goes_stale_between_its_samples_is_named(
     lines = [{"t": at(8.0 * n), "key": "vehicles/car/speed", "value": {"v": 3}} for n in range(10)]
     Path(drive).write_text("".join(json.dumps(line) + "\n" for line in lines))
     ran(monkeypatch, "check", detector, rules, "--recording", drive)
-    said = "samples of stream speed arrive every 8 s and go stale after 5 s, so EventRule fast finds them unknown"
+    logged = "samples of stream speed arrive every 8 s and go stale after 5 s, so EventRule fast finds them unknown"
     warned = capsys.readouterr().err
-    assert said in warned
+    assert logged in warned
     assert " [stale-between-samples]" in warned
 
 
@@ -249,5 +249,5 @@ def test_a_rule_about_pairs_is_told_of_the_maximum_age_as_well(caplog: pytest.Lo
     drive = Drive(a_detector(a_stream("speed")), rule)
     drive.take(arrival(0.5, "a", {"v": 3}), arrival(0.5, "b", {"v": 3}), until=4)
     Losses(drive.engine).sum_up()
-    (told,) = [each for each in caplog.messages if "unknown values" in each]
-    assert "no sample or an old one (a position is old after its maxAge)" in told
+    (reported,) = [each for each in caplog.messages if "unknown values" in each]
+    assert "no sample or an old one (a position is old after its maxAge)" in reported

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from detector.engine.samples.sample import Arrival
-from tests.driving import SECOND, Drive, a_detector, a_rule, a_stream, an_engine, arrival, at, compiled, told
+from tests.driving import SECOND, Drive, a_detector, a_rule, a_stream, an_engine, arrival, at, compiled, reported
 
 
 def test_what_is_received_exactly_at_a_tick_counts_and_what_comes_a_nanosecond_later_does_not() -> None:
@@ -160,7 +160,7 @@ def test_with_clock_data_samples_count_in_order_of_their_stamps_and_those_of_one
     drive.take(arrival(5, "car", {"t": zero + 10}, "pose"), until=0)
     in_order = sorted(sent, key=lambda each: each[0])  # stable: those of one time as they came
     times, values = [tenths / 10 for tenths, _ in in_order], [float(value) for _, value in in_order]
-    assert told(drive.events[:1]) == ["r car started 2"]
+    assert reported(drive.events[:1]) == ["r car started 2"]
     found = drive.events[0].values
     assert found["first"] == values[0]
     assert found["last"] == values[-1]

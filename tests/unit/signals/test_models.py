@@ -231,20 +231,20 @@ def test_of_too_many_points_every_so_many_th_is_taken(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("payload", "said"),
+    ("payload", "logged"),
     [
         (an_image(np.uint8([[[1, 2, 3]]]), "yuv422"), "image encoding 'yuv422' is not supported; use one of mono8"),
         (an_image(np.uint8([[[1, 2, 3]]]), height=9), "image of 1 x 9 rgb8 with step 3: 3 bytes"),
         (b"\0\1\0\0nonsense", "not a valid sensor_msgs/msg/Image"),
     ],
 )
-def test_what_is_no_image_is_unknown_and_counted_as_an_error(tmp_path: Path, payload: bytes, said: str) -> None:
+def test_what_is_no_image_is_unknown_and_counted_as_an_error(tmp_path: Path, payload: bytes, logged: str) -> None:
     given = {"stream": "camera", "width": 1, "height": 1}
     drive = sensed(tmp_path, [3, 1, 1], {"image": given}, payload, "camera")
     assert drive.values() == {}
     counters = drive.engine.counters.rule("r")
     assert counters.errors == 1
-    assert said in counters.last_error
+    assert logged in counters.last_error
 
 
 def test_a_model_that_fails_at_run_time_is_unknown_and_counted(tmp_path: Path) -> None:
@@ -272,7 +272,7 @@ def problems(tmp_path: Path, signal: dict[str, Any], detector: Detector | None =
 
 
 @pytest.mark.parametrize(
-    ("change", "where", "said"),
+    ("change", "where", "logged"),
     [
         ({"file": "/nowhere/m.onnx"}, "model.file", "cannot read /nowhere/m.onnx: No such file"),
         ({"file": __file__}, "model.file", "is not a valid ONNX model"),
@@ -297,13 +297,13 @@ def problems(tmp_path: Path, signal: dict[str, Any], detector: Detector | None =
     ],
 )
 def test_what_does_not_fit_is_found_by_a_check_with_its_place(
-    tmp_path: Path, change: dict[str, Any], where: str, said: str
+    tmp_path: Path, change: dict[str, Any], where: str, logged: str
 ) -> None:
     file = onnx_models.weighted(tmp_path / "m.onnx", [1.0, 1.0])
     signal = risk(file, x(signals=["speed", "gap"]))
     signal["model"] |= change
     found = problems(tmp_path, signal)
-    assert any(where in problem and said in problem for problem in found), found
+    assert any(where in problem and logged in problem for problem in found), found
 
 
 def test_a_fixed_first_axis_a_text_input_and_an_output_that_is_not_by_client_are_refused(tmp_path: Path) -> None:
@@ -320,12 +320,12 @@ def test_a_rule_with_another_model_is_another_rule(tmp_path: Path) -> None:
     file = onnx_models.weighted(tmp_path / "m.onnx", [1.0])
     detector = a_detector()
     rule = always(SPEED, risk(file, x(signals=["speed"])))
-    book, fields = RuleIndex(), inlets(detector).fields
+    index, fields = RuleIndex(), inlets(detector).fields
     drive = Driven(detector, rule)
     drive.take(arrival(0.5, "car", {"v": 1}), until=1)
-    assert drive.note(drive.engine.set_rules(book.compile([rule], detector, fields)[0])) == []
+    assert drive.note(drive.engine.set_rules(index.compile([rule], detector, fields)[0])) == []
     onnx_models.weighted(file, [2.0])
-    assert drive.note(drive.engine.set_rules(book.compile([rule], detector, fields)[0])) == ["r car RuleChanged 1"]
+    assert drive.note(drive.engine.set_rules(index.compile([rule], detector, fields)[0])) == ["r car RuleChanged 1"]
 
 
 def test_the_same_samples_give_the_same_bytes(tmp_path: Path) -> None:

@@ -60,7 +60,7 @@ def test_a_plugin_that_is_not_there_is_told_with_what_is(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(
-    ("plugin", "parameters", "told"),
+    ("plugin", "parameters", "reported"),
     [
         ("counting", "{}", "r.yaml:9:21: spec.signals[0].plugin.parameters.stream: is missing: add it"),
         ("counting", "{stream: spede}", "parameters.stream: the Detector has no stream spede; did you mean speed?"),
@@ -70,9 +70,11 @@ def test_a_plugin_that_is_not_there_is_told_with_what_is(tmp_path: Path) -> None
         ("broken", "{}", "plugin.name: cannot load plugin broken: ModuleNotFoundError"),
     ],
 )
-def test_what_a_plugin_refuses_is_told_where_it_stands(tmp_path: Path, plugin: str, parameters: str, told: str) -> None:
+def test_what_a_plugin_refuses_is_told_where_it_stands(
+    tmp_path: Path, plugin: str, parameters: str, reported: str
+) -> None:
     (problem,) = problems(tmp_path, plugin, parameters)
-    assert told in problem
+    assert reported in problem
 
 
 def test_a_rule_that_names_its_plugin_rightly_has_no_problems(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from rosbags.typesys import Stores, get_typestore
 
 from detector.engine.samples.sample import Arrival
-from tests.driving import POSITION, Drive, a_detector, a_rule, a_stream, an_engine, arrival, at, told
+from tests.driving import POSITION, Drive, a_detector, a_rule, a_stream, an_engine, arrival, at, reported
 
 COMPARED = a_rule(
     signals=[
@@ -84,7 +84,7 @@ def test_an_image_of_a_million_bytes_is_looked_at_without_becoming_a_list() -> N
     events = engine.advance(arrivals, at(1))
     events += engine.advance([Arrival(at(1.5), "image", "v/car/image", payload(lit))], at(2))
     spent = time.thread_time() - begin
-    assert told(events) == ["r car started 1", "r car Until 2"]
+    assert reported(events) == ["r car started 1", "r car Until 2"]
     assert events[0].values == {"dark": True, "frozen": [float(zlib.crc32(dark.tobytes()))], "image": None}
     assert spent < 2.0, "eleven images as lists of doubles, for three signals, would take several times this"
 
@@ -101,5 +101,5 @@ def test_a_raw_payload_is_read_by_functions() -> None:
     frames = [b"\0\1\0" + (8 * 4500).to_bytes(2, "big"), b"\0"]
     arrivals = [Arrival(at(0.1 * i + 0.1), "can", "v/car/can", frame) for i, frame in enumerate(frames)]
     events = engine.advance(arrivals, at(1))
-    assert told(events) == ["r car started 1"]
+    assert reported(events) == ["r car started 1"]
     assert events[0].values == {"rpm": 4500.0}

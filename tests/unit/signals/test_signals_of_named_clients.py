@@ -28,10 +28,10 @@ RED = a_rule("red", signals=[SPEED, LIGHT], when="speed > 1 && light == 'red'", 
 def test_who_drives_while_the_light_is_red_is_found_of_every_vehicle() -> None:
     drive = Drive(DETECTOR, RED)
     assert drive.engine.in_columns == {"red"}
-    told = drive.take(
+    reported = drive.take(
         speed(0.1, "a", 5), light(0.2, "green"), speed(0.3, "b", 0), light(0.4, "red"), speed(0.5, "b", 2), until=0.5
     )
-    assert told == ["red a started 0.4", "red b started 0.5"]
+    assert reported == ["red a started 0.4", "red b started 0.5"]
     assert drive.take(light(0.6, "green"), until=0.7) == ["red a Until 0.6", "red b Until 0.6"]
 
 
@@ -41,10 +41,10 @@ def test_it_is_unknown_while_stale_and_while_that_client_is_not_known() -> None:
     never = a_rule("never", signals=[SPEED, count], when="speed > 1 && reds == 0", evaluation={"every": "1s"})
     drive = Drive(DETECTOR, RED, never)
     assert drive.take(*(speed(n / 2, "a", 5) for n in range(1, 4)), until=1.9) == []  # nobody knows of the light
-    told = drive.take(light(2.5, "green"), *(speed(n / 2, "a", 5) for n in range(5, 9)), until=4)
-    assert told == ["never a started 3"]
-    told = drive.take(light(4.1, "red"), *(speed(n / 2, "a", 5) for n in range(9, 20)), until=9.9)
-    assert told == ["red a started 4.1", "never a Until 5", "red a Unknown 9.2"]
+    reported = drive.take(light(2.5, "green"), *(speed(n / 2, "a", 5) for n in range(5, 9)), until=4)
+    assert reported == ["never a started 3"]
+    reported = drive.take(light(4.1, "red"), *(speed(n / 2, "a", 5) for n in range(9, 20)), until=9.9)
+    assert reported == ["red a started 4.1", "never a Until 5", "red a Unknown 9.2"]
     assert "light-3" not in drive.engine.clients
 
 
@@ -57,9 +57,9 @@ def test_pairs_fleets_and_episodes_see_it_as_well() -> None:
     active = {"name": "on", "ruleName": "phase", "client": "light-3", "aggregate": "Active"}
     stop = a_rule("stop", signals=[active, SPEED], when="on && speed > 1")
     drive = Drive(DETECTOR, near, many, phase, stop)
-    told = drive.take(place(0.1, "a", 0), place(0.2, "b", 3), speed(0.3, "a", 5), light(0.4, "red"), until=1)
+    reported = drive.take(place(0.1, "a", 0), place(0.2, "b", 3), speed(0.3, "a", 5), light(0.4, "red"), until=1)
     expected = ["many ~fleet started 1", "near a+b started 1", "phase light-3 started 1", "stop a started 1"]
-    assert sorted(told) == expected
+    assert sorted(reported) == expected
 
 
 @pytest.mark.parametrize(

@@ -78,8 +78,8 @@ TASKS = [
 
 def explained(about: str | None = "scene-a", tasks: Any = TASKS, **more: Any) -> Explanation:
     found = Found([template(**FUSION)], tasks, more.pop("instances", [running()]), **more)
-    asked = next((each for each in tasks if each.name == about), None)
-    return explain(found, task=about, instance=serving(found, asked, NOW) if asked else NAME, now=NOW)
+    requested = next((each for each in tasks if each.name == about), None)
+    return explain(found, task=about, instance=serving(found, requested, NOW) if requested else NAME, now=NOW)
 
 
 def contributions(explanation: Explanation, parameter: str) -> dict[str, str]:
@@ -172,25 +172,25 @@ def test_the_text_says_what_each_task_does_and_whose_values_lost_and_why() -> No
 def test_who_has_no_place_under_a_limit_waits_though_nobody_has_written_it() -> None:
     one, two = task("one", {"region": "north"}), task("two", {"region": "south"}, created=1)
     found = Found([template(**FUSION, maxInstances=1)], [one, two], [running()])
-    told = explain(found, task="two", instance=serving(found, two, NOW), now=NOW)
-    assert told.task is not None
-    assert (told.task.standing, told.task.reason) == ("Waiting", "LimitReached")
+    reported = explain(found, task="two", instance=serving(found, two, NOW), now=NOW)
+    assert reported.task is not None
+    assert (reported.task.standing, reported.task.reason) == ("Waiting", "LimitReached")
 
 
 def test_a_sum_that_is_held_at_its_bound_says_what_it_would_be() -> None:
     spec = {"parameters": {"uplink": {"type": "number", "maximum": 100, "merge": "Sum"}}}
     tasks = [task("one", {"uplink": 60}), task("two", {"uplink": 70})]
     found = Found([template(**spec)], tasks, [])
-    told = explanation_text(explain(found, task="one", instance=serving(found, tasks[0], NOW), now=NOW))
-    assert "  uplink = 100 (merge Sum): the sum of 2 values, 130, is capped at the maximum of 100\n" in told
+    reported = explanation_text(explain(found, task="one", instance=serving(found, tasks[0], NOW), now=NOW))
+    assert "  uplink = 100 (merge Sum): the sum of 2 values, 130, is capped at the maximum of 100\n" in reported
 
 
 def test_what_is_over_does_not_push_what_counts_out_of_sight() -> None:
     over = [emitted(f"over-{number:02}", {"region": "north"}, ended=True, created=-60) for number in range(30)]
-    told = explanation_text(explained(None, [*over, TASKS[0]])).splitlines()
-    listed = told.index(f"tasks of instance {NAME}")
-    assert told[listed + 1].startswith("  scene-a (scene of car1+car2, Deploy")
-    assert "  and 11 more: -o json lists all" in told
+    reported = explanation_text(explained(None, [*over, TASKS[0]])).splitlines()
+    listed = reported.index(f"tasks of instance {NAME}")
+    assert reported[listed + 1].startswith("  scene-a (scene of car1+car2, Deploy")
+    assert "  and 11 more: -o json lists all" in reported
 
 
 def test_the_guide_shows_what_is_printed() -> None:

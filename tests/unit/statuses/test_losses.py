@@ -25,10 +25,10 @@ def test_the_first_loss_is_said_with_its_reason_and_further_ones_after_a_minute(
         now[0] = second
         drive.take(arrival(second / 20 + 0.5, "car", b"{", "pose"), until=second / 20 + 1)
         losses.log_new()
-    said = [message for message in caplog.messages if "could not be read" in message]
-    assert len(said) == 2
-    assert said[0].startswith("once a sample of stream pose could not be read; the last: vehicles/car/pose: not JSON")
-    assert said[1].startswith("3 times a sample of stream pose could not be read")
+    logged = [message for message in caplog.messages if "could not be read" in message]
+    assert len(logged) == 2
+    assert logged[0].startswith("once a sample of stream pose could not be read; the last: vehicles/car/pose: not JSON")
+    assert logged[1].startswith("3 times a sample of stream pose could not be read")
     caplog.clear()
     losses.sum_up()
     assert any(
@@ -37,7 +37,7 @@ def test_the_first_loss_is_said_with_its_reason_and_further_ones_after_a_minute(
 
 
 @pytest.mark.parametrize(
-    ("payload", "said"),
+    ("payload", "logged"),
     [
         (b'{"x": 1e13, "y": 0}', "x of car is 1e+13 m, where nobody is"),
         (b'{"x": 0, "y": "far"}', "y of car is absent, NaN, no number, or cannot be read"),
@@ -45,12 +45,12 @@ def test_the_first_loss_is_said_with_its_reason_and_further_ones_after_a_minute(
     ],
 )
 def test_a_sample_without_a_position_is_told_with_client_and_axis(
-    caplog: pytest.LogCaptureFixture, payload: bytes, said: str
+    caplog: pytest.LogCaptureFixture, payload: bytes, logged: str
 ) -> None:
     drive = Drive(a_detector(), PAIRS)
     drive.take(arrival(0.5, "car", payload, "pose"), until=1)
     Losses(drive.engine, Intake(lambda: 0)).log_new()
-    assert f"once a sample had no position for EventRule near; the last: {said}" in caplog.messages
+    assert f"once a sample had no position for EventRule near; the last: {logged}" in caplog.messages
 
 
 def test_a_stamp_ahead_of_the_rest_is_told_with_its_client(caplog: pytest.LogCaptureFixture) -> None:

@@ -18,7 +18,7 @@ from wayside.times import format_seconds, parse_seconds
 COUNTS = Verdict(Standing.COUNTS, "Accepted", "counts", "app")
 
 
-def said(status: Any) -> dict[str, str]:
+def logged(status: Any) -> dict[str, str]:
     return {each.type: each.status for each in status.conditions}
 
 
@@ -47,23 +47,23 @@ def test_a_tasks_phases_follow_its_instance() -> None:
 
 def test_a_task_is_not_ready_while_its_instance_is_not_made_and_keeps_what_was_known_of_it_afterwards() -> None:
     pending = task_status(task("a"), COUNTS, None, NOW)
-    assert said(pending) == {"Accepted": "True", "Ready": "False"}
+    assert logged(pending) == {"Accepted": "True", "Ready": "False"}
     ready = task_status(task("a"), COUNTS, Service("app", True, True), NOW)
     later = task_status(task("a").model_copy(update={"status": ready}), COUNTS, None, NOW + 1)
-    assert said(later) == {"Accepted": "True", "Applied": "True", "Ready": "True"}
+    assert logged(later) == {"Accepted": "True", "Applied": "True", "Ready": "True"}
 
 
 def test_a_task_is_no_more_applied_or_ready_than_its_instance_and_keeps_since_when_it_once_was() -> None:
     ready = task_status(task("a"), COUNTS, Service("app", True, True), NOW)
     served = task("a").model_copy(update={"status": ready})
     later = task_status(served, COUNTS, Service("app", False, False, "broken"), NOW + 1)
-    assert said(later) == {"Accepted": "True", "Applied": "False", "Ready": "False"}
+    assert logged(later) == {"Accepted": "True", "Applied": "False", "Ready": "False"}
     assert later.phase is TaskPhase.PENDING
     assert later.applied_time == later.ready_time == format_seconds(NOW)
     over = task_status(
         task("a").model_copy(update={"status": later}), Verdict(Standing.FINISHED, "Ended", "ended"), None, NOW + 2
     )
-    assert said(over) == {"Accepted": "True", "Finished": "True"}
+    assert logged(over) == {"Accepted": "True", "Finished": "True"}
     assert over.ready_time == format_seconds(NOW)
 
 
@@ -102,13 +102,13 @@ def test_a_finished_task_keeps_its_instance_and_tells_since_when() -> None:
 
 
 def test_a_task_that_ends_before_its_status_is_written_still_says_what_served_it() -> None:
-    book, name = ClaimIndex(), ("site", "a")
-    book.note(name, Entry({}, task("a")), template())
-    claimed = book.claim(name)
+    index, name = ClaimIndex(), ("site", "a")
+    index.note(name, Entry({}, task("a")), template())
+    claimed = index.claim(name)
     assert claimed is not None
     ended = task("a", ended=True)
-    book.note(name, Entry({}, ended), template())
-    verdict = book.verdict(name)
+    index.note(name, Entry({}, ended), template())
+    verdict = index.verdict(name)
     assert verdict is not None
     done = task_status(ended, verdict, None, NOW)
     assert (done.phase, done.instance_name) == (TaskPhase.FINISHED, claimed.instance)
@@ -117,7 +117,7 @@ def test_a_task_that_ends_before_its_status_is_written_still_says_what_served_it
 def test_a_holder_that_returns_takes_back_that_its_task_is_finished() -> None:
     lost = task_status(task("a"), Verdict(Standing.FINISHED, "DetectorLost", "lost"), None, NOW)
     back = task_status(task("a").model_copy(update={"status": lost}), COUNTS, None, NOW + 1)
-    assert said(back)["Finished"] == "False"
+    assert logged(back)["Finished"] == "False"
     assert finished_since(task("a").model_copy(update={"status": back})) is None
 
 

@@ -28,7 +28,7 @@ def expression(key: str, operator: str, *values: str) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(
-    ("spec", "says"),
+    ("spec", "shows"),
     [
         ({"nodeName": "rsu-9"}, "nodeName: there is no node rsu-9 (there are rsu-1, rsu-2)"),
         ({"nodeSelector": {"site": "west"}}, "nodeSelector: no node has the label site=west (there are north, south)"),
@@ -45,12 +45,12 @@ def expression(key: str, operator: str, *values: str) -> dict[str, Any]:
         ),
     ],
 )
-def test_what_no_node_is_like_is_told(spec: Any, says: str) -> None:
+def test_what_no_node_is_like_is_told(spec: Any, shows: str) -> None:
     found = misplaced(deployment(**spec), NODES)
     assert found is not None
     assert found.reason == "Unschedulable"
     assert found.message.startswith("Deployment app fits no node: ")
-    assert says in found.message
+    assert shows in found.message
     assert "Correct the value, or label a node" in found.message
 
 

@@ -30,5 +30,5 @@ def test_the_guides_template_is_placed_by_its_parameters() -> None:
     assert spec["tolerations"] == [{"key": "site", "value": "edge", "effect": "NoSchedule"}]
     found = misplaced(manifest, NODES)
     assert found is not None
-    told = found.message.replace(decision.name, "at-the-roadside-abc")
-    assert f"`{told}`" in " ".join(GUIDE.split())
+    reported = found.message.replace(decision.name, "at-the-roadside-abc")
+    assert f"`{reported}`" in " ".join(GUIDE.split())

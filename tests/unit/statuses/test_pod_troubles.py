@@ -39,7 +39,7 @@ def waiting(reason: str, message: str = "") -> dict[str, Any]:
     return container({"waiting": {"reason": reason, "message": message}})
 
 
-def said(status: dict[str, Any]) -> tuple[str, str] | None:
+def logged(status: dict[str, Any]) -> tuple[str, str] | None:
     found = trouble(pod(**status))
     return (found.reason.value, found.message) if found else None
 
@@ -55,17 +55,17 @@ def said(status: dict[str, Any]) -> tuple[str, str] | None:
     ],
 )
 def test_an_image_that_cannot_be_pulled_gives_the_same_words_at_each_attempt(status: dict[str, Any]) -> None:
-    assert said(status) == ("ImagePullFailed", f"cannot pull image app:1: {CAUSE}")
+    assert logged(status) == ("ImagePullFailed", f"cannot pull image app:1: {CAUSE}")
 
 
 def test_an_image_whose_cause_is_not_told_is_named_with_the_kubelets_word() -> None:
     back_off = waiting("ImagePullBackOff", 'Back-off pulling image "app:1"')
-    assert said(back_off) == ("ImagePullFailed", "cannot pull image app:1: ImagePullBackOff")
+    assert logged(back_off) == ("ImagePullFailed", "cannot pull image app:1: ImagePullBackOff")
 
 
 def test_an_init_containers_image_is_named_too() -> None:
     init = [{"name": "first", "state": {"waiting": {"reason": "InvalidImageName", "message": "no name"}}}]
-    assert said({"initContainerStatuses": init}) == ("ImagePullFailed", "cannot pull image setup:2: no name")
+    assert logged({"initContainerStatuses": init}) == ("ImagePullFailed", "cannot pull image setup:2: no name")
 
 
 ENDED = {"exitCode": 3, "reason": "Error", "finishedAt": "2026-01-01T00:00:00Z"}
@@ -90,14 +90,14 @@ def test_a_container_that_crashes_gives_the_same_words_between_and_during_its_at
 
 
 def test_a_container_that_is_ready_again_is_no_trouble() -> None:
-    assert said(container({"running": {}}, lastState={"terminated": ENDED}, ready=True)) is None
+    assert logged(container({"running": {}}, lastState={"terminated": ENDED}, ready=True)) is None
 
 
 def test_want_of_memory_and_a_containers_last_words_are_told() -> None:
     killed = container({"terminated": {"exitCode": 137, "reason": "OOMKilled"}})
-    assert "exit code 137, killed for exceeding its memory limit" in str(said(killed))
+    assert "exit code 137, killed for exceeding its memory limit" in str(logged(killed))
     speaks = container({"terminated": {**ENDED, "message": "no\nmap"}})
-    assert str(said(speaks)).endswith("exit code 3: no map')")
+    assert str(logged(speaks)).endswith("exit code 3: no map')")
 
 
 @pytest.mark.parametrize(
@@ -121,7 +121,7 @@ def test_want_of_memory_and_a_containers_last_words_are_told() -> None:
     ],
 )
 def test_other_troubles_and_none(status: dict[str, Any], expected: tuple[str, str] | None) -> None:
-    assert said(status) == expected
+    assert logged(status) == expected
 
 
 def test_what_is_not_restarted_has_failed_and_does_not_crash() -> None:
@@ -148,14 +148,14 @@ def test_the_same_trouble_of_many_pods_is_told_once_and_the_most_telling_first()
 
 
 def test_the_book_knows_an_instances_troubles_and_whether_news_change_them() -> None:
-    book, of = PodIndex(), ("site", "app")
-    assert not book.note(pod())
-    assert book.note(pod(**waiting("ErrImagePull", "no")))
-    assert not book.note(pod("app-2", **waiting("ErrImagePull", "no")))
-    assert [each.message for each in book.troubles(of)] == ["cannot pull image app:1: no"]
-    assert not book.forget(pod("app-2"))
-    assert book.note(pod())
-    assert book.troubles(of) == []
+    index, of = PodIndex(), ("site", "app")
+    assert not index.note(pod())
+    assert index.note(pod(**waiting("ErrImagePull", "no")))
+    assert not index.note(pod("app-2", **waiting("ErrImagePull", "no")))
+    assert [each.message for each in index.troubles(of)] == ["cannot pull image app:1: no"]
+    assert not index.forget(pod("app-2"))
+    assert index.note(pod())
+    assert index.troubles(of) == []
 
 
 def test_pods_of_every_workload_bear_the_label_by_which_they_are_found() -> None:

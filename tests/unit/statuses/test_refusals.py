@@ -29,19 +29,19 @@ def test_each_refusal_has_its_reason(code: int, message: str, reason: str) -> No
 
 
 def test_the_pods_of_a_deployment_that_are_refused_are_told_in_the_same_words_each_time() -> None:
-    def told(message: str, kind: str = "Deployment", status: str = "True") -> str | None:
+    def reported(message: str, kind: str = "Deployment", status: str = "True") -> str | None:
         conditions = [{"type": "ReplicaFailure", "status": status, "message": message}]
         found = refused_pods({"kind": kind, "metadata": {"name": "app"}, "status": {"conditions": conditions}})
         return found.text if found else None
 
-    text = told(QUOTA)
+    text = reported(QUOTA)
     assert text is not None
     assert text.startswith("pods are refused: forbidden: exceeded quota: few")
     assert "raise the ResourceQuota" in text
-    assert told(QUOTA.replace("zk5mt", "other")) == text
-    assert told(QUOTA, status="False") is None
-    assert told(QUOTA, kind="ReplicaSet") == text
-    assert told(QUOTA, kind="StatefulSet") is None
+    assert reported(QUOTA.replace("zk5mt", "other")) == text
+    assert reported(QUOTA, status="False") is None
+    assert reported(QUOTA, kind="ReplicaSet") == text
+    assert reported(QUOTA, kind="StatefulSet") is None
 
 
 @pytest.mark.parametrize(

@@ -265,18 +265,18 @@ def test_what_expressions_missed_or_failed_on_is_told() -> None:
 def test_a_subject_that_is_not_looked_at_is_told_why(subject: str, why: str) -> None:
     drive = Drive(a_detector(), a_rule("near", scope={"pairs": {"position": POSITION, "within": 100}}, when="true"))
     sent = [arrival(0.1, "a", {"x": 0, "y": 0}, "pose"), arrival(0.2, "b", {"x": 900, "y": 0}, "pose")]
-    (told,) = explained(drive, "near", subject, until=1, sent=sent).subjects
-    assert not told.looked_at
-    assert told.why == why
+    (reported,) = explained(drive, "near", subject, until=1, sent=sent).subjects
+    assert not reported.looked_at
+    assert reported.why == why
 
 
 def test_of_a_pair_each_ones_signals_are_told() -> None:
     scope = {"pairs": {"position": POSITION, "within": 100}}
     drive = Drive(a_detector(), a_rule("near", scope=scope, signals=[SPEED], when="a.v + b.v > 1"))
     sent = [arrival(0.1, "a", {"x": 0, "y": 0}, "pose"), arrival(0.2, "b", {"x": 9, "y": 0}, "pose")]
-    (told,) = explained(drive, "near", "a+b", until=1, sent=[*sent, arrival(0.3, "b", {"v": 3})]).subjects
-    assert told.near is True
-    assert told.unknown == {"a.v": "no sample of stream speed has arrived from a"}
+    (reported,) = explained(drive, "near", "a+b", until=1, sent=[*sent, arrival(0.3, "b", {"v": 3})]).subjects
+    assert reported.near is True
+    assert reported.unknown == {"a.v": "no sample of stream speed has arrived from a"}
 
 
 def test_a_rule_that_is_gone_is_watched_no_more_and_one_at_a_time() -> None:
@@ -302,10 +302,10 @@ def test_the_status_names_what_is_demanded_and_who_is_missing() -> None:
     status = kept.take(arrival(9.5, "rsu-1", {"v": 20}), until=10)
     assert (status.missing, status.missing_count) == (["rsu-2"], 1)
     shown = Console(width=160, file=io.StringIO(), record=True)
-    told = msgspec.structs.replace(
+    reported = msgspec.structs.replace(
         status, certificate=CertificateStatus(expires=status.taken + 90 * 86400, renewals=2, problem="expired")
     )
-    shown.print(status_view(told))
+    shown.print(status_view(reported))
     text = shown.export_text()
     assert "certificate expires in 90.0 days, renewed 2 times" in text
     assert "new certificates not in use: expired" in text

@@ -118,7 +118,7 @@ def answers(tmp_path: Path, north: Status, center: Status) -> Iterator[Answers]:
         each.close()
 
 
-def asked(*options: str) -> tuple[int, str, str]:
+def requested(*options: str) -> tuple[int, str, str]:
     done = CliRunner().invoke(app, ["status", "--all", *options])
     if done.exception is not None and not isinstance(done.exception, SystemExit):
         raise done.exception
@@ -128,10 +128,10 @@ def asked(*options: str) -> tuple[int, str, str]:
 def test_the_command_adds_up_the_detectors_of_a_file_each_in_its_own_network(
     answers: Answers, north: Status, center: Status
 ) -> None:
-    code, text, _ = asked("--detector", str(answers.file), "--json", "--timeout", "60")
+    code, text, _ = requested("--detector", str(answers.file), "--json", "--timeout", "60")
     expected = total([read_status(to_json(each)) for each in (north, center)])
     assert (code, msgspec.json.decode(text, type=Total)) == (0, expected)
-    code, text, _ = asked("--detector", str(answers.file), "--rule", "fast", "--timeout", "60")
+    code, text, _ = requested("--detector", str(answers.file), "--rule", "fast", "--timeout", "60")
     assert code == 0
     assert "2 detectors, 4 clients (1 of them known to several)" in text
     assert "known to several: car2" in text
@@ -141,7 +141,7 @@ def test_the_command_adds_up_the_detectors_of_a_file_each_in_its_own_network(
 
 def test_a_detector_that_does_not_answer_is_an_error_beside_the_sum_of_the_others(answers: Answers) -> None:
     answers.add("south", None)
-    code, text, errors = asked("--detector", str(answers.file), "--json", "--timeout", "2")
+    code, text, errors = requested("--detector", str(answers.file), "--json", "--timeout", "2")
     assert code == 1
     assert "the sums lack south: zenoh: cannot open a session" in errors
     added = msgspec.json.decode(text, type=Total)
@@ -158,13 +158,13 @@ def test_what_cannot_be_added_up_is_refused_with_the_remedy(answers: Answers, tm
             "no detector has this rule; the rules are fast, slow",
         ),
     ):
-        code, _, errors = asked(*options)
+        code, _, errors = requested(*options)
         assert code == 2
         assert error in " ".join(errors.replace("│", " ").split())
     for each in answers.networks:
         each.close()
     with pytest.raises(NoAnswerError, match=r"no detector answers: north: zenoh.*center: zenoh"):
-        asked("--detector", file, "--timeout", "0.5")
+        requested("--detector", file, "--timeout", "0.5")
     (tmp_path / "none.yaml").write_text("")
     with pytest.raises(DocumentError, match="contains no Detector"):
-        asked("--detector", str(tmp_path / "none.yaml"))
+        requested("--detector", str(tmp_path / "none.yaml"))

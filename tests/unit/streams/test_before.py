@@ -49,8 +49,8 @@ def test_the_first_sample_and_one_after_a_pause_have_none_before() -> None:
 
 def test_a_message_that_cannot_be_read_is_no_sample_before() -> None:
     drive = Drive(a_detector(a_stream("pose")), jump())
-    told = drive.take(place(0.1, "car", 1), arrival(0.2, "car", b"{", "pose"), place(0.3, "car", 90), until=0.5)
-    assert told == []
+    reported = drive.take(place(0.1, "car", 1), arrival(0.2, "car", b"{", "pose"), place(0.3, "car", 90), until=0.5)
+    assert reported == []
     assert drive.take(place(0.6, "car", 99), until=0.7) == ["jump car started 0.6"]
     assert drive.engine.counters.undecodable["pose"] == 1
 
@@ -80,8 +80,8 @@ def test_a_late_sample_changes_the_one_before_of_no_other() -> None:
         return Arrival(at(received), "pose", "vehicles/car/pose", payload)
 
     drive.take(sent(0.1, 0.1, 1), sent(0.2, 0.2, 2), sent(0.4, 0.4, 3), sent(1, 1, 3), until=0)
-    told = drive.take(sent(1.1, 0.3, -9), sent(1.2, 1.3, 4), until=0) + drive.finish()
-    assert told == []  # 3 - -9 would be a jump, had it been there in time
+    reported = drive.take(sent(1.1, 0.3, -9), sent(1.2, 1.3, 4), until=0) + drive.finish()
+    assert reported == []  # 3 - -9 would be a jump, had it been there in time
 
 
 def test_messages_of_ros_are_compared_by_their_fields() -> None:

@@ -90,8 +90,8 @@ def test_a_template_that_does_not_compile_is_told_with_its_field(client: str, pr
 def test_a_template_that_reads_a_member_of_a_number_is_told_with_the_number() -> None:
     drive = Drive(a_detector(a_stream("${msg.hdr.id}")), a_rule(**FAST))
     drive.take(sent(0.5, '{"hdr": 3}'), until=1)
-    told = "`msg.hdr` is 3.0, which has no field `id`: correct the path"
-    assert told in drive.engine.counters.last_unnamed["speed"]
+    reported = "`msg.hdr` is 3.0, which has no field `id`: correct the path"
+    assert reported in drive.engine.counters.last_unnamed["speed"]
 
 
 def test_a_member_of_a_raw_message_is_refused() -> None:

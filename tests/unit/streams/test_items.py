@@ -171,9 +171,9 @@ def test_live_and_replay_give_the_same_events() -> None:
         if n % 7 == 0:
             live.evaluator.ask("ask").result(10)
     recording = live.stop()
-    assert {event.subject for event in recording.said} >= {"1", "2", "3", "1+2"}
-    assert {str(event.reason) for event in recording.said} >= {"ClientLost", "Until"}
-    assert lines(replay_intake(recording.records, None, None).events) == lines(recording.said)
+    assert {event.subject for event in recording.logged} >= {"1", "2", "3", "1+2"}
+    assert {str(event.reason) for event in recording.logged} >= {"ClientLost", "Until"}
+    assert lines(replay_intake(recording.records, None, None).events) == lines(recording.logged)
 
 
 OBJECTS = "std_msgs/Header header\nlab_msgs/Track[] objects\ngeometry_msgs/Pose origin\nfloat64[] scores"
@@ -230,8 +230,8 @@ def tracks(*places: tuple[int, float]) -> bytes:
 def test_items_are_read_from_every_encoding(stream: Mapping[str, Any], payload: bytes, value: str) -> None:
     rule = a_rule(signals=[{"name": "x", "stream": "list", "value": value}], when="x > 5")
     drive = Drive(a_detector(stream, messages=MESSAGES), rule)
-    (told,) = drive.take(Arrival(at(0.5), "list", "stations/n/list", payload), until=1)
-    assert told.split()[1][-1] == "2"
+    (reported,) = drive.take(Arrival(at(0.5), "list", "stations/n/list", payload), until=1)
+    assert reported.split()[1][-1] == "2"
     assert drive.events[0].values["x"] == 9.0
 
 

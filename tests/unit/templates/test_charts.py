@@ -40,15 +40,15 @@ def refusal(text: str) -> str:
 
 
 def made(text: str = SERVICE, helm: dict[str, Any] | None = None, **values: Any) -> tuple[Rendering, ChartRequest]:
-    asked = []
+    requested = []
 
     def charts(request: ChartRequest) -> ChartObjects:
-        asked.append(request)
+        requested.append(request)
         return objects(text)
 
     spec = {"helm": CHART | (helm or {}), "parameters": values.pop("declared", {})}
     rendering = Renderer(template(**spec), Policy()).render(instance(parameters=values), charts)
-    return rendering, asked[0]
+    return rendering, requested[0]
 
 
 def test_each_document_is_an_object_with_its_file() -> None:

@@ -197,7 +197,7 @@ def deploying(of: str = "app", operation: str = "Deploy", **parameters: Any) -> 
 
 
 @pytest.mark.parametrize(
-    ("asked", "parts"),
+    ("requested", "parts"),
     [
         (deploying("ap", region="x"), ["spec.actions[0].deploy.templateName: there is no", "mean app?"]),
         (deploying("other", region="x"), ["create it, or tasks of this rule are refused"]),
@@ -207,12 +207,12 @@ def deploying(of: str = "app", operation: str = "Deploy", **parameters: Any) -> 
         (deploying(rate=3), ["deploy.parameters.region: is missing", "requires it"]),
     ],
 )  # fmt: skip
-def test_what_tasks_of_a_rule_would_be_refused_for_is_a_remark(asked: EventRule, parts: list[str]) -> None:
+def test_what_tasks_of_a_rule_would_be_refused_for_is_a_remark(requested: EventRule, parts: list[str]) -> None:
     app = template(parameters={**REGION, "rate": {"type": "number", "maximum": 50}})
-    (found,) = deploy_remarks(asked, [app])
+    (found,) = deploy_remarks(requested, [app])
     assert [part for part in parts if part not in str(found)] == []
-    metadata = asked.metadata.model_copy(update={"annotations": {IGNORE_ANNOTATION: f"x, {found.check}"}})
-    assert not deploy_remarks(asked.model_copy(update={"metadata": metadata}), [app])
+    metadata = requested.metadata.model_copy(update={"annotations": {IGNORE_ANNOTATION: f"x, {found.check}"}})
+    assert not deploy_remarks(requested.model_copy(update={"metadata": metadata}), [app])
 
 
 def test_what_a_template_takes_is_not_remarked_on() -> None:

@@ -79,7 +79,7 @@ def test_a_number_of_replicas_is_left_to_an_autoscaler_of_the_same_template(targ
     assert manifest == DEPLOYMENT
 
 
-def said(stopped: ApplicationInstance, *objects: Any) -> tuple[str, str, str] | None:
+def logged(stopped: ApplicationInstance, *objects: Any) -> tuple[str, str, str] | None:
     (decision,) = demand(
         [template()], [task("a"), task("night", operation="Suspend")], [stopped], {}, NOW
     ).instances.values()
@@ -93,12 +93,12 @@ def live(replicas: int, pods: int) -> dict[str, Any]:
 
 def test_the_instance_says_who_suspends_it_what_is_left_and_what_rests() -> None:
     stopped = instance(suspended=True)
-    assert said(instance(), live(1, 1)) is None
-    assert said(stopped, live(0, 2)) == (
+    assert logged(instance(), live(1, 1)) is None
+    assert logged(stopped, live(0, 2)) == (
         "False", "Stopping", "task night suspends it: Deployment app has 2 pods left",
     )  # fmt: skip
     scaler = {**autoscaler(), "metadata": {"name": "scaler"}}
-    assert said(stopped, live(0, 0), scaler, None) == (
+    assert logged(stopped, live(0, 0), scaler, None) == (
         "True",
         "Suspended",
         "task night suspends it, and its workloads are at zero; HorizontalPodAutoscaler scaler is inactive until then",

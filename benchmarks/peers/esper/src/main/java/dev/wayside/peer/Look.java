@@ -1,6 +1,6 @@
 package dev.wayside.peer;
 
-/** Asks who is near a client. Esper wants a public class with getters. */
+/** Queries the clients near a client. Esper wants a public class with getters. */
 public final class Look {
     private final Place place;
 

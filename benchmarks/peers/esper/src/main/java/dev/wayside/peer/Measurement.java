@@ -8,7 +8,7 @@ import java.util.List;
 import java.util.Locale;
 
 /**
- * Runs a task over a recording several times, in one runtime whose clock goes on, so that the code is compiled to
+ * Runs a task over a recording several times, in one runtime whose clock continues, so that the code is compiled to
  * machine code when it counts.
  *
  * <p>Esper's clock stands two milliseconds before a tick when the samples of that tick enter. Windows and ticks are
@@ -43,7 +43,7 @@ final class Measurement {
     private final long first;
     private final long last;
 
-    /** Period of the ticks, and how long the clock goes on between rounds to empty the windows; milliseconds. */
+    /** Period of the ticks, and how far the clock advances between rounds to empty the windows; milliseconds. */
     Measurement(Recording recording, long period, long rest) {
         samples = recording.samples;
         this.period = period;
@@ -81,7 +81,7 @@ final class Measurement {
         }
     }
 
-    /** Lets the clock go on without samples. */
+    /** Advances the clock without samples. */
     private void idle(Task task, long begin, long end) {
         for (long tick = begin; tick < end; tick += period) {
             task.before(tick);
