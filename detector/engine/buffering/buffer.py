@@ -23,7 +23,7 @@ NEVER = -(2**63)
 """Before all times: no sample has arrived yet."""
 
 HOUSEKEEPING = 1_000_000_000
-"""Old samples are forgotten this often, in nanoseconds, and there is a tick for it, also without rules."""
+"""Period in nanoseconds after which old samples are dropped; there is a tick for it, also without rules."""
 
 _RECEIVED = attrgetter("received")
 
@@ -67,7 +67,7 @@ class Lane:
         self.samples: deque[Sample] = deque()
         self.bytes = 0
         self._pushed_out = NEVER
-        """The time of the newest sample, if a cap pushed it out."""
+        """The time of the newest sample, if a cap evicted it."""
         self.evicted = 0
         """Samples that a cap evicted before they expired."""
 
@@ -94,7 +94,7 @@ class Lane:
 
     @property
     def latest(self) -> int:
-        """The greatest time of all samples that came, also of those that a cap pushed out."""
+        """The greatest time of all samples ever inserted, including evicted ones."""
         return max(self.samples[-1].received, self._pushed_out) if self.samples else self._pushed_out
 
     def insert(self, sample: Sample) -> int:
@@ -120,7 +120,7 @@ class Lane:
         return size
 
     def drop_oldest(self) -> int:
-        """Forget the oldest sample; returns the bytes freed."""
+        """Drop the oldest sample; returns the bytes freed."""
         oldest = self.samples.popleft()
         if not self.samples:
             self._pushed_out = max(self._pushed_out, oldest.time)
@@ -133,7 +133,7 @@ class Lane:
         return len(sample.payload) + SAMPLE_OVERHEAD
 
     def expire(self, now: int) -> int:
-        """Forget what is older than the duration, but never the newest; returns the bytes freed."""
+        """Drop samples older than the duration, but never the newest; returns the bytes freed."""
         samples, horizon = self.samples, now - self.duration
         if not samples or samples[0].received > horizon:
             return 0

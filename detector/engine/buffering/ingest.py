@@ -48,9 +48,9 @@ class Ingest:
         self._counters = counters
         self._number = 0
         self._newest = NEVER
-        """The greatest time of all that came: what is not before it is late in no lane."""
+        """The greatest time of all samples so far: a sample that is not before it is late in no lane."""
         self.came: list[Sample] = []
-        """What came since somebody took it, while `noting`."""
+        """Samples inserted since the last time they were taken, while `noting`."""
         self.lanes: list[Lane] = []
         """The lane of each of these."""
         self.noting = False
@@ -79,9 +79,9 @@ class Ingest:
         """By key; of streams whose messages name their client, by client: see `_lane_of_message`."""
 
     def insert(self, arrivals: Sequence[Arrival], times: Sequence[int] | None, size: int) -> None:
-        """Everything that is received comes through here.
+        """Insert everything that was received.
 
-        `times`: None for the receive times, in order. `size`: what the arrivals take at most, see `size_of`.
+        `times`: None for the receive times, in order. `size`: an upper bound of the arrivals' size, see `size_of`.
         """
         streams = {arrival.stream for arrival in arrivals}
         if len(streams) == 1:
@@ -107,7 +107,7 @@ class Ingest:
                     self._put(lane, arrival if times is None else Stamped(time, self._number, payload, key))
 
     def size_of(self, arrivals: Sequence[Arrival]) -> int:
-        """What these take at most in the buffer, in bytes: their items take less."""
+        """The maximum memory that these take in the buffer, in bytes: their items take less."""
         size = bytes_of(arrivals)
         if self._of_items:
             size += MAXIMUM_ITEMS * SAMPLE_OVERHEAD * sum(arrival.stream in self._of_items for arrival in arrivals)
@@ -143,7 +143,7 @@ class Ingest:
             self.lanes.append(lane)
 
     def _insert_in_order(self, arrivals: Sequence[Arrival], size: int) -> None:
-        """The hot path: what `_put` does is written out where nothing is late or pushed out."""
+        """The hot path: `_put` is inlined for arrivals that are not late and evict nothing."""
         known, buffer, newest = self._lanes, self._buffer, self._newest
         self._newest = max(newest, arrivals[-1].received)
         lanes: list[Lane]

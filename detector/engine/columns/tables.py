@@ -146,7 +146,7 @@ class Tables:
         return self._stale or self._evictions != self._buffer.evictions
 
     def settle(self, samples: list[Sample], lanes: list[Lane]) -> None:
-        """Take in what entered the buffer since the last time: samples, and the lane of each."""
+        """Add the samples that entered the buffer since the last call, each with its lane."""
         for table, reader in zip(self._tables.values(), self.readers.values(), strict=True):
             if len(table.columns) != reader.count:
                 table.set_columns(reader.count)

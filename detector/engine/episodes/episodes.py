@@ -76,8 +76,8 @@ NO_WAKE = 2**63 - 1
 
 
 Ran = tuple[int, Started | Ended | None, int | None]
-"""What became of ticks at which a subject was observed alike: the tick at which something happened, or after the last
-one; what happened; and when something will happen although nothing changes, in nanoseconds."""
+"""The result of consecutive ticks with the same observation of a subject: the tick at which something happened, or
+after the last one; what happened; and when something will happen although nothing changes, in nanoseconds."""
 
 
 @dataclass(slots=True)

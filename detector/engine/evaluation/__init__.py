@@ -1,1 +1,1 @@
-"""Rules at their ticks: what they look at, which are evaluated together, and the episodes that start and end."""
+"""Rules at their ticks: their inputs, which of them are evaluated together, and the episodes that start and end."""

@@ -165,7 +165,7 @@ class Blocks:
         return happened
 
     def _noted(self, happened: list[Happened]) -> list[Happened]:
-        """The same, once rules that look at episodes of others can see it."""
+        """The same, after making them visible to rules that read episodes of other rules."""
         if self._context.starts.needed:
             happened.sort(key=_place)
             for each in happened:

@@ -130,7 +130,7 @@ class Executor:
         return events
 
     def _may_wait(self, arrivals: Sequence[Arrival], times: Sequence[int] | None, size: int) -> bool:
-        """Whether what comes (at most `size` bytes) changes nothing that the ticks that wait see."""
+        """Whether these arrivals (at most `size` bytes) change nothing that the queued ticks read."""
         first, last = (arrivals[0].received, arrivals[-1].received) if times is None else (min(times), max(times))
         in_order = times is None or first > self._last_wait
         return in_order and last - self._blocks.since <= LONGEST and self._known.buffer.takes(size)
