@@ -8,7 +8,7 @@ from hypothesis import HealthCheck, Phase, settings
 from tests.failures import shorten
 from tests.sharing import run_folder
 
-# How long an example takes says more about what else the machine does than about the code, and how many of the first
+# The duration of an example depends more on the machine's load than on the code, and how many of the first
 # ones are too large or left out is a matter of luck; where no example is left, that is an error all the same.
 settings.register_profile(
     "wayside",

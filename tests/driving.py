@@ -94,7 +94,7 @@ class Drive:
         self.events: list[Event] = []
 
     def take(self, *arrivals: Arrival, until: float) -> list[str]:
-        """Advance; returns what happened in a few words (see `told`)."""
+        """Advance; returns what happened in a few words (see `reported`)."""
         return self.note(self.engine.advance(arrivals, at(until)))
 
     def finish(self) -> list[str]:

@@ -41,7 +41,7 @@ OLDEST_KUBERNETES = kubernetes("1.31.0")
 
 
 class BuildError(Exception):
-    """A program cannot be built; the message says what to do."""
+    """A program cannot be built; the message gives the remedy."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""An HTTP endpoint on a real socket that does as it is told, also what no well-behaved server does."""
+"""An HTTP endpoint on a real socket with configurable behaviour, including misbehaviour."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def echoes_headers(status: int = 400) -> Behaviour:
 
 
 class Endpoint:
-    """Each request is kept and then treated as `behaviour` says, which may be changed at any time."""
+    """Each request is kept and then treated according to `behaviour`, which may be changed at any time."""
 
     def __init__(self, behaviour: Behaviour | None = None, context: ssl.SSLContext | None = None) -> None:
         self.behaviour: Behaviour = behaviour or answers()
@@ -117,7 +117,7 @@ class Endpoint:
         return f"{'https' if self._context else 'http'}://localhost:{self.port}"
 
     def received(self, count: int) -> list[Received]:
-        """The requests, once there are so many."""
+        """The requests, once there is this number of them."""
         with self._arrived:
             assert self._arrived.wait_for(lambda: len(self.requests) >= count, WAIT), self.requests
             return list(self.requests)
@@ -142,7 +142,7 @@ class Endpoint:
             with connection:
                 request = _request(connection)
                 with self._arrived:
-                    behaviour = self.behaviour  # whoever sees the request may change what is done about the next
+                    behaviour = self.behaviour  # an observer of the request may change the behaviour for the next
                     self.requests.append(request)
                     self._arrived.notify_all()
                 behaviour(self, connection, request)
@@ -194,7 +194,7 @@ def nobody() -> Iterator[str]:
 
 @contextmanager
 def endpoint_for(authority: Path, certificate: tuple[Path, Path]) -> Iterator[Endpoint]:
-    """One that asks for a certificate of the authority."""
+    """One that requires a certificate of the authority."""
     context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH, cafile=str(authority))
     context.load_cert_chain(*certificate)
     context.verify_mode = ssl.CERT_REQUIRED

@@ -1,4 +1,4 @@
-"""In place of the worker processes, for tests that are about something else: jobs run where they are asked for."""
+"""Replaces the worker processes in tests about something else: jobs run in the calling process."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from tests.certificates import Authority
 from wayside.api.stream import Encoding, Stream
 
 PATIENCE = 60.0
-"""Seconds for what a test waits for but says nothing about the speed of: a test that passes does not wait for them."""
+"""Seconds for conditions whose speed a test does not check: a test that passes does not wait for them."""
 
 
 class Arrivals:

@@ -26,12 +26,12 @@ class Silent:
         raise AssertionError("nothing is published here")
 
     def query(self, selector: str, payload: bytes | None, timeout: float) -> list[bytes]:
-        raise AssertionError("nobody is asked here")
+        raise AssertionError("there are no queries here")
 
 
 @dataclass
 class Desk:
-    """A notify action, and all that it says."""
+    """A notify action, and all its reports."""
 
     action: Notify
     closing: threading.Event
@@ -64,7 +64,7 @@ class Desk:
 
 def a_desk(notify: Mapping[str, Any], *, state: Path | None = None, messenger: Any = None) -> Desk:
     parameters = Parameters.model_validate(notify)
-    rule = a_rule("braking", when="true", actions=[{"name": "tell", "notify": dict(notify)}])
+    rule = a_rule("braking", when="true", actions=[{"name": "notify", "notify": dict(notify)}])
     detector = a_detector(**({} if state is None else {"state": {"path": str(state)}}))
     desk = Desk.__new__(Desk)
 
@@ -83,7 +83,7 @@ def a_desk(notify: Mapping[str, Any], *, state: Path | None = None, messenger: A
     desk.changed = threading.Condition()
     setting = Setting(
         rule=rule,
-        action="tell",
+        action="notify",
         holder="h",
         surroundings=lambda: Surroundings(detector, {}, standard()),
         messenger=messenger or Silent(),

@@ -1,4 +1,4 @@
-"""Small ONNX models for tests, made when they are needed: exact arithmetic, so that what they give can be told."""
+"""Small ONNX models for tests, made when they are needed: exact arithmetic, so that their results are known."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from opentelemetry.proto.collector.trace.v1.trace_service_pb2 import (
 )
 
 ERROR = 2
-"""The code of a span's status that says it failed."""
+"""The code of the status of a failed span."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Received:
 
     @property
     def traceparent(self) -> str:
-        """As W3C's header says it."""
+        """In the form of W3C's header."""
         return f"00-{self.trace}-{self.id}-01"
 
 

@@ -14,7 +14,7 @@ _PACKAGE = "prometheus"
 
 
 class PromtoolUnavailableError(Exception):
-    """There is no promtool, and it cannot be had; the message says what to do."""
+    """There is no promtool, and it is unavailable; the message gives the remedy."""
 
 
 def find_promtool() -> Path:

@@ -1,4 +1,4 @@
-"""A record action without a detector around it: the test tells it of episodes, and reads what it wrote."""
+"""A record action without a detector around it: the test passes it episodes, and reads its files."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ STREAMS = (
 
 
 class Bench:
-    """A record action of rule `r`, and what it said."""
+    """A record action of rule `r`, and its reports."""
 
     def __init__(self, path: Path, *streams: dict[str, Any], rule: str = "r", **parameters: Any) -> None:
         self.detector = recording_detector(path, *streams)
@@ -69,7 +69,7 @@ class Bench:
         return self.folder(episode)
 
     def outcome(self, episode: Episode) -> Outcome:
-        """The last that was said of an episode."""
+        """The last report about an episode."""
         return [outcome for name, outcome in self.reports if name == episode.id][-1]
 
     def folder(self, episode: Episode) -> Path:

@@ -36,7 +36,7 @@ DISCOVERY = "application/json;g=apidiscovery.k8s.io;v=v2;as=APIGroupDiscoveryLis
 
 
 class ApiError(Exception):
-    """The API server refused; the text is what it said.
+    """The API server rejected the request; the text is its message.
 
     Attributes:
         code: the HTTP status, e.g. 409.
@@ -161,7 +161,7 @@ class Api:
         what: str,
         namespace: str = "",
     ) -> Object:
-        """Wait until the object exists and `holds` says yes of it; return it.
+        """Wait until the object exists and `holds` is true for it; return it.
 
         Raises:
             TimeoutError: with `what` and the object as last seen, after `timeout` seconds.
@@ -199,7 +199,7 @@ class Api:
         labels: str = "",
         namespace: str = "",
     ) -> Objects:
-        """Wait until `holds` says yes of the list of objects; return it.
+        """Wait until `holds` is true for the list of objects; return it.
 
         Raises:
             TimeoutError: with `what` and the list as last seen, after `timeout` seconds.
@@ -217,7 +217,7 @@ class Api:
         return self._request("GET", path, accept=accept)
 
     def discover(self) -> set[str]:
-        """Ask the API server anew for its kinds and return them."""
+        """Query the API server for its current kinds and return them."""
         resources: dict[str, Resource] = {}
         for root in ("/api", "/apis"):  # the core group first: its Event wins over that of events.k8s.io
             for group in json.loads(self.raw(root, DISCOVERY)).get("items", []):

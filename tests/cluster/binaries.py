@@ -48,7 +48,7 @@ VERSION = "WAYSIDE_TEST_KUBERNETES"
 
 
 class BinariesUnavailableError(Exception):
-    """A program of the control plane is missing and cannot be built; the message says what to do."""
+    """A program of the control plane is missing and cannot be built; the message gives the remedy."""
 
 
 @dataclass(frozen=True)

@@ -98,7 +98,7 @@ class Vehicles:
                     for vehicle, (x, y) in self._where.items():
                         own = self._instead.get(vehicle)
                         self.send(f"vehicles/{vehicle}/pose", self._encode(x, y) if own is None else own())
-        except BaseException as failure:  # noqa: BLE001  told to the test at the end of its block
+        except BaseException as failure:  # noqa: BLE001  raised in the test at the end of its block
             self._failure = failure
 
 

@@ -100,7 +100,7 @@ class Child:
         self._process.wait()
 
     def resident_bytes(self) -> int:
-        """Return the memory it holds now; 0 where the system does not tell (only Linux does)."""
+        """Return the memory it holds now; 0 if the system does not report it (only Linux does)."""
         try:
             status = Path(f"/proc/{self.pid}/status").read_text()
         except OSError:

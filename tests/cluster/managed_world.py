@@ -1,7 +1,7 @@
-"""What the manager should have made of a namespace, computed anew from what is live, and how the world differs.
+"""What the manager should have made of a namespace, computed from the live objects, and the differences.
 
 The expectation comes from `demand` and `Renderer`, called here on the live objects: whatever the manager has been
-through, after a while the world must equal this pure function of it, and nothing else may bear the manager's label.
+through, after a while the world must equal this pure function of it, and nothing else may have the manager's label.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def start_manager(
 ) -> Process:
     """Start `application-manager run` for the namespace (default: all) and wait until it watches.
 
-    It is told who it is, as a pod's container is: started again it takes its own Lease at once.
+    It receives its identity, like a pod's container: restarted, it takes its own Lease at once.
     """
     where = ["--namespace", namespace] if namespace is not None else []
     environment = {"POD_NAME": "manager", "POD_UID": secrets.token_hex(8)}
@@ -107,7 +107,7 @@ def differences(
     for name in outcome.instances.keys() - instances.keys():
         yield f"{name}: should exist"
     for leaked in objects.keys() - expected:
-        yield f"{leaked}: bears our label, and belongs to nothing"
+        yield f"{leaked}: has our label, and belongs to nothing"
     yield from _tasks(tasks, outcome)
 
 
@@ -153,7 +153,7 @@ def _objects(
 
 
 def _unlike(wanted: Any, live: Any, path: str) -> Iterator[str]:
-    """Where the live object lacks what the manifest says; it may have more."""
+    """The places where the live object lacks a part of the manifest; it may have more."""
     if isinstance(wanted, dict) and isinstance(live, dict):
         for key, value in wanted.items():
             yield from _unlike(value, live.get(key), f"{path}.{key}")

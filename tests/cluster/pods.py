@@ -1,6 +1,6 @@
-"""Playing the kubelet: there are no nodes here, so nothing but a test says that a pod runs.
+"""Playing the kubelet: there are no nodes here, so only a test reports that a pod runs.
 
-`mark_pods_ready` does it once, `kubelet` goes on doing it.
+`mark_pods_ready` does it once, `kubelet` does it continuously.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ KUBELET_INTERVAL = 0.2  # s between two looks at the pods
 
 
 def mark_pods_ready(api: Api, selector: str = "", *, namespace: str = "") -> list[str]:
-    """Write the status Ready to all pods that match the label selector, as a kubelet would; return whom it marked.
+    """Write the status Ready to all pods that match the label selector, as a kubelet would; return the marked pods.
 
     Pods that are ready or being deleted, or vanish meanwhile, are left out.
     """

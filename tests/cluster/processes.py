@@ -37,12 +37,12 @@ class Process:
 
     @property
     def alive(self) -> bool:
-        """Whether the present run goes on."""
+        """Whether the current run is alive."""
         return self._child.alive
 
     @property
     def returncode(self) -> int | None:
-        """The exit code of the present run, negative for a signal; None while it goes on."""
+        """The exit code of the present run, negative for a signal; None while it is alive."""
         return self._child.returncode
 
     def resident_bytes(self) -> int:

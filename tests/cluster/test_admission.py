@@ -1,4 +1,4 @@
-"""The API server asks the manager before it stores a template, rule or detector, and nobody is harmed if it cannot."""
+"""The API server calls the manager before it stores a template, rule or detector; an outage harms nobody."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def reported(api: Api, kind: str, name: str) -> Object:
 
 
 WRONG: list[tuple[Object, Object, list[str]]] = [
-    # a good object, what makes it wrong, and what is said
+    # a good object, the change that makes it wrong, and the message
     (
         template("unknown"),
         {"manifests": [deployment("app:${parameters.version}")]},
@@ -195,7 +195,7 @@ def test_kubectl_prints_what_is_refused_and_what_is_warned_of_as_the_guide_shows
 
 def test_only_a_new_spec_is_refused(api: Api, webhook: Webhook) -> None:
     wrong = template("wrong", manifests=[config({}, name="fixed")])
-    api.create(wrong)  # while nobody asks
+    api.create(wrong)  # while nothing calls it
     with webhook.requested():
         api.patch("ApplicationTemplate", "wrong", {"metadata": {"labels": {"a": "b"}, "finalizers": ["test.dev/x"]}})
         status = {"status": {"instances": 7}}
@@ -270,7 +270,7 @@ def test_a_renewed_certificate_is_shown_and_one_that_cannot_be_used_is_not(api: 
 
 @contextmanager
 def listener(folder: Path) -> Iterator[tuple[int, Path, list[Object]]]:
-    """An HTTPS server that allows everything: its port, its authority's file, and what it is asked."""
+    """An HTTPS server that allows everything: its port, its authority's file, and the requests to it."""
     requested: list[Object] = []
 
     class Handler(http.server.BaseHTTPRequestHandler):
@@ -315,7 +315,9 @@ def test_tasks_instances_statuses_and_deletions_are_never_asked_about(
         api.apply(printed("webhooks", "--url", url, *options))
         try:
             wait_until(
-                lambda: api.apply(template()) and bool(requested), bool, what="the API server asks about templates"
+                lambda: api.apply(template()) and bool(requested),
+                bool,
+                what="the API server calls the webhook for templates",
             )
             api.create(task("north"))
             (made,) = api.wait_list("ApplicationInstance", lambda found: len(found) == 1, what="an instance is made")

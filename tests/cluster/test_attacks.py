@@ -120,7 +120,7 @@ HOSTILE = ("../../x", "x: y\n", '"}', "${parameters.region}", "$${v}", "'; drop"
 
 
 def refusal(api: Api, name: str) -> str:
-    """What the template's or its instance's status says against it, so far."""
+    """The errors so far in the template's or its instance's status."""
     raws = [api.get("ApplicationTemplate", name), api.find("ApplicationInstance", instance_name(name, "north"))]
     wrong = [condition(raw, type_) for raw in raws if raw is not None for type_ in ("Accepted", "Applied")]
     return " ".join(each["message"] for each in wrong if each.get("status") == "False")
@@ -144,7 +144,7 @@ def test_nothing_that_a_template_may_not_make_comes_into_being(api: Api, attacke
             "ApplicationInstance",
             instance_name(f"host-{name}", "north"),
             lambda raw, part=part: part in condition(raw, "Ready").get("message", ""),  # type: ignore[misc]
-            what=f"the status says {part}",
+            what=f"the status contains {part}",
         )
     served(api, "later")
     api.wait_list("Pod", lambda found: len(found) == 2, what="what meets the standard has its pods")

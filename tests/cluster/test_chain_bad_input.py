@@ -1,4 +1,4 @@
-"""Bad input to the chain: each is told in a way that helps, and a well-behaved pair's episode goes on as if alone.
+"""Bad input to the chain: each has a helpful message, and a well-behaved pair's episode is not affected.
 
 In each test CARS are the well-behaved pair. Their episode is open before the bad input comes, is held through it with
 the two at 175 m, and ends as it should afterwards.
@@ -116,7 +116,7 @@ def test_json_of_the_wrong_shape_harms_nobody_else(chain: Chain) -> None:
 
 
 def harms_nobody(chain: Chain, vehicles: Vehicles, bad: Callable[[], bytes], *logged: str) -> None:
-    """One of another pair sends only bad poses for a while: that is said, and the pair's own episode holds too."""
+    """One of another pair sends only bad poses for a while: that is logged, and the pair's own episode is kept, too."""
     running = chain.start()
     with unharmed(chain, vehicles, running):
         vehicles.place(VANS, NEAR)
@@ -147,7 +147,7 @@ def test_with_clock_data_a_client_whose_clock_is_ahead_harms_nobody_else(chain: 
         running.wait_for_output(
             r"because their stamps are ahead of the rest; the last: van1 is 3[56]\d\d(\.\d+)? s ahead"
         )
-        vehicles.place(BUSES, NEAR)  # time goes on, by the others' stamps
+        vehicles.place(BUSES, NEAR)  # time advances by the others' stamps
         chain.wait_events(BUSES, "started")
 
 

@@ -1,4 +1,4 @@
-"""Rules and Detectors are changed while episodes are open: what is not concerned goes on untouched."""
+"""Rules and Detectors are changed while episodes are open: everything else continues unchanged."""
 
 from __future__ import annotations
 

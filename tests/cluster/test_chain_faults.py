@@ -1,4 +1,4 @@
-"""Whatever happens to the detector or the API server: open episodes go on, and so does what they demand."""
+"""Whatever happens to the detector or the API server: open episodes continue, and so do their demands."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def test_a_detector_ends_and_starts_while_the_api_server_is_away(
         assert running.terminate() == 0
         vehicles.place(CARS, BETWEEN)
         running.start()
-        running.wait_for_output("WARNING")  # it says what it waits for
+        running.wait_for_output("WARNING")  # it logs what it waits for
     running.wait_for_output(f"{RUNS} 1 rules and 1 restored demands")
     assert chain.wait_task(CARS)["metadata"]["uid"] == task["metadata"]["uid"]
     assert untouched(deployed, chain.deployment(CARS))

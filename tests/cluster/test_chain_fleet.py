@@ -80,7 +80,7 @@ def wait_sources(api: Api, region: str, sources: list[str]) -> tuple[Object, Obj
         "ConfigMap",
         lambda found: [json.loads(each["data"]["sources"].removeprefix("these: ")) for each in found] == [sources],
         labels=f"region={region}",
-        what=f"the application of {region} is told {sources}",
+        what=f"the application of {region} receives {sources}",
     )
     (deployment,) = api.wait_list(  # made after the ConfigMap
         "Deployment",

@@ -121,7 +121,7 @@ def test_what_is_installed_changes_with_upgrades_and_goes_with_the_release_but_f
     assert kept == filled["data"], "an upgrade keeps the certificates"
     assert there.find("PodDisruptionBudget", f"{RELEASE}-manager") is None
     assert there.get("Detector", "town")["metadata"]["uid"] == town["metadata"]["uid"], (
-        "it is taken over, not made anew"
+        "it is taken over, not recreated"
     )
     install(helm, there, ALL | {"eventRules": []}, "upgrade")
     there.wait_gone("EventRule", "one")
@@ -356,7 +356,7 @@ def trusted(api: Api, hook: str) -> bytes:
 
 
 def shown(port: int, authorities: bytes, host: str) -> bytes:
-    """The certificate that is shown at the port to whom trusts these authorities; empty where they do not."""
+    """The certificate at the port for a client that trusts these authorities; empty if it is not valid for them."""
     context = ssl.create_default_context(cadata=authorities.decode())
     try:
         with (

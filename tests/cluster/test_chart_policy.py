@@ -101,7 +101,7 @@ def held(name: str, holder: str) -> Object:
 
 
 def wait_in_force(api: Api, probe: Api) -> None:
-    """The API server takes up a policy, and roles, a moment after they were stored."""
+    """The API server applies a policy, and roles, a moment after they were stored."""
 
     def refused() -> str:
         try:

@@ -57,7 +57,7 @@ def connect(guarded: Guarded) -> Connect:
 
 @pytest.fixture
 def guarded(helm: Helm, tmp_path: Path) -> Iterator[Guarded]:
-    """Connects as who has a certificate of this name; by another authority's, or with none, where that is said."""
+    """Connects with a certificate of this name; optionally from another authority, or with none."""
     authority, other = Authority(tmp_path), Authority(tmp_path, "foreign")
     certificate, key = authority.sign("router")
     port = free_port()
@@ -120,7 +120,7 @@ def test_each_client_does_what_it_may_and_nothing_else(connect: Connect) -> None
 
     def arrives() -> bool:
         put(car, "vehicles/car1/pose")
-        put(car, "wayside/events/town/forged")  # beside what arrives, so what follows tells that it did not
+        put(car, "wayside/events/town/forged")  # beside what arrives, so what follows shows that it did not
         put(town, "wayside/events/town/rule")
         put(town, "vehicles/car1/forged")
         return "vehicles/car1/pose" in at_town and "wayside/events/town/rule" in at_anna
@@ -128,7 +128,7 @@ def test_each_client_does_what_it_may_and_nothing_else(connect: Connect) -> None
     wait_for(arrives)
     for _ in range(20):
         arrives()
-    assert set(at_town) <= {"vehicles/car1/pose", "wide vehicles/car1/pose"}, "what is asked for widely is not more"
+    assert set(at_town) <= {"vehicles/car1/pose", "wide vehicles/car1/pose"}, "a wide query returns no more"
     assert set(at_anna) == {"wayside/events/town/rule"}
 
     def reported(session: zenoh.Session) -> list[str]:
@@ -148,7 +148,7 @@ MAY: dict[str, dict[str, set[str]]] = {
         "answers": {STATUS, "wayside/detectors/other/status"},
     },
     "fusion": {"publishes": {"scenes/north"}, "receives": {"vehicles/car1/points"}},
-    "anna": {"receives": {EVENT}, "asks": {STATUS, "wayside/detectors/other/status"}},
+    "anna": {"receives": {EVENT}, "queries": {STATUS, "wayside/detectors/other/status"}},
     "stranger": {},
 }
 """Of all that is tried below everything else is refused. Who may publish on a key may have a token there."""
@@ -163,7 +163,7 @@ KEYS = (
 def test_of_all_that_can_be_tried_each_gets_its_own_alone(guarded: Guarded, who: str) -> None:
     """Watched from within the router, to which no access control applies."""
     inside, session = guarded.router, guarded.connect(who)
-    reached: dict[str, set[str]] = {each: set() for each in ("publishes", "token", "receives", "asks", "answers")}
+    reached: dict[str, set[str]] = {each: set() for each in ("publishes", "token", "receives", "queries", "answers")}
 
     def noting(what: str, by: str) -> Callable[[zenoh.Sample], None]:
         return lambda each: reached[what].add(str(each.key_expr)) if each.payload.to_string() == by else None
@@ -185,7 +185,7 @@ def test_of_all_that_can_be_tried_each_gets_its_own_alone(guarded: Guarded, who:
             session.put(key, "theirs")
             inside.put(key, "ours")
             if ask(session, key, "ours"):
-                reached["asks"].add(key)
+                reached["queries"].add(key)
             if ask(inside, key, "theirs"):
                 reached["answers"].add(key)
         return all(keys <= reached[what] for what, keys in MAY[who].items())

@@ -121,7 +121,7 @@ def test_charts_come_from_a_repository_and_from_a_registry_and_are_kept(
     for name in ("web", "oci"):
         api.create(demand(f"{name}-more", name, "car2"))
         api.wait_for(
-            "ConfigMap", f"{name}-sources", lambda raw: raw["data"]["sources"] == "car1,car2", what="it goes on"
+            "ConfigMap", f"{name}-sources", lambda raw: raw["data"]["sources"] == "car1,car2", what="it continues"
         )
 
 
@@ -163,7 +163,7 @@ def test_wrong_charts_block_nobody(api: Api, manager: Process, charts: Path) -> 
             "ApplicationInstance",
             "silent-0",
             lambda raw: condition(raw, "Applied").get("status") == "False",
-            what="one that waits for its chart says so",
+            what="one that waits for its chart reports it",
         )
         assert manager.terminate(patience=15) == 0
 

@@ -52,7 +52,7 @@ class Holding:
         self._future.result(PATIENCE)
 
     def die(self) -> None:
-        """As by kill -9: nothing is said to anybody."""
+        """As by kill -9: without a release."""
         self._future.cancel()
         with pytest.raises(CancelledError):
             self._future.result(PATIENCE)

@@ -114,7 +114,7 @@ def test_the_last_known_set_holds_while_the_detector_is_gone(
     following.wait_rules("a")
     before = len(following.sets)
     api.delete("Detector", "intersection-a")
-    wait_until(lambda: caplog.text.count("no Detector"), lambda n: n == 2, what="it is said again")
+    wait_until(lambda: caplog.text.count("no Detector"), lambda n: n == 2, what="it is logged again")
     # Only now: Detectors and rules come by two watches, and the rule may be faster.
     deploy = {"name": "x", "deploy": {"templateName": "t", "parameters": {"not-an-identifier": 1}}}
     api.create(rule("b"))
@@ -129,7 +129,7 @@ def test_the_last_known_set_holds_while_the_detector_is_gone(
 def test_a_rule_that_cannot_be_read_is_reported_and_left_out(
     api: Api, following: Following, caplog: pytest.LogCaptureFixture
 ) -> None:
-    # A map's keys are one thing that a CRD's schema cannot say, so the API server lets this in.
+    # A CRD's schema cannot constrain a map's keys, so the API server accepts this.
     deploy = {"name": "x", "deploy": {"templateName": "t", "parameters": {"not-an-identifier": 1}}}
     api.create(detector())
     api.create(rule("broken", actions=[deploy]))

@@ -74,7 +74,7 @@ class Running:
         return self._loop.call(restore(self.store))
 
     def counted(self, expected: DeployCounts) -> None:
-        """Wait for these counts: a change is counted only once the API server has told that it is made."""
+        """Wait for these counts: a change is counted only once the API server has reported it."""
         wait_until(lambda: self.counts, expected.__eq__, what=f"counted: {expected}")
 
     def stop(self, deadline: float = 60.0) -> None:
@@ -259,7 +259,7 @@ def test_others_tasks_are_neither_ended_nor_taken_for_own(api: Api, namespace: s
     usurped = task_manifest(to_task(wanted))
     usurped["metadata"]["labels"] = {"wayside.dev/holder": "intersection-b"}
     usurped["spec"]["requester"]["holder"] = "intersection-b"
-    disguised = task_manifest(to_task(foreign))  # the label says ours, the requester does not
+    disguised = task_manifest(to_task(foreign))  # the label is ours, the requester is not
     disguised["metadata"]["labels"] = {"wayside.dev/holder": HOLDER}
     persons = {
         "apiVersion": "wayside.dev/v1alpha1",

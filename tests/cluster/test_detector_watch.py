@@ -25,7 +25,7 @@ def loop(control_plane: ControlPlane) -> Iterator[Background]:
 
 
 class Following:
-    """Keeps what a reflector says, and the state that follows from it."""
+    """Keeps what a reflector yields, and the resulting state."""
 
     def __init__(self, loop: Background, namespace: str, resync: float = 600.0):
         self.changes: list[Change] = []

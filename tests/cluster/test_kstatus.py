@@ -149,7 +149,7 @@ def test_a_task_whose_instance_is_going_says_so(processes: Processes, namespace:
         "ApplicationTask",
         "second",
         lambda raw: "is being removed" in condition(raw, "Ready").get("message", ""),
-        what="the task's status says what it waits for",
+        what="the task's status reports what it waits for",
     )
     assert (waiting["status"]["phase"], condition(waiting, "Applied")["status"]) == ("Pending", "False")
     api.patch("ApplicationInstance", NORTH, {"metadata": {"finalizers": None}})

@@ -79,7 +79,7 @@ def wait_until_told(api: Api, *sources: str) -> Object:
     (pod,) = api.wait_list(
         "Pod",
         lambda pods: [each["metadata"].get("annotations", {}).get(ANNOTATION) for each in pods] == [content],
-        what=f"the only pod is told of {sources}",
+        what=f"the only pod receives {sources}",
     )
     return pod
 
@@ -108,7 +108,7 @@ def _sources_of(sample: zenoh.Sample) -> list[str]:
 
 
 def requested(session: zenoh.Session, key: str) -> list[list[str]]:
-    """What a late joiner gets who asks on the key."""
+    """What a late joiner gets from a query on the key."""
     return [_sources_of(reply.ok) for reply in session.get(key) if reply.ok is not None]
 
 
@@ -146,7 +146,7 @@ def test_pods_of_others_are_left_alone(api: Api, manager: Process) -> None:
     api.wait_list(
         "Pod",
         lambda pods: [_was_told(each) for each in pods if each["metadata"]["name"] != "stranger"] == [True],
-        what="the application's pod is told",
+        what="the application's pod is annotated",
     )
     assert not _was_told(api.get("Pod", "stranger"))
 
@@ -195,7 +195,7 @@ def test_zenoh_may_come_late_and_go(api: Api, namespace: str, endpoint: str, man
     api.create(template())
     api.create(vehicle("car1"))
     wait_for_sources(api, "car1")
-    wait_settled(api)  # without a network everything else goes on
+    wait_settled(api)  # without a network everything else continues
     for number in (2, 3):
         with router(listen__endpoints=[endpoint]) as session:
             cars = [f"car{each}" for each in range(1, number)]
@@ -209,7 +209,7 @@ def test_zenoh_may_come_late_and_go(api: Api, namespace: str, endpoint: str, man
 
 
 class Mount:
-    """A mounted ConfigMap, brought up to date as a kubelet does it that was told: when the pod's annotation changes."""
+    """A mounted ConfigMap, updated as by a kubelet when the pod's annotation changes."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -238,7 +238,7 @@ class Mount:
             self.sync(api)
             return sources_in((self.folder / "sources.yaml").read_text())
 
-        wait_until(look, lambda found: found == [*sources], what=f"the kubelet is told, and brings {sources}")
+        wait_until(look, lambda found: found == [*sources], what=f"the kubelet syncs, and brings {sources}")
 
 
 @pytest.mark.parametrize("way", ["zenoh", "file"])

@@ -1,4 +1,4 @@
-"""Why something runs, or does not, is told by the columns of kubectl and by `application-manager explain` alone."""
+"""The columns of kubectl and `application-manager explain` show why something runs, or does not."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def emitted(name: str, **parameters: Any) -> Object:
 
 
 def columns(control_plane: ControlPlane, api: Api, what: str, name: str) -> dict[str, str]:
-    """A row of `kubectl get` by its header; a cell goes on to where the next heading stands."""
+    """A row of `kubectl get` by its header; a cell extends to the next heading."""
     header, row = control_plane.kubectl("get", what, name, "--namespace", api.namespace).splitlines()
     starts = [
         (index, header[index:].split()[0])

@@ -1,4 +1,4 @@
-"""What is wrong is said where it is wrong, with field, value and remedy, and everything else goes on unharmed."""
+"""Errors are reported in place, with field, value and remedy, and everything else continues."""
 
 from __future__ import annotations
 
@@ -45,14 +45,16 @@ def unharmed(api: Api, manager: Process) -> Iterator[None]:
 def wait_told(api: Api, kind: str, name: str, type_: str, parts: list[str]) -> Object:
     """Wait until the object's condition is False and its message has all these parts; return the condition.
 
-    What is said first may be another thing, e.g. of a task that the manager hears of before its template.
+    The first message may be a different one, e.g. for a task that arrives before its template.
     """
 
     def shows(raw: Object) -> bool:
         reported = condition(raw, type_)
         return reported.get("status") == "False" and all(part in reported["message"] for part in parts)
 
-    return condition(api.wait_for(kind, name, shows, what=f"{type_} of {kind} {name} is False and says {parts}"), type_)
+    return condition(
+        api.wait_for(kind, name, shows, what=f"{type_} of {kind} {name} is False and contains {parts}"), type_
+    )
 
 
 def changed(container: Object) -> Object:
@@ -158,7 +160,7 @@ def test_a_template_that_makes_no_sense_keeps_what_runs_until_it_does(api: Api) 
         "ApplicationTemplate",
         "bad",
         lambda raw: condition(raw, "Accepted").get("reason") == "TemplateInvalid",
-        what="the template is told",
+        what="the template's status reports it",
     )
     assert "releaseTime" not in api.get("ApplicationInstance", BAD)["status"]
     api.patch("ApplicationTemplate", "bad", {"spec": {"parameters": {"rate": None}}})

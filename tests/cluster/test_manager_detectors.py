@@ -1,4 +1,5 @@
-"""The manager runs Detectors of mode Standalone: their objects come, change and go, and the status says how it is."""
+"""The manager runs Detectors of mode Standalone: their objects are created, changed and deleted, and the status reports
+it."""
 
 from __future__ import annotations
 
@@ -71,7 +72,7 @@ def shows(api: Api, status: str, reason: str) -> Object:
 
 
 def same(wanted: Any, live: Any) -> bool:
-    """Whether the live object has all that the manifest says; it may have more."""
+    """Whether the live object has everything in the manifest; it may have more."""
     if isinstance(wanted, dict):
         return isinstance(live, dict) and all(same(value, live.get(key)) for key, value in wanted.items())
     if isinstance(wanted, list):
@@ -80,13 +81,13 @@ def same(wanted: Any, live: Any) -> bool:
 
 
 def is_made(api: Api) -> None:
-    """Wait until all objects are as the pure function says of the Detector as it is."""
+    """Wait until all objects equal those of the pure function for the current Detector."""
 
     def unlike() -> list[str]:
         wanted = detector_objects(Detector.model_validate(api.get("Detector", HOLDER)), PodDefaults("wayside:1"))
         return [each["kind"] for each in wanted if not same(each, api.find(each["kind"], NAME))]
 
-    wait_until(unlike, lambda found: not found, what="its objects are as the Detector says")
+    wait_until(unlike, lambda found: not found, what="its objects match the Detector")
 
 
 def copied(labels: dict[str, str], name: str, kind: str = "Deployment") -> Object:
@@ -166,7 +167,7 @@ def test_its_objects_come_change_and_go_with_it(api: Api, processes: Processes, 
     api.patch("Detector", HOLDER, {"spec": {"mode": None}})
     for kind in KINDS:
         api.wait_gone(kind, NAME)
-    api.wait_for("Detector", HOLDER, lambda raw: not condition(raw, "Running"), what="nothing is said of running")
+    api.wait_for("Detector", HOLDER, lambda raw: not condition(raw, "Running"), what="no condition Running")
     api.patch("Detector", HOLDER, {"spec": {"mode": "Standalone"}})
     is_made(api)
     api.delete("Detector", HOLDER)
@@ -276,7 +277,7 @@ def test_a_detector_needs_all_the_rights_that_its_role_gives_and_no_more(
         assert running.terminate() == 0
         requested = set(used(proxy.seen, namespace))
     assert requested <= granted(roles)
-    # `hold` is asked of the API server by the chart's policy; a task is read and deleted after a crash within a write.
+    # the chart's policy checks `hold` at the API server; a task is read and deleted after a crash within a write.
     seldom = {("applicationtasks", "get"), ("applicationtasks", "delete"), ("detectors", "hold")}
     assert {(resource, verb) for _, resource, verb in granted(roles) - requested} <= seldom
     assert "orbidden" not in running.output()

@@ -35,7 +35,7 @@ def bomb(name: str = "bomb", *, key: str = "${parameters.region}", **spec: Any) 
 
 
 def accepted(api: Api, name: str, status: str) -> str:
-    """What the template's status says, once its condition Accepted is so."""
+    """The message in the template's status, once its condition Accepted is so."""
     found = api.wait_for(
         "ApplicationTemplate",
         name,

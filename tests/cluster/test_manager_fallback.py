@@ -1,4 +1,4 @@
-"""What does not become ready in time, on a real control plane: it is said, and the fallback serves until then."""
+"""An application that is not ready in time, on a real control plane: reported, and replaced by the fallback."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_what_is_not_ready_in_time_says_so(api: Api, processes: Processes, names
         "ApplicationTask",
         "north",
         lambda raw: condition(raw, "Ready").get("reason") == "ReadyTimeout",
-        what="the task says that its application was not ready in time",
+        what="the task reports that its application was not ready in time",
     )
     assert f"instance {FULL} was not ready for 2s" in reported["status"]["message"]
     api.wait_for(
@@ -55,7 +55,7 @@ def test_what_is_not_ready_in_time_says_so(api: Api, processes: Processes, names
             "not ready for 2s: Deployment" in condition(raw, "Ready").get("message", "")
             and "not ready for 2s" in raw["status"].get("message", "")
         ),
-        what="the instance says so too",
+        what="the instance reports it too",
     )
     become_ready(api, FULL)
     api.wait_for(

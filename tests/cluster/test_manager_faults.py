@@ -153,7 +153,7 @@ def test_an_object_of_somebody_else_is_left_alone(api: Api, manager: Process) ->
         "ApplicationInstance",
         NORTH,
         lambda raw: condition(raw, "Applied").get("reason") == "ObjectExists",
-        what="the instance says what stands in its way",
+        what="the instance reports the obstacle",
     )
     message = condition(reported, "Applied")["message"]
     assert f"Deployment {NORTH} exists already" in message
@@ -214,7 +214,7 @@ def test_a_template_that_breaks_leaves_what_runs_as_it_was(api: Api, manager: Pr
         "ApplicationInstance",
         NORTH,
         lambda raw: condition(raw, "Applied").get("reason") == "RenderFailed",
-        what="the instance says what is wrong",
+        what="the instance reports the error",
     )
     assert "`parameters.version` does not exist" in condition(reported, "Applied")["message"]
     wait_settled(api)

@@ -82,7 +82,7 @@ def test_a_lost_holder_releases_and_a_returning_one_counts_again(
         return api.find("Deployment", NORTH)
 
     wait_until(again, bool, what="the demand counts again")
-    api.wait_for("ApplicationTask", "north", lambda raw: reason(raw) == "Accepted", what="the task is told")
+    api.wait_for("ApplicationTask", "north", lambda raw: reason(raw) == "Accepted", what="the task is accepted")
 
 
 def test_a_lease_that_is_renewed_keeps_the_demand(api: Api, manager: Process, renew: Callable[..., None]) -> None:

@@ -1,4 +1,4 @@
-"""Merged values that are too large stop the update of their one instance, which says who makes them so."""
+"""Merged values that are too large stop the update of their one instance, which names the largest contributors."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_a_union_that_is_too_large_stops_its_own_instance_and_no_other(api: Api,
     api.wait_for("ConfigMap", CONFIG, lambda raw: raw["data"]["sources"] == '["car1"]!', what="the first one runs")
     for name, count in (("large", 40), ("larger", 50)):
         api.create(task(name, region="north", sources=sources(name[-1], count)))
-    instance = api.wait_for("ApplicationInstance", NORTH, too_large, what="the instance says why it stays as it is")
+    instance = api.wait_for("ApplicationInstance", NORTH, too_large, what="the instance reports why it is unchanged")
     reported = condition(instance, "Applied")
     assert reported["reason"] == "ParametersTooLarge"
     assert "task larger gives 50" in reported["message"]
@@ -40,7 +40,7 @@ def test_a_union_that_is_too_large_stops_its_own_instance_and_no_other(api: Api,
     api.wait_for("Deployment", SOUTH, lambda _: True, what="another instance of the template is made")
     for name in ("first", "second"):  # an instance that would be too large from its beginning
         api.create(task(name, region="west", sources=sources(name[0], 40)))
-    api.wait_for("ApplicationTask", "second", too_large, what="the second one says that both are too large")
+    api.wait_for("ApplicationTask", "second", too_large, what="the second one reports that both are too large")
 
     end(api, "larger")
     expected = len(str(sources("e", 40)))

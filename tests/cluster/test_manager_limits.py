@@ -1,4 +1,4 @@
-"""Limits on a real control plane: who runs, who waits, who gives way, and what each task is told."""
+"""Limits on a real control plane: what runs, what waits, what yields, and each task's status."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def wait_instance(api: Api, name: str, holds: Callable[[Object], bool], what: st
 def wait_event(api: Api, reason: str) -> None:
     """Wait for an Event of this reason: they are posted in the background, and a manager that is killed posts none."""
     api.wait_list(
-        "Event", lambda found: reason in {each["reason"] for each in found}, what=f"an Event {reason} is told"
+        "Event", lambda found: reason in {each["reason"] for each in found}, what=f"an Event {reason} is posted"
     )
 
 
@@ -122,7 +122,7 @@ def test_nothing_is_preempted_before_its_minimum_uptime(api: Api, processes: Pro
     uid = api.get("ApplicationInstance", LOW)["metadata"]["uid"]
     end(api, "low")  # nor is it released
     released = api.wait_for(
-        "ApplicationInstance", LOW, lambda raw: "releaseTime" in raw["status"], what="it says when it goes"
+        "ApplicationInstance", LOW, lambda raw: "releaseTime" in raw["status"], what="it has a release time"
     )
     assert released["metadata"]["uid"] == uid
     wait_settled(api)
@@ -146,12 +146,12 @@ def raise_quota(api: Api, hard: dict[str, str]) -> None:
 
 
 def beyond_the_quota(api: Api, name: str) -> Object:
-    """The task of this name, once it says what keeps it back."""
+    """The task of this name, once it reports what it waits for."""
     return api.wait_for(
         "ApplicationTask",
         name,
         lambda raw: "exceeded quota: few" in raw.get("status", {}).get("message", ""),
-        what="the task says that the quota is exceeded",
+        what="the task reports that the quota is exceeded",
     )
 
 
@@ -209,14 +209,14 @@ def test_pods_beyond_the_quota_are_told_to_the_tasks(api: Api, processes: Proces
         "ApplicationTask",
         "low",
         lambda raw: condition(raw, "Ready").get("reason") == "QuotaExceeded",
-        what="the task's Ready says that pods are beyond the quota",
+        what="the task's Ready reports that pods are beyond the quota",
     )
     assert "pods are refused: forbidden: exceeded quota: few" in reported["status"]["message"]
     wait_instance(
         api,
         LOW,
         lambda raw: condition(raw, "Ready").get("reason") == "QuotaExceeded",
-        "says that of its pods too",
+        "reports the same of its pods",
     )
 
 
@@ -237,7 +237,7 @@ def test_what_a_limit_range_refuses_is_told_as_well(api: Api, processes: Process
         "ApplicationInstance",
         LOW,
         lambda raw: condition(raw, "Applied").get("reason") == "AdmissionRefused",
-        what="the instance says that the claim is not admitted",
+        what="the instance reports that the claim is not admitted",
     )
     assert "maximum storage usage per PersistentVolumeClaim is 1Gi" in reported["status"]["message"]
     api.patch("LimitRange", "small", {"spec": {"limits": [{**most, "max": {"storage": "2Gi"}}]}})
@@ -276,7 +276,7 @@ def test_pods_that_only_events_tell_are_refused_are_said_and_made_once_there_is_
         api,
         LOW,
         lambda raw: condition(raw, "Ready").get("reason") == "QuotaExceeded",
-        "says that of its pods too",
+        "reports the same of its pods",
     )
     ready = condition(logged, "Ready")
     assert ready["status"] == "False"
@@ -287,7 +287,7 @@ def test_pods_that_only_events_tell_are_refused_are_said_and_made_once_there_is_
         "ApplicationInstance",
         LOW,
         lambda raw: condition(raw, "Ready")["reason"] != "QuotaExceeded",
-        what="it is not said any more",
+        what="it is not reported any more",
     )
     assert api.list("Pod") != []
 

@@ -93,7 +93,7 @@ def test_near_its_limit_it_serves_whom_it_served_and_tells_the_others_so(
         "ApplicationTask",
         "south",
         lambda raw: condition(raw, "Accepted").get("reason") == "ManagerOverloaded",
-        what="it is not taken in, and says so",
+        what="it is not admitted, and reports it",
     )
     assert waiting["status"]["phase"] == "Waiting"
     assert "memory limit" in condition(waiting, "Accepted")["message"]

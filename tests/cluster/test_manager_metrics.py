@@ -1,4 +1,4 @@
-"""A running manager tells of itself over HTTP: what there is, how long things took, and whether it is ready."""
+"""A running manager reports over HTTP: the objects, durations, and whether it is ready."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_what_becomes_of_tasks_is_counted_and_timed_from_their_events(
             and found["event_to_ready_seconds_count",] == 1
             and found["resync_time_seconds",] > 0
         ),
-        what="the metrics say what there is",
+        what="the metrics count the objects",
     )
     assert found["event_to_applied_seconds_count",] == 1
     assert found["event_to_applied_seconds_bucket", "300.0"] == 0

@@ -227,7 +227,7 @@ def test_what_an_autoscaler_owns_is_paused_and_goes_on_where_it_was(api: Api, ma
             ],
         },
     }
-    api.create(template(manifests=[deployment(), autoscaler]))  # its Deployment says 1: the autoscaler's word counts
+    api.create(template(manifests=[deployment(), autoscaler]))  # its Deployment has 1: the autoscaler's value counts
     api.create(task("north"))
     wait_replicas(api, NORTH, 3)
     wait_settled(api)
@@ -262,7 +262,7 @@ def test_a_baseline_runs_without_tasks_and_comes_back(api: Api, manager: Process
     wait_rate(api, "app", 1)
     before = api.get("ApplicationInstance", "app")["metadata"]["uid"]
     api.delete("ApplicationInstance", "app")
-    api.wait_for("ApplicationInstance", "app", lambda raw: raw["metadata"]["uid"] != before, what="it is made anew")
+    api.wait_for("ApplicationInstance", "app", lambda raw: raw["metadata"]["uid"] != before, what="it is recreated")
     wait_rate(api, "app", 1)
     wait_settled(api)
     api.patch("ApplicationTemplate", "app", {"spec": {"baseline": None}})

@@ -34,7 +34,7 @@ def test_a_task_becomes_a_deployment_that_is_ready_when_its_pods_are(api: Api, m
         "ApplicationInstance",
         NORTH,
         lambda raw: "has 0 of 1 pods available" in condition(raw, "Ready").get("message", ""),
-        what="the instance says what it waits for",
+        what="the instance reports what it waits for",
     )
 
     wait_until(lambda: mark_pods_ready(api), bool, what="the pod exists")

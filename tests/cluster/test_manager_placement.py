@@ -54,7 +54,7 @@ def node(api: Api, name: str, site: str, taints: list[Object]) -> None:
 
 
 def placed(**pod: object) -> Object:
-    """A template whose pods go where the parameters say."""
+    """A template whose parameters place its pods."""
     made = deployment()
     made["spec"]["template"]["spec"] |= {"schedulerName": SCHEDULER, **pod}
     parameters = {
@@ -82,7 +82,7 @@ def wait_told(api: Api, name: str, *parts: str) -> Object:
             condition(raw, "Ready").get("reason") == "Unschedulable"
             and all(part in raw["status"].get("message", "") for part in parts)
         ),
-        what=f"{name} says {parts}",
+        what=f"{name} reports {parts}",
     )
 
 
@@ -102,7 +102,7 @@ def test_the_node_that_a_task_names_gets_the_application_and_one_that_is_not_the
         "ApplicationInstance",
         instance_name("app", "west"),
         lambda raw: condition(raw, "Ready").get("reason") == "Unschedulable",
-        what="the instance says so too",
+        what="the instance reports it too",
     )
     api.patch("ApplicationTask", "west", {"spec": {"parameters": {"node": nodes[0]}}})
     wait_bound(api, "west", nodes[0])

@@ -1,4 +1,4 @@
-"""The manager lives on exactly the rights that `application-manager rbac` prints, and says which one it lacks."""
+"""The manager lives on exactly the rights that `application-manager rbac` prints, and reports a missing one."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def each_verb_is_missed(api: Api, whole: list[Object], lacks: Callable[[], list[
 
 
 def used(seen: list[Seen], namespace: str) -> Iterator[Verb]:
-    """What the requests of a manager asked for, in RBAC's words."""
+    """The rights that a manager's requests needed, in RBAC's terms."""
     for each in seen:
         parts = urlsplit(each.path)
         found = re.fullmatch(
@@ -179,7 +179,7 @@ def test_a_whole_life_needs_all_that_is_printed_and_nothing_more(
         wait_until(
             lambda: [each["metadata"].get("annotations", {}) for each in api.list("Pod")],
             lambda found: any("wayside.dev/configuration" in each for each in found),
-            what="a pod is told of its configuration",
+            what="a pod has its configuration",
         )
         api.patch("ApplicationTemplate", "app", {"spec": {"manifests": [mounted()]}})
         api.wait_gone("ConfigMap", f"{NORTH}-config")
@@ -195,7 +195,7 @@ def test_a_whole_life_needs_all_that_is_printed_and_nothing_more(
         wait_until(
             lambda: set(used(proxy.seen, namespace)),
             lambda found: {("events.k8s.io", "events", each) for each in ("create", "patch")} <= found,
-            what="what happened is told",
+            what="Events are posted",
         )
         assert manager.terminate() == 0
     assert "orbidden" not in manager.output()
@@ -253,7 +253,7 @@ def test_where_it_looks_after_all_namespaces_it_writes_in_those_that_are_granted
 
 
 def what_it_cannot_do(here: Api, elsewhere: Api, role: Object) -> None:
-    """Whoever has the manager's account cannot do these.
+    """The manager's account cannot do these.
 
     Args:
         here: with the account, for a namespace that is granted.
@@ -348,7 +348,7 @@ def test_what_only_some_need_is_said_at_the_start_and_where_it_shows(
         "ApplicationInstance",
         NORTH,
         lambda raw: condition(raw, "Applied").get("reason") == "ApplyRefused",
-        what="the instance says what lacks",
+        what="the instance reports the missing right",
     )
     message = condition(reported, "Applied")["message"]
     assert 'cannot patch resource "configmaps"' in message

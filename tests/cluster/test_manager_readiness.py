@@ -1,4 +1,4 @@
-"""Ready means that the workload does its work; what keeps its pods from running is said of the task in words.
+"""Ready means that the workload does its work; the task reports what keeps its pods from running.
 
 There is no kubelet here: the test writes what one writes into the status of a pod.
 """
@@ -19,9 +19,7 @@ PODS = f"wayside.dev/instance={NORTH}"
 
 
 def its_pod(api: Api) -> str:
-    (found,) = api.wait_list(
-        "Pod", lambda found: len(found) == 1, labels=PODS, what="the pod bears the instance's label"
-    )
+    (found,) = api.wait_list("Pod", lambda found: len(found) == 1, labels=PODS, what="the pod has the instance's label")
     return str(found["metadata"]["name"])
 
 
@@ -43,7 +41,7 @@ def wait_ready_says(api: Api, kind: str, name: str, *, status: str = "False", re
         found = condition(raw, "Ready")
         return (found.get("status"), found.get("reason")) == (status, reason) and text in found["message"]
 
-    api.wait_for(kind, name, holds, what=f"Ready={status} of {kind} {name}, reason {reason}, says {text!r}")
+    api.wait_for(kind, name, holds, what=f"Ready={status} of {kind} {name}, reason {reason}, contains {text!r}")
 
 
 def test_why_its_pods_do_not_run_is_said_of_task_and_instance_until_they_do(api: Api, manager: Process) -> None:
@@ -135,7 +133,7 @@ def test_other_kinds_are_judged_by_what_they_say(api: Api, manager: Process) -> 
                 condition(raw, "Ready").get("status") == status
                 and all(each in condition(raw, "Ready")["message"] for each in texts)
             ),
-            what=f"Ready={status} says {texts}",
+            what=f"Ready={status} contains {texts}",
         )
 
     lacks_address = f"Service {NORTH}-out has no address"

@@ -1,4 +1,4 @@
-"""How much the manager asks of the API server: counted by a proxy between the two."""
+"""The number of the manager's requests to the API server, counted by a proxy between the two."""
 
 from __future__ import annotations
 

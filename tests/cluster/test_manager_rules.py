@@ -1,4 +1,4 @@
-"""EventRules and Detectors are told in their status whether they can be evaluated."""
+"""The status of EventRules and Detectors reports whether they can be evaluated."""
 
 from __future__ import annotations
 

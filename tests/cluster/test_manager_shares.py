@@ -1,6 +1,6 @@
 """Namespaces take turns: whatever waits in one, the others' tasks are applied, and have their statuses, in between.
 
-Versions tell the order of writes: they grow over all objects of the cluster. Everything is there before the manager
+Versions give the order of writes: they grow over all objects of the cluster. Everything is there before the manager
 starts, so it is all enqueued at once, that of the small namespace last.
 """
 

@@ -96,13 +96,14 @@ def stopped(pair: Pair) -> None:
     """Stop the active one while its requests are under way and it waits for answers.
 
     Between its last look at whether it may still write and the system call that writes, nothing can hold it back (it is
-    said in application_manager/cluster/fence.py): a stop within these microseconds would show nothing but that.
+    described in application_manager/cluster/fence.py): a stop within these microseconds would show nothing but that.
     """
     wait_until(lambda: stopped_in(pair.active.pid), lambda call: call in WAITING, what="it is stopped while it waits")
 
 
 def stopped_in(pid: int) -> str:
-    """Stop the process: the number of the system call that it is in, or -1. In no waiting one, it goes on for now."""
+    """Stop the process: the number of the system call that it is in, or -1. If it is not waiting, it continues for
+    now."""
     os.kill(pid, signal.SIGSTOP)
     status = Path(f"/proc/{pid}/status")
     wait_until(status.read_text, lambda text: "State:\tT" in text, what="the process is stopped")

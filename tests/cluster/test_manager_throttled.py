@@ -87,5 +87,5 @@ def test_an_api_server_that_refuses_everything_for_a_while_is_waited_for(
 
 
 def watches(seen: Seen) -> bool:
-    """Whether the request is kopf's: a watch, or the list before it, which it begins anew when it likes."""
+    """Whether the request is kopf's: a watch, or the list before it, which it restarts at any time."""
     return "watch=true" in seen.path or "/namespaces/" not in seen.path

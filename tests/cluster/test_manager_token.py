@@ -32,7 +32,7 @@ def test_a_token_that_is_not_taken_any_more_is_replaced_by_the_files_new_one(
     api.create({**role, "kind": "RoleBinding", "subjects": subjects, "roleRef": reference})
 
     def bound(secret: str) -> str:
-        """A token that is taken for as long as the Secret exists."""
+        """A token that is valid as long as the Secret exists."""
         made = api.create({"apiVersion": "v1", "kind": "Secret", "metadata": {"name": secret}})
         to = {"apiVersion": "v1", "kind": "Secret", "name": secret, "uid": made["metadata"]["uid"]}
         request = {"apiVersion": "authentication.k8s.io/v1", "kind": "TokenRequest", "spec": {"boundObjectRef": to}}

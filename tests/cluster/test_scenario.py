@@ -1,6 +1,6 @@
 """The whole chain live: vehicles on real Zenoh, both programs as processes, a real API server.
 
-What exists over time is compared with what the simulated positions alone give should exist
+The objects over time are compared with those computed from the simulated positions
 (`cooperative_recording.expected`, which shares no code with either program).
 """
 
@@ -34,7 +34,7 @@ from cooperative_recording.vehicles import simulate  # noqa: E402
 SEED, DURATION = 3528, 25.0
 EVALUATION = 0.5  # s, of the example's rule
 REACTION = 2.0  # s from the evaluation to a Deployment that is there, or gone
-REQUESTS = 10  # how often the API server is asked on the way
+REQUESTS = 10  # the period of queries to the API server
 LOOKING = 0.1  # s between two looks of the observer
 SAMPLING = 0.2  # s: a pose is up to 0.1 s old, and so is what the observer saw
 
@@ -90,7 +90,7 @@ def apply_example(api: Api, namespace: str, endpoint: str) -> None:
 
 
 def drive(endpoint: str, *more: str) -> str:
-    """Let the vehicles drive; what they say in the end."""
+    """Let the vehicles drive; returns their output."""
     command = [sys.executable, str(EXAMPLE / "drive.py"), "--connect", endpoint, "--wait", f"{PATIENCE:g}"]
     command += ["--seed", str(SEED), "--duration", str(DURATION), *more]
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, timeout=DURATION + 2 * PATIENCE)
@@ -168,12 +168,12 @@ class Moments:
 
 
 def assert_recorders(seen: Moments, spans: dict[tuple[str, str], list[Any]]) -> None:
-    """A recorder exists when its pair's span says so, give or take what is allowed, and at no other time."""
+    """A recorder exists during its pair's span, within the tolerance, and at no other time."""
     assert len(seen.seen) > DURATION, "the observer must have looked often enough to prove anything"
     assert {pair for _, moment in seen for pair in moment.pairs} == spans.keys()
     allowed = seen.allowed
     for at, moment in seen:
-        until = at + moment.took_s  # when within this time it was so, a look does not say
+        until = at + moment.took_s  # a look does not show when within this time it was so
         for pair, its in spans.items():
             exists = pair in moment.pairs
             must = any(span.start_s + allowed <= at and until <= (span.end_s or DURATION) - SAMPLING for span in its)

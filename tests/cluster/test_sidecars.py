@@ -47,7 +47,7 @@ def webhook(api: Api, processes: Processes, tmp_path: Path, accounts: None) -> W
 
 @pytest.fixture
 def requested(webhook: Webhook, api: Api) -> Iterator[Webhook]:
-    """The API server asks about pods; a Detector is there for the account `vehicle`."""
+    """The API server calls the webhook for pods; a Detector exists for the account `vehicle`."""
     api.create(sidecar_detector("vehicle"))
     with webhook.requested():
         wait_injecting(api)
@@ -57,7 +57,7 @@ def requested(webhook: Webhook, api: Api) -> Iterator[Webhook]:
 def injected(
     control_plane: ControlPlane, namespace: str, *files: Path, given: str | None = None
 ) -> tuple[int, str, str]:
-    """What `application-manager inject` says: the exit code, stdout and stderr."""
+    """The result of `application-manager inject`: the exit code, stdout and stderr."""
     done = subprocess.run(
         [
             str(BIN / "application-manager"),
@@ -129,7 +129,7 @@ def test_a_second_webhook_that_is_asked_about_the_same_pod_adds_nothing(
                 assert (len(set(names)), len(sidecars(made))) == (len(names), min(len(sidecars(made)), 1))
                 return asked_about_pods(metrics) - before if sidecars(made) else 0
 
-            wait_until(asked_how_often, lambda found: found == 2, what="it is asked twice, and the pod has it once")
+            wait_until(asked_how_often, lambda found: found == 2, what="it is called twice, and the pod has it once")
         finally:
             api.delete("MutatingWebhookConfiguration", other["metadata"]["name"])
 

@@ -89,7 +89,7 @@ def test_a_trace_runs_from_the_event_to_the_readiness(
     plain = replayed(intake, tmp_path / "off", off)
     assert "traceparent" not in plain
     assert plain == live.replace(f'"traceparent":"{episode.traceparent}",', "")
-    assert len(receiver.spans()) == len(spans), "a replay tells no spans"
+    assert len(receiver.spans()) == len(spans), "a replay exports no spans"
 
 
 @pytest.mark.usefixtures("kubelet")
@@ -106,7 +106,7 @@ def test_an_episode_that_is_taken_up_again_ends_the_same_span(chain: Chain, rece
         episode = wait_spans(receiver, "episode close")["episode close"]
     assert (episode.trace, episode.id) == (created.trace, created.parent)
     assert {each["traceparent"] for each in chain.events(*CARS)} == {episode.traceparent}
-    wait_spans(receiver, "episode close", "create task record", "ready")  # nothing is told twice
+    wait_spans(receiver, "episode close", "create task record", "ready")  # nothing is exported twice
 
 
 @pytest.mark.usefixtures("kubelet")
@@ -166,7 +166,7 @@ def test_a_refusal_and_what_never_became_ready_are_failures_of_their_traces(
 
 
 def counted(port: int, name: str, cause: str) -> float:
-    """The counter `name` for the cause, as /metrics tells it."""
+    """The counter `name` for the cause in /metrics."""
     with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=60) as answer:
         families = text_string_to_metric_families(answer.read().decode())
     samples = [sample for family in families for sample in family.samples if sample.name == name]

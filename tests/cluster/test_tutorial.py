@@ -19,4 +19,4 @@ def test_the_tutorial_shows_what_a_run_prints(control_plane: ControlPlane, api: 
         printed = play(stage)
     assert len(printed) == len(shown)
     for step, (expected, found) in enumerate(zip(shown, printed, strict=True)):
-        assert found == expected, f"step {step}: write it anew with examples/cooperative-recording/tutorial.py --write"
+        assert found == expected, f"step {step}: rewrite it with examples/cooperative-recording/tutorial.py --write"

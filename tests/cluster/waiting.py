@@ -10,7 +10,7 @@ from typing import TypeVar
 State = TypeVar("State")
 
 PATIENCE = 120.0
-"""Seconds for what a test waits for but says nothing about the speed of. A test that passes does not wait for them, and
+"""Seconds for conditions whose speed a test does not check. A test that passes does not wait for them, and
 a machine that is many times slower than usual still passes."""
 
 INTERVAL = 0.05  # s between two looks: short beside what is waited for, long beside one request
@@ -25,15 +25,15 @@ def wait_until(
     transient: tuple[type[Exception], ...] = (),
     diagnose: Callable[[], str] | None = None,
 ) -> State:
-    """Read the state again and again until `holds` says yes; return that state.
+    """Read the state repeatedly until `holds` is true; return that state.
 
     Args:
         read: returns the present state.
         holds: whether the wait is over.
         timeout: seconds.
-        what: what is waited for, as the message should say it ("the Deployment is available").
+        what: the awaited condition, for the message ("the Deployment is available").
         transient: errors of `read` that mean "not yet", e.g. while the API server is away.
-        diagnose: more to say in the message, e.g. the end of a log.
+        diagnose: more text for the message, e.g. the end of a log.
 
     Raises:
         TimeoutError: with `what` and the last state or error seen.

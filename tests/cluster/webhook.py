@@ -1,4 +1,4 @@
-"""The webhook in tests: a manager with a certificate, and an API server that asks it about one namespace."""
+"""The webhook in tests: a manager with a certificate, and an API server that calls it for one namespace."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from tests.ports import free_port
 
 
 class Webhook:
-    """Started with its certificate, and not asked yet.
+    """Started with its certificate, and not called yet.
 
     Attributes:
         port: of the manager.
@@ -52,8 +52,8 @@ class Webhook:
             processes: start the manager.
             api: for the namespace.
             folder: for the certificates.
-            patience: seconds that the API server waits; by default so long that a slow machine is no test's fault.
-            options: more of the manager; with --detector-image the API server also asks about pods.
+            patience: seconds that the API server waits; by default enough for a slow machine.
+            options: more of the manager; with --detector-image the API server also calls it for pods.
             kubeconfig: the manager's account; by default the administrator's.
         """
         self._patience = patience
@@ -91,7 +91,7 @@ class Webhook:
 
     def wait_answering(self) -> None:
         """Wait until what is wrong is refused."""
-        wait_until(self._refuses, bool, what="the API server asks, and the manager refuses")
+        wait_until(self._refuses, bool, what="the API server calls the webhook, and the manager rejects")
 
     def wait_unasked(self) -> None:
         """Wait until what is wrong is stored."""

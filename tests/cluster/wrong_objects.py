@@ -1,4 +1,4 @@
-"""What the API server must refuse: wrong objects and forbidden changes of each kind, and what it says of them."""
+"""What the API server must reject: wrong objects and forbidden changes of each kind, with its messages."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ STREAM = "spec.streams.0"
 PARAMETER = "spec.parameters.rateHz"
 
 WRONG: list[tuple[str, str, Changes, str]] = [
-    # kind, what is wrong, how it becomes so, what the message says
+    # kind, error, the change that causes it, a part of the message
     (
         "EventRule",
         "two scopes",

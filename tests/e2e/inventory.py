@@ -9,7 +9,7 @@ Found = tuple[str, str, str]  # kind, namespace, name
 
 _TEMPLATE = '{range .items[*]}{.kind}{" "}{.metadata.namespace}{"/"}{.metadata.name}{"\\n"}{end}'
 _NOT_COUNTED = {"APIService", "Event"}
-"""What the API server makes and removes by itself for each group of CRDs; what tells of the past, and lapses."""
+"""What the API server makes and removes by itself for each group of CRDs; records of the past, which expire."""
 
 
 def inventory(node: Node) -> set[Found]:

@@ -57,7 +57,7 @@ SYSTEM_PATH = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
 
 
 class ProgramsUnavailableError(Exception):
-    """A program of the node is missing and cannot be had; the message says what to do."""
+    """A program of the node is missing and unavailable; the message gives the remedy."""
 
 
 @dataclass(frozen=True)

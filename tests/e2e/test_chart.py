@@ -105,9 +105,7 @@ def test_the_example_from_nothing_by_mutual_tls_through_an_upgrade_until_nothing
         (recorder,) = wait_pods(api, "scene-recorder", ready, "the recorder of the two runs")
         (fusion,) = wait_pods(api, "scene-fusion", ready, "the fusion of their scene runs")
         assert f"--key=vehicles/{first}/** --key=vehicles/{second}/** --output=/recording" in logged(node, recorder)
-        reported = wait_until(
-            lambda: logged(node, fusion), lambda text: first in text, what="it is told its configuration"
-        )
+        reported = wait_until(lambda: logged(node, fusion), lambda text: first in text, what="it has its configuration")
         assert reported.count(first) == 1, "once"
 
         running = lives([*applications(api, "scene-recorder"), *applications(api, "scene-fusion")])

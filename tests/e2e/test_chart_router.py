@@ -51,7 +51,7 @@ def test_a_vehicle_with_a_certificate_has_an_application_run_and_others_do_not_g
             car.put("vehicles/car1/speed", b'{"value": 40}')
             return any(task.get("status", {}).get("phase") == "Ready" for task in api.list("ApplicationTask"))
 
-        wait_until(is_ready, bool, timeout=PATIENCE, what="the application that the vehicle's speed asks for is ready")
+        wait_until(is_ready, bool, timeout=PATIENCE, what="the application demanded by the vehicle's speed is ready")
         assert api.find("Deployment", "watch") is not None
         requested = [task["spec"]["requester"]["subjects"] for task in api.list("ApplicationTask")]
         assert {name for subjects in requested for name in subjects} == {"car1"}
@@ -76,7 +76,7 @@ def test_a_vehicle_with_a_certificate_has_an_application_run_and_others_do_not_g
             wait_until(
                 lambda: log_of(api, ROUTER),
                 lambda log, reported=reported: reported in log,
-                what=f"the log says: {reported}",
+                what=f"the log contains: {reported}",
             )
 
 

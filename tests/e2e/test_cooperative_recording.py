@@ -22,15 +22,15 @@ REPORT = """
 import pathlib, sys, time
 print("#", *sys.argv[1:], flush=True)
 paths = [pathlib.Path(a.split("=", 1)[1]) for a in sys.argv if a.startswith("--configuration=")]
-told = None
+last = None
 while True:
     text = "".join(path.read_text() for path in paths)
-    if text != told:
+    if text != last:
         print("---", text, sep="\\n", flush=True)
-        told = text
+        last = text
     time.sleep(0.1)
 """
-"""What each application does: it says how it was started, and its configuration whenever that is another."""
+"""What each application does: it prints how it was started, and its configuration at each change."""
 
 
 def applications(api: Api, name: str) -> Objects:
@@ -64,7 +64,7 @@ def test_applications_really_run_while_vehicles_are_close_follow_who_joins_and_a
             return wait_until(lambda: node.plane.kubectl(*log), bool, what=f"pod {pod} has written")
 
         def configurations() -> list[list[str]]:
-            """The sources that the fusion has been told, one after the other."""
+            """The sources that the fusion received, one after the other."""
             documents = yaml.safe_load_all(logged(fusion["metadata"]["name"]))
             return [yaml.safe_load(str(each["sources"])) for each in documents if each]
 
@@ -75,7 +75,7 @@ def test_applications_really_run_while_vehicles_are_close_follow_who_joins_and_a
             configurations,
             bool,
             timeout=PATIENCE,
-            what="the fusion is told",
+            what="the fusion receives them",
             transient=(yaml.YAMLError, TypeError, KeyError),
         )
         assert written == [sorted([first, second])]
@@ -93,7 +93,7 @@ def test_applications_really_run_while_vehicles_are_close_follow_who_joins_and_a
             configurations,
             lambda found: found[-1] == everybody,
             timeout=PATIENCE,
-            what="the fusion is told of all",
+            what="the fusion receives all",
             transient=(yaml.YAMLError, TypeError, KeyError),
         )
         (same,) = applications(api, "scene-fusion")

@@ -21,7 +21,7 @@ import http.server, json, ssl
 class Handler(http.server.BaseHTTPRequestHandler):
     def do_POST(self):
         review = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
-        status = {"message": "the pod says no"}
+        status = {"message": "the pod refuses"}
         answer = {"uid": review["request"]["uid"], "allowed": False, "status": status}
         self.send_response(200)
         self.send_header("Content-Type", "application/json")
@@ -101,7 +101,7 @@ def test_the_api_server_reaches_a_webhook_on_a_pod(node: Node, api: Api, image: 
         "name": "hook.wayside.test",
         "rules": [{"apiGroups": [""], "apiVersions": ["v1"], "operations": ["CREATE"], "resources": ["configmaps"]}],
         "namespaceSelector": {"matchLabels": {"kubernetes.io/metadata.name": api.namespace}},
-        "matchConditions": [{"name": "asked", "expression": "object.metadata.name == 'asked'"}],
+        "matchConditions": [{"name": "requested", "expression": "object.metadata.name == 'requested'"}],
         "clientConfig": {"service": {"namespace": api.namespace, "name": "hook"}, "caBundle": authority_bundle},
         "admissionReviewVersions": ["v1"],
         "sideEffects": "None",
@@ -118,15 +118,15 @@ def test_the_api_server_reaches_a_webhook_on_a_pod(node: Node, api: Api, image: 
     try:
 
         def refusal() -> str:
-            requested = {"apiVersion": "v1", "kind": "ConfigMap", "metadata": {"name": "asked"}}
+            requested = {"apiVersion": "v1", "kind": "ConfigMap", "metadata": {"name": "requested"}}
             try:
                 api.create(requested)
             except ApiError as error:
                 return error.message
-            api.delete("ConfigMap", "asked")  # the API server has not read the webhook's configuration yet
+            api.delete("ConfigMap", "requested")  # the API server has not read the webhook's configuration yet
             return ""
 
-        output = wait_until(refusal, lambda output: "the pod says no" in output, what="the webhook is asked")
+        output = wait_until(refusal, lambda output: "the pod refuses" in output, what="the webhook is called")
         assert "hook.wayside.test" in output
     finally:
         api.delete(kind, api.namespace)

@@ -1,4 +1,4 @@
-"""What a node, its programs or the API server go through: afterwards everything is as the live demands say."""
+"""What a node, its programs or the API server go through: afterwards everything matches the live demands."""
 
 from __future__ import annotations
 
@@ -114,6 +114,6 @@ def test_without_the_api_server_applications_go_on_and_what_was_seen_is_told_aft
         assert parse_time(town.wait_task(BUSES)["spec"]["event"]["startTime"]) < back
         (ended,) = [task for task in api.list("ApplicationTask") if task["spec"]["event"]["subject"] == "+".join(VANS)]
         assert parse_time(ended["spec"]["endTime"]) < back
-        assert not town.pods(TRAMS), "an episode that nobody could be told of in time asks for nothing afterwards"
+        assert not town.pods(TRAMS), "an episode that could not be reported in time demands nothing afterwards"
         assert heard.kinds(CARS) == ["started"]
         assert [restarts_of(program) for program in town.programs()] == [0, 0]

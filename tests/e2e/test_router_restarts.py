@@ -44,11 +44,11 @@ ADVANCED_STREAM = {"name": "heading", "key": "vehicles/${client:*}/heading", "en
 POSE_STREAM = {"name": "pose", "key": "vehicles/${client:*}/pose", "encoding": "json", "staleAfter": "2s"}
 FLOAT = b"\x00\x01\x00\x00" + bytes(8)
 LOST = 20
-"""So many samples of each stream are published at least while no router is there."""
+"""Minimum number of samples of each stream that are published without a router."""
 
 
 class Numbered:
-    """A vehicle whose samples bear numbers, ten a second of each stream.
+    """A vehicle with numbered samples, ten a second of each stream.
 
     Attributes:
         sent: how many of each stream.
@@ -78,7 +78,7 @@ class Numbered:
         self._thread.start()
 
     def wait_sent(self, more: int) -> None:
-        """Wait until so many more were sent of each stream."""
+        """Wait until this number more were sent of each stream."""
         goal = self.sent + more
         wait_until(lambda: self.sent, lambda sent: sent >= goal, timeout=PATIENCE, what=f"{goal} were sent")
 
@@ -150,7 +150,7 @@ def test_detector_and_vehicles_find_a_restarted_router_and_losses_are_counted(
     streams = [each["name"] for each in (ROS_STREAM, ADVANCED_STREAM)]
 
     def flows(what: str) -> None:
-        """Wait until samples come in that are newer than what was said now."""
+        """Wait until samples arrive that are newer than the current ones."""
         before = town.metrics()
 
         def more(metrics: Mapping[str, float]) -> bool:

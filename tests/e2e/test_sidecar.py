@@ -107,7 +107,7 @@ def asking(api: Api, image: str, helm: Helm) -> None:
         lambda: api.apply(probe | {"spec": pod_spec(image, WAIT)}, dry_run=True)["spec"].get("initContainers"),
         bool,
         timeout=PATIENCE,
-        what="the API server asks about pods, and reaches who answers",
+        what="the API server calls the webhook for pods, and reaches it",
     )
 
 

@@ -65,7 +65,8 @@ class NodeTown(Town):
         return self.api.list("Pod", labels=f"pair={'-'.join(pair)}")
 
     def wait_running(self, pair: Pair, *, restarts: int = 0) -> Object:
-        """Wait until the pair's application is one pod, ready, whose container was restarted so often; return it."""
+        """Wait until the pair's application is one pod, ready, whose container was restarted this number of times;
+        return it."""
         what = f"one pod of {pair} is ready after {restarts} restarts"
 
         def holds(pods: Objects) -> bool:
@@ -83,7 +84,7 @@ class NodeTown(Town):
         return [pod for labels in (MANAGER, DETECTOR) for pod in self.api.list("Pod", labels=labels)]
 
     def wait_programs(self, *, restarts: int = 0) -> None:
-        """Wait until each program is one pod, ready, whose container was restarted so often."""
+        """Wait until each program is one pod, ready, whose container was restarted this number of times."""
 
         def holds(pods: Objects) -> bool:
             return len(pods) == 2 and all(is_ready(pod) and restarts_of(pod) == restarts for pod in pods)

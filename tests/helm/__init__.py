@@ -23,7 +23,7 @@ MODULE = GoModule("helm", Path(__file__).parent / "module", PACKAGES)
 
 
 class ToolsUnavailableError(Exception):
-    """Helm or the registry cannot be built; the message says what to do."""
+    """Helm or the registry cannot be built; the message gives the remedy."""
 
 
 @dataclass(frozen=True)

@@ -93,7 +93,7 @@ def helm(tools: Tools, home: Path, *arguments: str) -> str:
 
 @contextmanager
 def repository(tools: Tools, folder: Path, *charts: Path) -> Iterator[tuple[str, list[str]]]:
-    """A chart repository over HTTP with these charts; its URL, and what was asked of it so far."""
+    """A chart repository over HTTP with these charts; its URL, and the requests so far."""
     folder.mkdir()
     for chart in charts:
         helm(tools, folder.parent / "home", "package", str(chart), "--destination", str(folder))

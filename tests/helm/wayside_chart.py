@@ -17,7 +17,7 @@ Values = dict[str, Any]
 
 
 class HelmError(Exception):
-    """Helm refused; the text is what it said."""
+    """Helm failed; the text is its message."""
 
 
 @dataclass(frozen=True)

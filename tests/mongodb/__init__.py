@@ -32,7 +32,7 @@ SERVER = GoModule("mongodb", Path(__file__).parent / "server", {"mongodb": "."})
 
 
 class ServerUnavailableError(Exception):
-    """There is no server and none can be built; the message says what to do."""
+    """There is no server and none can be built; the message gives the remedy."""
 
 
 @dataclass(frozen=True)

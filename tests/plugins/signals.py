@@ -20,7 +20,7 @@ class CountingParameters(PluginParameters):
 
 
 class Counting(Plugin[CountingParameters]):
-    """How many evaluations the subject has had, until the newest value of the stream says to go wrong."""
+    """How many evaluations the subject has had, until the newest value of the stream requests a failure."""
 
     Parameters = CountingParameters
     count = 0
@@ -32,7 +32,7 @@ class Counting(Plugin[CountingParameters]):
             return None
         reported = newest.message["v"]
         if reported == self.parameters.raise_at:
-            raise ValueError(f"{reported:g} is not to be borne")
+            raise ValueError(f"{reported:g} is not acceptable")
         while reported == self.parameters.hang_at:
             time.sleep(0.01)
         if reported == self.parameters.exit_at:

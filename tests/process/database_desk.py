@@ -28,7 +28,7 @@ class Nobody:
         raise AssertionError("the database action publishes nothing")
 
     def query(self, *_: Any) -> list[bytes]:
-        raise AssertionError("the database action asks nobody")
+        raise AssertionError("the database action sends no queries")
 
 
 class Desk:

@@ -1,4 +1,4 @@
-"""A `detector run` process over real Zenoh, for tests: its files, a vehicle that is connected to it, what it says."""
+"""A `detector run` process over real Zenoh, for tests: its files, a vehicle that is connected to it, its output."""
 
 from __future__ import annotations
 
@@ -97,12 +97,12 @@ class Process:
         self.process.send_signal(signal.SIGHUP)
 
     def written(self) -> list[dict[str, Any]]:
-        """The events in the file. A thread of its own writes it: what was told elsewhere may not be there yet."""
+        """The events in the file. A separate thread writes it: events reported elsewhere may not be there yet."""
         whole = (self.folder / "out" / "events.jsonl").read_text().split("\n")[:-1]
         return [json.loads(line) for line in whole]
 
     def events_when(self, count: int) -> list[dict[str, Any]]:
-        """The events in the file once there are so many."""
+        """The events in the file once there is this number of them."""
         end = time.monotonic() + PATIENCE
         while len(found := self.written()) < count:
             assert time.monotonic() < end, found

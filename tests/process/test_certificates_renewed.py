@@ -1,4 +1,4 @@
-"""Certificates are renewed under a running detector: no sample is lost, none comes twice, and what fails is said."""
+"""Certificates are renewed under a running detector: no sample is lost or duplicated, and failures are reported."""
 
 from __future__ import annotations
 

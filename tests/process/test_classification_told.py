@@ -1,4 +1,4 @@
-"""The rule's classification is in all that a running detector tells of an episode."""
+"""The rule's classification is in all messages of a running detector about an episode."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_events_recordings_scenarios_tasks_and_notices_have_it(process: Process,
         actions=[
             {"name": "bag", "record": {"before": "1m"}},
             {"name": "keep", "database": {"database": name, "before": "1m"}},
-            {"name": "tell", "notify": {"zenoh": {"key": "told"}}},
+            {"name": "notify", "notify": {"zenoh": {"key": "notices"}}},
             a_deploy("start"),
         ],
     )
@@ -60,7 +60,7 @@ def test_events_recordings_scenarios_tasks_and_notices_have_it(process: Process,
     process.start()
     notices: list[dict[str, Any]] = []
     listening = process.vehicle.declare_subscriber(
-        "told", lambda sample: notices.append(json.loads(sample.payload.to_bytes()))
+        "notices", lambda sample: notices.append(json.loads(sample.payload.to_bytes()))
     )
     process.send("car1", {"v": 20})
     process.status_when(lambda status: status.rules[0].open == 1)

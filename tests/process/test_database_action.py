@@ -63,7 +63,7 @@ def test_with_renew_after_an_episode_becomes_one_scenario_after_the_other(desk: 
     keep.finish(episode)
     outcome = keep.outcome()
     assert outcome.state is OutcomeState.DONE, outcome
-    assert outcome.samples == 1000 + 5  # what was said on latched streams is in each
+    assert outcome.samples == 1000 + 5  # the latched samples are in each
     parts = {each["_id"]: each for each in database["Scenarios"].find()}
     assert [each["complete"] for each in parts.values()] == [True] * 4
     assert sorted(numbers(database, part) for part in parts) == [

@@ -1,4 +1,5 @@
-"""The database is away for a minute under load: events and recordings go on, and what it then lacks is counted."""
+"""The database is away for a minute under load: events and recordings continue, and its missing documents are
+counted."""
 
 from __future__ import annotations
 
@@ -55,7 +56,7 @@ class Detecting(Process):
         return [each["data"]["episode"] for each in self.written() if each["type"].endswith(kind)]
 
     def at_rest(self, samples: int) -> list[str]:
-        """Ids of all episodes, once so many samples were taken in, and what came of them is over and in the file."""
+        """Ids of all episodes, once this number of samples was taken in, and their results are in the file."""
         status = self.status_when(lambda status: status.streams[0].samples == samples and not status.rules[0].open)
         self.events_when(2 * status.rules[0].started)
         begun = self.episodes("started")
@@ -158,4 +159,6 @@ def test_a_minute_without_the_database_costs_neither_events_nor_recordings_and_e
     def reported() -> dict[str, float]:
         return {key[1]: value for key, value in tight.metrics().items() if key[0] == "action_missing_total"}
 
-    wait_until(lambda: reported() == {"bag": 0, "keep": missing}, PATIENCE)  # told once the database has the last of it
+    wait_until(
+        lambda: reported() == {"bag": 0, "keep": missing}, PATIENCE
+    )  # reported once the database has the last document

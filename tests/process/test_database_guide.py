@@ -1,4 +1,4 @@
-"""The rules of docs/database.md do what the text says, and what is wrong in one is said with its place."""
+"""The rules of docs/database.md work as described, and errors in one are reported with their place."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ class Drive:
         self.published.append(json.loads(payload))
 
     def query(self, *_: Any) -> list[bytes]:
-        raise AssertionError("the database action asks nobody")
+        raise AssertionError("the database action sends no queries")
 
     def take(self, samples: list[Any], until: float) -> None:
         self.engine.advance(samples, at(until))

@@ -120,7 +120,7 @@ BOUTS = (0, 20) * 5
 
 
 class Drive:
-    """Two clients that tell a process their speeds, in samples with numbers from `first` on."""
+    """Two clients that send a process their speeds, in samples with numbers from `first` on."""
 
     def __init__(self, process: Process, first: int = 0) -> None:
         self._process = process

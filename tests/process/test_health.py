@@ -1,4 +1,4 @@
-"""What a detector says of its health, of real processes in which something is made to fail."""
+"""The reported health of real detector processes in which something fails."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The intake: one order for all streams, whoever puts, and never a wait."""
+"""The intake: one order for all streams and producers, and never a wait."""
 
 from __future__ import annotations
 

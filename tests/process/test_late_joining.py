@@ -1,4 +1,4 @@
-"""What Advanced Publishers remember is asked for, what was lost on the way is asked for again, and counted."""
+"""The history of Advanced Publishers is requested, and lost samples are requested again, and counted."""
 
 import re
 import time
@@ -19,7 +19,7 @@ from wayside.api.zenoh import Zenoh, ZenohMode
 KEY = "vehicles/car1/pose"
 
 LOSSY = [{"messages": ["put"], "flows": ["egress"], "rules": [{"key_expr": "vehicles/**", "freq": 4.0}]}]
-"""The router lets only so many samples a second pass."""
+"""The router forwards only this number of samples a second."""
 
 
 def network(endpoint: str, arrivals: Arrivals, tally: Tally, streams: list[Stream]) -> Network:

@@ -172,5 +172,5 @@ def test_a_client_sees_live_what_the_results_of_the_replay_have(watched: Watched
 
 
 def plain(message: dict[str, Any]) -> dict[str, Any]:
-    """Without the reasons: these say how old something is."""
+    """Without the reasons: these contain ages."""
     return {name: value for name, value in message.items() if not name.endswith("_reason")}

@@ -1,4 +1,4 @@
-"""The manager's connection to Zenoh when its certificate is renewed: it connects anew with the new files."""
+"""The manager's connection to Zenoh when its certificate is renewed: it reconnects with the new files."""
 
 from __future__ import annotations
 

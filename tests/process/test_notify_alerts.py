@@ -30,7 +30,7 @@ def notify(there: Endpoint, repeat: str = "1h", **fields: Any) -> dict[str, Any]
 
 
 def posted(there: Endpoint, count: int = 1) -> list[dict[str, Any]]:
-    """The alerts of so many requests."""
+    """The alerts of this number of requests."""
     return [alert for request in there.received(count) for alert in json.loads(request.body)]
 
 

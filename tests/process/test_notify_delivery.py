@@ -113,7 +113,7 @@ def test_what_is_refused_is_a_dead_letter_at_once(there: Endpoint, tmp_path: Pat
     first, second = letters(tmp_path)
     assert (first["event"]["id"], second["event"]["id"]) == ("e1.started", "e1.ended")
     assert first["texts"] == {"text": "car1 brakes"}
-    assert (first["rule"], first["action"], first["attempts"]) == ("braking", "tell", 1)
+    assert (first["rule"], first["action"], first["attempts"]) == ("braking", "notify", 1)
     desk.end()
 
 
@@ -136,7 +136,7 @@ def test_a_message_that_the_endpoint_cannot_take_holds_up_no_other_episode(there
     desk = a_desk({"http": http(there)})
     desk.run(an_episode("e1"), an_episode("e2"))
     desk.outcome("e2")
-    assert "e1.ended" not in ids(there.requests), "the end is not told before the start"
+    assert "e1.ended" not in ids(there.requests), "the end is not sent before the start"
     desk.end()
 
 

@@ -23,7 +23,7 @@ from tests.notifying import a_desk, an_episode
 desk = a_desk({"http": {"url": sys.argv[1], "timeout": "2m"}, "text": "x"}, state=Path(sys.argv[2]))
 for number in range(20):
     desk.run(an_episode(f"e{number}", rendered={"text": f"number {number}"}))
-print("told", flush=True)
+print("accepted", flush=True)
 sys.stdin.read()
 """
 
@@ -34,7 +34,7 @@ def test_what_was_told_before_a_kill_is_delivered_after_it_each_event_once(tmp_p
             [sys.executable, "-c", _KILLED, there.url, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
         )
         assert process.stdout is not None
-        assert process.stdout.readline() == b"told\n"
+        assert process.stdout.readline() == b"accepted\n"
         there.received(1)
         os.kill(process.pid, signal.SIGKILL)
         process.communicate()

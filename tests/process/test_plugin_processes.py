@@ -1,4 +1,4 @@
-"""Plugins in processes of their own: the same values, and one that hangs or dies is stopped while the others go on."""
+"""Plugins in separate processes: the same values, and one that hangs or dies is stopped while others continue."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_in_a_process_the_events_are_those_of_the_own_process(host: ProcessHost)
 
 
 def stuck(host: ProcessHost, **parameters: Any) -> PluginDrive:
-    """A drive in which the plugin of rule r goes wrong at 2.5 s; rule z goes on."""
+    """A drive in which the plugin of rule r goes wrong at 2.5 s; rule z continues."""
     rules = plugin_rule("r", parameters=parameters), plugin_rule("z", when="p.count >= 5")
     drive = PluginDrive(a_detector(), *rules, host=host)
     for seconds, value in ((0.5, 1), (2.4, 7), (3.5, 1)):

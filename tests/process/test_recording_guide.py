@@ -1,4 +1,4 @@
-"""The examples in docs/recording.md do what the text says, in a running detector."""
+"""The examples in docs/recording.md work as described, in a running detector."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def process(tmp_path: Path) -> Iterator[Process]:
 
 
 def named(folder: Path, rule: str, count: int) -> list[Path]:
-    """The recordings of a rule, once there are so many."""
+    """The recordings of a rule, once there is this number of them."""
     end = time.monotonic() + PATIENCE
     while time.monotonic() < end:
         found = [each for each in folder.glob(f"recordings/{rule}/*") if not each.name.startswith(".")]

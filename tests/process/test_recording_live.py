@@ -52,7 +52,7 @@ TURNS = {100: (0, 0), 150: (1, 0), 200: (1, 1), 240: (0, 1), 260: (0, 0), 300: (
 class Vehicle(threading.Thread):
     """Sends 100 messages a second and 10 clouds of 1 MB; every tenth message is overtaken by the next.
 
-    Its course is as long as `duration`. At a turn it goes on as before until it is let go on: however late all is on a
+    Its course is as long as `duration`. At a turn it continues as before until it is released: however late all is on a
     busy machine, what it does was seen.
     """
 
@@ -62,7 +62,7 @@ class Vehicle(threading.Thread):
         self.sent: list[tuple[int, str, bytes]] = []
         """Stamp, key and payload."""
         self.free = 0 if turns else 2**31
-        """Up to which turn it may go on."""
+        """The turn up to which it is released."""
 
     def run(self) -> None:
         begin, held = time.time(), None
@@ -215,7 +215,7 @@ def test_overlapping_episodes_have_exactly_their_samples_in_recordings_and_in_th
 
 
 def contents(recording: Path) -> tuple[Any, list[Recorded]]:
-    """What a recording says of itself, and its messages."""
+    """The description of a recording, and its messages."""
     reported = json.loads((recording / "recording.json").read_text())
     return reported, sorted(each for file in mcap_files(recording) for each in read_with_mcap(file))
 

@@ -1,4 +1,4 @@
-"""Who is refused by a router is told: in its log, and as a client that the detector expects and misses."""
+"""Clients rejected by a router are reported: in its log, and as missing expected clients of the detector."""
 
 from __future__ import annotations
 

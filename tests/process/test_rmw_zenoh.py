@@ -1,4 +1,4 @@
-"""Samples of rmw_zenoh nodes come in by their topics; what their keys and numbers tell is checked and counted."""
+"""Samples of rmw_zenoh nodes come in by their topics; their keys and numbers are checked and counted."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class Node:
         self._number = 0
 
     def publish(self, payload: bytes, *, skip: int = 0, named: bool = False) -> None:
-        """Publishes a message, after so many that get lost."""
+        """Publishes a message, after this number of lost ones."""
         self._number += 1 + skip
         self._session.put(
             self._key,

@@ -69,14 +69,14 @@ def test_status_and_metrics_are_what_was_sent(process: Process) -> None:
 
 
 def test_a_rule_is_asked_paused_and_resumed_by_commands(process: Process) -> None:
-    process.change(FAST, a_rule("asked", signals=[SPEED], when="v > 10", evaluation={"onDemand": True}))
+    process.change(FAST, a_rule("on-demand", signals=[SPEED], when="v > 10", evaluation={"onDemand": True}))
     process.send("car1", {"v": 20})
     process.status_when(lambda s: len(s.rules) == 2 and s.streams[1].samples == 1)
 
     def command(*words: str) -> subprocess.CompletedProcess[str]:
         return programs.run("detector", *words, "--detector", "detector.yaml", folder=process.folder)
 
-    answer = json.loads(command("evaluate", "asked").stdout)
+    answer = json.loads(command("evaluate", "on-demand").stdout)
     assert (answer["subject"], answer["when"], answer["values"]) == ("car1", True, {"v": 20})
     refused = command("evaluate", "fast")
     assert refused.returncode == 2
@@ -124,7 +124,7 @@ def test_a_detector_that_is_stopped_evaluates_the_last_lateness_and_so_does_the_
     )
     process.write(FAST, sampled, streams=streams, clock="Data", lateness="5m", maxAhead="1h")
     process.start("--output", "out", "--record-intake", "intake.mcap")
-    for number in (1, 2):  # a status says of one sample each second when it was received
+    for number in (1, 2):  # a status has the receive time of one sample each second
         process.send("car1", {"t": 1_000 + number / 2, "v": 20})
         process.status_when(lambda s, number=number: s.streams[0].latency.count == number)  # type: ignore[misc]
     assert process.written() == []

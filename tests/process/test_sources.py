@@ -166,7 +166,7 @@ def test_a_source_that_hangs_is_left_behind_and_what_it_brings_later_is_not_take
     Hanging.began.clear()
     Hanging.ended.clear()
     thread = a_thread("hanging", arrivals, tally)
-    assert Hanging.began.wait(PATIENCE)  # what is told to stop before it runs, ends
+    assert Hanging.began.wait(PATIENCE)  # a source that is stopped before it runs ends
     thread.request_stop()
     thread.join(0.05)
     assert [(entry.cause, entry.count) for entry in tally.entries()] == [(Cause.LEFT_BEHIND, 1)]

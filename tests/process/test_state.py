@@ -219,14 +219,14 @@ def test_an_episode_whose_task_has_ended_is_not_taken_up_again(tmp_path: Path) -
 
 
 class Car:
-    """Publishes one value on Zenoh until it is told otherwise."""
+    """Publishes one value on Zenoh until it is changed."""
 
     def __init__(self, endpoint: str) -> None:
         self._session = open_session(Zenoh(mode=ZenohMode.PEER, connect=[endpoint]))
         self.value = 20.0
 
     def wait_for(self, reached: Callable[[], bool], what: str) -> None:
-        """Go on publishing until it is so."""
+        """Keep publishing until it is so."""
 
         def look() -> bool:
             self._session.put("vehicles/car/speed", json.dumps({"v": self.value}).encode())

@@ -155,7 +155,7 @@ def test_an_endpoint_that_is_away_costs_its_spans_and_they_are_counted(monkeypat
 def test_events_and_what_actions_are_told_bear_the_trace_of_their_episode(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OTEL_EXPORTER_OTLP_ENDPOINT", "http://127.0.0.1:1")
     event = Event("town", "close", "a+b", ("a", "b"), "e", 1, 2, None, None, {}, None)
-    run = Run("close", "tell", "e")
+    run = Run("close", "notify", "e")
     with episode_traces(export=False) as traces:
         assert traces is not None
         marked = traces.event(event)

@@ -86,7 +86,7 @@ def endpoint() -> Iterator[str]:
 
 
 def a_recorder(folder: Path, endpoint: str) -> Peer:
-    """It records what it is asked for."""
+    """It records on request."""
     peer = Peer(folder / "rsu", endpoint, "rsu")
     idle = a_rule("idle", signals=[SPEED], when="v > 1000")
     peer.write(idle, recordings={"path": str(folder / "rsu" / "recordings"), "onRequest": {}}, clientTimeout="60s")
@@ -235,7 +235,7 @@ def test_a_killed_requester_comes_back_and_stops_what_it_started(rsu: Peer, town
 
 
 def test_a_requester_that_finds_its_episode_gone_stops_what_it_had_started(rsu: Peer, town: Peer) -> None:
-    """Its rule is another when it comes back: the journal tells what is to be stopped."""
+    """Its rule is another when it comes back: the journal has the recordings to stop."""
     town.send("car1", {"v": 20})
     wait_for(lambda: recording(town.endpoint), PATIENCE)
     town.kill()
@@ -247,7 +247,7 @@ def test_a_requester_that_finds_its_episode_gone_stops_what_it_had_started(rsu: 
 
 
 def test_a_recorder_that_is_killed_goes_on_when_it_is_back(rsu: Peer, town: Peer) -> None:
-    """What it had is kept as cut; the requester says the start again within seconds."""
+    """What it had is kept as cut; the requester repeats the start within seconds."""
     town.send("car1", {"v": 20})
     wait_for(lambda: recording(town.endpoint), PATIENCE)
     wait_for(lambda: rsu.under_way() > 0, PATIENCE)  # the file's header, which alone would not be kept

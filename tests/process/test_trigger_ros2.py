@@ -50,7 +50,7 @@ def call(service: str, name: str, **fields: Any) -> dict[str, Any]:
 
 
 def test_a_service_of_rmw_zenoh_is_called_once_for_each_episode(process: Process) -> None:
-    """With the very key that a node of std_srvs has, and the attachment that its server asks for."""
+    """With the very key that a node of std_srvs has, and the attachment that its server requires."""
     start_with(process, fast(domain=7, stop={"service": "/recorder/snap", "type": "std_srvs/srv/Trigger"}))
     node = Node(process.vehicle, domain=7)
     served = {"success": True, "message": "snapped"}
@@ -90,7 +90,7 @@ def test_episodes_that_overlap_are_one_recording_of_a_bridged_recorder(process: 
 
 
 def test_a_silent_service_is_called_again_and_what_had_arrived_is_no_failure(process: Process) -> None:
-    """rosbag2 answers 1 to a second Record: after a call that was not answered this says that it had arrived."""
+    """rosbag2 answers 1 to a second Record: after a call without a response this shows that it had arrived."""
     start = call("record", "Record", request={"uri": "/bags/${client}-${int(v)}"})
     start_with(process, fast(timeout="1s", layout="Plain", start=start, stop=call("stop", "Stop")))
     node = Node(process.vehicle, bridged=True)

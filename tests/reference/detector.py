@@ -1,4 +1,4 @@
-"""The whole of it: arrivals go in, events come out, and at each tick everything is computed anew."""
+"""The whole of it: arrivals go in, events come out, and at each tick everything is recomputed."""
 
 from __future__ import annotations
 
@@ -177,7 +177,7 @@ class Reference:
         return {time for time in regular | samples | wakes if time > self.now}
 
     def gap(self, time: int) -> None:
-        """Time goes on from here without the ticks between."""
+        """Time continues here without the ticks between."""
         self._enter(time)
         self.now = time
         self.world.gap(time)

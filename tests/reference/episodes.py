@@ -11,7 +11,7 @@ Truth = bool | None
 
 @dataclass(frozen=True)
 class Seen:
-    """What the rule said of the subject at a tick."""
+    """The verdicts of the rule for the subject at a tick."""
 
     time: int
     condition: Truth

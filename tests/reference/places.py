@@ -118,7 +118,7 @@ def _seen(a: dict[str, Any], b: dict[str, Any], name: str) -> float | None:
 
 
 def _arc(at: Vector, segments: list[tuple[Vector, Vector]]) -> tuple[float, float, int]:
-    """Along, across and the nearest segment; the first and the last go on beyond the ends of the line."""
+    """Along, across and the nearest segment; the first and the last extend beyond the ends of the line."""
     distances = [_to_segment(at, *each) for each in segments]
     nearest = distances.index(min(distances))
     part, cross = _part(at, *segments[nearest])

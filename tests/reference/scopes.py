@@ -1,4 +1,4 @@
-"""Whom a rule is about, and what its conditions see of them."""
+"""The subjects of a rule, and the variables of its conditions."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ def _distance(one: tuple[float, ...] | None, other: tuple[float, ...] | None) ->
 
 
 def _closing_speed(position: dict[str, str], a: str, b: str, world: World, now: int) -> float | None:
-    """By how much the distance shrank in the last second for which both have said where they are."""
+    """By how much the distance shrank in the last second for which both have sent their places."""
     end = now
     if _limits(position, world) != []:
         end = min(world.kept(client, position["stream"], now)[-1].time for client in (a, b))

@@ -22,7 +22,7 @@ def _compiled(source: str, names: tuple[str, ...]) -> Expression:
 
 
 def truth(source: str | None, variables: dict[str, Any], names: Iterable[str]) -> bool | None:
-    """What a condition says; None is unknown, and one that is absent holds."""
+    """The result of a condition; None is unknown, and one that is absent holds."""
     if source is None:
         return True
     value = evaluated(source, variables, tuple(names))
@@ -39,7 +39,7 @@ def tell_places(places: Iterable[dict[str, Any]], position: dict[str, str]) -> N
 
 
 def evaluated(source: str, variables: dict[str, Any], names: tuple[str, ...]) -> Any:
-    """What an expression says; NOTHING is unknown."""
+    """The result of an expression; NOTHING is unknown."""
     source, variables, more = with_fields(source, variables, _WHERE)
     value = _compiled(source, (*names, *more)).evaluate_or_unknown(variables)
     return NOTHING if value is UNKNOWN else value

@@ -1,4 +1,4 @@
-"""Templates, tasks and instances for the tests of the manager's core, as short as they can be said."""
+"""Templates, tasks and instances for the tests of the manager's core, as short as possible."""
 
 from __future__ import annotations
 

@@ -145,7 +145,7 @@ class ControlPlane:
     def start_api_server(self) -> None:
         """Start the API server, on the same port and data as before, and wait until it is ready.
 
-        A controller manager that saw the API server away is started anew: its watches back off for up to 30 s each, and
+        A controller manager that lost the API server is restarted: its watches back off for up to 30 s each, and
         after an outage of 20 s it took 49 s until a Deployment had pods. That is Kubernetes' matter, not what we test.
         """
         began = time.monotonic()
@@ -222,7 +222,7 @@ class ControlPlane:
         return done.stdout
 
     def kubeconfig_with_token(self, name: str, token: str) -> Path:
-        """Write a kubeconfig for whom the token belongs to and return its path; `name` names the file."""
+        """Write a kubeconfig for the owner of the token and return its path; `name` names the file."""
         path = self.folder / f"kubeconfig-{name}"
         write_kubeconfig(path, self.url, self._setup.serving_certificate.read_bytes(), token)
         return path

@@ -50,7 +50,7 @@ CONTROLLERS_USER = "system:kube-controller-manager"
 
 
 def write_tokens(setup: Setup, administrator: str, controllers: str) -> None:
-    """Write the file of those whom the API server lets in.
+    """Write the file of the accounts that the API server accepts.
 
     The controller manager has a user of its own, as in any cluster: who is of the group system:masters goes past API
     Priority and Fairness.

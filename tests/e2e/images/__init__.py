@@ -3,7 +3,7 @@
 The image of this project has three layers: a root from debootstrap (cached by what it is made of), the packages that
 the project depends on (cached by their pins), and the project. It has what the Dockerfile makes it have: both programs,
 an unprivileged user, no start through a shell; and all of it compiled, as a container's root cannot be written to, so
-that each start would compile anew.
+that each start would compile again.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ sys.exit(main())
 
 
 class ImageError(Exception):
-    """An image cannot be made; the message says what to do."""
+    """An image cannot be built; the message gives the remedy."""
 
 
 def pause_archive(program: Path, folder: Path) -> Path:
@@ -174,7 +174,7 @@ def _within(base: Layer, target: Path) -> Iterator[Path]:
 
 
 def _compile(root: Path, folder: str) -> None:
-    """Compile what is below a folder of the root. Bytecode that is not compared with its source bears no times."""
+    """Compile what is below a folder of the root. Bytecode that is not compared with its source contains no times."""
     options = ["--invalidation-mode=unchecked-hash", "-q", "-f", "-x", "/tests/|/lib2to3/tests/"]
     _run(["/usr/sbin/chroot", str(root), f"/usr/bin/python{PYTHON}", "-m", "compileall", *options, folder])
 

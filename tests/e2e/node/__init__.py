@@ -168,7 +168,7 @@ class Node:
         )
 
     def stop_program(self, name: str) -> None:
-        """Kill `containerd`, `kubelet`, `kube-proxy`, `kube-scheduler` or `coredns`; what runs in pods goes on."""
+        """Kill `containerd`, `kubelet`, `kube-proxy`, `kube-scheduler` or `coredns`; pods keep running."""
         self._children.pop(name).kill9()
 
     def power_off(self) -> None:

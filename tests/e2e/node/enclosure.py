@@ -2,7 +2,7 @@
 
 Everything that a node does to a machine (network interfaces, iptables rules, mounts, daemons that outlive their parent)
 happens inside, so it neither meets what else runs on the machine nor stays: the kernel removes it all when the first
-process inside ends, also where the test run was killed (`tests.cluster.reaper`). Only cgroups live outside. They bear
+process inside ends, also where the test run was killed (`tests.cluster.reaper`). Only cgroups live outside. They have
 the number of the test run in their name, and those of runs that are no more are removed before the next one.
 
 Outside and inside are joined by one pair of interfaces, on addresses of RFC 2544 that are nobody's.

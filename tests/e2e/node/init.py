@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 
 LAYERED = ("etc", "opt", "var")
-"""Folders of the machine that programs of a node write to whatever they are told; what they write lies elsewhere."""
+"""Folders of the machine that programs of a node always write to; their writes are redirected."""
 
 KERNEL = {
     "vm/overcommit_memory": "1",

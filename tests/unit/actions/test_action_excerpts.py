@@ -1,4 +1,4 @@
-"""What actions are told: each sample of an episode's window exactly once, however it comes in, on both clocks."""
+"""The input of actions: each sample of an episode's window exactly once, in any order of arrival, on both clocks."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def test_each_sample_of_a_window_is_told_once_and_no_other(
     ]
     arrivals.sort(key=lambda each: each.received)
     arrivals = [replace(each, received=each.received + index) for index, each in enumerate(arrivals)]
-    if on_data:  # time goes on with the stamps
+    if on_data:  # time advances with the stamps
         arrivals.append(replace(message(11.0, "car2", "load", 0.0), received=at(12)))
     edges = sorted({0, *(cut for cut in cuts if cut < len(arrivals)), len(arrivals)})
     batches = [arrivals[first:last] for first, last in pairwise(edges) if last > first]

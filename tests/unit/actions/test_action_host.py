@@ -32,11 +32,11 @@ from wayside.api import EventRule
 
 DETECTOR = a_detector(a_stream("speed"), clientTimeout="60s")
 SLOW = threading.Event()
-"""Set: the actions that wait for it go on."""
+"""Set: the actions that wait for it continue."""
 
 
 class Recorded(Action[ActionParameters]):
-    """Notes what it is told."""
+    """Records its calls."""
 
     Parameters = ActionParameters
     reported: ClassVar[list[str]] = []
@@ -89,7 +89,7 @@ class Hangs(Recorded):
 
 
 class Silent(Recorded):
-    """Never says what became of its work."""
+    """Never reports the outcome of its work."""
 
     def completed(self, episode: Episode, completion: Completion) -> None:
         self.note("completed", episode)

@@ -1,4 +1,4 @@
-"""From samples to documents: nothing changes on the way, and what does not fit is split off, or cut and said."""
+"""From samples to documents: nothing changes, and parts that do not fit are moved to files, or cut and reported."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_a_document_says_what_was_said_by_whom_and_when() -> None:
 def test_a_sample_has_the_same_id_whoever_makes_its_document_and_no_two_have_the_same() -> None:
     samples = [
         sample(b"1"),
-        sample(b"1"),  # with clock Data a client may say the same twice at one time
+        sample(b"1"),  # with clock Data a client may send the same twice at one time
         sample(b"2"),
         sample(b"1", START + 1),
         sample(b"1"),  # late, and once more
@@ -156,7 +156,7 @@ def test_only_binary_fields_above_the_size_leave_the_document() -> None:
 
 
 def of_png(file: bytes) -> np.ndarray[Any, Any]:
-    """Reads what the PNG's own fields say; without filters, as RFC 2083 has them."""
+    """Reads the PNG by its own fields; without filters, as in RFC 2083."""
     assert file[:8] == b"\x89PNG\r\n\x1a\n"
     chunks, at = {}, 8
     while at < len(file):

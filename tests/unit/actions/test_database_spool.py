@@ -1,4 +1,4 @@
-"""The spool keeps records in their order, within its bounds, beyond crashes; what it cannot read it says."""
+"""The spool keeps records in their order, within its bounds, beyond crashes; unreadable records are reported."""
 
 from __future__ import annotations
 

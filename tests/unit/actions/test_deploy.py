@@ -50,7 +50,7 @@ async def reconciling(folder: Path, interval: float = 0.02, **options: Any) -> A
 async def eventually(holds: Callable[[], bool], what: str) -> None:
     try:
         async with asyncio.timeout(60):
-            while not holds():  # noqa: ASYNC110  files tell nobody that they changed
+            while not holds():  # noqa: ASYNC110  files do not notify of changes
                 await asyncio.sleep(0.005)
     except TimeoutError:
         raise AssertionError(f"still not: {what}") from None
@@ -170,7 +170,7 @@ def test_another_holders_task_under_the_name_is_left_alone(tmp_path: Path, caplo
 
     assert asyncio.run(drive()).created == 1
     assert file.read_text() == text
-    assert caplog.text.count("belongs to another holder") == 1, "said once, then only counted"
+    assert caplog.text.count("belongs to another holder") == 1, "logged once, then only counted"
 
 
 def test_what_a_person_deletes_comes_back_and_what_they_end_stays_ended(tmp_path: Path) -> None:
@@ -223,7 +223,7 @@ def test_an_outage_delays_and_loses_nothing(tmp_path: Path, caplog: pytest.LogCa
             await eventually(lambda: reconciler.counts.retried > 1, "the outage was met")
             reconciler.update(by_name(B), {C.name: 6})
             retried = reconciler.counts.retried  # with one attempt that may have begun before
-            await eventually(lambda: reconciler.counts.retried > retried + 1, "it goes on")
+            await eventually(lambda: reconciler.counts.retried > retried + 1, "it continues")
             turn(there)
             await eventually(lambda: ends(folder) == {A.name: format_time(5), B.name: None}, "all is made good")
         return reconciler.counts

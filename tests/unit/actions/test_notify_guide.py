@@ -1,4 +1,4 @@
-"""The rule in docs/notify.md has nothing wrong, and what is wrong with a notify action is told with its place."""
+"""The rule in docs/notify.md is valid, and errors of a notify action are reported with their place."""
 
 from __future__ import annotations
 

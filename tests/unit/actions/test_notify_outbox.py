@@ -1,4 +1,4 @@
-"""The outbox: nothing is lost or told twice, each episode in order, bounded, and patient with a busy endpoint."""
+"""The outbox: nothing is lost or sent twice, each episode in order, bounded, and patient with a busy endpoint."""
 
 from __future__ import annotations
 
@@ -162,8 +162,8 @@ def test_every_event_is_in_one_group_with_its_like_and_waits_no_longer_than_it_m
 
 def test_a_group_has_an_id_of_its_events_and_is_a_cloudevent() -> None:
     some = [notice("a"), notice("a", "ended"), notice("b")]
-    event = event_of_group(some, "tell", [], 2)
-    assert event["id"] == event_of_group(some, "tell", [], 3)["id"] != event_of_group(some[:2], "tell", [], 2)["id"]
-    assert (event["type"], event["subject"]) == (GROUP_TYPE, "braking/tell")
+    event = event_of_group(some, "notify", [], 2)
+    assert event["id"] == event_of_group(some, "notify", [], 3)["id"] != event_of_group(some[:2], "notify", [], 2)["id"]
+    assert (event["type"], event["subject"]) == (GROUP_TYPE, "braking/notify")
     counts = {name: event["data"][name] for name in ("count", "started", "ended", "omitted")}
     assert counts == {"count": 3, "started": 2, "ended": 1, "omitted": 1}

@@ -1,4 +1,4 @@
-"""What is known of recordings that others asked for: nothing is done twice, and everything has a bound."""
+"""The index of requested recordings: nothing is done twice, and everything has a bound."""
 
 from __future__ import annotations
 

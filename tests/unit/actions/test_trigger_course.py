@@ -1,4 +1,5 @@
-"""The course of a recording elsewhere: what is confirmed is not asked again, what is not is, until it is given up."""
+"""The course of a recording elsewhere: confirmed requests are not repeated, others are retried until they are given
+up."""
 
 from __future__ import annotations
 
@@ -117,7 +118,7 @@ def test_a_system_that_counts_the_time_itself_says_so() -> None:
 
 @given(st.lists(st.tuples(st.sampled_from(["ask", "end"]), st.sampled_from([*Progress, None])), max_size=40))
 def test_whatever_is_answered_a_course_comes_to_its_end(happenings: list[tuple[str, Progress | None]]) -> None:
-    """And while it is not finished, there is always a time at which something is asked."""
+    """And while it is not finished, there is always a time of the next request."""
     course, now = a_course(give_up=20), 0.0
 
     def turn(progress: Progress | None) -> None:

@@ -1,4 +1,4 @@
-"""docs/trigger.md says what is: its Detector and its rules are accepted."""
+"""docs/trigger.md is correct: its Detector and its rules are accepted."""
 
 from __future__ import annotations
 

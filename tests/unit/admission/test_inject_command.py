@@ -101,7 +101,7 @@ def test_the_detectors_own_image_wins(detector: Path) -> None:
 
 
 def error(*arguments: str) -> str:
-    """What is said on stderr by the program; exit code 2."""
+    """The program's output on stderr; exit code 2."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("KUBECONFIG", "/nonexistent")
         reported: list[str] = []

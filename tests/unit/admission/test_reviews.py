@@ -1,4 +1,4 @@
-"""What the API server asks before it stores an object, and what it is answered: only a new spec is ever refused."""
+"""The API server's requests before it stores an object, and the responses: only a new spec is ever rejected."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a pod gets that asks for a detector: once, without harm to the pod, and never against its Detector's word."""
+"""Injection into a pod that requests a detector: once, harmless to the pod, and only if its Detector allows it."""
 
 from __future__ import annotations
 

@@ -86,7 +86,7 @@ def test_every_field_is_described_and_bounded(kind: str) -> None:
                 assert "maxLength" in node or "enum" in node, f"{kind} {path} is unbounded"
             if node.get("type") == "array":
                 assert "maxItems" in node, f"{kind} {path} is unbounded"
-                assert "x-kubernetes-list-type" in node, f"{kind} {path} does not say how lists merge"
+                assert "x-kubernetes-list-type" in node, f"{kind} {path} does not define how lists merge"
             if "additionalProperties" in node:
                 assert "maxProperties" in node, f"{kind} {path} is unbounded"
 

@@ -1,4 +1,4 @@
-"""What of the Helm chart follows from the code is as the code says."""
+"""The generated parts of the Helm chart match the code."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The tests' own images: the same content gives the same bytes, and the archive says what is in it."""
+"""The tests' own images: the same content gives the same bytes, and the archive describes its contents."""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ LATER = {"notify": {"zenoh": {"key": "k"}, "grouping": {"wait": "5s"}}}
 
 
 def reported(classification: dict[str, list[str]], *others: Any, **spec: Any) -> list[str]:
-    """The warnings of a rule with signal v and condition v > 1, unless it says otherwise."""
+    """The warnings of a rule with signal v and condition v > 1, unless given otherwise."""
     full = {"signals": [SPEED], "when": "v > 1", **spec}
     rule = a_rule("r", classification=classification, **full)
     named = {other.name: other for other in others}
@@ -191,7 +191,7 @@ RIGHT: dict[str, tuple[str, str, dict[str, Any]]] = {
         "typeOfParticipants", "Vehicle", {"signals": [{"name": "v", "stream": "any-its", "value": "msg.v"}]}
     ),
     "a report, as in Table 2": ("typeOfAction", "Notification", {"actions": act(RECORD, REPORT)}),
-    "told to reconfigure": ("typeOfAction", "Reconfiguration", {"actions": act(REPORT)}),
+    "a notified reconfiguration": ("typeOfAction", "Reconfiguration", {"actions": act(REPORT)}),
     "nothing is written": ("typeOfAction", "Notification", {"actions": act(DRY, REPORT)}),
     "a call may do anything": ("typeOfAction", "Reconfiguration", {"actions": act(CALL)}),
     "somebody else acts on the events": ("typeOfAction", "Deployment", {}),
@@ -200,7 +200,7 @@ RIGHT: dict[str, tuple[str, str, dict[str, Any]]] = {
     "a plugin may have learnt": ("detectionAlgorithm", "LearningBased", {"signals": [PLUGIN], "when": "p"}),
     "what it looks at was learnt": ("detectionAlgorithm", "RuleBased LearningBased", {}),
     "the model decides nothing": ("detectionAlgorithm", "RuleBased", {"signals": [SPEED, a_model()]}),
-    "not said to hold always": ("incidence", "Rare", {"when": "v > 1 || true"}),
+    "not known to hold always": ("incidence", "Rare", {"when": "v > 1 || true"}),
 }  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Both programs tell what is wrong in one line, and take `--debug` before or after the command."""
+"""Both programs report errors in one line, and take `--debug` before or after the command."""
 
 from __future__ import annotations
 

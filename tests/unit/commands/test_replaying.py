@@ -1,4 +1,4 @@
-"""Replays: tasks, pauses, and what a person is told."""
+"""Replays: tasks, pauses, and the output for users."""
 
 from __future__ import annotations
 

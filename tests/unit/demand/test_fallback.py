@@ -74,7 +74,7 @@ def of(*tasks: ApplicationTask, **more: Any) -> Outcome:
 @pytest.mark.parametrize(
     ("since", "beyond", "change"),
     [
-        ({}, True, None),  # nothing is said of it yet: since its creation
+        ({}, True, None),  # it has no condition yet: since its creation
         ({"Ready": ("False", 59)}, False, NOW + 1),
         ({"Ready": ("False", 60)}, True, None),
         ({"Ready": ("True", 9999)}, False, None),
@@ -106,7 +106,7 @@ def test_an_update_that_is_refused_makes_nothing_overdue_that_runs() -> None:
 
 @given(st.lists(st.tuples(st.booleans(), st.integers(1, 100)), min_size=1, max_size=12))
 def test_it_changes_only_after_a_whole_timeout_in_the_other_state(series: list[tuple[bool, int]]) -> None:
-    """Each pair says whether the app is ready, and for how many seconds; a new manager looks each second."""
+    """Each pair is whether the app is ready, and for how many seconds; a new manager looks each second."""
     of, app, status = template(**FULL), runs(), ApplicationInstanceStatus()
     now, ready_since, previous = NOW, NOW, False
     timed_out: list[Condition] = []

@@ -28,7 +28,7 @@ def limited(count: int | None, name: str = "app", **lifecycle: Any) -> Any:
 
 
 def wants(region: str, **more: Any) -> ApplicationTask:
-    """A task of the region's name, unless `name` says another."""
+    """A task with the region's name, unless `name` is given."""
     return task(more.pop("name", region), {"region": region}, **more)
 
 
@@ -43,7 +43,7 @@ def since(made: ApplicationInstance, created: float) -> ApplicationInstance:
 
 
 def served(live: ApplicationTask) -> ApplicationTask:
-    """The task once its instance was applied, as its status says it."""
+    """The task once its status reports that its instance was applied."""
     raw = live.to_json()
     condition = {"type": "Applied", "status": "True", "reason": "Applied", "lastTransitionTime": format_seconds(NOW)}
     raw["status"] = {"conditions": [condition]}
@@ -237,7 +237,7 @@ class Site:
                 self.instances[each.name] = made.model_copy(update={"metadata": metadata})
             else:
                 del self.instances[each.name]
-        for each in decided:  # the status says when what lingers goes
+        for each in decided:  # the status has the release time of lingering instances
             if each.name in self.instances and not each.wanted and each.release_time is not None:
                 raw = self.instances[each.name].to_json()
                 raw["status"] = {"releaseTime": format_seconds(each.release_time)}

@@ -1,4 +1,4 @@
-"""The guide's template, with more demands than it allows: what the guide says becomes of them."""
+"""The guide's template, with more demands than it allows: they are handled as described."""
 
 from __future__ import annotations
 

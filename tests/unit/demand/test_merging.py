@@ -130,7 +130,7 @@ def test_where_all_must_agree_those_that_take_part_do(logged: list[tuple[str, An
     assert result.parameters["max"] == max(each.parameters["max"] for each in taking_part)
 
 
-# --- What a template and a task may say
+# --- Valid templates and tasks
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""docs/etsi.md says what is: its table of units is the code's, its Detector and rule are accepted."""
+"""docs/etsi.md is correct: its table of units is the code's, its Detector and rule are accepted."""
 
 from __future__ import annotations
 

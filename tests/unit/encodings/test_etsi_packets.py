@@ -24,7 +24,7 @@ EXTENDED = {
     "anyone at a place (GAC)": (3, 1, struct.pack(">HH", 7, 0) + LONG_POSITION + AREA),
     "one station (GUC)": (2, 0, struct.pack(">HH", 7, 0) + LONG_POSITION + bytes(20)),
 }
-"""Header type, subtype and extended header, by whom a packet is for."""
+"""Header type, subtype and extended header, by the destination of a packet."""
 
 
 def btp(message: bytes, port: int = 2001) -> bytes:

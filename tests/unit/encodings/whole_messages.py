@@ -32,7 +32,7 @@ def assert_reads_as_decoded(decoder: FieldDecoder, paths: Sequence[Path], payloa
                 odd.add(place)
     assert {place: str(error) for place, error in found.errors.items()} == errors
     assert list(found.odd) == sorted(odd)
-    # The text of a value also tells doubles from integers and booleans, and one zero from the other.
+    # The text of a value also distinguishes doubles from integers and booleans, and the two zeros.
     assert [repr(list(column)) for column in found.columns] == [repr(column) for column in columns], payloads
     return len(errors)
 

@@ -18,7 +18,7 @@ from wayside.api import Detector
 
 
 class Recording:
-    """Keeps what a live engine consumes and says: recorder and outlet in one."""
+    """Keeps the input and output of a live engine: recorder and outlet in one."""
 
     def __init__(self) -> None:
         self.records: list[Arrival | Control] = []

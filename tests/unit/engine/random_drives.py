@@ -233,7 +233,7 @@ def _derived(draw: st.DrawFn, name: str, expressions: list[str]) -> dict[str, An
 
 
 def _conditions(variables: list[str]) -> st.SearchStrategy[str]:
-    """The distance is known to be a number, so what is said of strings and booleans would not compile."""
+    """The distance is known to be a number, so conditions on strings and booleans would not compile."""
     simple = st.sampled_from(variables).flatmap(
         lambda name: st.sampled_from(_FORMS[:8] if name in _NUMBERS else _FORMS).map(lambda form: form.format(name))
     )
@@ -362,7 +362,7 @@ def scenes(draw: st.DrawFn) -> Scene:
     messages = draw(st.lists(_message, min_size=10, max_size=40))
     if draw(st.integers(0, 2)) == 0:  # else there is hardly ever a place of now and of a second ago
         messages += [Message(time, 0, client, "pose", draw(_places)) for time in range(1, 20, 2) for client in "ab"]
-    if draw(st.booleans()):  # on a common grid: a and b move together, what they say changes, some of it twice
+    if draw(st.booleans()):  # on a common grid: a and b move together, their values change, some twice
         speeds = draw(st.lists(st.sampled_from([0.0, 1.0, 1.5, 2.0, 3.0]), min_size=3, max_size=6))
         grid = [(time, client, stream) for time in range(1, 24) for client in "ab" for stream in ("pose", "speed")]
         twice = [each for each in grid if each[0] % len(speeds) == 0]

@@ -142,7 +142,7 @@ class Outcome(NamedTuple):
 
 
 def driven(scene: Scene, cut: Callable[[], int], *, one_by_one: bool = False) -> Outcome:
-    """Drive the scene; `cut` says how many arrivals come in one call, at least: those of equal times come together.
+    """Drive the scene; `cut` is the minimum number of arrivals in one call: those of equal times come together.
 
     `one_by_one`: every rule is evaluated by CEL, subject by subject, as if somebody watched each evaluation.
     """

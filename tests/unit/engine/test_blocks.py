@@ -165,7 +165,7 @@ def test_a_replay_writes_tasks_that_begin_and_end_within_one_call() -> None:
         for second in range(1, 9)
         for part, value in enumerate((5, 20, 21.5, 22, 5))
         for client, late in (("car", 0), ("bus", 0.05))
-    ][:-1]  # the bus's last episode goes on
+    ][:-1]  # the bus's last episode continues
     whole, single = (tasks_of(rule, arrivals, cut) for cut in (1000, 1))
     assert whole == single
     assert len(whole) == 2 * 16

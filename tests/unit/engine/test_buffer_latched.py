@@ -1,4 +1,4 @@
-"""Latched streams: what was said last holds until it is said anew; caps by number; what the buffer holds is told."""
+"""Latched streams: the last sample stays valid until replaced; caps by number; the contents are reported."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_when_time_steps_back_what_was_latched_holds_since_then() -> None:
     assert latched.latest == 20
     assert not plain.samples
     assert buffer.bytes == latched.bytes
-    assert latched.expire(100) == SAMPLE_OVERHEAD + 1  # said anew at 20
+    assert latched.expire(100) == SAMPLE_OVERHEAD + 1  # replaced at 20
 
 
 def test_samples_that_are_equal_to_the_byte_and_of_one_time_are_so_many_samples() -> None:

@@ -15,7 +15,7 @@ RULE = a_rule(signals=[SPEED], when="v > 10", actions=[a_deploy("x")])
 
 
 def change(drive: Drive, *streams: Any, rules: Any = (RULE,), **spec: Any) -> list[str]:
-    """Go on with another Detector and the rules compiled against it."""
+    """Switch to another Detector and the rules compiled against it."""
     detector = a_detector(*streams, **spec)
     entries = inlets(detector)
     drive.engine.set_detector(detector, entries.decoders, entries.read_key)

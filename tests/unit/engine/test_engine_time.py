@@ -135,7 +135,7 @@ COUNT = a_rule(
 
 
 def sent(t: float, client: str = "car", *, received: float = 0) -> Arrival:
-    """A sample stamped at t, with clock Data; all are received at once where nothing is said."""
+    """A sample stamped at t, with clock Data; all are received at once by default."""
     return arrival(received, client, {"t": at(t) / SECOND})
 
 
@@ -221,7 +221,7 @@ def test_one_of_two_clients_must_keep_it_up_while_the_other_is_silent() -> None:
     drive.take(sent(10, "a"), sent(10, "b"), until=0)
     drive.take(*(sent(500 + n / 2, "a") for n in range(6)), until=0)
     assert timeline(drive).jumps == 0
-    drive.take(sent(10.1, "b"), until=0)  # a contradiction: it begins anew
+    drive.take(sent(10.1, "b"), until=0)  # a contradiction: it restarts
     drive.take(*(sent(503 + n / 2, "a") for n in range(6)), until=0)
     assert timeline(drive).jumps == 0
     drive.take(sent(506, "a"), until=0)

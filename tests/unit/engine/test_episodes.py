@@ -36,7 +36,7 @@ class Moment:
 
     @property
     def condition(self) -> float:
-        """Whether an episode may be on its way: 1 yes, 0 no, a half unknown; the least of all that is asked for."""
+        """Whether an episode may be on its way: 1 yes, 0 no, a half unknown; the least of all required conditions."""
         seen = self.seen
         return min(worth(seen.in_scope), worth(seen.near), worth(seen.when), 1 - worth(seen.until))
 
@@ -46,7 +46,7 @@ def worth(truth: Truth) -> float:
 
 
 def run(history: list[Moment], timing: Timing) -> list[Happening]:
-    """What the state machine says."""
+    """The results of the state machine."""
     state = SubjectState()
     happenings = []
     for moment in history:
@@ -61,7 +61,7 @@ def run(history: list[Moment], timing: Timing) -> list[Happening]:
 
 
 def read(history: list[Moment], timing: Timing) -> list[Happening]:
-    """What the rules say, by looking back from every moment."""
+    """The definition, by looking back from every moment."""
     happenings: list[Happening] = []
     begin, rests_until = 0, 0
     while (found := first_start(history, begin, rests_until, timing)) is not None:
@@ -137,7 +137,7 @@ def histories(draw: st.DrawFn) -> list[Moment]:
 
 
 SEEN = Observation(in_scope=True, near=True, when=True, until=False)
-"""An episode may start and go on."""
+"""An episode may start and continue."""
 
 
 def seen(**fields: Truth) -> Observation:

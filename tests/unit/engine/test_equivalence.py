@@ -61,7 +61,7 @@ def ordered(scene: Scene) -> list[tuple[int, Message]]:
 
 
 def by_the_engine(scene: Scene, cut: int) -> list[Event]:
-    """`cut`: in one call come the messages of so many times, but for a gap."""
+    """`cut`: one call has the messages of this number of times, except for a gap."""
     lateness = f"{scene.lateness * 500}ms"
     clock = {"clock": "Data", "lateness": lateness, "maxAhead": "1h"} if scene.data else {}
     caps = {"speed": {"count": scene.count}, "pose": {"bytes": scene.pose_bytes}}

@@ -177,7 +177,7 @@ EXPECTED = ["sample car started 1.4", "tick car started 1.4", "sample car Until 
 
 
 def received(detector: Detector, rules: Sequence[Any], sent: Sequence[tuple[int, int]]) -> Recording:
-    """What a live engine that receives this has consumed and said when it is stopped."""
+    """The input and output of a live engine that receives this, after its stop."""
     live = Live(detector, rules)
     for step, value in sent:
         live.now = START + step * STEP
@@ -224,7 +224,7 @@ def test_at_the_end_all_that_waits_is_in_the_buffer() -> None:
 
 
 def replayed_before(detector: Detector, rules: Sequence[Any], *records: Arrival | Control) -> list[Event]:
-    """The replay of an intake file that says nothing of an order of time, nor of its end."""
+    """The replay of an intake file without an order of time, and without its end."""
     start = {
         "kind": "start",
         "holder": "h",

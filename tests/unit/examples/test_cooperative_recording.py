@@ -1,4 +1,4 @@
-"""The case cooperative recording: a drive that can be trusted, and files that say what the README says."""
+"""The case cooperative recording: a correct drive, and files as described in the README."""
 
 from __future__ import annotations
 

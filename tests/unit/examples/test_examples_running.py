@@ -1,4 +1,4 @@
-"""The use cases: each gives what its own truth says, and a runner that would notice if one did not."""
+"""The use cases: each gives the results of its own truth, and the runner detects differences."""
 
 from __future__ import annotations
 

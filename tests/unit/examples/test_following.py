@@ -1,4 +1,4 @@
-"""Which pods are told of a configuration; and the example's rule for what comes by two ways."""
+"""Which pods get the annotation of a configuration; and the example's rule for two sources of content."""
 
 from __future__ import annotations
 

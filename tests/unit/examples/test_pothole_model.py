@@ -1,4 +1,4 @@
-"""The model of examples/pothole-detection is what its script trains, and tells what no threshold tells."""
+"""The model of examples/pothole-detection is what its script trains, and separates what no threshold can."""
 
 from __future__ import annotations
 

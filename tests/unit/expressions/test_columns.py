@@ -1,4 +1,4 @@
-"""Expressions over columns yield what CEL yields row by row, and say where only CEL can."""
+"""Expressions over columns yield what CEL yields row by row, and report where only CEL can."""
 
 import math
 import subprocess

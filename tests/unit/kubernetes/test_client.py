@@ -1,4 +1,4 @@
-"""The client sends so many requests at once, waits where the API server asks for it, and writes only while it may."""
+"""The client bounds concurrent requests, waits on the API server's request, and writes only while it is active."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ def test_one_that_may_not_act_reads_and_asks_but_writes_nothing() -> None:
 
 @pytest.mark.parametrize("looks", [1, 2])
 def test_a_write_whose_time_ends_before_it_is_sent_is_not_sent(looks: int) -> None:
-    """As when the process is stopped after it has begun a request and goes on when another one is active."""
+    """As if the process is suspended during a request and resumes when another one is active."""
     answers = [10.0] * looks
     methods: list[str] = []
 

@@ -1,4 +1,4 @@
-"""A kubeconfig that cannot be used is told in one line, with its file and what to do."""
+"""A kubeconfig that cannot be used is reported in one line, with its file and the remedy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""In a pod the account's token is followed as the kubelet renews it, and what lacks is said."""
+"""In a pod the account's token is followed as the kubelet renews it, and missing parts are reported."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The queue works on each key at most once at a time, and again where that is asked for or failed."""
+"""The queue works on each key at most once at a time, and again if it was enqueued or failed."""
 
 from __future__ import annotations
 

@@ -131,7 +131,7 @@ def test_news_are_published_in_order_and_each_question_answered() -> None:
             for content in ("1", "1", "2"):
                 call(lambda content=content: publisher.publish(NAME, {"a": content}))  # type: ignore[misc]
                 heard.wait_for(content)
-            # A new connection has everything told again; what is old never comes back.
+            # Everything is published again on a new connection; old content never comes back.
             assert [content for content, _ in groupby(heard.contents)] == ["1", "2"]
             call(lambda: publisher.publish(("site", "other"), {"a": "3"}))
             heard.wait_for("3")

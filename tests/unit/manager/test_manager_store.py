@@ -1,4 +1,4 @@
-"""The store holds the newest version of each object, whatever the order in which news come."""
+"""The store holds the newest version of each object, in any order of events."""
 
 from __future__ import annotations
 

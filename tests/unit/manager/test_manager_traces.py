@@ -1,4 +1,4 @@
-"""A task that ends before its status says anything of its instance still has a failed `ready` in its trace."""
+"""A task that ends before its status has its instance still has a failed `ready` in its trace."""
 
 from __future__ import annotations
 

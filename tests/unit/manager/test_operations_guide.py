@@ -1,4 +1,4 @@
-"""Each thing that docs/operations.md says may happen is backed by tests, which exist."""
+"""Each case in docs/operations.md names existing tests."""
 
 from __future__ import annotations
 

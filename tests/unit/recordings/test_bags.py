@@ -44,7 +44,7 @@ def pose(store: Typestore, x: float, seconds: int) -> bytes:
 
 @pytest.fixture
 def bag(tmp_path: Path, noetic: Typestore) -> Path:
-    """Poses of two cars over a second, and something that nobody asks for."""
+    """Poses of two cars over a second, and an unused topic."""
     path = tmp_path / "drive.bag"
     with Writer(path) as writer:
         connections = [writer.add_connection(f"/vehicles/car{n}/pose", POSE, typestore=noetic) for n in (1, 2)]

@@ -58,7 +58,7 @@ def block(kind: int, body: bytes, order: str) -> bytes:
 
 
 def pcapng(frames: list[tuple[int, bytes]], link: int = 1, order: str = "<") -> bytes:
-    """With times in nanoseconds, as an option of the interface says."""
+    """With times in nanoseconds, by an option of the interface."""
     raw = block(0x0A0D0D0A, struct.pack(order + "IHHq", 0x1A2B3C4D, 1, 0, -1), order)
     raw += block(1, struct.pack(order + "HHIHHB3xHH", link, 0, 65535, 9, 1, 9, 0, 0), order)
     raw += block(5, bytes(12), order)  # statistics, which are passed over

@@ -1,4 +1,4 @@
-"""What a recording holds, as the libraries mcap and rosbags read it, and what it says of itself."""
+"""The contents of a recording, read by the libraries mcap and rosbags, and its description."""
 
 from __future__ import annotations
 

@@ -104,7 +104,7 @@ def test_a_window_that_reaches_further_back_than_the_buffer_is_refused(tmp_path:
 
 
 def test_a_replay_cuts_the_windows_of_record_actions_from_the_recording(desk: Desk) -> None:
-    """One episode is whole; the other is still open when the recording ends, so its clip is cut and says so."""
+    """One episode is whole; the other is still open when the recording ends, so its clip is cut and marked as such."""
     window = {"before": "500ms", "after": "1s"}
     rule = a_rule("fast", **FAST, actions=[{"name": "bag", "record": {**window, "split": {"duration": "1s"}}}])
     desk.write(a_detector(a_stream("speed"), buffer={"duration": "2s"}), rule)

@@ -1,4 +1,4 @@
-"""Recordings of every kind read as the same messages, in order of time; what is wrong is said with its place."""
+"""Recordings of every kind read as the same messages, in order of time; errors are reported with their place."""
 
 import json
 from pathlib import Path

@@ -24,7 +24,7 @@ YEAR = 365 * 24 * 3600.0
 
 
 def test_several_recordings_are_independent_of_each_other(desk: Desk) -> None:
-    """An episode that is open at the end of the first does not go on in the second, a year later."""
+    """An episode that is open at the end of the first does not continue in the second, a year later."""
     desk.drive("a.jsonl", *LEFT_OPEN)
     desk.drive("b.jsonl", *((YEAR + time, {"v": 4}) for time in (0.0, 2.0, 4.0)))
     (alone,) = desk.replay("a.jsonl").events + desk.replay("b.jsonl").events

@@ -1,4 +1,4 @@
-"""Parameters of a rule: shared by its expressions, set otherwise for single clients; wrong ones are told in place."""
+"""Parameters of a rule: shared by its expressions, overridden for single clients; wrong ones are reported in place."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A rule that is refused goes on as it last was."""
+"""A rejected rule keeps its last good version."""
 
 from __future__ import annotations
 

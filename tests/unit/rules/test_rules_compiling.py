@@ -1,4 +1,4 @@
-"""What is wrong with a rule is told at the field it is wrong in, with what to do; a right one is compiled."""
+"""Errors of a rule are reported at their field, with the remedy; a valid rule is compiled."""
 
 from __future__ import annotations
 

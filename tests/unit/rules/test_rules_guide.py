@@ -1,4 +1,4 @@
-"""The examples in docs/rules.md do what the text says: every rule and Detector in it is accepted."""
+"""The examples in docs/rules.md work as described: every rule and Detector in it is accepted."""
 
 from __future__ import annotations
 

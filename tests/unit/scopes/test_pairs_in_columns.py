@@ -40,7 +40,7 @@ def rules() -> list[EventRule]:
 
 
 def walk(seed: int, clients: int, side: float, steps: int) -> Iterator[Arrival]:
-    """Clients that walk in a square; some fall silent or say what makes no sense."""
+    """Clients that walk in a square; some fall silent or send nonsense."""
     draw = random.Random(seed)
     places = {f"c{number}": (draw.uniform(0, side), draw.uniform(0, side)) for number in range(clients)}
     for step in range(1, steps):
@@ -59,7 +59,7 @@ def walk(seed: int, clients: int, side: float, steps: int) -> Iterator[Arrival]:
 def test_all_pairs_at_once_give_the_events_of_each_by_itself(seed: int, clients: int, side: float, steps: int) -> None:
     together, one_by_one = (Drive(a_detector(clients=CLIENTS, clientTimeout="2s"), *rules()) for _ in range(2))
     for run in one_by_one.engine.rules.values():
-        run.witness = lambda sight: None  # whoever looks at each evaluation gets each by itself
+        run.witness = lambda sight: None  # an observer of each evaluation gets each one separately
     for drive in (together, one_by_one):
         drive.take(*walk(seed, clients, side, steps), until=steps / 10 + 3)
     assert [event.to_json() for event in together.events] == [event.to_json() for event in one_by_one.events]

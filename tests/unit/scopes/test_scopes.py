@@ -112,7 +112,7 @@ def test_the_closing_speed_ends_with_the_newest_place_of_the_one_who_fell_silent
 
 
 def test_the_closing_speed_to_one_whose_place_has_no_age_is_that_of_now() -> None:
-    """A station says once where it stands."""
+    """A station sends its position once."""
     rule = pairs(scope={"position": EARTH}, when="closingSpeed > 10.0", evaluation={"every": "500ms"})
     drive = Drive(a_detector(a_stream("pose", staleAfter="Never")), rule)
     car = [north(20 + n / 2, "car", 0.001 - 0.0001 * n, 0) for n in range(8)]

@@ -1,4 +1,4 @@
-"""What is wrong with a scope or with elements is said of the field where it stands."""
+"""Errors of a scope or of elements are reported at their field."""
 
 from __future__ import annotations
 

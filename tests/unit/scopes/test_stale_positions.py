@@ -1,4 +1,4 @@
-"""Road users that leave the picture: what they sent last is no place for long, and says so where it counts on."""
+"""Road users that leave the picture: their last positions expire soon, and uses of older ones are reported."""
 
 from __future__ import annotations
 
@@ -161,7 +161,7 @@ def near(**position: Any) -> Any:
         ({"maxAge": "4s"}, {"staleAfter": "2s"}, 2.0),
         ({}, {"staleAfter": "500ms"}, 0.5),
         ({}, {"staleAfter": "20s"}, 1.0),
-        ({}, {"staleAfter": "Never"}, None),  # what was said holds: it has no age
+        ({}, {"staleAfter": "Never"}, None),  # the last sample stays valid: it has no maximum age
         ({"maxAge": "2s"}, {"staleAfter": "Never"}, 2.0),
     ],
 )

@@ -59,7 +59,7 @@ RULE = a_rule(
     when="probe",
     until="!probe",
 )
-"""Starts and ends with each change of the probe, so that every tick tells the signals' values."""
+"""Starts and ends with each change of the probe, so that every tick reports the signals' values."""
 
 
 @dataclass(frozen=True)
@@ -226,7 +226,7 @@ def test_aggregates_are_what_a_look_at_all_samples_says(sent: list[Sent], gap: i
     arrivals.sort()
     if gap is None:
         drive.take(*arrivals, until=ticks[-1])
-    else:  # the engine was stopped at gap - 1 and goes on, 0.9 s later, after what queued up
+    else:  # the engine was stopped at gap - 1 and continues, 0.9 s later, after what queued up
         split = [a for a in arrivals if a.received <= at(gap - 1)]
         drive.take(*split, until=gap - 1)
         drive.note(drive.engine.gap(at(gap - 0.1)))

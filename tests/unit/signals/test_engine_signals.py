@@ -1,4 +1,4 @@
-"""Signals: which samples count and when, what a sample tells, and what is unknown."""
+"""Signals: which samples count and when, the values of a sample, and what is unknown."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_a_signal_of_a_stale_stream_is_unknown_and_the_stream_is_not_among_the_c
     drive = Drive(detector, stale, latched, listed)
     one = [arrival(0.5, "car", {"v": 1}, "pose"), arrival(0.5, "car", {"v": 1}, "speed")]
     assert drive.take(*one, until=2) == ["latched car started 1", "listed car started 1", "stale car started 1"]
-    assert drive.take(until=25) == ["listed car Until 3"]  # speed was never told again, and still holds
+    assert drive.take(until=25) == ["listed car Until 3"]  # speed was never sent again, and stays valid
     assert drive.engine.counters.rules["stale"].unknowns > 0
 
 

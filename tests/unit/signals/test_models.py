@@ -51,7 +51,7 @@ class Driven(Drive):
 
 
 def always(*signals: Any, **spec: Any) -> EventRule:
-    """A rule whose episode starts at once for each client, so that the event tells its signals."""
+    """A rule whose episode starts at once for each client, so that the event has its signals."""
     return a_rule("r", signals=list(signals), when="true", **spec)
 
 

@@ -1,4 +1,4 @@
-"""What the detector and the process of a plugin tell each other arrives whole, however it is cut on the way."""
+"""Messages between the detector and a plugin's process arrive whole, however they are split."""
 
 from __future__ import annotations
 

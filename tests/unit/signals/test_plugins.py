@@ -165,7 +165,7 @@ def test_one_that_throws_is_unknown_counted_and_told_and_goes_on_afterwards() ->
     assert [event.rule for event in driven.events] == ["other", "r"]
     counters = driven.engine.counters.rule("r")
     assert counters.errors == 1
-    assert counters.last_error.startswith("signal p: plugin counting: ValueError: 2 is not to be borne (signals.py:")
+    assert counters.last_error.startswith("signal p: plugin counting: ValueError: 2 is not acceptable (signals.py:")
     assert driven.engine.counters.rule("other").errors == 0
 
 

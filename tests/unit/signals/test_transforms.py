@@ -1,4 +1,4 @@
-"""The transform tree of a client: chains, interpolation, static transforms, prefixes, and what cannot be told."""
+"""The transform tree of a client: chains, interpolation, static transforms, prefixes, and what is unknown."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An explanation follows the chain from the event to the pods, and says of each task and value what came of it."""
+"""An explanation follows the chain from the event to the pods, and gives the result of each task and value."""
 
 from __future__ import annotations
 
@@ -164,7 +164,7 @@ def test_the_text_says_what_each_task_does_and_whose_values_lost_and_why() -> No
     assert "rest (by a person, Suspend, priority 5) Counts" in lines
     assert "20 of scene-a (car1+car2) is outbid: a Reconfigure task overrides it" in lines
     assert "2 of thin is it" in lines
-    assert not [each for each in lines if " of rest " in each], "its parameters only say which instance it means"
+    assert not [each for each in lines if " of rest " in each], "its parameters only select its instance"
     of_all = explanation_text(explained("thin", tasks)).splitlines()
     assert "instances: all of the template" in of_all
 

@@ -1,4 +1,4 @@
-"""What is lost is said at once, then no more than once a minute, and in all at the end."""
+"""Losses are logged at once, then at most once a minute, and in total at the end."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""EventRules and Detectors are told whether they can be evaluated, and what is wrong where."""
+"""The status of EventRules and Detectors reports whether they can be evaluated, and errors with their place."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a detector's status says is what a scrape gets; and liveness and readiness are told over HTTP."""
+"""A scrape returns a detector's status; liveness and readiness are served over HTTP."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What no node is like is told by field and value, with what there is instead; and what one is like, is not."""
+"""Unmatched constraints are reported by field and value, with the existing values; matched ones are not."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The guide's template goes where its parameters say, and the guide's message is what the manager says."""
+"""The guide's template is placed by its parameters, and the guide's message is the manager's."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What keeps a pod from running is said in words, the same ones while a kubelet tries and tries again."""
+"""What keeps a pod from running is reported in words that stay the same while a kubelet retries."""
 
 from __future__ import annotations
 

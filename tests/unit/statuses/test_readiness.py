@@ -1,4 +1,4 @@
-"""Ready means that the workload does its work, as its controller says; anything else goes by its conditions."""
+"""Ready means that the workload is ready according to its controller; other kinds by their conditions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the cluster's own rules refuse is told by its kind, in the same words each time, and tried again ever later."""
+"""Rejections by the cluster's own rules are reported by kind, in constant words, and retried with backoff."""
 
 from __future__ import annotations
 

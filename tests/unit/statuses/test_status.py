@@ -1,4 +1,4 @@
-"""A running detector says what it takes in, evaluates and loses; the numbers are those of what was sent."""
+"""A running detector reports what it receives, evaluates and loses; the numbers match what was sent."""
 
 from __future__ import annotations
 
@@ -163,7 +163,7 @@ def test_what_is_asked_of_the_evaluation_is_done_on_its_thread_and_errors_are_th
     assert early.result(60) == drive.engine.now
     with pytest.raises(ZeroDivisionError):
         evaluator.call(lambda: 1 // 0).result(60)
-    assert evaluator.call(lambda: "goes on").result(60) == "goes on"
+    assert evaluator.call(lambda: "continues").result(60) == "continues"
     evaluator.stop()
     assert evaluator.call(lambda: "too late").cancelled()
     assert failures == []

@@ -1,4 +1,4 @@
-"""Clients that are expected are there from the start and are never lost; so a rule can tell that one is silent."""
+"""Expected clients are known from the start and are never lost, so a rule can detect that one is silent."""
 
 from __future__ import annotations
 

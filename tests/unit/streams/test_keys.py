@@ -1,4 +1,4 @@
-"""Key patterns subscribe to what they match, and say where they are wrong."""
+"""Key patterns subscribe to what they match, and report the place of errors."""
 
 import pytest
 import zenoh

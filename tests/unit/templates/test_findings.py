@@ -1,4 +1,5 @@
-"""What is wrong with templates, rules and detectors is found before anybody uses them, and told from what may pass."""
+"""What is wrong with templates, rules and detectors is found before anybody uses them, and distinguished from valid
+uses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rendering: a template and an instance give manifests, or say what is wrong with the template."""
+"""Rendering: a template and an instance give manifests, or the template's errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Suspended: which objects are at zero, which are paused, and what the instance says of it."""
+"""Suspended: which objects are at zero, which are paused, and the instance's condition."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The examples in docs/templates.md do what the text says."""
+"""The examples in docs/templates.md work as described."""
 
 from __future__ import annotations
 
