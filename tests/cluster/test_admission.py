@@ -129,7 +129,7 @@ def spoilt(good: Object, change: Object) -> Object:
     return {"spec": change}
 
 
-def test_what_is_wrong_is_refused_the_old_version_stays_and_a_condition_says_the_same_where_nobody_asks(
+def test_what_is_wrong_is_refused_the_old_version_stays_and_without_the_webhook_a_condition_reports_it(
     api: Api, webhook: Webhook
 ) -> None:
     api.create(detector())
@@ -304,7 +304,7 @@ def listener(folder: Path) -> Iterator[tuple[int, Path, list[Object]]]:
         server.server_close()
 
 
-def test_tasks_instances_statuses_and_deletions_are_never_asked_about(
+def test_tasks_instances_statuses_and_deletions_are_never_reviewed(
     api: Api, processes: Processes, namespace: str, tmp_path: Path
 ) -> None:
     start_manager(processes, namespace)

@@ -39,7 +39,7 @@ def test_programs_in_kubebuilder_assets_win_and_only_the_rest_comes_from_the_cac
     assert (found.kube_controller_manager, found.kubectl) == (ours.kube_controller_manager, ours.kubectl)
 
 
-def test_kubebuilder_assets_without_a_program_is_told_before_anything_is_built(
+def test_kubebuilder_assets_without_a_program_is_reported_before_anything_is_built(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     program(tmp_path / "etcd")
@@ -48,7 +48,7 @@ def test_kubebuilder_assets_without_a_program_is_told_before_anything_is_built(
         ensure_binaries()
 
 
-def test_kubebuilder_assets_that_is_no_folder_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kubebuilder_assets_that_is_no_folder_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("KUBEBUILDER_ASSETS", "/nowhere/at/all")
     with pytest.raises(BinariesUnavailableError, match="KUBEBUILDER_ASSETS=/nowhere/at/all is not a folder"):
         ensure_binaries()

@@ -48,7 +48,7 @@ def test_the_rules_of_the_namespace_are_listed_and_those_of_others_are_not(
     assert json.loads(elsewhere.stdout)["rules"] == []
 
 
-def test_a_rule_that_cannot_be_read_is_told_and_the_others_are_listed(
+def test_a_rule_that_cannot_be_read_is_reported_and_the_others_are_listed(
     control_plane: ControlPlane, api: Api, namespace: str
 ) -> None:
     api.create(rule("battery", RARE))
@@ -65,7 +65,7 @@ def test_a_rule_that_cannot_be_read_is_told_and_the_others_are_listed(
     assert summary == "1 of 1 rules"
 
 
-def test_who_may_not_list_rules_is_told_so_in_one_line(control_plane: ControlPlane, namespace: str) -> None:
+def test_a_user_who_may_not_list_rules_gets_one_line(control_plane: ControlPlane, namespace: str) -> None:
     stranger = control_plane.kubeconfig_with_token("catalog-stranger", "no-such-token")
     answer = catalog(stranger, namespace)
     assert answer.returncode == 2

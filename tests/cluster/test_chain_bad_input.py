@@ -184,7 +184,7 @@ def test_rules_that_do_not_compile_are_refused_and_the_others_run(chain: Chain) 
         assert chain.wait_condition("EventRule", "syntax", "Accepted", "True")
 
 
-def test_detector_check_tells_where_each_rule_is_wrong(tmp_path: Path) -> None:
+def test_detector_check_reports_where_each_rule_is_wrong(tmp_path: Path) -> None:
     good = [detector("tcp/127.0.0.1:7447"), rule()]
     (tmp_path / "good.yaml").write_text(yaml.safe_dump_all(good), encoding="utf-8")
     for name, (bad, _) in BAD_RULES.items():
@@ -196,7 +196,7 @@ def test_detector_check_tells_where_each_rule_is_wrong(tmp_path: Path) -> None:
         assert re.search(rf"^{name}\.yaml:\d+:\d+: {logged}", checked.stderr, re.MULTILINE), checked.stderr
 
 
-def test_a_rule_for_a_template_that_is_not_there_says_so_on_its_task(chain: Chain) -> None:
+def test_a_rule_for_a_template_that_is_not_there_reports_it_on_its_task(chain: Chain) -> None:
     missing = [{"name": "record", "deploy": {"templateName": "recordr", "parameters": {}}}]
     chain.apply(rule(), of_vans(missing), detector(chain.endpoint))
     running = chain.start(rules=2)
@@ -246,7 +246,7 @@ def test_bad_usage_is_one_line_and_exit_code_2(tmp_path: Path, arguments: list[s
     assert not done.stdout
 
 
-def test_a_detector_that_is_not_in_the_cluster_is_waited_for_and_that_is_said(chain: Chain) -> None:
+def test_a_detector_that_is_not_in_the_cluster_is_waited_for_and_that_is_reported(chain: Chain) -> None:
     running = chain.processes.start("detector", "run", "--name", HOLDER, "--namespace", chain.namespace)
     running.wait_for_output(f"there is no Detector '{HOLDER}' in namespace {chain.namespace}: create it")
     chain.apply(rule(), detector(chain.endpoint))

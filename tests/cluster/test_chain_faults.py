@@ -132,7 +132,7 @@ def test_a_detector_ends_and_starts_while_the_api_server_is_away(
     chain.settled()
 
 
-def test_a_detector_told_to_end_does_so_promptly_and_its_tasks_stay(chain: Chain, vehicles: Vehicles) -> None:
+def test_a_detector_that_is_stopped_ends_promptly_and_its_tasks_stay(chain: Chain, vehicles: Vehicles) -> None:
     running = chain.start()
     vehicles.place(CARS, NEAR)
     deployed = chain.wait_deployed(CARS)

@@ -224,7 +224,7 @@ def wait_for_pods(api: Api, component: str, count: int) -> None:
     )
 
 
-def test_the_manager_lives_on_what_is_installed_and_the_test_pods_script_says_that_it_answers(
+def test_the_manager_lives_on_what_is_installed_and_the_test_pods_script_reports_that_it_answers(
     helm: Helm, there: Api, bare: ControlPlane, tmp_path: Path
 ) -> None:
     mine = {"namespaces": [there.namespace], "allowedKinds": ["v1/ConfigMap"], "metrics": {"tlsSecretName": "metrics"}}

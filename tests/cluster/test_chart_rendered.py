@@ -196,7 +196,7 @@ def test_sidecars_are_scraped_by_the_port_that_they_have(helm: Helm) -> None:
     assert [each["port"] for each in monitor["spec"]["podMetricsEndpoints"]] == [container["ports"][0]["name"]]
 
 
-def test_traces_go_where_it_says_from_both_programs(helm: Helm) -> None:
+def test_traces_go_to_the_endpoint_from_both_programs(helm: Helm) -> None:
     endpoint, variables = "http://collector:4318", {"OTEL_TRACES_SAMPLER": "always_on"}
     rendered = helm.rendered({"tracing": {"endpoint": endpoint, "variables": variables}})
     wanted = {"OTEL_EXPORTER_OTLP_ENDPOINT": endpoint, **variables}
@@ -218,7 +218,7 @@ def test_the_examples_values_are_its_detector_where_vehicles_reach_it(helm: Helm
     assert [each["targetPort"] for each in ports] == [7447]
 
 
-def test_a_new_version_of_the_chart_alone_makes_no_pod_anew(helm: Helm, tmp_path: Path) -> None:
+def test_a_new_version_of_the_chart_alone_recreates_no_pod(helm: Helm, tmp_path: Path) -> None:
     newer = tmp_path / "wayside"
     shutil.copytree(CHART, newer)
     described = (newer / "Chart.yaml").read_text()
@@ -267,7 +267,7 @@ def test_a_cluster_that_gives_users_and_has_one_registry_gets_what_it_takes(helm
         assert [each for each in arguments if "detector-user" in each] == options
 
 
-def test_the_deployment_and_the_webhooks_are_as_the_values_say(helm: Helm) -> None:
+def test_the_deployment_and_the_webhooks_follow_the_values(helm: Helm) -> None:
     given: Values = {
         "manager": {
             "annotations": {"reloader/auto": "true"},

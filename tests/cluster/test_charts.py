@@ -168,7 +168,7 @@ def test_wrong_charts_block_nobody(api: Api, manager: Process, charts: Path) -> 
         assert manager.terminate(patience=15) == 0
 
 
-def test_a_chart_that_is_not_there_is_said_and_outside_its_folder_refused(api: Api, manager: Process) -> None:
+def test_a_chart_that_is_not_there_is_reported_and_outside_its_folder_refused(api: Api, manager: Process) -> None:
     api.create(template("away", {"chart": "app", "version": "1.0.0", "repository": "http://127.0.0.1:1"}))
     api.create(template("outside", {"chart": "/etc"}))
     for name in ("away", "outside"):

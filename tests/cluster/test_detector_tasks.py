@@ -149,7 +149,7 @@ def test_changed_parameters_are_patched_and_removed_ones_go(api: Api, namespace:
     running.counted(DeployCounts(created=1, patched=1))
 
 
-def test_what_cannot_be_changed_is_made_anew_under_the_same_name(api: Api, namespace: str, running: Running) -> None:
+def test_what_cannot_be_changed_is_recreated_under_the_same_name(api: Api, namespace: str, running: Running) -> None:
     wanted = demand(namespace)
     running.update(by_name(wanted))
     [before] = tasks_are(api, {wanted.name})
@@ -211,7 +211,7 @@ def test_an_outage_delays_starts_and_ends_and_loses_none(
 
 
 @pytest.mark.own_control_plane
-def test_an_end_that_a_stopped_detector_could_not_tell_is_told_by_the_next(
+def test_an_end_that_a_stopped_detector_could_not_report_is_reported_by_the_next(
     control_plane: ControlPlane, api: Api, namespace: str
 ) -> None:
     wanted = demand(namespace)
@@ -253,7 +253,7 @@ def test_a_detector_that_stops_leaves_its_live_tasks_alive_and_adopts_them(
         assert api.get("ApplicationTask", task["metadata"]["name"]) == task
 
 
-def test_others_tasks_are_neither_ended_nor_taken_for_own(api: Api, namespace: str, running: Running) -> None:
+def test_others_tasks_are_neither_ended_nor_treated_as_own(api: Api, namespace: str, running: Running) -> None:
     wanted = demand(namespace)
     foreign = demand(namespace, "x+y", holder="intersection-b")
     usurped = task_manifest(to_task(wanted))
@@ -277,7 +277,7 @@ def test_others_tasks_are_neither_ended_nor_taken_for_own(api: Api, namespace: s
     assert [api.get("ApplicationTask", each["metadata"]["name"]) for each in before] == before
 
 
-def test_a_task_that_exists_is_told_from_other_refusals(namespace: str, running: Running, api: Api) -> None:
+def test_a_task_that_exists_is_distinguished_from_other_refusals(namespace: str, running: Running, api: Api) -> None:
     wanted = demand(namespace)
     running.update(by_name(wanted))
     tasks_are(api, {wanted.name})

@@ -98,7 +98,7 @@ def test_what_happens_around_an_outage_is_not_missed(
 
 
 @pytest.mark.own_control_plane
-def test_history_that_the_server_no_longer_has_is_told_as_such(
+def test_history_that_the_server_no_longer_has_is_reported_as_such(
     control_plane: ControlPlane, api: Api, namespace: str, loop: Background
 ) -> None:
     old = api.create(config_map("a", "1"))["metadata"]["resourceVersion"]

@@ -137,7 +137,7 @@ def test_what_cannot_be_applied_is_not_ready_though_its_old_version_runs(
     assert api.get("Deployment", NORTH)["status"]["availableReplicas"] == 1
 
 
-def test_a_task_whose_instance_is_going_says_so(processes: Processes, namespace: str, api: Api) -> None:
+def test_a_task_whose_instance_is_going_reports_it(processes: Processes, namespace: str, api: Api) -> None:
     start_manager(processes, namespace)
     api.create(template())
     api.create(task("first", region="north"))

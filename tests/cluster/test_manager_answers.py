@@ -55,7 +55,7 @@ def wait_column(control_plane: ControlPlane, api: Api, what: str, name: str, **c
     )
 
 
-def test_columns_tell_what_is_wanted_what_runs_and_what_is_lacking(
+def test_columns_show_what_is_wanted_what_runs_and_what_is_missing(
     control_plane: ControlPlane, api: Api, manager: Process
 ) -> None:
     api.create(template(**RATED, linger="300s"))
@@ -118,7 +118,7 @@ def test_what_cannot_be_explained_is_one_line_with_the_remedy(control_plane: Con
     assert "the manager has not processed its current generation" in reported
 
 
-def test_explain_knows_who_has_no_place_and_what_stands_in_for_whom(
+def test_explain_knows_what_has_no_place_and_what_replaces_what(
     control_plane: ControlPlane, api: Api, processes: Processes, namespace: str
 ) -> None:
     start_manager(processes, namespace, "--max-instances", "2")

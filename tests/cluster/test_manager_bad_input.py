@@ -81,7 +81,7 @@ def changed(container: Object) -> Object:
     ids=["unknown template", "wrong type", "too large"],
 )
 @pytest.mark.usefixtures("unharmed")
-def test_a_task_that_cannot_be_served_is_told_why(api: Api, spec: Object, reason: str, parts: list[str]) -> None:
+def test_a_task_that_cannot_be_served_reports_why(api: Api, spec: Object, reason: str, parts: list[str]) -> None:
     api.create({**task("wrong"), "spec": spec})
     accepted = wait_told(api, "ApplicationTask", "wrong", "Accepted", parts)
     assert accepted["reason"] == reason
@@ -106,7 +106,7 @@ def test_a_task_that_cannot_be_served_is_told_why(api: Api, spec: Object, reason
     ids=["unknown parameter", "forbidden kind"],
 )
 @pytest.mark.usefixtures("unharmed")
-def test_a_template_that_cannot_be_rendered_is_told_why(api: Api, manifest: Object, parts: list[str]) -> None:
+def test_a_template_that_cannot_be_rendered_reports_why(api: Api, manifest: Object, parts: list[str]) -> None:
     api.create(template("bad", manifests=[manifest]))
     api.create(task("north", of="bad"))
     wait_told(api, "ApplicationTemplate", "bad", "Accepted", parts)
@@ -129,7 +129,7 @@ def test_a_template_that_cannot_be_rendered_is_told_why(api: Api, manifest: Obje
     ids=["another namespace", "a name for all", "wrong type", "unknown field", "refused by the API server"],
 )
 @pytest.mark.usefixtures("unharmed")
-def test_an_instance_that_cannot_be_applied_is_told_why(api: Api, manifest: Object, parts: list[str]) -> None:
+def test_an_instance_that_cannot_be_applied_reports_why(api: Api, manifest: Object, parts: list[str]) -> None:
     api.create(template("bad", manifests=[manifest]))
     api.create(task("north", of="bad"))
     wait_told(api, "ApplicationInstance", BAD, "Applied", parts)

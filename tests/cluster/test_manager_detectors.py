@@ -175,7 +175,7 @@ def test_its_objects_come_change_and_go_with_it(api: Api, processes: Processes, 
         api.wait_gone(kind, NAME)
 
 
-def test_the_status_says_why_it_does_not_run(api: Api, processes: Processes, namespace: str) -> None:
+def test_the_status_reports_why_it_does_not_run(api: Api, processes: Processes, namespace: str) -> None:
     other = {"apiVersion": "v1", "kind": "ServiceAccount", "metadata": {"name": NAME}}
     foreign = api.create(other)
     manager = start_manager(processes, namespace)

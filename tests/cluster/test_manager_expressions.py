@@ -56,7 +56,7 @@ def applied(api: Api, name: str, reason: str) -> Object:
     )
 
 
-def test_what_runs_stays_as_it_is_and_the_template_says_why(api: Api, namespace: str, processes: Processes) -> None:
+def test_what_runs_stays_as_it_is_and_the_template_reports_why(api: Api, namespace: str, processes: Processes) -> None:
     start_manager(processes, namespace, *LIMIT)
     north = instance_name("bomb", "north")
     api.create(bomb())

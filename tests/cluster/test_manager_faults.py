@@ -247,7 +247,7 @@ def test_without_its_template_an_instance_lingers_and_goes(api: Api, manager: Pr
     wait_settled(api)
 
 
-def test_a_linger_goes_on_through_a_restart(api: Api, manager: Process) -> None:
+def test_a_linger_continues_through_a_restart(api: Api, manager: Process) -> None:
     api.create(template(linger="15s"))
     api.create(task("north"))
     there(api, NORTH)

@@ -155,7 +155,7 @@ def beyond_the_quota(api: Api, name: str) -> Object:
     )
 
 
-def test_an_object_beyond_the_quota_is_said_and_made_once_there_is_room(
+def test_an_object_beyond_the_quota_is_reported_and_made_once_there_is_room(
     api: Api, processes: Processes, namespace: str
 ) -> None:
     api.create(quota({"count/deployments.apps": "1"}))
@@ -183,7 +183,7 @@ def test_an_object_beyond_the_quota_is_said_and_made_once_there_is_room(
     assert manager.alive
 
 
-def test_an_instance_beyond_the_quota_is_told_to_its_tasks(api: Api, processes: Processes, namespace: str) -> None:
+def test_an_instance_beyond_the_quota_is_reported_to_its_tasks(api: Api, processes: Processes, namespace: str) -> None:
     api.create(quota({"count/applicationinstances.wayside.dev": "1"}))
     wait_enforced(api)
     start_manager(processes, namespace)
@@ -199,7 +199,7 @@ def test_an_instance_beyond_the_quota_is_told_to_its_tasks(api: Api, processes: 
     wait_settled(api)
 
 
-def test_pods_beyond_the_quota_are_told_to_the_tasks(api: Api, processes: Processes, namespace: str) -> None:
+def test_pods_beyond_the_quota_are_reported_to_the_tasks(api: Api, processes: Processes, namespace: str) -> None:
     api.create(quota({"pods": "0"}))
     wait_enforced(api)
     start_manager(processes, namespace)
@@ -220,7 +220,7 @@ def test_pods_beyond_the_quota_are_told_to_the_tasks(api: Api, processes: Proces
     )
 
 
-def test_what_a_limit_range_refuses_is_told_as_well(api: Api, processes: Processes, namespace: str) -> None:
+def test_what_a_limit_range_refuses_is_reported_as_well(api: Api, processes: Processes, namespace: str) -> None:
     most = {"type": "PersistentVolumeClaim", "max": {"storage": "1Gi"}}
     spec = {"limits": [most]}
     api.create({"apiVersion": "v1", "kind": "LimitRange", "metadata": {"name": "small"}, "spec": spec})
@@ -262,7 +262,7 @@ def test_a_limit_that_is_lowered_and_raised_stops_and_starts_the_last(
 
 
 @pytest.mark.parametrize("kind", ["StatefulSet", "Job"])
-def test_pods_that_only_events_tell_are_refused_are_said_and_made_once_there_is_room(
+def test_pods_whose_refusal_only_events_report_are_reported_and_made_once_there_is_room(
     kind: str, api: Api, processes: Processes, namespace: str
 ) -> None:
     api.create(quota({"pods": "0"}))

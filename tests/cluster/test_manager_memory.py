@@ -77,7 +77,7 @@ def test_parameters_and_templates_that_are_too_large_are_refused_with_their_size
     api.wait_for("Deployment", instance_name("app", "north"), lambda _: True, what="others are served")
 
 
-def test_near_its_limit_it_serves_whom_it_served_and_tells_the_others_so(
+def test_near_its_limit_it_serves_those_that_it_served_and_reports_it_to_the_others(
     api: Api, processes: Processes, namespace: str
 ) -> None:
     roomy = start_manager(processes, namespace)

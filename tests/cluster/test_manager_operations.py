@@ -150,7 +150,7 @@ def test_a_suspended_instance_is_at_zero_and_comes_back_with_the_replicas_it_had
     wait_settled(api)
 
 
-def test_a_suspension_that_is_outbid_says_so_and_wins_when_the_higher_ends(api: Api, manager: Process) -> None:
+def test_a_suspension_that_is_outbid_reports_it_and_wins_when_the_higher_ends(api: Api, manager: Process) -> None:
     api.create(template())
     first = task("important", region="north")
     first["spec"]["priority"] = 5
@@ -210,7 +210,7 @@ def test_a_manager_killed_while_it_suspends_or_resumes_loses_no_replicas(
     wait_settled(api)
 
 
-def test_what_an_autoscaler_owns_is_paused_and_goes_on_where_it_was(api: Api, manager: Process) -> None:
+def test_what_an_autoscaler_owns_is_paused_and_continues_where_it_was(api: Api, manager: Process) -> None:
     autoscaler = {
         "apiVersion": "autoscaling/v2",
         "kind": "HorizontalPodAutoscaler",

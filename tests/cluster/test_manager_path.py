@@ -170,7 +170,7 @@ def test_a_persons_instance_is_made_but_never_released(api: Api, manager: Proces
     wait_settled(api)
 
 
-def test_events_tell_the_story_once(api: Api, manager: Process) -> None:
+def test_events_report_each_change_once(api: Api, manager: Process) -> None:
     api.create(template())
     api.wait_for("ApplicationTemplate", "app", lambda raw: bool(condition(raw, "Accepted")), what="it is known")
     api.create(task("north"))

@@ -332,7 +332,7 @@ def test_what_nothing_works_without_ends_the_start_with_one_line(
     assert "apply the output of `application-manager rbac`" in manager.output()
 
 
-def test_what_only_some_need_is_said_at_the_start_and_where_it_shows(
+def test_what_only_some_need_is_reported_at_the_start_and_where_it_shows(
     api: Api, processes: Processes, namespace: str, account: Path
 ) -> None:
     whole = printed("--namespace", namespace, "--account", f"{namespace}/manager", *ALLOWED)

@@ -44,7 +44,7 @@ def wait_ready_says(api: Api, kind: str, name: str, *, status: str = "False", re
     api.wait_for(kind, name, holds, what=f"Ready={status} of {kind} {name}, reason {reason}, contains {text!r}")
 
 
-def test_why_its_pods_do_not_run_is_said_of_task_and_instance_until_they_do(api: Api, manager: Process) -> None:
+def test_why_its_pods_do_not_run_is_reported_by_task_and_instance_until_they_do(api: Api, manager: Process) -> None:
     api.create(template(image="registry.example/app:9"))
     api.create(task("north"))
     pod = its_pod(api)
@@ -102,7 +102,7 @@ def test_a_new_version_that_does_not_run_is_not_ready_though_the_old_one_still_d
     wait_ready_says(api, "ApplicationInstance", NORTH, reason="NotReady", text=f"Deployment {NORTH} ")
 
 
-def test_other_kinds_are_judged_by_what_they_say(api: Api, manager: Process) -> None:
+def test_other_kinds_are_judged_by_their_conditions(api: Api, manager: Process) -> None:
     claim = {
         "apiVersion": "v1",
         "kind": "PersistentVolumeClaim",

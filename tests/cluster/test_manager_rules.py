@@ -14,7 +14,9 @@ def judged(raw: Object) -> str:
     return str(condition(raw, "Accepted").get("reason"))
 
 
-def test_a_rule_follows_its_detectors_and_what_is_wrong_is_told(api: Api, processes: Processes, namespace: str) -> None:
+def test_a_rule_follows_its_detectors_and_what_is_wrong_is_reported(
+    api: Api, processes: Processes, namespace: str
+) -> None:
     start_manager(processes, namespace)
     rule, detector = copy.deepcopy(EVENT_RULE), copy.deepcopy(DETECTOR)
     rule["metadata"]["labels"] = {"site": "intersection-a"}

@@ -121,7 +121,7 @@ def test_the_standby_takes_over_what_a_killed_one_was_doing(api: Api, pair: Pair
     interrupted(api, pair, lambda pair: pair.active.kill9())
 
 
-def test_one_that_stood_still_writes_nothing_when_it_goes_on(api: Api, pair: Pair) -> None:
+def test_one_that_stood_still_writes_nothing_when_it_continues(api: Api, pair: Pair) -> None:
     interrupted(api, pair, stopped)
     for name in (*REGIONS[1:], "late"):
         end(api, name)
@@ -155,7 +155,7 @@ def test_one_that_was_cut_off_comes_back_as_a_standby(api: Api, pair: Pair) -> N
     pair.never_both()
 
 
-def test_one_that_is_cut_off_ends_when_it_is_told_to(api: Api, pair: Pair) -> None:
+def test_one_that_is_cut_off_ends_when_it_is_stopped(api: Api, pair: Pair) -> None:
     demanded(api)
     pair.old.cut = True
     assert pair.active.terminate() == 0

@@ -39,7 +39,7 @@ def test_a_burst_of_tasks_is_worked_off_with_few_requests_at_once(
         wait_settled(api)
 
 
-def test_nothing_is_asked_before_the_time_that_the_api_server_gave_is_over(
+def test_nothing_is_requested_before_the_time_that_the_api_server_gave_is_over(
     api: Api, processes: Processes, namespace: str, control_plane: ControlPlane
 ) -> None:
     with faulty_proxy(control_plane.kubeconfig) as (proxy, kubeconfig):

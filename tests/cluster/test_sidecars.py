@@ -77,7 +77,7 @@ def injected(
     return done.returncode, done.stdout, done.stderr
 
 
-def test_a_pod_that_asks_gets_the_detector_once_and_as_the_command_prints_it(
+def test_a_pod_that_requests_it_gets_the_detector_once_and_as_the_command_prints_it(
     api: Api, requested: Webhook, namespace: str, control_plane: ControlPlane
 ) -> None:
     made = api.create(pod())
@@ -108,7 +108,7 @@ def without_token(items: list[Object]) -> list[Object]:
     return [each for each in items if not each["name"].startswith("kube-api-access-")]
 
 
-def test_a_second_webhook_that_is_asked_about_the_same_pod_adds_nothing(
+def test_a_second_webhook_that_is_called_for_the_same_pod_adds_nothing(
     api: Api, processes: Processes, tmp_path: Path, accounts: None
 ) -> None:
     metrics = free_port()
@@ -160,7 +160,7 @@ def test_a_deployments_pods_get_it_however_they_are_made(api: Api, requested: We
     assert not api.get("Deployment", "cars")["spec"]["template"]["spec"].get("initContainers")
 
 
-def test_a_pod_that_cannot_have_it_is_made_and_its_event_says_why(api: Api, requested: Webhook) -> None:
+def test_a_pod_that_cannot_have_it_is_created_and_its_event_reports_why(api: Api, requested: Webhook) -> None:
     lost = pod("lost")
     lost["metadata"]["labels"] = {"wayside.dev/detector": "nowhere"}
     for each in (lost, pod("foreign", account="other")):
@@ -207,7 +207,7 @@ def test_a_manager_that_hangs_or_is_gone_keeps_no_pod_from_being_made(
             event_of(api, name, "it was created before its Detector, or while no webhook was available")
 
 
-def test_an_event_is_not_told_again_by_the_next_manager(
+def test_an_event_is_not_reported_again_by_the_next_manager(
     api: Api, processes: Processes, namespace: str, webhook: Webhook
 ) -> None:
     api.create(pod())

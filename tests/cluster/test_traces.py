@@ -93,7 +93,7 @@ def test_a_trace_runs_from_the_event_to_the_readiness(
 
 
 @pytest.mark.usefixtures("kubelet")
-def test_an_episode_that_is_taken_up_again_ends_the_same_span(chain: Chain, receiver: Receiver) -> None:
+def test_an_episode_that_is_restored_ends_the_same_span(chain: Chain, receiver: Receiver) -> None:
     program = chain.start()
     with Vehicles(chain.endpoint) as vehicles:
         vehicles.place(CARS, NEAR)

@@ -73,7 +73,7 @@ def test_a_service_is_reached_by_its_name_from_a_pod_and_by_its_port_from_outsid
     )
 
 
-def test_a_pod_can_ask_the_api_server_with_its_own_account(node: Node, api: Api, image: str) -> None:
+def test_a_pod_can_query_the_api_server_with_its_own_account(node: Node, api: Api, image: str) -> None:
     api.apply(deployment("app", image, ("python3", "-c", "import time; time.sleep(10**6)")))
     pod = wait_available(api, "app")["metadata"]["name"]
     ask = (

@@ -78,7 +78,7 @@ def test_after_a_restart_of_the_node_everything_runs_that_is_demanded_then(town:
         town.settled()
 
 
-def test_without_the_api_server_applications_go_on_and_what_was_seen_is_told_afterwards(
+def test_without_the_api_server_applications_continue_and_what_was_seen_is_reported_afterwards(
     town: NodeTown, api: Api
 ) -> None:
     town.start(after="1s")

@@ -49,7 +49,7 @@ def test_before_it_is_installed_it_is_missed(site: Path) -> None:
     assert check(site).returncode == 0
 
 
-def test_it_writes_its_lines_and_its_outcomes_are_told_and_counted(
+def test_it_writes_its_lines_and_its_outcomes_are_reported_and_counted(
     site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(site), *filter(None, sys.path)]))

@@ -188,7 +188,7 @@ def test_a_certificate_to_which_the_router_gives_nothing_leaves_the_session_alon
         assert came == list(range(came[0], came[-1] + 1))
 
 
-def test_tokens_and_latched_samples_are_told_of_once(
+def test_tokens_and_latched_samples_are_reported_once(
     at: str, authority: Authority, mounted: Path, arrivals: Arrivals
 ) -> None:
     latched = stream("map", "maps/${client:*}", history={"samples": 1})
@@ -222,7 +222,7 @@ def test_tokens_and_latched_samples_are_told_of_once(
         stays.undeclare()
 
 
-def test_a_detector_that_listens_opens_its_session_anew_and_stays_as_it_was_with_bad_files(
+def test_a_detector_that_listens_reopens_its_session_and_stays_as_it_was_with_bad_files(
     at: str, authority: Authority, mounted: Path, arrivals: Arrivals, caplog: pytest.LogCaptureFixture
 ) -> None:
     authority.mount(mounted, "localhost")

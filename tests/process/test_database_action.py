@@ -164,7 +164,7 @@ def test_large_binary_data_goes_to_files_that_the_documents_name(desk: MakeDesk,
     assert scenario(database)["files"] == 2
 
 
-def test_without_files_what_mongodb_does_not_take_is_cut_counted_and_said(desk: MakeDesk, database: Any) -> None:
+def test_without_files_what_mongodb_does_not_take_is_cut_counted_and_reported(desk: MakeDesk, database: Any) -> None:
     keep = desk(streams=[a_stream("blob", encoding="raw")])
     episode = keep.begin()
     keep.take(episode, [EpisodeSample("car1", "blob", "vehicles/car1/blob", START, START, bytes(17 * 2**20))])

@@ -166,7 +166,7 @@ def test_what_somebody_removed_from_the_spool_costs_its_scenario_and_no_other(
     assert keep.losses.total() > 0
 
 
-def test_open_episodes_say_that_the_database_is_away(desk: MakeDesk, way: Way) -> None:
+def test_open_episodes_report_that_the_database_is_away(desk: MakeDesk, way: Way) -> None:
     keep = desk(spool=2**26)
     episode = keep.begin()
     way.cut()

@@ -66,7 +66,9 @@ def test_a_rule_that_wants_files_needs_a_place_for_them(tmp_path: Path) -> None:
         ({"before": "1h"}, "reach back further"),
     ],
 )
-def test_what_is_wrong_in_an_action_is_said_with_its_place(tmp_path: Path, fields: dict[str, Any], logged: str) -> None:
+def test_what_is_wrong_in_an_action_is_reported_with_its_place(
+    tmp_path: Path, fields: dict[str, Any], logged: str
+) -> None:
     action = {"name": "keep", "database": fields}
     problem, *_ = checked(tmp_path, DETECTOR, {**RECORD_ALL, "spec": {**RECORD_ALL["spec"], "actions": [action]}})
     assert re.search(r"all\.yaml:\d+:\d+: .*spec\.actions\[0\]\.database", problem)
@@ -81,7 +83,7 @@ def test_what_is_wrong_in_an_action_is_said_with_its_place(tmp_path: Path, field
         ({"uriVariable": "A", "writeConcern": "Two"}, "writeConcern"),
     ],
 )
-def test_what_is_wrong_in_the_detectors_database_is_said_with_its_place(
+def test_what_is_wrong_in_the_detectors_database_is_reported_with_its_place(
     tmp_path: Path, database: dict[str, Any], logged: str
 ) -> None:
     (tmp_path / "d.yaml").write_text(

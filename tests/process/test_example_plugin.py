@@ -42,7 +42,7 @@ def test_a_rule_that_the_detector_does_not_select_is_no_silent_success(tmp_path:
         run(RULES, picky, DRIVE)
 
 
-def test_the_readme_says_the_same_three_lines() -> None:
+def test_the_readme_has_the_same_three_lines() -> None:
     readme = (EXAMPLE / "README.md").read_text()
     code = readme.split("```python\n")[1].split("```")[0]
     assert len([line for line in code.splitlines() if line]) == 3

@@ -91,7 +91,7 @@ def has(faulty: Faulty, page: str, code: int, text: str) -> Callable[[], bool]:
     ("fault", "shows"),
     [("stall-evaluation", "the last evaluation was"), ("stall-loop", "the event loop has been blocked for")],
 )
-def test_what_stands_still_is_not_live_and_live_again_once_it_goes_on(faulty: Faulty, fault: str, shows: str) -> None:
+def test_what_stands_still_is_not_live_and_live_again_once_it_continues(faulty: Faulty, fault: str, shows: str) -> None:
     faulty.write(ALWAYS, streams=(a_stream("speed"),))
     faulty.start()
     wait_for(has(faulty, "/readyz", 200, "the last evaluation"))

@@ -97,7 +97,7 @@ def test_the_bytes_that_wait_are_bounded_over_all_streams() -> None:
     assert intake.dropped == 1
 
 
-def test_after_a_step_back_of_the_clock_time_goes_on_from_there() -> None:
+def test_after_a_step_back_of_the_clock_time_continues_from_there() -> None:
     clock = Clock(1_000)
     intake = Intake(clock)
     put = intake.putter("s")

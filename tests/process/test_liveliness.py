@@ -92,7 +92,7 @@ def test_tokens_beyond_the_bound_are_ignored_and_counted(monkeypatch: pytest.Mon
     assert drive.engine.counters.crowded[LIVELINESS] == 1
 
 
-def test_when_the_detector_asks_for_other_tokens_the_timeout_decides_about_the_old_ones() -> None:
+def test_when_the_detector_requests_other_tokens_the_timeout_decides_about_the_old_ones() -> None:
     drive = Drive(detector(), HERE)
     drive.take(alive(0.1, "car1", Token.DECLARED), until=10)
     changed = a_detector(a_stream("speed"), clientTimeout="3s")
@@ -120,7 +120,7 @@ def _told(drive: Drive) -> list[str]:
     ]
 
 
-def test_a_pattern_that_is_none_is_told_with_its_field() -> None:
+def test_a_pattern_that_is_none_is_reported_with_its_field() -> None:
     with pytest.raises(DetectorError, match=r"spec\.zenoh\.liveliness: key 'a/x\$\{client:\*\}', column 3"):
         inlets(a_detector(zenoh={"liveliness": "a/x${client:*}"}))
     with pytest.raises(ValueError, match="liveliness does not capture the client"):

@@ -19,7 +19,7 @@ from tests.ports import free_endpoint
 SHORT = datetime.timedelta(seconds=20)
 
 
-def test_at_the_end_of_its_certificate_it_goes_on_with_the_new_one(
+def test_at_the_end_of_its_certificate_it_continues_with_the_new_one(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level("INFO")

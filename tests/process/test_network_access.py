@@ -106,7 +106,7 @@ def test_with_mtls_only_who_has_a_certificate_comes_in(
             wait_for(lambda: welcome.connected)
 
 
-def test_a_peer_listens_with_tls_and_asks_for_certificates(
+def test_a_peer_listens_with_tls_and_requires_certificates(
     endpoint: str,
     arrivals: Arrivals,
     authority: Authority,
@@ -129,7 +129,7 @@ def test_a_peer_listens_with_tls_and_asks_for_certificates(
             open_session(without).close()
 
 
-def test_only_the_right_password_opens_a_router_that_asks_for_one(
+def test_only_the_right_password_opens_a_router_that_requires_one(
     endpoint: str,
     arrivals: Arrivals,
     tmp_path: Path,
@@ -203,7 +203,7 @@ def test_samples_in_shared_memory_arrive(endpoint: str, arrivals: Arrivals) -> N
                 assert (sample.payload.as_shm() is not None) == shares
 
 
-def test_a_killed_router_is_said_and_so_is_its_return(
+def test_a_killed_router_is_reported_and_so_is_its_return(
     endpoint: str, arrivals: Arrivals, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level("INFO")
@@ -275,7 +275,7 @@ def test_a_running_detector_moves_to_another_network_with_its_buffer(endpoint: s
         ),
     ],
 )
-def test_what_is_not_there_is_told_with_its_field(given: dict[str, Any], problem: str) -> None:
+def test_what_is_not_there_is_reported_with_its_field(given: dict[str, Any], problem: str) -> None:
     config = Zenoh.model_validate({"connect": ["tcp/127.0.0.1:1"], "listen": ["tcp/127.0.0.1:0"], **given})
     with pytest.raises(NetworkError, match=re.escape(problem)):
         open_session(config)

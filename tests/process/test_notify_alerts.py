@@ -144,7 +144,7 @@ def test_more_alerts_than_may_be_are_dead_letters(there: Endpoint) -> None:
     desk.end()
 
 
-def test_at_the_end_what_is_over_is_told_and_what_fires_is_left_to_the_next_start(there: Endpoint) -> None:
+def test_at_the_end_what_is_over_is_reported_and_what_fires_is_left_to_the_next_start(there: Endpoint) -> None:
     there.behaviour = answers(503, Retry_After="60")
     desk = a_desk(notify(there))
     desk.action.started(open_of(an_episode("over")))

@@ -78,7 +78,7 @@ def test_the_cloudevents_sdk_reads_what_arrives(there: Endpoint, mode: str) -> N
 
 
 @pytest.mark.parametrize(("wanted", "reported"), [(["Started"], ["e1.started"]), (["Ended"], ["e1.ended"])])
-def test_only_the_wanted_events_are_told(there: Endpoint, wanted: list[str], reported: list[str]) -> None:
+def test_only_the_wanted_events_are_reported(there: Endpoint, wanted: list[str], reported: list[str]) -> None:
     desk = a_desk({"http": http(there), "events": wanted})
     desk.run(an_episode())
     desk.outcome("e1")
@@ -140,7 +140,7 @@ def test_a_message_that_the_endpoint_cannot_take_holds_up_no_other_episode(there
     desk.end()
 
 
-def test_the_end_is_told_after_the_start(there: Endpoint) -> None:
+def test_the_end_is_reported_after_the_start(there: Endpoint) -> None:
     there.behaviour = answers(500)
     desk = a_desk({"http": http(there)})
     desk.run(an_episode())
@@ -153,7 +153,9 @@ def test_the_end_is_told_after_the_start(there: Endpoint) -> None:
     desk.end()
 
 
-def test_an_endpoint_that_says_when_is_left_alone_until_then(there: Endpoint, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_endpoint_that_gives_a_time_is_left_alone_until_then(
+    there: Endpoint, monkeypatch: pytest.MonkeyPatch
+) -> None:
     there.behaviour = first_then(answers(429, Retry_After="1"), answers(200))
     desk = a_desk({"http": http(there), "events": ["Started"]})
     desk.run(an_episode("e1"), an_episode("e2"))
@@ -164,7 +166,7 @@ def test_an_endpoint_that_says_when_is_left_alone_until_then(there: Endpoint, mo
     desk.end()
 
 
-def test_who_tells_does_not_wait_for_an_endpoint_that_hangs(there: Endpoint) -> None:
+def test_the_publisher_does_not_wait_for_an_endpoint_that_hangs(there: Endpoint) -> None:
     there.behaviour = hangs()
     desk = a_desk({"http": http(there, "30s"), "waiting": 3, "events": ["Started"]})
     desk.run(an_episode("e0"))
@@ -279,7 +281,9 @@ def test_an_action_that_the_rule_no_longer_has_leaves_dead_letters(tmp_path: Pat
     assert len(list((tmp_path / "notify").iterdir())) == 1
 
 
-def test_of_a_resumed_episode_only_the_end_is_told_with_the_texts_of_its_start(there: Endpoint, tmp_path: Path) -> None:
+def test_of_a_resumed_episode_only_the_end_is_reported_with_the_texts_of_its_start(
+    there: Endpoint, tmp_path: Path
+) -> None:
     notify = {"http": http(there), "text": "x"}
     first = a_desk(notify, state=tmp_path)
     first.action.started(
@@ -297,7 +301,7 @@ def test_of_a_resumed_episode_only_the_end_is_told_with_the_texts_of_its_start(t
     second.end()
 
 
-def test_a_text_that_could_not_be_rendered_is_missing_and_said(there: Endpoint) -> None:
+def test_a_text_that_could_not_be_rendered_is_missing_and_reported(there: Endpoint) -> None:
     desk = a_desk({"http": http(there), "title": "t", "text": "x"})
     desk.run(an_episode(rendered={"title": "braking"}, unrendered={"text": "speed is unknown"}))
     assert events(there.received(1))[0]["data"]["notification"] == {"title": "braking"}
@@ -305,7 +309,7 @@ def test_a_text_that_could_not_be_rendered_is_missing_and_said(there: Endpoint) 
     desk.end()
 
 
-def test_an_episode_that_does_not_end_is_done_when_its_start_is_told(there: Endpoint) -> None:
+def test_an_episode_that_does_not_end_is_done_when_its_start_is_reported(there: Endpoint) -> None:
     desk = a_desk({"http": http(there)})
     episode = an_episode()
     open_ = type(episode)(**{**episode.__dict__, "ended": None, "end_time": None, "reason": None})

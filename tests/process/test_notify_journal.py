@@ -28,7 +28,7 @@ sys.stdin.read()
 """
 
 
-def test_what_was_told_before_a_kill_is_delivered_after_it_each_event_once(tmp_path: Path) -> None:
+def test_what_was_reported_before_a_kill_is_delivered_after_it_each_event_once(tmp_path: Path) -> None:
     with endpoint(hangs()) as there:  # so that nothing else is on its way when the process ends
         process = subprocess.Popen(
             [sys.executable, "-c", _KILLED, there.url, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
@@ -109,7 +109,7 @@ def test_the_file_does_not_grow_with_what_is_dropped(tmp_path: Path) -> None:
     assert Journal(tmp_path, "j").live == {"kept": {"text": "x"}}
 
 
-def test_a_folder_that_cannot_be_written_is_said_and_costs_only_the_keeping(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_written_is_reported_and_costs_only_the_keeping(tmp_path: Path) -> None:
     (tmp_path / "notify").write_text("a file where a folder should be")
     with pytest.raises(JournalError, match="cannot write"):
         Journal(tmp_path / "notify", "j")
@@ -135,7 +135,7 @@ def test_dead_letters_are_bounded(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="there is no /dev/full")
-def test_a_full_disk_is_told(tmp_path: Path) -> None:
+def test_a_full_disk_is_reported(tmp_path: Path) -> None:
     (tmp_path / "a.dead.jsonl").symlink_to("/dev/full")
     with pytest.raises(OSError, match="No space left"):
         DeadLetters(tmp_path / "a.dead.jsonl").write({"a": 1})

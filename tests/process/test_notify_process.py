@@ -66,7 +66,7 @@ def test_who_hangs_holds_up_nobody_and_hears_of_it_after_a_kill(tmp_path: Path) 
         assert process.stop() == 0
 
 
-def test_an_alert_goes_on_after_a_kill_with_the_labels_that_it_had(tmp_path: Path) -> None:
+def test_an_alert_continues_after_a_kill_with_the_labels_that_it_had(tmp_path: Path) -> None:
     process = Process(tmp_path)
     with endpoint() as there:
         rule = a_rule(

@@ -74,7 +74,7 @@ def stuck(host: ProcessHost, **parameters: Any) -> PluginDrive:
     return drive
 
 
-def test_one_that_ends_is_told_and_the_others_go_on(host: ProcessHost) -> None:
+def test_one_that_ends_is_reported_and_the_others_continue(host: ProcessHost) -> None:
     drive = stuck(host, exitAt=7)
     assert drive.take(until=6) == ["z a started 5"]
     counters = drive.engine.counters.rule("r")
@@ -83,7 +83,7 @@ def test_one_that_ends_is_told_and_the_others_go_on(host: ProcessHost) -> None:
     assert counters.unknowns == 3 + 4  # the signal's, and those of the condition
 
 
-def test_one_that_hangs_is_stopped_and_told(caplog: pytest.LogCaptureFixture) -> None:
+def test_one_that_hangs_is_stopped_and_reported(caplog: pytest.LogCaptureFixture) -> None:
     with closing(ProcessHost(wait=True, patience=PATIENT)) as host:
         drive = PluginDrive(a_detector(), plugin_rule("r", parameters={"hangAt": 7}), plugin_rule("z"), host=host)
         drive.take(arrival(0.5, "a", {"v": 1}), until=1)
@@ -118,7 +118,7 @@ def wait_for_it(host: ProcessHost, drive: PluginDrive, seconds: int) -> None:
     assert host._signals["r", "p"].is_ready(PATIENT, again=False)
 
 
-def test_what_did_not_run_is_the_same_when_it_is_told_beforehand() -> None:
+def test_what_did_not_run_is_the_same_when_it_is_given_beforehand() -> None:
     """Live, the plugin starts, gives values, ends, and is started again; a replay with the same outages agrees."""
     clock = Clock()
     rule = plugin_rule(when="p.count >= 2", until="p.count >= 4", parameters={"exitAt": 6})
@@ -153,7 +153,7 @@ def test_a_rule_that_goes_takes_its_process_along(host: ProcessHost) -> None:
         os.kill(process.pid, 0)
 
 
-def test_what_the_shipped_plugin_takes_long_to_load_is_there_before_it_is_asked() -> None:
+def test_what_the_shipped_plugin_takes_long_to_load_is_there_before_it_is_called() -> None:
     """A value must be there within half a second; loading scipy takes longer than that."""
     program = """
         import sys

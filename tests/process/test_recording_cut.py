@@ -218,7 +218,7 @@ def test_the_reserve_keeps_the_disk_from_getting_full(small_disk: Path) -> None:
         assert bench.outcome(an_episode(number)).state is OutcomeState.DONE
 
 
-def test_a_disk_that_is_full_from_the_start_is_told(small_disk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_that_is_full_from_the_start_is_reported(small_disk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bench = Bench(small_disk)
     (small_disk / "filler").write_bytes(bytes(4 * 2**20))
     with pytest.raises(ActionError, match=r"cannot start the recording: less than 0 of the disk would be free"):
@@ -249,7 +249,7 @@ def test_a_write_error_costs_that_recording_only(tmp_path: Path) -> None:
     assert bench.outcome(other).state is OutcomeState.DONE
 
 
-def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_made_is_reported(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     bench = Bench(tmp_path / "file")
     with pytest.raises(ActionError, match="cannot start the recording: writing failed"):

@@ -64,7 +64,7 @@ def test_a_chart_that_would_be_refused_is_refused(helm: Path, tmp_path: Path) ->
     assert "hook" in done.stderr
 
 
-def test_without_helm_it_says_what_is_missing(tmp_path: Path) -> None:
+def test_without_helm_it_reports_what_is_missing(tmp_path: Path) -> None:
     chart = write_chart(tmp_path / "charts", "app")
     done = render(tmp_path, "no-such-helm", [template(str(chart)), task("car1")])
     assert done.returncode == 1

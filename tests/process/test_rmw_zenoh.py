@@ -164,7 +164,7 @@ def test_earlier_versions_and_missing_attachments_are_understood(receiver: Recei
     assert receiver.counted(Cause.MISSED) == 2
 
 
-def test_a_key_of_another_type_is_dropped_counted_and_said(receiver: Receiver, vehicle: zenoh.Session) -> None:
+def test_a_key_of_another_type_is_dropped_counted_and_reported(receiver: Receiver, vehicle: zenoh.Session) -> None:
     Node(vehicle, "vehicles/car1/pose", type_name="nav_msgs/msg/Odometry").publish(cdr(odometry()))
     vehicle.put("town/vehicles/car1/pose/on/foot", b"of another layout")
     Node(vehicle, "vehicles/car1/pose").publish(b"last")
@@ -220,12 +220,12 @@ def test_the_same_detector_gives_the_same_events_live_and_from_a_bag_of_topics(
         ("0/add/example::srv::dds_::Add_Request_/h", ("add", "example/srv/Add_Request")),
     ],
 )
-def test_a_key_tells_topic_and_type(key: str, reported: tuple[str, str]) -> None:
+def test_a_key_contains_topic_and_type(key: str, reported: tuple[str, str]) -> None:
     assert split(key) == reported
 
 
 @pytest.mark.parametrize("key", ["", "0", "0/a/b", "x/chatter/std_msgs::msg::dds_::String_/h", "0/chatter/String/h"])
-def test_what_is_no_such_key_is_said(key: str) -> None:
+def test_what_is_no_such_key_is_reported(key: str) -> None:
     with pytest.raises(MisfitError):
         split(key)
 
@@ -252,7 +252,7 @@ def test_losses_less_late_ones_are_what_is_missing_in_any_order(numbers: list[in
     assert counted(tally, Cause.MISSED) - counted(tally, Cause.OVERTAKEN) == max(rest) + 1 - (len(rest) + 1)
 
 
-def test_a_publisher_that_begins_anew_has_lost_nothing_and_one_sent_twice_neither() -> None:
+def test_a_publisher_that_restarts_has_lost_nothing_and_one_sent_twice_neither() -> None:
     tally = Tally()
     sequences = Sequences("s", tally)
     for number in (5_000, 5_001, 5_001, 1, 2, 2**62, 3):
@@ -281,7 +281,7 @@ spec:
 """
 
 
-def test_what_does_not_go_together_is_said_with_its_place(tmp_path: Path) -> None:
+def test_what_does_not_go_together_is_reported_with_its_place(tmp_path: Path) -> None:
     (tmp_path / "detector.yaml").write_text(DETECTOR)
     with pytest.raises(DocumentError) as caught:
         check_documents(load_documents([tmp_path / "detector.yaml"]))

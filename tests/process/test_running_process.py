@@ -68,7 +68,7 @@ def test_status_and_metrics_are_what_was_sent(process: Process) -> None:
     assert "the last evaluation" in process.page("/readyz")
 
 
-def test_a_rule_is_asked_paused_and_resumed_by_commands(process: Process) -> None:
+def test_a_rule_is_evaluated_paused_and_resumed_by_commands(process: Process) -> None:
     process.change(FAST, a_rule("on-demand", signals=[SPEED], when="v > 10", evaluation={"onDemand": True}))
     process.send("car1", {"v": 20})
     process.status_when(lambda s: len(s.rules) == 2 and s.streams[1].samples == 1)

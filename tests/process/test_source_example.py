@@ -30,7 +30,7 @@ def detector(*arguments: str | Path) -> list[str | Path]:
     return [sys.executable, "-m", "detector.commands.cli", *arguments]
 
 
-def test_what_the_plugin_asks_for_is_checked_with_line_and_column(
+def test_what_the_plugin_requests_is_checked_with_line_and_column(
     environment: Mapping[str, str], tmp_path: Path
 ) -> None:
     wrong = tmp_path / "detector.yaml"

@@ -193,7 +193,7 @@ def test_sources_that_stay_the_same_go_on_while_others_change(arrivals: Arrivals
     sources.close()
 
 
-def test_a_running_detector_follows_changes_of_its_sources_and_tells_their_state(
+def test_a_running_detector_follows_changes_of_its_sources_and_reports_their_state(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     first, second = ({"name": name, "plugin": "lasting"} for name in ("first", "second"))
@@ -240,7 +240,7 @@ def test_a_running_detector_follows_changes_of_its_sources_and_tells_their_state
         ({"plugin": "once", "parameters": {"txt": "a"}}, "spec.sources[0].parameters.txt: unknown field"),
     ],
 )
-def test_what_is_wrong_with_a_source_is_told_with_its_field(source: dict[str, Any], problem: str) -> None:
+def test_what_is_wrong_with_a_source_is_reported_with_its_field(source: dict[str, Any], problem: str) -> None:
     found = [str(each) for each in source_plugin_problems(a_detector_of({"name": "s", **source}))]
     assert len(found) == 1
     assert problem in found[0]

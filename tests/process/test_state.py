@@ -58,7 +58,7 @@ def saved(folder: Path, episodes: list[OpenEpisode]) -> StateFile:
 # The engine
 
 
-def test_an_episode_without_a_task_goes_on_after_a_restart() -> None:
+def test_an_episode_without_a_task_continues_after_a_restart() -> None:
     episodes = open_in(speeding())
     drive = Drive(a_detector(), speeding())
     assert drive.note(drive.engine.restore([], at(0), episodes)) == []
@@ -77,7 +77,7 @@ def test_one_whose_rule_changed_meanwhile_ends() -> None:
     assert drive.engine.open_episodes() == []
 
 
-def test_tasks_come_first_and_an_episode_that_has_one_is_taken_up_once() -> None:
+def test_tasks_come_first_and_an_episode_that_has_one_is_restored_once() -> None:
     rule = speeding(actions=[a_deploy("x", parameters={"v": "${speed}"})])
     before = Drive(a_detector(), rule, start=-100)
     before.take(speed(-99.5, 20), until=-99)
@@ -156,7 +156,7 @@ def test_what_was_saved_last_is_loaded_and_no_draft_stays(tmp_path: Path) -> Non
         lambda text: text.replace(b'"values":{', b'"values":null,"v":{'),
     ],
 )
-def test_a_broken_file_is_said_and_set_aside(
+def test_a_broken_file_is_reported_and_set_aside(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, spoil: Callable[[bytes], bytes]
 ) -> None:
     before = open_in(speeding())
@@ -178,7 +178,7 @@ def test_a_broken_file_is_said_and_set_aside(
     assert StateFile(tmp_path, "default", "h").load() == before
 
 
-def test_a_disk_that_refuses_is_said_once_and_the_newest_is_written_later(
+def test_a_disk_that_refuses_is_reported_once_and_the_newest_is_written_later(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     before = open_in(speeding())
@@ -197,7 +197,7 @@ def test_a_disk_that_refuses_is_said_once_and_the_newest_is_written_later(
     assert StateFile(tmp_path, "default", "h").load() == before
 
 
-def test_an_episode_whose_task_has_ended_is_not_taken_up_again(tmp_path: Path) -> None:
+def test_an_episode_whose_task_has_ended_is_not_restored(tmp_path: Path) -> None:
     rule = speeding(actions=[a_deploy("x")])
     drive = Drive(a_detector(), rule, start=-100)
     drive.take(speed(-99.5, 20), speed(-99.4, 30, "bus"), until=-99)
@@ -301,7 +301,7 @@ def test_an_episode_survives_that_its_detector_is_killed_and_its_replay_is_the_s
     assert events_in(tmp_path / "again" / "events.jsonl") == events_in(events)[1:]
 
 
-def test_a_folder_that_cannot_be_made_is_said_with_its_field(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_made_is_reported_with_its_field(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     detector = a_detector(state={"path": str(tmp_path / "file" / "state")})
     with pytest.raises(OSError, match=r"spec\.state\.path: cannot write .*/file/state \(Not a directory\): give"):

@@ -80,7 +80,7 @@ def test_the_standard_variables_turn_traces_off(monkeypatch: pytest.MonkeyPatch,
     assert tracing("x") is None
 
 
-def test_a_protocol_that_is_not_spoken_and_a_missing_extra_are_said(
+def test_a_protocol_that_is_not_spoken_and_a_missing_extra_are_reported(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setenv("OTEL_EXPORTER_OTLP_ENDPOINT", "http://127.0.0.1:1")
@@ -152,7 +152,7 @@ def test_an_endpoint_that_is_away_costs_its_spans_and_they_are_counted(monkeypat
     assert reported.failed == 1
 
 
-def test_events_and_what_actions_are_told_bear_the_trace_of_their_episode(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_events_and_the_input_of_actions_have_the_trace_of_their_episode(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OTEL_EXPORTER_OTLP_ENDPOINT", "http://127.0.0.1:1")
     event = Event("town", "close", "a+b", ("a", "b"), "e", 1, 2, None, None, {}, None)
     run = Run("close", "notify", "e")
@@ -166,7 +166,7 @@ def test_events_and_what_actions_are_told_bear_the_trace_of_their_episode(monkey
     assert "traceparent" not in event.cloud_event()
 
 
-def test_a_trace_that_is_not_sampled_says_so_to_those_who_follow(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_trace_that_is_not_sampled_reports_it_to_those_who_follow(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OTEL_TRACES_SAMPLER", "always_off")
     with Receiver() as receiver:
         monkeypatch.setenv("OTEL_EXPORTER_OTLP_ENDPOINT", receiver.endpoint)

@@ -246,7 +246,7 @@ def test_a_requester_that_finds_its_episode_gone_stops_what_it_had_started(rsu: 
     wait_for(lambda: [each.state for each in listed(rsu.endpoint)] == [Progress.DONE], PATIENCE)
 
 
-def test_a_recorder_that_is_killed_goes_on_when_it_is_back(rsu: Peer, town: Peer) -> None:
+def test_a_recorder_that_is_killed_continues_when_it_is_back(rsu: Peer, town: Peer) -> None:
     """What it had is kept as cut; the requester repeats the start within seconds."""
     town.send("car1", {"v": 20})
     wait_for(lambda: recording(town.endpoint), PATIENCE)
@@ -283,7 +283,7 @@ def test_nobody_who_records_costs_only_the_recording(endpoint: str, tmp_path: Pa
     assert town.stop() == 0
 
 
-def test_people_ask_for_recordings_by_commands(unhurt: Peer) -> None:
+def test_people_request_recordings_by_commands(unhurt: Peer) -> None:
     def command(*words: str) -> Result:
         return CliRunner().invoke(app, [*words, "--connect", unhurt.endpoint])
 

@@ -93,7 +93,7 @@ def end(episode: Episode) -> Episode:
     return replace(episode, end_time=time.time_ns(), reason="Until", ended={})
 
 
-def test_an_endpoint_is_told_of_the_start_and_of_the_end() -> None:
+def test_an_endpoint_is_notified_of_the_start_and_of_the_end() -> None:
     with endpoint() as there:
         driven = Driven(http(there.url, maximumDuration="5m"))
         episode = an_episode(driven.parameters)
@@ -199,7 +199,7 @@ def test_at_the_end_of_the_detector_an_episode_that_will_not_be_known_again_is_s
     assert driven.outcomes[-1].state is OutcomeState.DONE
 
 
-def test_what_the_next_run_takes_up_goes_on_and_is_stopped_by_that_one(tmp_path: Path) -> None:
+def test_what_the_next_run_restores_continues_and_is_stopped_by_that_one(tmp_path: Path) -> None:
     """The journal keeps what was rendered, of which the next run knows nothing else."""
     with endpoint() as there:
         trigger = http(there.url)

@@ -123,7 +123,7 @@ def test_a_silent_service_is_called_again_and_what_had_arrived_is_no_failure(pro
     assert set(uris) == {"/bags/car1-20"}
 
 
-def test_what_a_service_refuses_is_told(process: Process) -> None:
+def test_what_a_service_refuses_is_reported(process: Process) -> None:
     start = {"service": "/recorder/on", "type": "std_srvs/srv/Trigger"}
     start_with(process, fast("5s", layout="Plain", start=start))
     node = Node(process.vehicle, bridged=True)
@@ -135,7 +135,7 @@ def test_what_a_service_refuses_is_told(process: Process) -> None:
     assert len(node.calls) >= 2
 
 
-def test_what_is_wrong_with_a_call_is_told_with_its_place(tmp_path: Path) -> None:
+def test_what_is_wrong_with_a_call_is_reported_with_its_place(tmp_path: Path) -> None:
     documents = [
         a_detector().to_json(),
         fast(

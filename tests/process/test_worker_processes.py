@@ -48,7 +48,7 @@ def test_what_takes_too_much_cpu_time_is_ended_and_its_process_replaced() -> Non
     with_pool(work)
 
 
-def test_the_event_loop_goes_on_while_an_expression_holds_the_interpreters_lock() -> None:
+def test_the_event_loop_continues_while_an_expression_holds_the_interpreters_lock() -> None:
     async def work(pool: Pool) -> None:
         bomb = asyncio.create_task(pool.run("a", BOMB))
         turns = 0

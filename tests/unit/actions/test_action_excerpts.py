@@ -101,7 +101,7 @@ messages = st.lists(
     cuts=[],
     on_data=True,
 )
-def test_each_sample_of_a_window_is_told_once_and_no_other(
+def test_each_sample_of_a_window_is_passed_on_once_and_no_other(
     drawn: list[tuple[int, str, str, float, int]], cuts: list[int], on_data: bool
 ) -> None:
     arrivals = [
@@ -155,7 +155,7 @@ def speeds(*values: tuple[float, float]) -> list[list[Arrival]]:
 PLAIN = a_detector(a_stream("speed"), a_stream("map", latched=True), buffer=BUFFER, clientTimeout="60s")
 
 
-def test_a_run_is_told_in_order_and_completed_once_time_has_passed_its_window() -> None:
+def test_a_run_is_passed_on_in_order_and_completed_once_time_has_passed_its_window() -> None:
     engine = an_engine(PLAIN, fast(an_action(before="1s", after="1s")))
     reported = run(engine, speeds((0.55, 0.0), (1.05, 1.0), (2.05, 0.0), (2.55, 0.0)), 3.0)
     assert order(reported) == ["Begun", "Sampled", "Over", "Sampled"]
@@ -173,7 +173,7 @@ def test_what_was_latched_comes_with_the_window_however_old_it_is() -> None:
     assert [(sample.stream, sample.client) for sample in sampled.samples] == [("map", "car1"), ("speed", "car1")]
 
 
-def test_what_a_cap_pushes_out_in_between_is_told_all_the_same() -> None:
+def test_what_a_cap_pushes_out_in_between_is_reported_all_the_same() -> None:
     tight = a_detector(a_stream("speed", buffer={"count": 1}), clientTimeout="60s")
     engine = an_engine(tight, fast(an_action()))
     engine.advance([arrival(0.05, "car1", {"v": 1})], at(0.2))
@@ -182,7 +182,7 @@ def test_what_a_cap_pushes_out_in_between_is_told_all_the_same() -> None:
     assert sum(len(each.samples) for each in reported if isinstance(each, Sampled)) == 49
 
 
-def test_a_dry_run_tells_nobody() -> None:
+def test_a_dry_run_notifies_nobody() -> None:
     engine = an_engine(PLAIN, fast(an_action(), dryRun=True))
     assert run(engine, speeds((0.05, 1.0), (1.05, 0.0)), 3.0) == []
 

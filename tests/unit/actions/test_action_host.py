@@ -183,7 +183,7 @@ def one_episode(site: Site, client: str = "car1", begin: float = 0.0) -> None:
     site.take((begin + 0.55, client, 0.0), until=begin + 1.0)
 
 
-def test_an_action_is_told_of_an_episode_in_order_and_closed_at_last() -> None:
+def test_an_action_receives_an_episode_in_order_and_closed_at_last() -> None:
     site = Site(fast(a="recorded"))
     one_episode(site)
     site.host.close()
@@ -242,7 +242,7 @@ def test_one_that_hangs_at_the_end_is_left_behind() -> None:
     ]
 
 
-def test_one_that_is_replaced_completes_what_it_has_and_the_new_one_goes_on() -> None:
+def test_one_that_is_replaced_completes_what_it_has_and_the_new_one_continues() -> None:
     site = Site(fast(a="recorded"))
     site.take((0.05, "car1", 1.0), until=0.5)
     site.when(lambda: "a 1 samples car1" in Recorded.reported)
@@ -260,7 +260,7 @@ def test_one_is_woken_when_it_wishes_and_what_it_raises_then_is_counted() -> Non
     site.host.close()
 
 
-def test_one_that_says_nothing_has_failed_at_the_end() -> None:
+def test_one_that_reports_nothing_has_failed_at_the_end() -> None:
     site = Site(fast(a="silent"))
     one_episode(site)
     site.host.close()
@@ -268,7 +268,7 @@ def test_one_that_says_nothing_has_failed_at_the_end() -> None:
     assert (tally.running, tally.failed, tally.last_failure) == (0, 1, SILENT)
 
 
-def test_each_outcome_is_told_once() -> None:
+def test_each_outcome_is_reported_once() -> None:
     site = Site(fast(a="recorded", b="raises"))
     one_episode(site)
     site.host.close()
@@ -280,7 +280,7 @@ def test_each_outcome_is_told_once() -> None:
     assert any(b'"type":"dev.wayside.action.failed"' in payload for _, payload in site.published)
 
 
-def test_a_plugin_that_is_not_there_is_said_with_its_place() -> None:
+def test_a_plugin_that_is_not_there_is_reported_with_its_place() -> None:
     rule = fast(a="recordet")
     [problem] = registry.action_problems(rule, DETECTOR)
     assert str(problem).startswith("spec.actions[0].plugin.name: ")

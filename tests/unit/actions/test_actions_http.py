@@ -85,7 +85,7 @@ def test_a_body_shorter_than_announced_is_not_whole() -> None:
     assert (answer.body, answer.whole) == (b"short", False)
 
 
-def test_a_refusal_that_never_ends_is_told_with_its_status() -> None:
+def test_a_refusal_that_never_ends_is_reported_with_its_status() -> None:
     with endpoint(drips(b"HTTP/1.1 500 No\r\nContent-Type: text/plain\r\n\r\nthe disk is full", b"")) as there:
         answer = send(client("20s"), there.url)
     assert answer.status == 500
@@ -109,12 +109,12 @@ def test_redirects_are_not_followed() -> None:
         (sends(b"HTTP/1.1 200 OK\r\nX: " + b"a" * 100_000 + b"\r\n\r\n"), "is not HTTP"),
     ],
 )
-def test_what_is_no_answer_is_told(behaviour: Behaviour, reported: str) -> None:
+def test_what_is_no_answer_is_reported(behaviour: Behaviour, reported: str) -> None:
     with endpoint(behaviour) as there, pytest.raises(HttpError, match=reported):
         send(client(), there.url)
 
 
-def test_nobody_there_and_no_such_name_are_told_without_the_path() -> None:
+def test_nobody_there_and_no_such_name_are_reported_without_the_path() -> None:
     with nobody() as there, pytest.raises(HttpError, match=rf"^{there}: cannot connect: "):
         send(client(), f"{there}/secret-path")
     with pytest.raises(HttpError, match=r"^http://nobody\.invalid:80: ") as caught:

@@ -73,7 +73,7 @@ def test_an_action_gets_its_parameters_as_its_model() -> None:
         ("lamp", {"colour": "red", "color": "red"}, "plugin.parameters.color: unknown field"),
     ],
 )
-def test_what_is_wrong_with_an_action_is_told_with_its_field(
+def test_what_is_wrong_with_an_action_is_reported_with_its_field(
     name: str, parameters: dict[str, Any], problem: str
 ) -> None:
     (found,) = action_problems(rule(name, **parameters), a_detector())
@@ -81,7 +81,7 @@ def test_what_is_wrong_with_an_action_is_told_with_its_field(
     assert str(found).startswith("spec.actions[0].plugin.")
 
 
-def test_check_tells_line_and_column(tmp_path: Path) -> None:
+def test_check_reports_line_and_column(tmp_path: Path) -> None:
     (tmp_path / "d.json").write_text(a_detector().model_dump_json(by_alias=True, exclude_none=True))
     (tmp_path / "r.yaml").write_text(
         "apiVersion: wayside.dev/v1alpha1\nkind: EventRule\nmetadata: {name: r}\nspec:\n  when: 'true'\n"
@@ -91,7 +91,7 @@ def test_check_tells_line_and_column(tmp_path: Path) -> None:
     assert "r.yaml:8:49: spec.actions[0].plugin.parameters.colour: must be a string, but is 3" in str(problem)
 
 
-def test_a_rule_whose_action_is_refused_goes_on_as_it_last_was() -> None:
+def test_a_rule_whose_action_is_refused_continues_as_it_last_was() -> None:
     index, detector = RuleIndex(), a_detector()
     index.compile([rule("lamp", colour="red")], detector, inlets(detector).fields)
     (kept,), (refusal,) = index.compile([rule("lamp")], detector, inlets(detector).fields)

@@ -39,7 +39,7 @@ def sample(payload: bytes, time: int = START, stream: str = "speed", client: str
     return EpisodeSample(client, stream, f"vehicles/{client}/{stream}", time, time, payload)
 
 
-def test_a_document_says_what_was_said_by_whom_and_when() -> None:
+def test_a_document_has_the_message_its_sender_and_its_time() -> None:
     made = documents().make(sample(b'{"v": 12.5, "unit": "m/s", "list": [1, null, true]}'))
     document = bson.decode(made.document)
     assert made.collection == "json/speed"
@@ -56,7 +56,7 @@ def test_a_document_says_what_was_said_by_whom_and_when() -> None:
     }
 
 
-def test_a_sample_has_the_same_id_whoever_makes_its_document_and_no_two_have_the_same() -> None:
+def test_a_sample_has_the_same_id_in_each_document_and_no_two_have_the_same() -> None:
     samples = [
         sample(b"1"),
         sample(b"1"),  # with clock Data a client may send the same twice at one time
@@ -135,7 +135,7 @@ def test_a_document_beyond_16_mb_goes_to_a_file_as_a_whole() -> None:
     assert str(LARGEST) in document["note"]
 
 
-def test_without_a_place_for_files_what_is_too_large_is_cut_and_said() -> None:
+def test_without_a_place_for_files_what_is_too_large_is_cut_and_reported() -> None:
     made = documents().make(sample(bytes(17 * 2**20), stream="blob"))
     document = bson.decode(made.document)
     assert len(made.document) < 1000

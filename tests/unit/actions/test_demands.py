@@ -54,7 +54,7 @@ def test_the_name_does_not_depend_on_what_may_change() -> None:
 @pytest.mark.parametrize(
     "fields", [{"holder": "b"}, {"rule": "r"}, {"action": "x"}, {"subject": "car1"}, {"start_time": 5}]
 )
-def test_the_name_tells_demands_apart(fields: dict[str, Any]) -> None:
+def test_the_name_distinguishes_demands(fields: dict[str, Any]) -> None:
     assert changed(**fields).name != DEMAND.name
 
 
@@ -87,7 +87,7 @@ def test_what_json_cannot_carry_is_left_out() -> None:
     assert task.spec.parameters == {"kept": False}
 
 
-def test_an_ended_demand_says_when() -> None:
+def test_an_ended_demand_reports_its_end() -> None:
     assert to_task(DEMAND, 1_767_225_604_000_000_003).spec.end_time == "2026-01-01T00:00:04.000000003Z"
 
 

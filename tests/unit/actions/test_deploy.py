@@ -103,7 +103,7 @@ def test_what_is_due_when_it_stops_is_still_done(tmp_path: Path) -> None:
     assert ends(tmp_path) == {A.name: format_time(7), B.name: None}
 
 
-def test_a_demand_whose_end_nobody_tells_ends_now(tmp_path: Path) -> None:
+def test_a_demand_whose_end_nobody_reports_ends_now(tmp_path: Path) -> None:
     async def drive() -> None:
         async with reconciling(tmp_path, now=lambda: 42) as reconciler:
             reconciler.update(by_name(A), {})
@@ -191,7 +191,7 @@ def test_what_a_person_deletes_comes_back_and_what_they_end_stays_ended(tmp_path
     assert ends(tmp_path) == {A.name: None, B.name: format_time(3)}
 
 
-def test_a_task_that_an_earlier_run_over_the_same_data_ended_is_made_anew(tmp_path: Path) -> None:
+def test_a_task_that_an_earlier_run_over_the_same_data_ended_is_recreated(tmp_path: Path) -> None:
     put(tmp_path, task_manifest(to_task(A, end_time=3)))
 
     async def drive() -> DeployCounts:

@@ -74,7 +74,7 @@ def test_nothing_is_due_before_both_sides_are_known() -> None:
     assert ledger.see(Snapshot({}, 1)) == [DEMAND.name]
 
 
-def test_what_the_store_says_late_does_not_undo_what_is_known_since() -> None:
+def test_what_the_store_reports_late_does_not_undo_what_is_known_since() -> None:
     ledger = Ledger()
     ledger.accept({DEMAND.name: DEMAND}, {})
     ledger.see(Snapshot({}, 3))

@@ -85,7 +85,7 @@ def test_restored_demands_follow_again_from_the_next_evaluation() -> None:
     assert parameters(again) == [{"v": 30}]
 
 
-def test_an_action_begins_to_follow_when_its_rule_says_so() -> None:
+def test_an_action_begins_to_follow_when_its_rule_changes() -> None:
     rule = a_rule(signals=SIGNALS, when="speed > 10", actions=[a_deploy("d", parameters={"v": "${speed}"})])
     drive = Drive(a_detector(), rule)
     drive.take(speed(0.5, 20), speed(1.5, 30), until=2)

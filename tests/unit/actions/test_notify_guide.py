@@ -35,7 +35,7 @@ def test_the_guides_rule_has_nothing_wrong(tmp_path: Path) -> None:
     assert problems(tmp_path, HEAD + "".join(f"  {line}\n" for line in example.splitlines())) == []
 
 
-def test_the_built_in_action_asks_for_what_the_rule_has() -> None:
+def test_the_built_in_action_requests_what_the_rule_has() -> None:
     assert Notify.Parameters is Parameters
 
 
@@ -63,7 +63,7 @@ def test_the_built_in_action_asks_for_what_the_rule_has() -> None:
         ("{zenoh: {key: a}, rate: {messages: 0}}", "spec.actions[0].notify.rate.messages"),
     ],
 )
-def test_what_is_wrong_is_told_with_its_place(tmp_path: Path, notify: str, reported: str) -> None:
+def test_what_is_wrong_is_reported_with_its_place(tmp_path: Path, notify: str, reported: str) -> None:
     found = problems(tmp_path, HEAD + SIGNAL + notify + "\n")
     assert len(found) == 1, found
     assert found[0].startswith("r.yaml:9:")

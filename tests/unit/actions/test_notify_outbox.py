@@ -98,7 +98,7 @@ def test_a_message_that_is_not_liked_holds_up_no_other() -> None:
 
 
 @pytest.mark.parametrize(("retry_after", "waited"), [(100.0, 100.0), (1e9, LONGEST_RETRY_AFTER)])
-def test_what_an_endpoint_asks_for_is_heeded_within_reason(retry_after: float, waited: float) -> None:
+def test_what_an_endpoint_requests_is_heeded_within_reason(retry_after: float, waited: float) -> None:
     box = Outbox(10, 1e9)
     box.add(message("a"))
     taken = box.take(0.0)

@@ -19,7 +19,7 @@ def a_course(
     return Course(Order("x", {}), Timeouts(maximum, give_up, renew), 0, -1, resumed=resumed)
 
 
-def test_a_recording_is_started_said_again_stopped_and_awaited() -> None:
+def test_a_recording_is_started_again_stopped_and_awaited() -> None:
     course = a_course()
     assert course.look(0) is CourseStep.START
     course.answered(0, RECORDING)
@@ -47,7 +47,7 @@ def test_an_episode_that_is_over_before_the_start_is_confirmed_is_recorded_never
     assert course.look(0.5) is CourseStep.STOP
 
 
-def test_what_is_not_confirmed_is_asked_later_and_later_and_given_up() -> None:
+def test_what_is_not_confirmed_is_requested_later_and_later_and_given_up() -> None:
     course = a_course()
     times = []
     for tenth in range(2000):
@@ -62,7 +62,7 @@ def test_what_is_not_confirmed_is_asked_later_and_later_and_given_up() -> None:
     assert not course.lost_stop
 
 
-def test_a_stop_that_is_given_up_is_told() -> None:
+def test_a_stop_that_is_given_up_is_reported() -> None:
     course = a_course(give_up=5)
     course.answered(0, RECORDING)
     course.end(1, 1)
@@ -74,7 +74,7 @@ def test_a_stop_that_is_given_up_is_told() -> None:
     assert course.problem == "gave up waiting for the confirmation of the stop: silence"
 
 
-def test_what_is_refused_is_asked_again_and_then_needs_no_stop() -> None:
+def test_what_is_refused_is_requested_again_and_then_needs_no_stop() -> None:
     course = a_course(give_up=1)
     for now in (0.0, 0.5, 1.5):
         assert course.look(now) is CourseStep.START
@@ -83,7 +83,7 @@ def test_what_is_refused_is_asked_again_and_then_needs_no_stop() -> None:
     assert course.problem == "gave up starting it: too many"
 
 
-def test_a_system_that_was_restarted_goes_on_with_the_next_start() -> None:
+def test_a_system_that_was_restarted_continues_with_the_next_start() -> None:
     course = a_course()
     course.answered(0, RECORDING)
     assert course.confirmed
@@ -108,7 +108,7 @@ def test_a_system_that_does_not_count_the_time_is_stopped_after_it() -> None:
     assert course.note == "its maximumDuration ended it before the episode ended"
 
 
-def test_a_system_that_counts_the_time_itself_says_so() -> None:
+def test_a_system_that_counts_the_time_itself_reports_it() -> None:
     course = a_course()
     course.answered(0, RECORDING)
     course.answered(10, Report(Progress.DONE, "ended by its maximumDuration"))

@@ -61,13 +61,13 @@ def test_a_definition_may_use_messages_of_the_detector() -> None:
         (None, {}, "unknown service type a/srv/B: give its .srv file as definition"),
     ],
 )
-def test_what_does_not_fit_is_told_with_its_place(
+def test_what_does_not_fit_is_reported_with_its_place(
     definition: str | None, request_: dict[str, Any], reported: str
 ) -> None:
     with pytest.raises(ServiceError, match=reported):
         service("a/srv/B", definition, standard()).request(request_)
 
 
-def test_bytes_that_are_no_response_are_told() -> None:
+def test_bytes_that_are_no_response_are_reported() -> None:
     with pytest.raises(ServiceError, match="the response is not of type std_srvs/srv/Trigger"):
         service("std_srvs/srv/Trigger", None, standard()).response(b"\x00\x01\x00\x00\x01\xff\xff")

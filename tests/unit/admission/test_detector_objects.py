@@ -149,7 +149,7 @@ def test_the_image_and_resources_are_the_detectors_where_it_gives_them() -> None
     assert given["nodeSelector"] == {"site": "a"}
 
 
-def test_what_holds_for_all_detectors_is_in_each_pod_and_what_a_detector_says_itself_wins() -> None:
+def test_settings_for_all_detectors_are_in_each_pod_and_a_detectors_own_win() -> None:
     environment = {"OTEL_EXPORTER_OTLP_ENDPOINT": "http://all:4318", "B": "all"}
     defaults = PodDefaults(IMAGE, PullPolicy.ALWAYS, ("registry",), environment)
     key = {"name": "collector", "key": "headers"}
@@ -275,7 +275,7 @@ def deployment(available: int) -> dict[str, Any]:
     }
 
 
-def test_it_runs_when_its_pod_is_ready_and_else_it_is_said_why() -> None:
+def test_it_runs_when_its_pod_is_ready_and_otherwise_reports_why() -> None:
     assert running(deployment(1), []).holds
     assert running(None, []).reason == "NotReady"
     assert "0 of 1 pods" in running(deployment(0), []).message

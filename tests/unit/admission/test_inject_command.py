@@ -110,7 +110,7 @@ def error(*arguments: str) -> str:
     return "\n".join(reported)
 
 
-def test_what_cannot_be_used_is_said_with_its_place_and_the_remedy(detector: Path, tmp_path: Path) -> None:
+def test_what_cannot_be_used_is_reported_with_its_place_and_the_remedy(detector: Path, tmp_path: Path) -> None:
     (pod := tmp_path / "pod.yaml").write_text(yaml.safe_dump({"kind": "Pod", **template(name="car")}))
     assert "Detector town has no image: give --detector-image" in error("-f", str(pod), "-f", str(detector))
     assert "Detector town is in none of the files" in error("-f", str(pod), *IMAGE)

@@ -113,7 +113,7 @@ def test_warnings_are_few_short_lines_whatever_is_in_them(texts: list[str]) -> N
 @pytest.mark.parametrize(
     "requested", [None, [], {}, {"apiVersion": "admission.k8s.io/v1"}, question() | {"request": {}}]
 )
-def test_what_is_no_review_is_said_to_be_none(requested: Any) -> None:
+def test_what_is_no_review_is_reported_to_be_none(requested: Any) -> None:
     with pytest.raises(ReviewError, match="only the API server may call this path"):
         read(requested)
 
@@ -124,7 +124,7 @@ def test_of_a_kind_that_is_not_looked_at_nothing_is_kept() -> None:
     assert answered(question(new=named))["status"]["details"]["name"] == "a b"
 
 
-def test_the_configuration_asks_about_three_kinds_and_stands_in_nobodys_way() -> None:
+def test_the_configuration_covers_three_kinds_and_stands_in_nobodys_way() -> None:
     made = webhook_configuration(WebhookClientConfig.of_service("wayside/manager:8443"), b"PEM", ["b", "a"])
     (webhook,) = made["webhooks"]
     service = {"namespace": "wayside", "name": "manager", "port": 8443, "path": "/admission"}
@@ -193,7 +193,7 @@ def reviewed(
     return response
 
 
-def test_what_a_rule_has_with_its_detector_is_looked_up_before_it_is_said() -> None:
+def test_what_a_rule_has_with_its_detector_is_looked_up_before_it_is_reported() -> None:
     old, new = detector(stream="odometry"), detector()
     assert reviewed(rule(), old, live=(new,)) == {"uid": "u1", "allowed": True}
     assert reviewed(rule(), live=(new,)) == {"uid": "u1", "allowed": True}

@@ -234,7 +234,7 @@ def test_in_the_nodes_network_it_takes_no_port() -> None:
         (pod() | {"metadata": {"labels": LABELS, "annotations": MIRROR}}, detector(), "static"),
     ],
 )  # fmt: skip
-def test_why_a_pod_goes_without_is_said_with_the_remedy(requested: Json, of: Detector | None, logged: str) -> None:
+def test_why_a_pod_goes_without_is_reported_with_the_remedy(requested: Json, of: Detector | None, logged: str) -> None:
     assert logged in why_not(requested, of)
 
 
@@ -243,11 +243,11 @@ def test_a_detector_that_is_not_accepted_comes_into_no_pod() -> None:
     assert "is not accepted" in why_not(pod(), detector(streams=wrong))
 
 
-def test_a_manager_that_runs_no_detectors_says_so() -> None:
+def test_a_manager_that_runs_no_detectors_reports_it() -> None:
     assert "--detector-image" in why_not(pod(), detector(), None)
 
 
-def test_a_pod_that_asks_for_none_or_has_a_container_of_the_name_is_left_alone() -> None:
+def test_a_pod_that_requests_none_or_has_a_container_of_the_name_is_left_alone() -> None:
     unlabelled = pod() | {"metadata": {"name": "car"}}
     assert why_not(unlabelled, None) == ""
     theirs = pod(containers=[{"name": CONTAINER, "image": "mine:1"}])
@@ -305,7 +305,7 @@ def test_the_accounts_and_no_others_are_bound_to_what_the_detector_needs() -> No
     assert detector_objects(detector(serviceAccountNames=[]), DEFAULTS)[1]["subjects"] == []
 
 
-def test_who_puts_it_into_pods_by_hand_is_told_the_same_rights() -> None:
+def test_who_puts_it_into_pods_by_hand_gets_the_same_rights() -> None:
     options = ["detector-rbac", "town", "-n", "site", "--pod-account", "vehicle"]
     done = CliRunner().invoke(app, options)
     assert list(yaml.safe_load_all(done.stdout)) == sidecar_roles("site", "town", ["vehicle"])
@@ -318,7 +318,7 @@ def state(one: Json, **how: Any) -> Json:
     return one | {"status": {"phase": "Running", "initContainerStatuses": [{"name": name, "image": IMAGE, **how}]}}
 
 
-def test_the_condition_says_in_how_many_pods_it_runs_and_what_keeps_it_from_running() -> None:
+def test_the_condition_reports_in_how_many_pods_it_runs_and_what_keeps_it_from_running() -> None:
     of = detector()
     runs = state(injected(pod(), of), state={"running": {}}, ready=True)
     logged = carried(of, [runs, pod()])

@@ -153,14 +153,16 @@ def test_renewed_files_are_taken_whole_or_not_at_all(folder: Path) -> None:
     ],
     ids=["absent", "none", "of another"],
 )  # fmt: skip
-def test_files_that_cannot_be_used_are_said_at_the_start(folder: Path, spoil: Callable[[Path], Any], part: str) -> None:
+def test_files_that_cannot_be_used_are_reported_at_the_start(
+    folder: Path, spoil: Callable[[Path], Any], part: str
+) -> None:
     spoil(folder)
     with pytest.raises(CertificateError, match=r"^--admission-certificates .*certificates: ") as error:
         ServingCertificate(folder, "--admission-certificates")
     assert part in str(error.value)
 
 
-def test_a_port_that_is_taken_is_said(folder: Path) -> None:
+def test_a_port_that_is_taken_is_reported(folder: Path) -> None:
     async def review(requested: Any) -> dict[str, Any]:
         return {}
 
@@ -188,7 +190,7 @@ def command(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str,
     return command
 
 
-def test_check_says_where_in_the_files_what_would_be_refused_is(
+def test_check_reports_where_in_the_files_what_would_be_refused_is(
     command: Callable[..., tuple[int, str, str]], tmp_path: Path
 ) -> None:
     file = tmp_path / "all.yaml"

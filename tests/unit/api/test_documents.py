@@ -162,7 +162,7 @@ def test_problems_of_other_files(tmp_path: Path, text: str | bytes, expected: st
     assert found.startswith(expected)
 
 
-def test_all_problems_of_all_files_are_told_in_order(tmp_path: Path) -> None:
+def test_all_problems_of_all_files_are_reported_in_order(tmp_path: Path) -> None:
     (tmp_path / "a.yaml").write_text(HEAD + "  whem: x\n---\n" + HEAD + "  when: 5\n")
     (tmp_path / "b.yml").write_text("a: 'x")
     (tmp_path / "good.yaml").write_text(HEAD + "  when: x\n")
@@ -179,7 +179,7 @@ def test_all_problems_of_all_files_are_told_in_order(tmp_path: Path) -> None:
     assert "there is no such file: check the path" in str(caught.value)
 
 
-def test_a_folder_without_files_of_ours_is_told(tmp_path: Path) -> None:
+def test_a_folder_without_files_of_ours_is_reported(tmp_path: Path) -> None:
     with pytest.raises(DocumentError, match=r"the folder contains no \.yaml"):
         load_documents([tmp_path])
 
@@ -229,7 +229,7 @@ def test_aliases_that_multiply_themselves_are_refused(tmp_path: Path) -> None:
     assert "more than 200000 fields" in found
 
 
-def test_an_object_of_the_api_server_is_told_by_its_fields() -> None:
+def test_an_object_of_the_api_server_is_reported_by_its_fields() -> None:
     raw: dict[str, Any] = {"apiVersion": "wayside.dev/v1alpha1", "kind": "EventRule", "metadata": {"name": "r"}}
     assert parse_object(raw | {"spec": {"when": "a"}}).name == "r"
     with pytest.raises(ValueError, match=r"spec\.when: is missing: add it; spec\.for: '2y' is not a duration"):
@@ -259,7 +259,7 @@ def reported(file: Path) -> tuple[Problem, ...]:
 
 @settings(max_examples=150, deadline=None)
 @given(st.dictionaries(fields, values, max_size=4) | values, st.booleans())
-def test_whatever_a_file_holds_it_is_read_or_its_problems_are_told(
+def test_whatever_a_file_holds_it_is_read_or_its_problems_are_reported(
     tmp_path_factory: pytest.TempPathFactory, spec: Any, as_json: bool
 ) -> None:
     raw = {"apiVersion": "wayside.dev/v1alpha1", "kind": "EventRule", "metadata": {"name": "r"}, "spec": spec}

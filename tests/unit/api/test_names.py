@@ -29,7 +29,7 @@ def test_different_subjects_have_different_texts(
     assert (subject_text(*one) == subject_text(*other)) == (one == other)
 
 
-def test_subjects_read_as_the_design_says() -> None:
+def test_subjects_read_as_in_the_design() -> None:
     assert subject_text(["car1"]) == "car1"
     assert subject_text(["car1", "car2"], "north") == "car1+car2~north"
     assert subject_text([]) == "~fleet"
@@ -38,7 +38,7 @@ def test_subjects_read_as_the_design_says() -> None:
 
 
 @given(subjects)
-def test_a_subjects_text_tells_its_clients_and_element(subject: tuple[list[str], str | None]) -> None:
+def test_a_subjects_text_contains_its_clients_and_element(subject: tuple[list[str], str | None]) -> None:
     clients, element = subject
     assert parse_subject(subject_text(clients, element)) == (tuple(clients), element)
 

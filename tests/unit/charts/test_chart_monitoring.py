@@ -60,7 +60,7 @@ def exported() -> set[str]:
     return found
 
 
-def test_alerts_and_dashboard_ask_only_for_what_the_programs_export() -> None:
+def test_alerts_and_dashboard_query_only_what_the_programs_export() -> None:
     requested = {name for each in expressions() for name in NAME.findall(each)}
     assert len(requested) > 20
     assert requested - exported() == set()
@@ -72,7 +72,7 @@ def test_every_panel_is_within_what_is_chosen() -> None:
             assert target["expr"].count('{namespace=~"$namespace"}') == len(NAME.findall(target["expr"]))
 
 
-def test_every_alert_says_what_is_wrong_and_has_a_case_in_which_it_fires() -> None:
+def test_every_alert_reports_what_is_wrong_and_has_a_case_in_which_it_fires() -> None:
     cases = yaml.safe_load(CASES.read_text())["tests"]
     fired = {each["alertname"] for case in cases for each in case["alert_rule_test"] if each.get("exp_alerts")}
     silent = {each["alertname"] for case in cases for each in case["alert_rule_test"] if not each.get("exp_alerts")}

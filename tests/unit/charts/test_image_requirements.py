@@ -31,7 +31,7 @@ PINS = {"requirements.txt": pins("requirements.txt"), "requirements-full.txt": p
 
 
 @pytest.mark.parametrize(("file", "extras"), [("requirements.txt", EXTRAS), ("requirements-full.txt", FULL)])
-def test_the_image_has_what_the_programs_ask_for(file: str, extras: tuple[str, ...]) -> None:
+def test_the_image_has_what_the_programs_need(file: str, extras: tuple[str, ...]) -> None:
     requested = [
         *PROJECT["dependencies"],
         *(each for extra in extras for each in PROJECT["optional-dependencies"][extra]),

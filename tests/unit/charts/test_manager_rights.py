@@ -72,7 +72,7 @@ def test_all_namespaces_can_be_read_and_those_that_are_granted_written() -> None
     assert all(each["subjects"][0]["name"] == "manager" for each in everywhere if "subjects" in each)
 
 
-def test_the_command_prints_what_the_table_says() -> None:
+def test_the_command_prints_the_table() -> None:
     done = CliRunner().invoke(app, ["rbac", "--allowed-kinds", "apps/v1/Deployment", "--account", "system/manager"])
     assert done.exit_code == 0
     assert list(yaml.safe_load_all(done.stdout)) == roles({DEPLOYMENT: "deployments"}, [], LEASE, ACCOUNT)
@@ -101,7 +101,7 @@ def test_a_kind_that_nobody_knows_is_looked_up_in_a_cluster(monkeypatch: pytest.
     assert "cannot look up the plural of example.com/v1/Widget" in str(done.exception)
 
 
-def test_what_is_lacking_is_said_with_its_purpose_and_the_remedy(caplog: pytest.LogCaptureFixture) -> None:
+def test_what_is_missing_is_reported_with_its_purpose_and_the_remedy(caplog: pytest.LogCaptureFixture) -> None:
     needed = {(each.resource, each.vital): each for each in rights({DEPLOYMENT: "deployments"})}
     report_missing([(needed["deployments", False], "patch", "a")])
     (logged,) = caplog.messages

@@ -93,7 +93,7 @@ def test_what_the_scheme_does_not_have_is_refused_with_what_it_has(text: str, sh
         choose([text])
 
 
-def test_rules_of_one_name_are_told_apart_by_where_they_are() -> None:
+def test_rules_of_one_name_are_distinguished_by_where_they_are() -> None:
     one, other = an_entry("r", "examples/a/rules.yaml:3"), an_entry("r", "examples/b/rules.yaml:3")
     labels = catalog([other, one, BATTERY]).labels()
     assert [labels[one], labels[other], labels[BATTERY]] == ["r (a/rules.yaml:3)", "r (b/rules.yaml:3)", "battery"]
@@ -136,7 +136,7 @@ def test_the_page_has_all_rules_with_their_values_and_fetches_nothing() -> None:
     assert "It has no classification." in seen.text
 
 
-def test_what_rules_say_is_text_on_the_page_and_in_markdown() -> None:
+def test_texts_of_rules_are_text_on_the_page_and_in_markdown() -> None:
     calm = an_entry("r", "p", "words", incidence=["Rare"])
     hostile = an_entry("r", HOSTILE, HOSTILE, incidence=["Rare"])
     assert Page(page(Catalog((hostile,)))).tags == Page(page(Catalog((calm,)))).tags
@@ -217,7 +217,7 @@ def test_wrong_usage_is_one_line(arguments: list[str], shows: str, capsys: pytes
     assert reported.count("\n") == 1
 
 
-def test_without_an_api_server_it_is_said_what_else_this_command_can_do(
+def test_without_an_api_server_it_is_reported_what_else_this_command_can_do(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("KUBECONFIG", str(tmp_path / "nowhere"))

@@ -159,7 +159,7 @@ WAYS = [
 
 
 @pytest.mark.parametrize("given_way", WAYS, ids=lambda each: each.shows.removeprefix("spec.classification.")[:60])
-def test_a_contradiction_is_told_and_what_fits_is_not(given_way: Way) -> None:
+def test_a_contradiction_is_reported_and_what_fits_is_not(given_way: Way) -> None:
     warnings = reported(given_way.given, **given_way.spec)
     assert any(warning.startswith(given_way.shows) for warning in warnings), warnings
     assert reported(given_way.right, **given_way.spec) == []
@@ -244,7 +244,7 @@ PAPER = {
 
 
 @pytest.mark.parametrize("table", PAPER)
-def test_the_papers_own_classifications_do_not_contradict_rules_that_do_what_it_says(table: str) -> None:
+def test_the_papers_own_classifications_do_not_contradict_rules_that_follow_it(table: str) -> None:
     text, actions = PAPER[table]
     values = {each.name: part.split() for each, part in zip(SCHEME, text.split("|"), strict=True)}
     assert reported(values, signals=[over("10s")], when="m > 1", actions=actions) == []
@@ -305,7 +305,7 @@ def check(folder: Path, *options: str) -> int:
     return commandline.run(app, "detector", (), ["check", str(folder), *options])
 
 
-def test_check_tells_where_it_is_and_only_strict_fails(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_reports_where_it_is_and_only_strict_fails(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert check(tmp_path) == 0
     lines = capsys.readouterr().err.splitlines()
     rules = tmp_path / "rules.yaml"

@@ -138,7 +138,7 @@ def the_catalog() -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("folder", TABLES)
-def test_the_catalog_says_of_an_example_what_the_papers_table_says(folder: str) -> None:
+def test_the_catalog_has_for_an_example_the_values_of_the_papers_table(folder: str) -> None:
     document = the_catalog()
     (index,) = [
         index

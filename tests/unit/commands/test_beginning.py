@@ -83,6 +83,6 @@ def test_a_command_on_files_loads_neither_networks_nor_recordings(
     assert not loaded(LOADED.format(package=package), *words) & needs_not
 
 
-def test_a_detector_loads_what_its_detector_and_options_ask_for_and_no_more() -> None:
+def test_a_detector_loads_what_its_detector_and_options_request_and_no_more() -> None:
     code = "import sys, detector.live.service; print(*sys.modules)"
     assert loaded(code) & HEAVY == {"zenoh"}

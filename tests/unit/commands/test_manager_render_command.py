@@ -86,7 +86,7 @@ def test_refusals_go_to_stderr_and_the_rest_is_printed(render: Any) -> None:
     assert unknown.startswith("ApplicationTask default/x: TemplateNotFound")
 
 
-def test_a_template_that_cannot_be_rendered_is_told_with_its_place(render: Any) -> None:
+def test_a_template_that_cannot_be_rendered_is_reported_with_its_place(render: Any) -> None:
     broken = {**TEMPLATE, "spec": {**TEMPLATE["spec"], "manifests": [{**DEPLOYMENT, "metadata": {"name": "${nam}"}}]}}
     result = render(broken, task("a", parameters={"region": "n"}))
     assert result.exit_code == 1
@@ -99,7 +99,7 @@ def test_a_kind_that_is_not_allowed_is_refused(render: Any) -> None:
     assert "allowed are v1/ConfigMap" in result.stderr
 
 
-def test_a_task_that_waits_and_a_capped_sum_are_said_without_an_error(render: Any) -> None:
+def test_a_task_that_waits_and_a_capped_sum_are_reported_without_an_error(render: Any) -> None:
     load = {"type": "number", "merge": "Sum", "maximum": 5}
     template = {
         **TEMPLATE,
@@ -131,7 +131,7 @@ def test_bad_files_and_bad_options_are_one_clear_line_and_exit_code_2(
     assert option.stderr.count("\n") == 1
 
 
-def test_without_a_cluster_run_says_so(
+def test_without_a_cluster_run_reports_it(
     monkeypatch: pytest.MonkeyPatch, command: Callable[..., Result], tmp_path: Path
 ) -> None:
     monkeypatch.setenv("KUBECONFIG", str(tmp_path / "none"))

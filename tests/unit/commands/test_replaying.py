@@ -44,7 +44,7 @@ def test_a_pause_of_hours_is_a_gap_over_which_an_open_episode_holds() -> None:
     assert any(note.startswith("the recording pauses after 2026-01-01T00:00:00.5") for note in outcome.notes)
 
 
-def test_a_misspelt_field_is_told_after_the_replay() -> None:
+def test_a_misspelt_field_is_reported_after_the_replay() -> None:
     rule = a_rule("fast", signals=[{"name": "v", "stream": "speed", "value": "msg.w"}], when="v > 10")
     outcome = replay_arrivals([BRIEF], a_detector(), [rule])
     (note,) = outcome.notes
@@ -53,7 +53,7 @@ def test_a_misspelt_field_is_told_after_the_replay() -> None:
     assert '"w"' in note
 
 
-def test_an_intake_file_that_is_cut_gives_what_it_holds_and_says_so() -> None:
+def test_an_intake_file_that_is_cut_gives_what_it_holds_and_reports_it() -> None:
     detector = a_detector()
     start = {"kind": "start", "holder": "h", "detector": detector.to_json(), "rules": [FAST.to_json()]}
     records = [Control(START, start), *BRIEF[:2], Control(at(2.5), {"kind": "cut", "reason": "killed"})]

@@ -62,7 +62,7 @@ def test_the_oldest_are_within_and_every_change_is_reported(steps: list[Step]) -
         assert len(moved) <= 3  # looks at the task that two budgets move in opposite directions, too
 
 
-def test_one_beyond_them_waits_and_says_for_what() -> None:
+def test_one_beyond_them_waits_and_reports_for_what() -> None:
     index = BudgetIndex(POLICY)
     for name in ("t2", "t1", "t0"):
         index.enter(made(name))

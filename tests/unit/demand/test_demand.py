@@ -206,7 +206,7 @@ def test_a_new_demand_within_the_linger_ends_it() -> None:
 
 
 @pytest.mark.parametrize(("annotations", "linger"), [({"wayside.dev/linger": "2s"}, 2), ({}, 30)])
-def test_instances_of_a_deleted_template_linger_as_it_said(annotations: dict[str, str], linger: int) -> None:
+def test_instances_of_a_deleted_template_linger_as_it_defined(annotations: dict[str, str], linger: int) -> None:
     outcome = of(task("a"), templates=[], instances=[instance(annotations=annotations)])
     assert only(outcome).release_time == NOW + linger
     assert outcome.verdicts["a"].reason == "TemplateNotFound"

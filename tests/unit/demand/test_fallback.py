@@ -148,7 +148,7 @@ def test_the_fallback_serves_with_what_it_knows_and_the_first_one_tries_on() -> 
     )
 
 
-def test_both_instances_say_it() -> None:
+def test_both_instances_report_it() -> None:
     outcome = of(wants())
     first, other = outcome.instances[NORTH], outcome.instances[LITE_NORTH]
     (timed_out,) = aspects([], first.overdue, first.fallback, first.stands_in_for)
@@ -185,7 +185,7 @@ def test_own_tasks_of_the_fallback_and_those_that_turn_to_it_share_it() -> None:
         ([template("lite", parameters={"region": {"type": "string", "enum": ["south"]}})], "spec.parameters.region"),
     ],
 )
-def test_where_the_fallback_cannot_serve_the_task_says_why_and_stays(other: Any, shows: str) -> None:
+def test_where_the_fallback_cannot_serve_the_task_reports_why_and_stays(other: Any, shows: str) -> None:
     verdict = of(wants(), templates=[template(**FULL), *other]).verdicts["a"]
     assert (verdict.standing, verdict.reason, verdict.instance) == (Standing.COUNTS, "FallbackFailed", NORTH)
     assert shows in verdict.message

@@ -281,7 +281,7 @@ def test_no_order_and_no_duplication_changes_anything(before: Any, drawn: Any, b
 
 @few
 @given(st.lists(demands, min_size=1, max_size=4), limits, st.sampled_from([0, 4]), st.randoms())
-def test_no_limit_is_ever_exceeded_whatever_comes_and_whoever_is_slow(
+def test_no_limit_is_ever_exceeded_whatever_comes_and_whatever_is_slow(
     history: Any, bounds: Any, uptime: int, source: Any
 ) -> None:
     site = Site(bounds, uptime)

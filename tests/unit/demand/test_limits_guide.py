@@ -18,7 +18,7 @@ def documents() -> list[Any]:
     return [yaml.safe_load(block) for block in yaml_blocks(guide("limits"))]
 
 
-def test_the_guides_template_serves_as_many_as_it_says_in_the_order_that_it_says() -> None:
+def test_the_guides_template_serves_as_many_as_described_in_the_order_described() -> None:
     raw = next(each for each in documents() if each["metadata"]["name"] == "fusion")
     raw["metadata"]["namespace"] = "site"
     tasks = [task(name, {"region": name}, of="fusion", priority=number) for number, name in enumerate("abc")]

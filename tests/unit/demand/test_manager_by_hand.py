@@ -55,7 +55,7 @@ def test_a_persons_instance_can_be_paused_too() -> None:
     assert decided(annotated(PAUSE_ANNOTATION, by_person=True)).paused
 
 
-def test_the_status_says_who_keeps_it_and_once_more_when_that_is_over() -> None:
+def test_the_status_reports_who_keeps_it_and_once_more_when_that_is_over() -> None:
     assert list(manual_aspects(instance())) == []
     held = annotated(HOLD_ANNOTATION, "anna, measuring")
     (aspect,) = manual_aspects(held)

@@ -44,7 +44,7 @@ def test_a_lease_is_as_old_as_we_have_seen_it_unchanged() -> None:
     assert index.view(KEY, 14.5) == LeaseView(1.5, 3.0, renewed=True)
 
 
-def test_time_in_which_nobody_looked_says_nothing() -> None:
+def test_time_in_which_nobody_looked_reports_nothing() -> None:
     index = LeaseIndex()
     index.observe(KEY, lease("a"), 0.0)
     assert index.view(KEY, 100.0).unchanged == 0.0
@@ -84,7 +84,7 @@ def test_a_lease_that_vanishes_is_no_renewal_but_one_that_appears_is() -> None:
     assert index.view(KEY, 6.0).unchanged == 0.0
 
 
-def test_the_first_look_at_a_lease_is_no_sign_of_life_though_somebody_asked_before() -> None:
+def test_the_first_look_at_a_lease_is_no_sign_of_life_even_after_an_earlier_request() -> None:
     index = LeaseIndex()
     assert index.view(KEY, 1.0).unchanged == 0.0
     assert not index.seen(KEY)

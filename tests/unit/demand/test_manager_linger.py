@@ -39,14 +39,14 @@ def decided(cache: ClusterCache, at: float) -> Decision:
     return found.decision
 
 
-def test_a_deadline_holds_from_when_it_was_decided_though_no_status_says_it_yet() -> None:
+def test_a_deadline_holds_from_when_it_was_decided_though_no_status_reports_it_yet() -> None:
     cache = world_with(instance())
     assert decided(cache, 0).release_time == NOW + 30
     assert decided(cache, 20).release_time == NOW + 30
     assert decided(cache, 31).release_time == NOW + 30
 
 
-def test_a_demand_that_came_and_went_begins_the_linger_anew_though_the_status_says_the_old_deadline() -> None:
+def test_a_demand_that_came_and_went_restarts_the_linger_though_the_status_has_the_old_deadline() -> None:
     cache = world_with(instance(release_at=NOW + 10))
     assert decided(cache, 0).release_time == NOW + 10
     claim(cache, task("a"))

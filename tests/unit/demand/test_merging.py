@@ -57,7 +57,7 @@ def test_the_order_does_not_matter(strategy: str, data: st.DataObject, source: r
 
 @pytest.mark.parametrize("strategy", IDEMPOTENT)
 @given(data=st.data())
-def test_a_value_said_twice_is_as_said_once(strategy: str, data: st.DataObject) -> None:
+def test_a_value_sent_twice_is_as_sent_once(strategy: str, data: st.DataObject) -> None:
     logged = data.draw(st.lists(KINDS[strategy][1], min_size=1, max_size=5))
     assert merged(parameter(strategy), *logged, logged[0]) == merged(parameter(strategy), *logged)
 
@@ -90,14 +90,14 @@ def test_a_sum_is_exact_and_is_an_integer_where_it_can_be() -> None:
 
 
 @given(st.lists(st.integers(0, 9), min_size=1, max_size=6), st.integers(9, 30))
-def test_a_sum_is_held_at_the_maximum_and_it_is_said(logged: list[int], maximum: int) -> None:
+def test_a_sum_is_held_at_the_maximum_and_it_is_reported(logged: list[int], maximum: int) -> None:
     declared = {"p": parameter("Sum", minimum=0, maximum=maximum)}
     result = merge(declared, [Contribution(str(index), {"p": value}) for index, value in enumerate(logged)])
     assert result.parameters["p"] == min(sum(logged), maximum)
     assert bool(result.capped) == (sum(logged) > maximum)
 
 
-def test_the_instance_says_that_a_sum_is_capped_and_when_it_is_no_more() -> None:
+def test_the_instance_reports_that_a_sum_is_capped_and_when_it_is_no_more() -> None:
     bandwidth = {"type": "number", "merge": "Sum", "maximum": 50, "description": "Mbit/s"}
     templates = [template(parameters={"rate": bandwidth})]
     here = instance()
@@ -182,6 +182,6 @@ def test_a_value_is_matched_with_pattern_and_enum(spec: dict[str, Any], value: A
         ({"type": "string", "pattern": "^a", "default": "b"}, r'spec.parameters.p.default: "b" does not match'),
     ],
 )
-def test_a_template_with_a_wrong_pattern_is_told(spec: dict[str, Any], message: str) -> None:
+def test_a_template_with_a_wrong_pattern_is_reported(spec: dict[str, Any], message: str) -> None:
     with pytest.raises(RenderError, match=message):
         Renderer(template(parameters={"p": spec}), Policy())

@@ -107,7 +107,7 @@ def test_without_the_keys_parameters_it_is_for_all_instances() -> None:
     assert [values(only, name)["rateHz"] for name in (NORTH, SOUTH)] == [10, 2]
 
 
-def test_one_for_all_says_where_it_conflicts() -> None:
+def test_one_for_all_reports_where_it_conflicts() -> None:
     here = change("here", {"region": "north", "model": "large"}, priority=1)
     outcome = of(deploy("a"), deploy("b", "south"), here, change("all", {"model": "tiny"}))
     assert (values(outcome)["model"], values(outcome, SOUTH)["model"]) == ("large", "tiny")
@@ -220,7 +220,7 @@ def test_a_baseline_is_reconfigured_and_suspended_by_any_priority() -> None:
     assert (values(outcome, "app")["rateHz"], outcome.instances["app"].suspended) == (3, True)
 
 
-def test_a_baseline_that_does_not_fit_is_told_to_the_template_and_one_beside_a_key_is_refused() -> None:
+def test_a_baseline_that_does_not_fit_is_reported_to_the_template_and_one_beside_a_key_is_refused() -> None:
     with pytest.raises(RenderError, match=r"spec\.baseline\.parameters\.rateHz: 99 is above the maximum of 50"):
         Renderer(template(**with_baseline(rateHz=99)), Policy())
     assert of(spec=with_baseline(rateHz=99)).instances == {}
@@ -321,7 +321,7 @@ def test_a_task_that_comes_and_goes_restores_what_was(
 
 @few
 @given(tasks())
-def test_every_task_is_told_what_became_of_it_and_none_but_deploy_makes_anything_run(
+def test_every_task_reports_what_became_of_it_and_none_but_deploy_makes_anything_run(
     live: list[ApplicationTask],
 ) -> None:
     outcome = of(*live)

@@ -119,7 +119,7 @@ def test_a_path_through_what_has_no_members_makes_every_message_odd() -> None:
     assert [list(column) for column in found.columns] == [[MISSING] * 2] * 2
 
 
-def test_without_paths_only_what_cannot_be_read_is_told() -> None:
+def test_without_paths_only_what_cannot_be_read_is_reported() -> None:
     assert assert_reads_as_decoded(CdrDecoder("geometry_msgs/msg/PoseStamped"), [], [cdr(pose_stamped()), b""]) == 1
 
 

@@ -198,7 +198,7 @@ VALID = {
 
 
 @pytest.mark.parametrize("encoding", VALID)
-def test_a_detector_counts_what_it_cannot_read_and_goes_on(encoding: str) -> None:
+def test_a_detector_counts_what_it_cannot_read_and_continues(encoding: str) -> None:
     stream = {"name": "s", "key": "${client:*}", "encoding": encoding, **(POSES if encoding == "cdr" else {})}
     looked = {"name": "n", "stream": "s", "where": "has(msg.x)", "over": "10s", "aggregate": "Count"}
     drive = Drive(a_detector(stream), a_rule("r", signals=[looked], when="n >= 0"))

@@ -125,13 +125,13 @@ PUBLISHED = (
         (lambda chance: random_message("mapem", chance), lambda read: None),
     ],
 )
-def test_stamps_of_messages_that_tell_the_whole_time_and_of_those_that_tell_none(raw: Any, seconds: Any) -> None:
+def test_stamps_of_messages_that_contain_the_whole_time_and_of_those_that_contain_none(raw: Any, seconds: Any) -> None:
     message, expected = raw(random.Random(3))
     wanted = seconds(expected)
     assert EtsiDecoder().stamp_near(message, NOW) == (None if wanted is None else round(wanted * 1000) * 1_000_000)
 
 
-def test_a_spatem_tells_the_minute_of_the_year_and_the_year_is_that_of_the_receipt() -> None:
+def test_a_spatem_contains_the_minute_of_the_year_and_the_year_is_that_of_the_receipt() -> None:
     state = {"id": {"id": 7}, "revision": 0, "status": (0, 16), "states": []}
     state["states"] = [{"signalGroup": 1, "state-time-speed": [{"eventState": "stop-And-Remain"}]}]
     late = {**state, "moy": 525_599, "timeStamp": 59_500}  # the last minute of 2025
@@ -172,7 +172,7 @@ LANE = {
         ("msg.denm", "msg has no field denm; it has cam, header"),
     ],
 )
-def test_a_field_that_the_message_does_not_have_is_told_before_any_has_come(expression: str, problem: str) -> None:
+def test_a_field_that_the_message_does_not_have_is_reported_before_any_has_come(expression: str, problem: str) -> None:
     detector = a_detector(STREAM)
     rule = a_rule(signals=[{"name": "x", "stream": "cam", "value": expression}], when="x == 1")
     with pytest.raises(RuleError, match=problem):

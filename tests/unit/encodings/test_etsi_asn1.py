@@ -230,7 +230,7 @@ def test_random_bytes_are_read_or_refused_for_every_kind_of_type() -> None:
         ([], r"spec.streams\[0\].type: no package provides the ASN.1 definition of etsi/cpm: name the files"),
     ],
 )
-def test_what_is_wrong_with_modules_is_told_with_their_field(modules: list[dict[str, str]], problem: str) -> None:
+def test_what_is_wrong_with_modules_is_reported_with_their_field(modules: list[dict[str, str]], problem: str) -> None:
     stream = {"name": "cpm", "key": "its/${client:*}/cpm", "encoding": "uper", "type": "etsi/cpm"}
     with pytest.raises(DetectorError, match=problem) as raised:
         inlets(a_detector(stream, asn1=modules))

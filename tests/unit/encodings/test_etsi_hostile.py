@@ -48,7 +48,7 @@ def test_only_decode_errors_come_of_noise_behind_headers(raw: bytes, headers: by
         message_in(headers + raw)
 
 
-def test_what_cannot_be_read_is_counted_and_the_rest_goes_on() -> None:
+def test_what_cannot_be_read_is_counted_and_the_rest_continues() -> None:
     stream = {"name": "cam", "key": "its/${client:*}/cam", "encoding": "uper", "type": "etsi/cam"}
     rule = a_rule(
         signals=[{"name": "at", "stream": "cam", "value": "msg.cam.generationDeltaTime"}],

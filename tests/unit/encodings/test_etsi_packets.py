@@ -125,7 +125,7 @@ ENCRYPTED = {
         (bytes(70_000), "70000 bytes; an ITS packet has at most 65535"),
     ],
 )
-def test_what_carries_no_readable_message_says_why(raw: bytes, problem: str) -> None:
+def test_what_carries_no_readable_message_reports_why(raw: bytes, problem: str) -> None:
     with pytest.raises(DecodeError, match=problem):
         message_in(raw)
 

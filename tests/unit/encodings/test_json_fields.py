@@ -66,7 +66,7 @@ def test_paths_that_lie_below_each_other_and_indices_are_read() -> None:
     assert [list(values) for values in found.columns] == [[1.0], [{"x": 1.0}], [1.0], [2.0], [MISSING]]
 
 
-def test_without_paths_only_what_cannot_be_read_is_told() -> None:
+def test_without_paths_only_what_cannot_be_read_is_reported() -> None:
     assert assert_reads_as_decoded(JsonDecoder(), [], [b"{}", b"1", b"{"]) == 1
 
 

@@ -176,11 +176,11 @@ A, B = "a_msgs/msg/A", "a_msgs/msg/B"
         (f"int32 X={'9' * 5000}", "line 1: 'int32 X=999"),
     ],
 )
-def test_what_is_wrong_with_a_definition_is_said_with_its_line(text: str, words: str) -> None:
+def test_what_is_wrong_with_a_definition_is_reported_with_its_line(text: str, words: str) -> None:
     assert words in wrong((A, text))[A]
 
 
-def test_what_is_wrong_between_definitions_is_said() -> None:
+def test_what_is_wrong_between_definitions_is_reported() -> None:
     assert "a_msgs/msg/A → a_msgs/msg/B → a_msgs/msg/A" in wrong((A, "B b"), (B, "A a"))[A]
     assert "defines a_msgs/msg/A differently" in wrong((A, "int32 x"), (B, "A a\n===\nMSG: a_msgs/A\nint64 x"))[B]
     chain = [(f"a_msgs/msg/N{n}", f"N{n + 1} one\nN{n + 1} two") for n in range(70)]
@@ -233,7 +233,7 @@ def problems(path: Path, text: str) -> list[str]:
         return [str(problem).removeprefix(f"{path}:") for problem in error.problems]
 
 
-def test_check_tells_where_a_definition_is_missing_or_wrong(tmp_path: Path) -> None:
+def test_check_reports_where_a_definition_is_missing_or_wrong(tmp_path: Path) -> None:
     path = tmp_path / "d.yaml"
     others, tracks = sorted(problems(path, DETECTOR))
     assert others.startswith("10:19: spec.messages[0].definition: line 2: tracks is of fleet_msgs/msg/Track, which is")
@@ -257,7 +257,7 @@ def test_rules_are_evaluated_over_a_type_of_the_detector(tmp_path: Path) -> None
     assert not drive.engine.counters.undecodable
 
 
-def test_samples_of_a_type_that_is_defined_anew_are_not_read_by_the_new_definition() -> None:
+def test_samples_of_a_type_that_is_redefined_are_not_read_by_the_new_definition() -> None:
     store = other_store()
     detector = a_detector(STREAM, messages=MESSAGES)
     drive = Drive(detector, CROWDED)
@@ -377,7 +377,7 @@ def test_a_definition_that_cannot_be_read_is_an_error_unless_the_type_is_known(
     assert ("using the known one" in caplog.text) is bool(text)
 
 
-def test_a_definition_of_the_recording_that_lacks_a_part_is_told(tmp_path: Path) -> None:
+def test_a_definition_of_the_recording_that_lacks_a_part_is_reported(tmp_path: Path) -> None:
     with pytest.raises(DetectorError, match=r"spec\.messages\[0\]\.definition: line 1: x is of fleet_msgs/msg/Nowhere"):
         inlets(with_recorded(mcap(tmp_path / "a.mcap", "Nowhere x")))
 

@@ -121,7 +121,7 @@ GEARS = a_rule(
 
 
 @pytest.mark.parametrize("limit", ["MAXIMUM_CLIENTS", "_MAXIMUM_TEXTS"])
-def test_numbers_and_texts_that_run_out_begin_anew(limit: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_numbers_and_texts_that_run_out_restart(limit: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ingest, "MAXIMUM_LOST", 3)
     detector = a_detector(clientTimeout="1s")
     rules = [speeding("fast", evaluation=OFTEN, **{"for": "300ms"}), GEARS]

@@ -78,7 +78,7 @@ def test_when_time_steps_back_what_was_latched_holds_since_then() -> None:
     assert latched.expire(100) == SAMPLE_OVERHEAD + 1  # replaced at 20
 
 
-def test_samples_that_are_equal_to_the_byte_and_of_one_time_are_so_many_samples() -> None:
+def test_samples_that_are_equal_to_the_byte_and_of_one_time_are_separate_samples() -> None:
     lane = LatchedLane("car", "map", 10, None, 2, topic=by_key)
     logged = arrival(1, "car", {}, "map")
     for _ in range(3):

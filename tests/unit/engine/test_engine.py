@@ -7,7 +7,7 @@ from tests.driving import POSITION, Drive, a_detector, a_rule, a_stream, arrival
 from tests.unit.engine.rules import near, speeding
 
 
-def test_an_episode_tells_when_its_condition_began_to_hold_and_when_it_started_and_ended() -> None:
+def test_an_episode_reports_when_its_condition_began_to_hold_and_when_it_started_and_ended() -> None:
     drive = Drive(a_detector(), speeding(**{"for": "2s"}, cooldown="3s", description="fast"))
     reported = drive.take(*(speed(n + 0.5, 20 if n in (1, 2, 3, 5, 6, 7, 8, 9) else 5) for n in range(12)), until=12)
     assert reported == ["r car started 4", "r car Until 5", "r car started 10", "r car Until 11"]
@@ -73,7 +73,7 @@ def test_where_turning_false_ends_a_pairs_episode_as_out_of_scope() -> None:
     assert drive.take(*sorted(heard), until=8) == ["near a+b started 2", "near a+b OutOfScope 4"]
 
 
-def test_a_position_that_is_unknown_for_no_longer_than_for_does_not_begin_the_onset_anew() -> None:
+def test_a_position_that_is_unknown_for_no_longer_than_for_does_not_restart_the_onset() -> None:
     detector = a_detector(a_stream("pose", staleAfter="1s"))
     drive = Drive(detector, near(**{"for": "3s"}))
     reported = drive.take(

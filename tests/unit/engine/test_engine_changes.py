@@ -89,7 +89,7 @@ def test_changed_actions_are_applied_to_open_episodes_with_what_was_seen_at_thei
     assert all(name in after for name in same)  # the same demand keeps its name
 
 
-def test_a_dry_run_tells_events_and_demands_nothing_until_it_is_over() -> None:
+def test_a_dry_run_publishes_events_and_demands_nothing_until_it_is_over() -> None:
     drive = Drive(a_detector(), speeding(dryRun=True, actions=[a_deploy("x")]))
     assert drive.take(speed(0.5, 20), until=1) == ["r car started 1"]
     assert drive.engine.demands() == {}

@@ -102,7 +102,7 @@ def test_actions_that_changed_while_the_detector_was_away_are_applied_at_the_nex
     assert {demand.start_time for demand in drive.engine.demands().values()} == {at(-999)}
 
 
-def test_actions_that_change_after_a_restart_let_no_demand_go_before_it_is_rendered_anew() -> None:
+def test_actions_that_change_after_a_restart_let_no_demand_go_before_it_is_rendered_again() -> None:
     drive = Drive(a_detector(), RECORD)
     drive.engine.restore([held_by(RECORD)], at(0))
     drive.take(speed(0.5, 15), until=1)

@@ -185,7 +185,7 @@ def test_a_sample_later_than_the_lateness_enters_in_its_place_while_it_is_inside
     assert late.take(sent(14.5), until=0) == ["r car started 14"]
 
 
-def test_a_stamp_from_the_future_is_dropped_and_counted_and_time_goes_on() -> None:
+def test_a_stamp_from_the_future_is_dropped_and_counted_and_time_continues() -> None:
     drive = data_drive()
     ahead = sent(3_600, "liar")
     assert drive.take(sent(10.2), ahead, sent(10.6), sent(11.1), ahead, sent(11.6), until=0) == ["r car started 11"]
@@ -228,7 +228,7 @@ def test_one_of_two_clients_must_keep_it_up_while_the_other_is_silent() -> None:
     assert timeline(drive).jumps == 1
 
 
-def test_the_time_of_the_data_begins_with_its_first_stamp_whatever_the_wall_says() -> None:
+def test_the_time_of_the_data_begins_with_its_first_stamp_whatever_the_wall_clock_is() -> None:
     """A restored client is lost no sooner than clientTimeout after that, and its age is no wall's age."""
     drive = data_drive(clientTimeout="3s")
     drive.engine.clients.heard("known", at(10**6))
@@ -293,7 +293,7 @@ def test_a_client_is_not_lost_because_the_detector_stood_still() -> None:
     assert "car" not in drive.engine.clients
 
 
-def test_after_a_step_back_of_the_clock_the_past_is_forgotten_and_time_goes_on_from_there() -> None:
+def test_after_a_step_back_of_the_clock_the_past_is_forgotten_and_time_continues_from_there() -> None:
     age = a_rule("age", signals=[{"name": "age", "stream": "speed", "aggregate": "Age"}], when="age < 0")
     again = a_rule("again", signals=COUNT.to_json()["spec"]["signals"], when="n == 1", until="n == 3", cooldown="10s")
     drive = Drive(a_detector(), COUNT, age, again)

@@ -174,7 +174,7 @@ def test_an_episode_from_its_onset_to_the_end_of_its_cooldown() -> None:
     assert run(history, Timing(1, 3, 9)) == [(1, "started 0"), (2, "Until"), (6, "started 5")]
 
 
-def test_after_a_gap_what_was_pending_begins_anew_and_what_is_open_stays_open() -> None:
+def test_after_a_gap_what_was_pending_restarts_and_what_is_open_stays_open() -> None:
     timing = Timing(2, 0, 2)
     state = SubjectState()
     state.step(0, timing, SEEN)

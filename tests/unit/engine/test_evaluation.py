@@ -77,7 +77,7 @@ def test_a_lost_client_ends_the_episodes_of_a_rule_with_on_sample() -> None:
     assert drive.take(speed(0.3, 20), until=9) == ["r car started 0.3", "r car ClientLost 6"]
 
 
-def test_who_is_lost_and_who_wakes_at_one_tick_are_told_in_order_of_the_subjects() -> None:
+def test_who_is_lost_and_who_wakes_at_one_tick_are_reported_in_order_of_the_subjects() -> None:
     drive = Drive(a_detector(clientTimeout="4s"), fast(unknownTimeout="2s"))
     reported = drive.take(speed(0.1, 20, "b"), speed(0.2, 20, "a"), arrival(3, "a", {}), until=5)
     assert reported[2:] == ["r a Unknown 5", "r b ClientLost 5"]
@@ -127,7 +127,7 @@ def test_how_arrivals_are_parcelled_changes_nothing() -> None:
     assert lines(whole.events) == lines(parts.events) != []
 
 
-def test_on_demand_a_rule_is_evaluated_when_asked_and_tells_what_it_says_of_each_subject() -> None:
+def test_on_demand_a_rule_is_evaluated_on_request_and_reports_each_subject() -> None:
     drive = Drive(a_detector(), fast(evaluation={"onDemand": True}))
     assert drive.take(speed(0.3, 20, "a"), speed(0.4, 5, "b"), arrival(0.5, "c", {}), until=3) == []
     events, answers = drive.engine.evaluate_now("r")
@@ -141,7 +141,7 @@ def test_on_demand_a_rule_is_evaluated_when_asked_and_tells_what_it_says_of_each
     assert drive.note(drive.engine.evaluate_now("r")[0]) == ["r a Until 4"]
 
 
-def test_only_rules_with_on_demand_can_be_asked() -> None:
+def test_only_rules_with_on_demand_can_be_evaluated_on_demand() -> None:
     drive = Drive(a_detector(), fast(), fast("q", evaluation={"onDemand": True}))
     with pytest.raises(NoAnswerError, match="there is no rule x; there is q, r"):
         drive.engine.evaluate_now("x")
@@ -176,7 +176,7 @@ def test_more_episodes_than_a_client_may_start_within_an_hour_are_left_out_and_c
     assert drive.engine.counters.rule("r").suppressed == 2
 
 
-def test_an_episode_of_a_dry_run_says_so() -> None:
+def test_an_episode_of_a_dry_run_reports_it() -> None:
     drive = Drive(a_detector(), fast(dryRun=True), fast("real"))
     drive.take(speed(0.5, 20), until=1)
     dry, real = (event.cloud_event()["data"] for event in drive.events)

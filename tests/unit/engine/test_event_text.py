@@ -170,7 +170,7 @@ def test_a_value_that_json_does_not_have_is_the_same_error(event: Event) -> None
 
 
 @given(events(TIMES, VALUES))
-def test_actions_get_the_cloud_event_that_the_text_says(event: Event) -> None:
+def test_actions_get_the_cloud_event_of_the_text(event: Event) -> None:
     event = msgspec.structs.replace(event, classification={"timeSensitivity": ["Immediate"]})
     document = event.cloud_event()
     assert compact(document) == reference_text(event)

@@ -244,7 +244,7 @@ def stamped(step: int, value: float) -> Arrival:
     return Arrival(time, "speed", "vehicles/car/speed", json.dumps({"t": time / SECOND, "v": value}).encode())
 
 
-def test_an_intake_file_that_does_not_say_its_order_replays_as_it_was() -> None:
+def test_an_intake_file_that_does_not_contain_its_order_replays_as_it_was() -> None:
     arrivals = [stamped(step, value) for step, value in SENT]
     for number, each in enumerate(arrivals):
         arrivals[number] = replace(each, received=each.received + number)
@@ -259,7 +259,7 @@ def test_an_intake_file_that_does_not_say_its_order_replays_as_it_was() -> None:
     assert recorded_before(detector_of({}), [sample], stamped(5, 1), gap, stamped(30, 20)) == ["sample car started 3"]
 
 
-def test_an_intake_file_that_does_not_say_its_order_has_closing_speeds_that_end_now() -> None:
+def test_an_intake_file_that_does_not_contain_its_order_has_closing_speeds_that_end_now() -> None:
     """The one in front falls silent; once, that counted as closing in."""
     rule = a_rule(scope=APART["scope"], when="closingSpeed > 3.0", until="false", evaluation={"every": "500ms"})
     arrivals = [
@@ -272,7 +272,7 @@ def test_an_intake_file_that_does_not_say_its_order_has_closing_speeds_that_end_
     assert replay_arrivals([arrivals], a_detector(), [rule]).events == []
 
 
-def test_an_intake_file_that_does_not_say_its_order_has_the_distances_of_then_to_the_last_digit() -> None:
+def test_an_intake_file_that_does_not_contain_its_order_has_the_distances_of_then_to_the_last_digit() -> None:
     rule = a_rule(scope=APART["scope"], when="closingSpeed == 0.0", evaluation={"every": "500ms"})
     a, b = (8.1, 0.6183689966753316), (4.3, 0.9170189691149498)
     arrivals = [

@@ -168,7 +168,7 @@ def test_what_arrives_over_zenoh_is_the_drive_byte_for_byte() -> None:
     assert arrived == expected
 
 
-def test_nobody_to_connect_to_is_told_with_the_endpoint() -> None:
+def test_nobody_to_connect_to_is_reported_with_the_endpoint() -> None:
     with pytest.raises(UnreachableError, match=r"--connect tcp/127\.0\.0\.1:\d+: no Zenoh session within 0.2 s"):
         publish(simulate(1, 1), 1.0, connect=[free_endpoint()], wait_s=0.2)
     with pytest.raises(UnreachableError, match="--listen here: no Zenoh session"):
@@ -242,7 +242,7 @@ def test_new_sources_change_the_configuration_but_not_the_deployment() -> None:
     assert three.manifests[0]["data"] == {"sources.yaml": 'place: west\nsources: ["p","q","r"]\n'}
 
 
-def test_the_recorder_is_told_its_two_vehicles() -> None:
+def test_the_recorder_receives_its_two_vehicles() -> None:
     renderer = Renderer(only(ApplicationTemplate, "scene-recorder"), Policy())
     rendered = renderer.render(instance("scene-recorder", key='["p","q"]', parameters={"vehicles": ["p", "q"]}))
     (container,) = rendered.manifests[0]["spec"]["template"]["spec"]["containers"]

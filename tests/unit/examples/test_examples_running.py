@@ -27,13 +27,13 @@ def ran(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
     return run(request.param, tmp_path_factory.mktemp(request.param))
 
 
-def test_a_use_case_gives_what_its_truth_says(ran: Ran) -> None:
+def test_a_use_case_gives_the_results_of_its_truth(ran: Ran) -> None:
     assert ran.verdict.problems == []
     assert ran.verdict.expected == ran.verdict.found > 0
     assert ran.verdict.actions_expected == ran.verdict.actions_done > 0
 
 
-def test_it_is_told_where_nothing_comes_of_a_use_case(ran: Ran, tmp_path: Path) -> None:
+def test_a_use_case_without_results_is_reported(ran: Ran, tmp_path: Path) -> None:
     problems = judge(ran.scenario, Played(tmp_path), folder_of(ran.name)).problems
     assert {each.split(" of ")[0] for each in problems if " starts never; expected: " in each} == {
         each.rule for each in ran.scenario.episodes
@@ -43,7 +43,7 @@ def test_it_is_told_where_nothing_comes_of_a_use_case(ran: Ran, tmp_path: Path) 
     }
 
 
-def test_a_use_case_is_told_with_its_picture_and_files(ran: Ran) -> None:
+def test_a_use_case_is_reported_with_its_picture_and_files(ran: Ran) -> None:
     folder, picture = folder_of(ran.name), ran.scenario.picture_file
     readme = (folder / "README.md").read_text(encoding="utf-8")
     assert f"]({picture})" in readme
@@ -60,14 +60,14 @@ def test_its_files_are_accepted_without_a_word(name: str, capsys: pytest.Capture
     assert "nothing wrong" in logged.err
 
 
-def test_the_guide_tells_of_all_of_them() -> None:
+def test_the_guide_describes_all_of_them() -> None:
     text = guide("use-cases")
     assert set(re.findall(r"\(\.\./examples/([a-z-]+)\)", text)) == set(use_cases())
     fields = {each.name for each in dataclasses.fields(Scenario)}
     assert set(re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE)) <= fields
 
 
-def test_what_differs_is_told(tmp_path: Path) -> None:
+def test_what_differs_is_reported(tmp_path: Path) -> None:
     scenario = scenario_of("battery-health")
     recording = tmp_path / "drive.mcap"
     write_recording(scenario.messages(), recording)
@@ -88,7 +88,7 @@ def test_what_differs_is_told(tmp_path: Path) -> None:
     ]
 
 
-def test_what_runs_otherwise_is_told() -> None:
+def test_what_runs_otherwise_is_reported() -> None:
     moment = Moment(3, {"driving/a": {"maxSpeed": 4}, "driving/b": {}})
     right = {"driving/a": Running(("Deployment",), {"maxSpeed": 4, "vehicle": "a"}), "driving/b": Running(("Pod",))}
     assert list(unlike(moment, right)) == []
@@ -103,7 +103,7 @@ def test_what_runs_otherwise_is_told() -> None:
     assert list(unlike(dataclasses.replace(moment, suspended=["driving/b"]), asleep)) == []
 
 
-def test_the_command_says_what_differs_with_its_exit_code(
+def test_the_command_reports_what_differs_with_its_exit_code(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def command(*arguments: str) -> int:

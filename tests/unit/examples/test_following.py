@@ -25,7 +25,7 @@ PROJECTED = {"projected": {"sources": [{"secret": {"name": "s"}}, DIRECT]}}
 
 
 @pytest.mark.parametrize("volume", [DIRECT, PROJECTED])
-def test_a_pod_that_mounts_the_configuration_is_behind_until_it_is_told(volume: dict[str, Any]) -> None:
+def test_a_pod_that_mounts_the_configuration_is_behind_until_it_is_annotated(volume: dict[str, Any]) -> None:
     content = fingerprint({"a": "b"})
     assert list(behind([pod(volume)], "app", content)) == [("pod", "u")]
     assert list(behind([pod(volume, reported="other")], "app", content)) == [("pod", "u")]

@@ -42,7 +42,7 @@ def test_as_many_pairs_as_there_can_be_and_of_these_the_nearest(first: Any, seco
     assert sum(math.dist(first[a], second[b]) for a, b in found.items()) == pytest.approx(cost)
 
 
-def test_a_point_lasts_while_it_is_followed_and_begins_anew_after_a_gap() -> None:
+def test_a_point_lasts_while_it_is_followed_and_restarts_after_a_gap() -> None:
     tracks = Tracks(1.0, 10.0, 3)
     tracks.follow([(0.0, 0.0), (50.0, 0.0)], 1)
     tracks.follow([(0.5, 0.0)], 2)
@@ -78,7 +78,7 @@ def drive(rule: EventRule, *streams: Any) -> PluginDrive:
     return PluginDrive(a_detector(*(streams or STAMPED), clientTimeout="1h"), rule, host=LocalHost())
 
 
-def test_what_the_other_does_not_see_for_long_enough_is_told() -> None:
+def test_what_the_other_does_not_see_for_long_enough_is_reported() -> None:
     driven = drive(rule(counterparts=LIDAR, persist=1))
     for n in range(6):
         seconds = 0.3 + n / 2

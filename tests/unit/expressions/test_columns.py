@@ -94,7 +94,7 @@ INNER = [
 
 @pytest.mark.parametrize("source", INNER)
 @pytest.mark.parametrize("others", [(), ({"a": None, "b": 1.0, "c": 1.0},)], ids=["numbers", "absent"])
-def test_numbers_where_others_are_asked_are_unknown_or_nan_as_in_cel(source: str, others: Sequence[Row]) -> None:
+def test_numbers_where_others_are_required_are_unknown_or_nan_as_in_cel(source: str, others: Sequence[Row]) -> None:
     table = Table([*({"a": a, "b": b, "c": 1.0} for a in (0.0, 1.0, -1.0) for b in (1.0, -1.0)), *others])
     expression = ENVIRONMENT.compile(source)
     found, expected = table.by_columns(expression), table.by_cel(expression)
@@ -183,7 +183,7 @@ def test_results_have_a_value_for_each_row(source: str, count: int) -> None:
     assert [part.shape for part in results.truths([graph.truth(root)] * 2)] == [(2, count)] * 2
 
 
-def test_has_tells_a_field_that_is_missing_from_one_without_a_map_to_be_in() -> None:
+def test_has_distinguishes_a_missing_field_from_one_without_a_map_to_be_in() -> None:
     expression = ENVIRONMENT.compile("has(m.a.b)")
     messages: list[object] = [{"a": {"b": 1.0}}, {"a": {"b": [2.0]}}, {"a": {}}, {"a": {"b": None}}, {"a": 1.0}, {}]
     leaves = [1.0, [2.0], MISSING, None, NOWHERE, NOWHERE]

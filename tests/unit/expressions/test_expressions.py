@@ -108,7 +108,7 @@ def test_maps_come_back_sorted_in_every_process() -> None:
         ("int", "yields a value of type Type, which is no data"),
     ],
 )
-def test_failures_say_what_is_wrong(source: str, message: str) -> None:
+def test_failures_report_what_is_wrong(source: str, message: str) -> None:
     with pytest.raises(EvaluationError, match=f"^{message}"):
         evaluate(source, a={"region": "north", "none": None}, msg=b"ab", l=[1])
 

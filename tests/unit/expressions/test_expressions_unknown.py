@@ -141,7 +141,7 @@ def test_nan_in_a_list_shifts_no_index_and_leaves_the_rest_known() -> None:
         ("msg.data > 3", {"msg": {"data": b"\0"}}),
     ],
 )
-def test_an_input_that_is_not_there_is_told_from_a_fault(source: str, values: dict[str, object]) -> None:
+def test_an_input_that_is_not_there_is_distinguished_from_a_fault(source: str, values: dict[str, object]) -> None:
     assert reasons(source, **values) == [Reason.ABSENT]
 
 
@@ -158,7 +158,9 @@ def test_an_input_that_is_not_there_is_told_from_a_fault(source: str, values: di
         ("d > 1", {"d": "far"}),
     ],
 )
-def test_a_fault_of_the_expression_is_told_from_an_absent_input(source: str, values: dict[str, object]) -> None:
+def test_a_fault_of_the_expression_is_distinguished_from_an_absent_input(
+    source: str, values: dict[str, object]
+) -> None:
     assert reasons(source, **values) == [Reason.ERROR]
 
 
@@ -170,7 +172,7 @@ def test_a_boolean_that_turns_out_to_be_none_is_a_fault() -> None:
     assert expression.evaluate_or_unknown({"p": True}) is True
 
 
-def test_nothing_is_told_of_what_is_known() -> None:
+def test_nothing_is_reported_about_what_is_known() -> None:
     reported: list[object] = []
     assert ENVIRONMENT.compile("d < 3 || p").evaluate_or_unknown({"d": 1.0}, lambda *why: reported.append(why)) is True
     assert reported == []

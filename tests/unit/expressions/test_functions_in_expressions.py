@@ -118,7 +118,7 @@ def test_a_wrong_call_does_not_compile(source: str, column: int, message: str, h
         ("wgs84Distance(91, 0, 0, 0)", {}, Reason.ERROR, "latitude 91 is beyond"),
     ],
 )  # fmt: skip
-def test_what_has_no_answer_is_unknown_and_says_why(
+def test_what_has_no_answer_is_unknown_and_reports_why(
     source: str, values: dict[str, object], reason: Reason, text: str
 ) -> None:
     found, message = why_unknown(source, **values)

@@ -44,7 +44,7 @@ def refused(code: int, seconds: int | None) -> web.Response:
 
 
 @pytest.mark.parametrize("code", [429, 503])
-def test_what_the_api_server_did_not_look_at_is_asked_again_after_its_time_and_nothing_meanwhile(code: int) -> None:
+def test_what_the_api_server_did_not_look_at_is_sent_again_after_its_time_and_nothing_meanwhile(code: int) -> None:
     came: list[float] = []
 
     async def handle(_: web.Request) -> web.Response:
@@ -79,7 +79,7 @@ def test_a_refusal_without_a_time_is_the_callers_matter() -> None:
     asyncio.run(scenario())
 
 
-def test_an_api_server_that_always_asks_to_wait_is_said_in_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_api_server_that_always_requests_a_wait_is_reported_in_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("wayside.kubernetes.client._PATIENCE", 1.5)
 
     async def handle(_: web.Request) -> web.Response:
@@ -113,7 +113,7 @@ def test_no_more_requests_are_under_way_than_allowed() -> None:
     assert most == 3
 
 
-def test_one_that_may_not_act_reads_and_asks_but_writes_nothing() -> None:
+def test_one_that_may_not_act_reads_but_writes_nothing() -> None:
     methods: list[str] = []
 
     async def handle(request: web.Request) -> web.Response:
@@ -170,7 +170,7 @@ def test_a_write_is_given_up_when_its_time_is_over_and_the_api_server_knows_it()
     assert queries == ["2000ms"]
 
 
-def test_rights_that_lack_are_told_with_the_remedy() -> None:
+def test_missing_rights_are_reported_with_the_remedy() -> None:
     text = 'leases "x" is forbidden: User "system:serviceaccount:n:m" cannot get resource "leases" in API group "c"'
 
     async def handle(_: web.Request) -> web.Response:

@@ -171,7 +171,7 @@ def test_one_whose_lease_was_taken_may_not_act_however_much_time_it_thinks_it_ha
         ("system/mine", ("north",), "system/mine"),
     ],
 )
-def test_the_lease_is_where_it_is_said_or_looked_after(
+def test_the_lease_is_in_the_given_or_the_managed_namespace(
     given: str | None, namespaces: tuple[str, ...], found: str
 ) -> None:
     assert str(lease_key(given, namespaces)) == found

@@ -35,7 +35,7 @@ def test_a_renewed_token_is_used_from_the_next_request_on(folder: Path) -> None:
     assert token(configuration) == "Bearer second"
 
 
-def test_while_the_file_is_away_the_last_token_serves_and_that_is_said_once(
+def test_while_the_file_is_away_the_last_token_serves_and_that_is_reported_once(
     folder: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     configuration = Configuration()
@@ -56,7 +56,7 @@ def test_a_file_that_lacks_is_named(folder: Path, file: str, text: str | None) -
         use_pod_account(Configuration(), folder)
 
 
-def test_an_environment_that_is_no_pods_is_said(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_environment_that_is_no_pods_is_reported(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("KUBERNETES_SERVICE_PORT")
     with pytest.raises(AccountError, match="KUBERNETES_SERVICE_PORT"):
         use_pod_account(Configuration(), folder)

@@ -35,7 +35,7 @@ def in_a_loop(test: Callable[[], Coroutine[None, None, None]]) -> Callable[[], N
 
 
 @in_a_loop
-async def test_a_key_asked_for_while_it_waits_is_worked_on_once() -> None:
+async def test_a_key_requested_while_it_waits_is_worked_on_once() -> None:
     done: list[str] = []
     idle = asyncio.Event()
 
@@ -53,7 +53,7 @@ async def test_a_key_asked_for_while_it_waits_is_worked_on_once() -> None:
 
 
 @in_a_loop
-async def test_a_key_asked_for_while_it_runs_is_worked_on_once_more_and_never_twice_at_once() -> None:
+async def test_a_key_requested_while_it_runs_is_worked_on_once_more_and_never_twice_at_once() -> None:
     started = 0
     at_once = 0
     once, twice, more = asyncio.Event(), asyncio.Event(), asyncio.Event()
@@ -124,7 +124,7 @@ def test_a_failure_is_tried_again_and_stops_nobody_else(error: Exception, monkey
     assert done == ["bad", "good", "bad", "bad"]
 
 
-def test_what_the_api_server_asks_for_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_the_api_server_requests_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(workqueue, "FIRST_PAUSE", 0.01)
     at: list[float] = []
 
@@ -147,7 +147,7 @@ def test_what_the_api_server_asks_for_is_waited_for(monkeypatch: pytest.MonkeyPa
 
 
 @in_a_loop
-async def test_the_earliest_time_asked_for_counts() -> None:
+async def test_the_earliest_time_requested_counts() -> None:
     done = asyncio.Event()
 
     async def work(key: str) -> None:

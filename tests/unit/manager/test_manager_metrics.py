@@ -83,7 +83,7 @@ def test_requests_events_and_times_are_counted() -> None:
     assert found["refusals_total", "Conflict"] == 1
 
 
-def test_a_queue_tells_how_long_its_work_took_and_what_failed() -> None:
+def test_a_queue_reports_how_long_its_work_took_and_what_failed() -> None:
     measures, failures = Measures(), [ApiError(503, "busy")]
 
     async def scenario() -> None:
@@ -111,7 +111,7 @@ def test_a_queue_tells_how_long_its_work_took_and_what_failed() -> None:
     assert found["reconcile_seconds_count", "task"] >= 2
 
 
-def test_pages_are_served_and_what_is_lacking_is_503() -> None:
+def test_pages_are_served_and_what_is_missing_is_503() -> None:
     async def scenario() -> None:
         lacks: list[str] = ["not yet"]
         measures = Measures()
@@ -137,7 +137,7 @@ def test_pages_are_served_and_what_is_lacking_is_503() -> None:
     asyncio.run(scenario())
 
 
-def test_an_object_that_changes_all_the_time_is_told_of_now_and_then() -> None:
+def test_an_object_that_changes_all_the_time_is_reported_now_and_then() -> None:
     allowance = Allowance()
     assert [allowance.takes("a", 0.0) for _ in range(BURST + 2)] == [True] * BURST + [False] * 2
     assert allowance.takes("b", 0.0)

@@ -122,7 +122,7 @@ def test_what_changes_while_the_connection_is_lost_is_published_once_it_is_back(
         wire.cut()
 
 
-def test_news_are_published_in_order_and_each_question_answered() -> None:
+def test_changes_are_published_in_order_and_each_query_answered() -> None:
     endpoint = free_endpoint()
     with router(listen__endpoints=[endpoint]) as network:
         heard = Heard(network)
@@ -158,7 +158,7 @@ def test_what_is_neither_endpoint_nor_file_is_refused(given: list[str]) -> None:
         settings(given)
 
 
-def test_a_file_says_it_all(tmp_path: Path) -> None:
+def test_a_file_contains_everything(tmp_path: Path) -> None:
     file = tmp_path / "zenoh.json5"
     file.write_text('{mode: "peer", connect: {endpoints: ["tcp/127.0.0.1:1"]}}')
     assert json.loads(settings([str(file)]).get_json("mode")) == "peer"

@@ -23,7 +23,7 @@ def requested(*failures: Exception) -> str:
     return asyncio.run(until_answered(ask, pause=0.0))
 
 
-def test_an_api_server_that_is_away_or_overloaded_is_waited_for_and_it_is_said_once(
+def test_an_api_server_that_is_away_or_overloaded_is_waited_for_and_it_is_reported_once(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     caplog.set_level(logging.INFO)
@@ -41,7 +41,7 @@ def test_an_api_server_that_is_away_or_overloaded_is_waited_for_and_it_is_said_o
 
 
 @pytest.mark.parametrize("code", [401, 403, 400])
-def test_what_waiting_cannot_change_is_told_at_once(code: int) -> None:
+def test_what_waiting_cannot_change_is_reported_at_once(code: int) -> None:
     with pytest.raises(ApiError, match="no"):
         requested(ApiError(code, "no"))
 

@@ -28,7 +28,7 @@ def test_the_newest_version_wins_in_any_order(order: list[int]) -> None:
     assert entry.version == 4
 
 
-def test_the_same_version_again_is_no_news() -> None:
+def test_the_same_version_again_is_no_event() -> None:
     store = Store([])
     assert store.put(raw(1)) is not None
     assert store.put(raw(1)) is None

@@ -101,7 +101,7 @@ def failed(found: dict[str, Received]) -> None:
     assert found["apply"].error is reconciled.error is None
 
 
-def test_a_task_that_ends_before_its_status_says_that_it_is_applied_was_never_ready(
+def test_a_task_that_ends_before_its_status_reports_that_it_is_applied_was_never_ready(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     async def run(traces: TaskTraces, cache: ClusterCache, server: Server, end: Callable[[], Awaitable[None]]) -> None:

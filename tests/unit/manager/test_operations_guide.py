@@ -24,6 +24,6 @@ def test_each_case_names_tests_that_exist(case: str) -> None:
         assert test in {each.name for each in tree.body if isinstance(each, ast.FunctionDef)}
 
 
-def test_what_is_asked_about_first_is_there() -> None:
+def test_the_main_cases_are_there() -> None:
     for what in ("node restarts", "API server", "router", "manager", "detector", "database", "disk"):
         assert any(what in case.partition("**")[2].partition("**")[0] for case in CASES), what

@@ -108,7 +108,7 @@ def test_a_bag_of_common_types_leaves_the_detector_as_it_is(bag: Path) -> None:
     assert with_recorded_types(detector, [bag]) is detector
 
 
-def test_a_type_that_ros_2_defines_otherwise_is_refused_if_it_is_asked_for(bag: Path) -> None:
+def test_a_type_that_ros_2_defines_otherwise_is_refused_if_it_is_requested(bag: Path) -> None:
     with pytest.raises(RecordingError, match="/other is recorded as sensor_msgs/msg/Range, which has other fields"):
         list(messages_in([bag]))
 
@@ -147,7 +147,7 @@ def test_a_bag_that_is_cut_is_read_up_to_there(
     assert types.spec.messages == []
 
 
-def test_a_damaged_bag_is_told(bag: Path, tmp_path: Path) -> None:
+def test_a_damaged_bag_is_reported(bag: Path, tmp_path: Path) -> None:
     whole = bag.read_bytes()
     damaged = tmp_path / "damaged.bag"
     place = whole.index(b"compression=")

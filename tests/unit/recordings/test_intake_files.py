@@ -87,7 +87,7 @@ def test_rosbags_reads_the_messages_with_their_type(tmp_path: Path) -> None:
         assert "geometry_msgs/Pose pose" in poses[0].msgdef.data
 
 
-def test_a_stream_whose_type_changes_goes_on_in_another_channel(tmp_path: Path) -> None:
+def test_a_stream_whose_type_changes_continues_in_another_channel(tmp_path: Path) -> None:
     path = tmp_path / "intake.mcap"
     writer = IntakeWriter(path, [POSES])
     first = Arrival(1, "pose", "vehicles/car1/pose", POSE)
@@ -103,7 +103,7 @@ def test_a_stream_whose_type_changes_goes_on_in_another_channel(tmp_path: Path) 
 
 @settings(max_examples=100, deadline=None)
 @given(cut=st.integers(0, 10_000))
-def test_a_cut_file_gives_what_can_be_read_and_says_that_it_is_cut(
+def test_a_cut_file_gives_what_can_be_read_and_reports_that_it_is_cut(
     cut: int, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     path = tmp_path_factory.getbasetemp() / "whole.mcap"

@@ -124,7 +124,7 @@ def test_a_capture_that_is_cut_is_read_up_to_there(write: object, tmp_path: Path
     assert {(0, 1), (1, 1), (2, 1)} <= counts <= {(0, 0), (0, 1), (1, 0), (1, 1), (2, 0), (2, 1)}
 
 
-def test_a_capture_that_is_damaged_is_told(tmp_path: Path) -> None:
+def test_a_capture_that_is_damaged_is_reported(tmp_path: Path) -> None:
     raw = bytearray(pcapng([(START, ethernet(CAM))]))
     raw[4:8] = struct.pack("<I", 27)  # no length of a block
     with pytest.raises(RecordingError, match="capture: the capture is damaged: a block of 27 bytes at byte 0"):

@@ -136,7 +136,7 @@ def test_a_cut_recording_with_protobuf_is_read_up_to_there(recording: Path) -> N
     assert read[0].decode(read[0].payload)["kind"] == "BIKE"  # type: ignore[index]
 
 
-def test_another_encoding_than_replay_can_give_is_said_with_those_it_can(recording: Path) -> None:
+def test_another_encoding_than_replay_can_give_is_reported_with_those_it_can(recording: Path) -> None:
     stream = Stream(name="t", key="vehicles/${client:*}/track", encoding=Encoding.CDR, type="std_msgs/msg/Header")
     with pytest.raises(
         RecordingError, match=r"track is recorded as protobuf.*streams\[t\].encoding is cdr: write json"
@@ -168,7 +168,9 @@ def test_a_file_that_does_not_define_its_messages_is_an_error(tmp_path: Path) ->
             list(messages_in([path]))
 
 
-def test_without_the_extra_the_error_says_how_to_install_it(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_extra_the_error_reports_how_to_install_it(
+    recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "mcap_protobuf.decoder", None)
     with pytest.raises(RecordingError, match=r"pip install 'wayside\[protobuf\]'"):
         list(messages_in([recording]))

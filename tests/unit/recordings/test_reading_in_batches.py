@@ -285,7 +285,7 @@ def arrivals_into(found: list[Arrival], router: Router, messages: Iterable[Messa
     most=st.integers(1, 8),
     step=st.integers(1, 5),
 )
-def test_a_recording_is_cut_at_pauses_and_where_time_goes_on(
+def test_a_recording_is_cut_at_pauses_and_where_time_continues(
     steps: list[int], cuts: set[int], most: int, step: int
 ) -> None:
     arrivals = [Arrival(sum(steps[: at + 1]), "s", "k", b"") for at in range(len(steps))]

@@ -62,7 +62,7 @@ def test_a_late_sample_is_found_at_its_own_time(tmp_path: Path) -> None:
     assert read_with_mcap(file) == sorted(map(as_recorded, given), key=lambda each: each.time)
 
 
-def test_channels_say_whose_they_are_and_how_they_read(tmp_path: Path) -> None:
+def test_channels_show_whose_they_are_and_how_they_read(tmp_path: Path) -> None:
     given = [tf_static(0.5), pose(1.1), pose(1.1, client="car2"), speed(1.2), a_sample(1.2, "objects", b"\x01")]
     (file,) = mcap_files(Bench(tmp_path, before="1s").record(an_episode(), given))
     with file.open("rb") as stream:
@@ -150,7 +150,7 @@ def test_a_file_has_about_the_size_that_it_may_have(tmp_path: Path) -> None:
     assert max(file.stat().st_size for file in files) < 2_500_000
 
 
-def test_name_folder_and_metadata_tell_of_the_episode(tmp_path: Path) -> None:
+def test_name_folder_and_metadata_describe_the_episode(tmp_path: Path) -> None:
     bench = Bench(tmp_path, rule="harsh-braking", metadata={"driver": "${x}"})
     episode = an_episode(
         rule="harsh-braking", clients=("car1", "car2"), element="north", rendered={"driver": "Ann", "runs": [1]}
@@ -227,7 +227,7 @@ def test_an_episode_without_samples_has_an_empty_recording(tmp_path: Path) -> No
     assert bench.outcome(an_episode()).state is OutcomeState.DONE
 
 
-def test_a_resumed_episode_goes_on_in_a_recording_that_says_so(tmp_path: Path) -> None:
+def test_a_resumed_episode_continues_in_a_recording_that_reports_it(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     whole = bench.record(an_episode(), [pose(1.1)])
     resumed = an_episode(resumed=True)
@@ -240,7 +240,7 @@ def test_a_resumed_episode_goes_on_in_a_recording_that_says_so(tmp_path: Path) -
     assert [each.time for each in read_with_mcap(file)] == [7.5, 7.5]
 
 
-def test_what_is_missing_is_told_by_name_metadata_and_outcome(tmp_path: Path) -> None:
+def test_what_is_missing_is_reported_by_name_metadata_and_outcome(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     folder = bench.record(an_episode(), [pose(1.1)], Completion(missing=4))
     assert folder.name.endswith("_cut")
@@ -249,7 +249,7 @@ def test_what_is_missing_is_told_by_name_metadata_and_outcome(tmp_path: Path) ->
     assert (outcome.state, outcome.missing, outcome.samples) == (OutcomeState.FAILED, 4, 1)
 
 
-def test_a_window_that_ends_early_is_told(tmp_path: Path) -> None:
+def test_a_window_that_ends_early_is_reported(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     folder = bench.record(an_episode(), [pose(1.1)], Completion(cut="the detector stops"))
     assert folder.name.endswith("_cut")

@@ -50,7 +50,7 @@ def test_each_sample_is_in_exactly_one_recording(tmp_path: Path, batch: int) -> 
     assert (outcome.state, outcome.details["recordings"]) == (OutcomeState.DONE, 4)
 
 
-def test_recordings_say_that_they_continue_and_are_continued(tmp_path: Path) -> None:
+def test_recordings_report_that_they_continue_and_are_continued(tmp_path: Path) -> None:
     bench = Bench(tmp_path, renewAfter="1s")
     bench.record(an_episode(), [pose(1.0), pose(2.5)])
     one, other = sorted((tmp_path / "r").iterdir())

@@ -68,7 +68,7 @@ def test_a_replay_of_a_recording_gives_the_event_again(tmp_path: Path) -> None:
     assert events[0].start_time == at(2.0)
 
 
-def test_a_file_that_is_gone_is_said(tmp_path: Path) -> None:
+def test_a_file_that_is_gone_is_reported(tmp_path: Path) -> None:
     folder = Bench(tmp_path).record(an_episode(), [pose(1.1)])
     (file,) = mcap_files(folder)
     file.unlink()

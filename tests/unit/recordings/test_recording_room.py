@@ -55,7 +55,7 @@ def test_the_limit_is_over_the_recordings_of_all_rules(tmp_path: Path) -> None:
     assert recordings_of(tmp_path) == ["episode2"]
 
 
-def test_stop_keeps_what_there_is_and_says_so(tmp_path: Path) -> None:
+def test_stop_keeps_what_there_is_and_reports_it(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     bench.limit(bytes="5M", whenFull="Stop")
     bench.record(an_episode(1), THREE)

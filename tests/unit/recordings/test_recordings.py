@@ -151,7 +151,7 @@ GOOD = '{"t": 5, "key": "a", "value": {}}'
         (['{"t": -1, "key": "a", "value": 1}'], 1, "negative"),
     ],
 )
-def test_a_broken_line_is_said_with_file_and_line(tmp_path: Path, lines: list[str], where: int, words: str) -> None:
+def test_a_broken_line_is_reported_with_file_and_line(tmp_path: Path, lines: list[str], where: int, words: str) -> None:
     path = write_lines(tmp_path / "drive.jsonl", *lines)
     with pytest.raises(RecordingError) as caught:
         list(messages_in([path]))

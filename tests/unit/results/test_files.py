@@ -190,7 +190,7 @@ def assert_declared(value: Any, schema: dict[str, Any]) -> None:
             assert_declared(child, schema["properties"][name])
 
 
-def test_the_mcap_file_says_what_conditions_said_and_why_they_are_unknown(results: Results) -> None:
+def test_the_mcap_file_has_the_conditions_and_why_they_are_unknown(results: Results) -> None:
     messages = results.messages["/wayside/too-fast/car2"]
     unknown = [(time, message) for time, message in messages if message["when"] == "unknown"]
     assert (unknown[0][0] - START) / SECOND == pytest.approx(21.1)

@@ -87,7 +87,7 @@ def test_parameters_of_single_clients_hold_for_variants_that_do_not_set_them(tmp
         (["harsh.signals.speed.over=x"], [], "harsh with signals.speed.over=x: spec.signals.0.over"),
     ],
 )
-def test_what_cannot_be_changed_is_an_error_that_says_why(
+def test_what_cannot_be_changed_is_an_error_that_reports_why(
     tmp_path: Path, sets: list[str], sweeps: list[str], words: str
 ) -> None:
     _, rules = documents(tmp_path)

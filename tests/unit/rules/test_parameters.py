@@ -144,7 +144,7 @@ def test_a_change_of_parameters_is_a_change_of_the_rule_wherever_it_is_made() ->
         ),
     ],
 )
-def test_a_parameter_that_is_not_there_or_does_not_fit_is_told_where_it_is_used(
+def test_a_parameter_that_is_not_there_or_does_not_fit_is_reported_where_it_is_used(
     spec: dict[str, Any], field: str, parts: list[str]
 ) -> None:
     with pytest.raises(RuleError) as caught:
@@ -165,7 +165,7 @@ def test_a_parameter_that_is_not_there_or_does_not_fit_is_told_where_it_is_used(
         ({"m": {"a": {"b": 1}}}, {"m": {"a": {"b": []}}}, "m", ["m.a.b", "is a number, this is a list"]),
     ],
 )
-def test_a_clients_value_that_does_not_fit_is_told_at_its_place_in_the_detector(
+def test_a_clients_value_that_does_not_fit_is_reported_at_its_place_in_the_detector(
     own: dict[str, Any], values: dict[str, Any], field: str, parts: list[str]
 ) -> None:
     with pytest.raises(RuleError) as caught:
@@ -176,7 +176,7 @@ def test_a_clients_value_that_does_not_fit_is_told_at_its_place_in_the_detector(
     assert all(part in problem.message for part in parts), problem.message
 
 
-def test_has_asks_for_a_parameter_as_for_any_member() -> None:
+def test_has_checks_a_parameter_as_for_any_member() -> None:
     rule = too_fast(when="has(parameters.maxSpeed) && v > parameters.maxSpeed")
     assert Drive(with_values(), rule).take(arrival(0.5, "car", {"v": 12}), until=1) == ["too-fast car started 1"]
 

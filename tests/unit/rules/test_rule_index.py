@@ -8,7 +8,7 @@ from tests.driving import a_detector, a_rule
 GOOD = {"signals": [{"name": "fast", "stream": "speed", "value": "msg.v"}], "when": "fast > 10"}
 
 
-def test_a_refused_version_leaves_the_last_good_one_in_place_and_says_so() -> None:
+def test_a_refused_version_leaves_the_last_good_one_in_place_and_reports_it() -> None:
     index, detector = RuleIndex(), a_detector()
     (first,), refused = index.compile([a_rule("r", **GOOD)], detector, {})
     assert refused == []

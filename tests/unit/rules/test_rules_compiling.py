@@ -152,7 +152,7 @@ def test_a_problem_of_a_position_names_the_axis(axis: str, source: str, parts: l
     assert all(part in message for part in parts), message
 
 
-def test_all_problems_are_told_at_once() -> None:
+def test_all_problems_are_reported_at_once() -> None:
     found = problems(
         signals=[SPEED | {"stream": "sped", "where": "1"}, SPEED | {"name": "labels"}],
         when="spee > 3",
@@ -165,7 +165,7 @@ def test_all_problems_are_told_at_once() -> None:
     }
 
 
-def test_fields_that_the_messages_type_does_not_have_are_told_before_any_message_came() -> None:
+def test_fields_that_the_messages_type_does_not_have_are_reported_before_any_message_came() -> None:
     fields: dict[str, Fields] = {"speed": {"twist": {"linear": {"x": None}}, "list": None}}
     found = problems(
         fields,
@@ -254,7 +254,7 @@ def test_a_streams_stamp_is_checked_like_a_rules_expressions() -> None:
     assert compile_stream(stream, 0).stamp is not None
 
 
-def test_what_the_types_cannot_tell_is_left_to_the_evaluation() -> None:
+def test_what_the_types_cannot_decide_is_left_to_the_evaluation() -> None:
     rule = a_rule(signals=[SPEED], when="v > 3 && v.deep[0] == 'x'")
     assert compile_rule(rule, a_detector()).when.evaluate({"v": 1.0}) is False
 

@@ -56,7 +56,7 @@ def test_one_folder_may_hold_everything(write: Write, tmp_path: Path) -> None:
     assert [each.name for each in loaded.rule_set.rules] == ["a"]
 
 
-def test_a_rule_that_the_detector_does_not_select_is_left_out_and_said(write: Write) -> None:
+def test_a_rule_that_the_detector_does_not_select_is_left_out_and_reported(write: Write) -> None:
     selecting = detector(ruleSelector={"matchLabels": {"site": "a"}})
     loaded = load_rules(write("d.yaml", selecting), [write("r.yaml", rule("in", site="a"), rule("out", site="b"))])
     assert [each.name for each in loaded.rule_set.rules] == ["in"]
@@ -66,7 +66,7 @@ def test_a_rule_that_the_detector_does_not_select_is_left_out_and_said(write: Wr
     assert "selects by labels: site=a: correct metadata.labels" in warning
 
 
-def test_a_rule_of_another_namespace_is_left_out_and_said(write: Write) -> None:
+def test_a_rule_of_another_namespace_is_left_out_and_reported(write: Write) -> None:
     elsewhere = rule("out")
     elsewhere["metadata"]["namespace"] = "elsewhere"
     loaded = load_rules(write("d.yaml", detector()), [write("r.yaml", elsewhere)])
@@ -97,7 +97,7 @@ def test_all_problems_come_at_once_and_each_once(write: Write) -> None:
     assert any("no such file" in problem.message for problem in caught.value.problems)
 
 
-def test_a_client_that_is_no_name_is_told_what_a_name_is(write: Write) -> None:
+def test_a_client_that_is_no_name_is_reported_with_the_valid_form(write: Write) -> None:
     stream = {"name": "cam", "key": "all/cams", "encoding": "json", "client": "a b"}
     with pytest.raises(
         DocumentError, match=r"must be a name of up to 63 letters, .* or a template such as its-"

@@ -46,7 +46,7 @@ def test_an_example_is_accepted(example: dict[str, Any]) -> None:
     accepted(example)
 
 
-def test_unknowns_are_as_the_table_says() -> None:
+def test_unknowns_are_as_in_the_table() -> None:
     table = GUIDE.split("with `u` unknown:", 1)[1].split("\n## ", 1)[0]
     rows = re.findall(r"^\| `(.*)` \| (\w+) \|$", table, re.MULTILINE)
     environment = Environment({"u": CelType.DYN, "m": CelType.MAP})

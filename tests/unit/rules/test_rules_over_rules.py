@@ -164,7 +164,7 @@ def test_rules_are_evaluated_by_depth_then_name() -> None:
     assert sorted(rule.name for rule in in_order(circle)) == ["a", "b", "c"]
 
 
-def test_a_circle_is_told_with_its_way_and_an_unknown_rule_with_the_nearest() -> None:
+def test_a_circle_is_reported_with_its_way_and_an_unknown_rule_with_the_nearest() -> None:
     rules = [
         a_rule("a", signals=[count("b", "1s")], when="it > 0"),
         a_rule("b", signals=[SPEED, count("c", "1s")], when="it > 0"),

@@ -243,7 +243,7 @@ def test_a_stream_that_goes_stale_between_its_samples_is_named(
     assert " [stale-between-samples]" in warned
 
 
-def test_a_rule_about_pairs_is_told_of_the_maximum_age_as_well(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_rule_about_pairs_is_warned_of_the_maximum_age_as_well(caplog: pytest.LogCaptureFixture) -> None:
     position = {"stream": "speed", "x": "msg.v", "y": "0.0"}
     rule = a_rule("near", scope={"pairs": {"position": position, "within": 10}}, when="distance < 1")
     drive = Drive(a_detector(a_stream("speed")), rule)

@@ -51,7 +51,7 @@ def test_values_kept_of_a_rule_do_not_outlive_its_change() -> None:
     assert drive.take(until=5) == []
 
 
-def test_a_sample_tells_its_key_stamp_latency_and_size() -> None:
+def test_a_sample_has_its_key_stamp_latency_and_size() -> None:
     detector = a_detector(
         {"name": "s", "key": "v/${client:*}/${sensor:*}", "encoding": "json", "stamp": "msg.t"}, clientTimeout="1h"
     )

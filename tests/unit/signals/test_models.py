@@ -224,7 +224,7 @@ def test_a_point_cloud_becomes_rows_of_fields_filled_up_without_those_that_are_n
     assert np.array(drive.values()["out"]) == pytest.approx(np.array([[3, 1], [6, 2], [0, 0]]))
 
 
-def test_of_too_many_points_every_so_many_th_is_taken(tmp_path: Path) -> None:
+def test_of_too_many_points_every_nth_is_taken(tmp_path: Path) -> None:
     given = {"stream": "lidar", "fields": ["x"], "count": 4}
     drive = sensed(tmp_path, [4, 1], {"points": given}, a_cloud([[n, 0, 0, 0] for n in range(8)]), "lidar")
     assert drive.values()["out"] == [[0.0], [2.0], [4.0], [6.0]]

@@ -39,7 +39,7 @@ def test_a_message_that_comes_in_pieces_is_kept_while_nothing_more_comes_in_time
     assert wire.receive(60) == ["result", 7]
 
 
-def test_messages_that_come_together_are_told_one_by_one(ends: tuple[socket.socket, Wire]) -> None:
+def test_messages_that_come_together_are_reported_one_by_one(ends: tuple[socket.socket, Wire]) -> None:
     sender, wire = ends
     sender.send(framed("query", "newest") + framed("result", None))
     assert [wire.receive(60), wire.receive(60)] == [["query", "newest"], ["result", None]]

@@ -51,7 +51,7 @@ def test_what_is_installed_and_what_is_shipped_is_there() -> None:
     assert {"counting", "strange", "unmatched-objects"} <= OFFERS.installed().keys()
 
 
-def test_a_plugin_that_is_not_there_is_told_with_what_is(tmp_path: Path) -> None:
+def test_a_plugin_that_is_not_there_is_reported_with_what_is(tmp_path: Path) -> None:
     (problem,) = problems(tmp_path, "countin", "{stream: speed}")
     assert problem.startswith("r.yaml:8:15: spec.signals[0].plugin.name: no plugin countin is installed")
     assert "did you mean counting?" in problem
@@ -70,7 +70,7 @@ def test_a_plugin_that_is_not_there_is_told_with_what_is(tmp_path: Path) -> None
         ("broken", "{}", "plugin.name: cannot load plugin broken: ModuleNotFoundError"),
     ],
 )
-def test_what_a_plugin_refuses_is_told_where_it_stands(
+def test_what_a_plugin_refuses_is_reported_where_it_stands(
     tmp_path: Path, plugin: str, parameters: str, reported: str
 ) -> None:
     (problem,) = problems(tmp_path, plugin, parameters)
@@ -104,7 +104,7 @@ def test_each_client_has_state_of_its_own_that_goes_with_it() -> None:
     assert driven.take(arrival(6.5, "a", {"v": 1}), until=7) == ["r a started 7"]
 
 
-def test_a_client_that_was_away_between_two_evaluations_begins_anew() -> None:
+def test_a_client_that_was_away_between_two_evaluations_restarts() -> None:
     driven = drive(plugin_rule(when="p.count >= 2", evaluation={"every": "10s"}), clientTimeout="3s")
     driven.take(arrival(9.5, "a", {"v": 1}), until=10)
     assert driven.take(arrival(19.5, "a", {"v": 1}), until=20) == []
@@ -158,7 +158,7 @@ def test_of_the_fleet_the_plugin_sees_the_members_at_the_tick() -> None:
     assert driven.events[0].values["p"]["clients"] == ["a", "b"]
 
 
-def test_one_that_throws_is_unknown_counted_and_told_and_goes_on_afterwards() -> None:
+def test_one_that_throws_is_unknown_counted_and_reported_and_continues_afterwards() -> None:
     other = plugin_rule("other")
     driven = drive(plugin_rule(parameters={"raiseAt": 2}), other)
     driven.take(arrival(0.5, "a", {"v": 1}), arrival(1.5, "a", {"v": 2}), arrival(2.5, "a", {"v": 1}), until=3)

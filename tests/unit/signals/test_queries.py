@@ -121,7 +121,7 @@ def test_before_the_first_sample_and_after_the_last_there_is_no_pose() -> None:
         ({"position": {"x": 1, "y": 2}, "orientation": dict.fromkeys("xyzw", 0.0)}, "", "a quaternion of length zero"),
     ],
 )
-def test_a_message_without_a_pose_is_told(message: Any, at_path: str, text: str) -> None:
+def test_a_message_without_a_pose_is_reported(message: Any, at_path: str, text: str) -> None:
     with pytest.raises(PoseError, match=text):
         pose_in(message, at_path)
 

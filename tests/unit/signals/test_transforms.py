@@ -94,7 +94,7 @@ def test_without_a_time_it_is_the_newest_that_all_transforms_on_the_way_have() -
     assert place(drive, "base", "camera", None) == (1, 0, 0)
 
 
-def test_beyond_the_stamps_nothing_is_known_and_the_times_are_told() -> None:
+def test_beyond_the_stamps_nothing_is_known_and_the_times_are_reported() -> None:
     drive = driven(*MOVING)
     with pytest.raises(TransformError) as error:
         place(drive, "map", "lidar", 1.75)
@@ -105,7 +105,7 @@ def test_beyond_the_stamps_nothing_is_known_and_the_times_are_told() -> None:
     assert place(drive, "camera", "lidar", 1.75) == (1, 0, 0)  # what moves is not on the way
 
 
-def test_unknown_and_unconnected_frames_are_told_apart() -> None:
+def test_unknown_and_unconnected_frames_are_distinguished() -> None:
     drive = driven(*MOVING, tf(1.7, transform("room", "chair", 1.7, x=0)))
     with pytest.raises(TransformError, match=r"client car has no frame 'lidr': did you mean 'lidar'\?"):
         place(drive, "map", "lidr", 1.5)
@@ -117,7 +117,7 @@ def test_unknown_and_unconnected_frames_are_told_apart() -> None:
         place(drive, "map", "base", 1.5, client="bus")
 
 
-def test_a_circle_of_frames_is_told_and_does_not_hang() -> None:
+def test_a_circle_of_frames_is_reported_and_does_not_hang() -> None:
     drive = driven(tf(1, transform("a", "b", 1, x=0), transform("b", "a", 1, x=0)))
     with pytest.raises(TransformError, match="cycle"):
         place(drive, "c", "a", 1)
@@ -133,7 +133,7 @@ def test_a_frame_that_changes_its_parent_is_where_it_was_until_then() -> None:
     assert place(drive, "map", "load", 2.0) == (202, 0, 0)
 
 
-def test_static_transforms_of_several_publishers_outlive_the_buffer_and_are_said_anew() -> None:
+def test_static_transforms_of_several_publishers_outlive_the_buffer_and_are_replaced() -> None:
     drive = driven(*MOVING, until=2)
     drive.take(tf(60, transform("map", "base", 60, x=0)), until=60)
     assert place(drive, "lidar", "camera", None) == (0, 1, 0)

@@ -101,7 +101,7 @@ def test_who_gives_a_value_and_who_is_outbid() -> None:
     assert contributions(found, "quality") == {"by-anna": "decides"}
 
 
-def test_a_default_and_a_value_that_is_kept_are_told_apart_from_what_tasks_give() -> None:
+def test_a_default_and_a_value_that_is_kept_are_distinguished_from_what_tasks_give() -> None:
     by_default = explained("scene-b", [TASKS[1]])
     assert {each.name: each.source for each in by_default.parameters}["quality"] == "default"
     kept = explained(None, [], instances=[running(rateHz=30)])
@@ -109,14 +109,14 @@ def test_a_default_and_a_value_that_is_kept_are_told_apart_from_what_tasks_give(
     assert {each.name: each.source for each in kept.parameters}["sources"] == "none"
 
 
-def test_a_refused_task_has_no_instance_and_says_why() -> None:
+def test_a_refused_task_has_no_instance_and_reports_why() -> None:
     found = explained("wrong")
     assert found.task is not None
     assert (found.task.standing, found.task.reason, found.instance) == ("Refused", "InvalidParameters", None)
     assert "'fast' is not of type number" in found.task.message
 
 
-def test_a_task_that_differs_where_all_must_agree_is_told_among_those_of_the_instance() -> None:
+def test_a_task_that_differs_where_all_must_agree_is_reported_among_those_of_the_instance() -> None:
     spec = {**FUSION, "parameters": {**FUSION["parameters"], "model": {"type": "string"}}}  # type: ignore[dict-item]
     tasks = [
         task("first", {"region": "north", "model": "a"}),
@@ -143,7 +143,7 @@ def test_a_missing_template_ends_the_chain() -> None:
     assert found.task.reason == "TemplateNotFound"
 
 
-def test_objects_and_pods_say_why_they_are_not_ready() -> None:
+def test_objects_and_pods_report_why_they_are_not_ready() -> None:
     found = explained(objects={("apps/v1", "Deployment", NAME): DEPLOYMENT, ("v1", "Service", NAME): None}, pods=[POD])
     assert [(each.kind, each.problem) for each in found.objects] == [
         ("Deployment", "has 0 of 1 pods available"),
@@ -152,7 +152,7 @@ def test_objects_and_pods_say_why_they_are_not_ready() -> None:
     assert [each.problem for each in found.pods] == ["cannot pull image fusion:9: not found"]
 
 
-def test_the_text_says_what_each_task_does_and_whose_values_lost_and_why() -> None:
+def test_the_text_shows_what_each_task_does_and_whose_values_lost_and_why() -> None:
     tasks = [
         *TASKS[:2],
         task("thin", {"rateHz": 2}, operation="Reconfigure"),
@@ -177,7 +177,7 @@ def test_who_has_no_place_under_a_limit_waits_though_nobody_has_written_it() -> 
     assert (reported.task.standing, reported.task.reason) == ("Waiting", "LimitReached")
 
 
-def test_a_sum_that_is_held_at_its_bound_says_what_it_would_be() -> None:
+def test_a_sum_that_is_held_at_its_bound_reports_what_it_would_be() -> None:
     spec = {"parameters": {"uplink": {"type": "number", "maximum": 100, "merge": "Sum"}}}
     tasks = [task("one", {"uplink": 60}), task("two", {"uplink": 70})]
     found = Found([template(**spec)], tasks, [])

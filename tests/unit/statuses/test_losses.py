@@ -13,7 +13,7 @@ from tests.driving import POSITION, Drive, a_detector, a_rule, arrival
 PAIRS = a_rule("near", scope={"pairs": {"position": POSITION, "within": 100}}, when="distance < 10")
 
 
-def test_the_first_loss_is_said_with_its_reason_and_further_ones_after_a_minute(
+def test_the_first_loss_is_reported_with_its_reason_and_further_ones_after_a_minute(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     now = [0.0]
@@ -44,7 +44,7 @@ def test_the_first_loss_is_said_with_its_reason_and_further_ones_after_a_minute(
         (b'{"y": 0}', "x of car is absent, NaN, no number, or cannot be read"),
     ],
 )
-def test_a_sample_without_a_position_is_told_with_client_and_axis(
+def test_a_sample_without_a_position_is_reported_with_client_and_axis(
     caplog: pytest.LogCaptureFixture, payload: bytes, logged: str
 ) -> None:
     drive = Drive(a_detector(), PAIRS)
@@ -53,7 +53,7 @@ def test_a_sample_without_a_position_is_told_with_client_and_axis(
     assert f"once a sample had no position for EventRule near; the last: {logged}" in caplog.messages
 
 
-def test_a_stamp_ahead_of_the_rest_is_told_with_its_client(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_stamp_ahead_of_the_rest_is_reported_with_its_client(caplog: pytest.LogCaptureFixture) -> None:
     stream = {"name": "pose", "key": "vehicles/${client:*}/pose", "encoding": "json", "stamp": "msg.t"}
     drive = Drive(a_detector(stream, clock="Data"))
     stamps = count(1_767_225_600)
@@ -65,7 +65,7 @@ def test_a_stamp_ahead_of_the_rest_is_told_with_its_client(caplog: pytest.LogCap
     assert "the last: c is 3601 s ahead of the rest" in message
 
 
-def test_unknown_values_are_told_by_their_reasons_with_samples_that_are_not_there_or_old(
+def test_unknown_values_are_reported_by_their_reasons_with_samples_that_are_not_there_or_old(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     speeding = a_rule("fast", signals=[{"name": "v", "stream": "speed", "value": "msg.v"}], when="v > 1")

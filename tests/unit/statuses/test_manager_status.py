@@ -93,7 +93,7 @@ def test_a_tasks_conditions_name_the_trouble_of_its_instance_before_and_after_it
     assert (later.status, later.reason, later.message) == ("False", "ImagePullFailed", pulling.problem)
 
 
-def test_a_finished_task_keeps_its_instance_and_tells_since_when() -> None:
+def test_a_finished_task_keeps_its_instance_and_reports_since_when() -> None:
     served = task("a").model_copy(update={"status": task_status(task("a"), COUNTS, None, NOW)})
     done = task_status(served, Verdict(Standing.FINISHED, "Ended", "ended"), None, NOW + 7)
     assert (done.phase, done.instance_name) == (TaskPhase.FINISHED, "app")
@@ -101,7 +101,7 @@ def test_a_finished_task_keeps_its_instance_and_tells_since_when() -> None:
     assert finished_since(served) is None
 
 
-def test_a_task_that_ends_before_its_status_is_written_still_says_what_served_it() -> None:
+def test_a_task_that_ends_before_its_status_is_written_still_reports_what_served_it() -> None:
     index, name = ClaimIndex(), ("site", "a")
     index.note(name, Entry({}, task("a")), template())
     claimed = index.claim(name)

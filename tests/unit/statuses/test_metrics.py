@@ -32,7 +32,7 @@ def samples(status: Status) -> dict[tuple[str, ...], float]:
     }
 
 
-def test_a_scrape_says_what_the_status_says() -> None:
+def test_a_scrape_has_the_values_of_the_status() -> None:
     streams = a_stream("pose"), a_stream("speed", stamp="msg.t")
     kept = Kept(Drive(a_detector(*streams), FAST, a_rule("off", when="true", enabled=False)))
     sent = {"v": 20, "t": at(0.5) / 1e9 - 0.03}
@@ -81,7 +81,7 @@ def test_pages_are_served_and_what_is_not_well_is_503(server: StatusServer) -> N
     assert get("/") == (404, "unknown page; the pages are /metrics, /readyz\n")
 
 
-def test_a_port_that_is_taken_is_told_with_the_option(server: StatusServer) -> None:
+def test_a_port_that_is_taken_is_reported_with_the_option(server: StatusServer) -> None:
     with pytest.raises(OSError, match=rf"--metrics-port {server.port}: .*: give another port"):
         StatusServer(PagesAddress(server.port), {})
 

@@ -45,7 +45,7 @@ def expression(key: str, operator: str, *values: str) -> dict[str, Any]:
         ),
     ],
 )
-def test_what_no_node_is_like_is_told(spec: Any, shows: str) -> None:
+def test_what_no_node_is_like_is_reported(spec: Any, shows: str) -> None:
     found = misplaced(deployment(**spec), NODES)
     assert found is not None
     assert found.reason == "Unschedulable"
@@ -71,7 +71,7 @@ def test_what_a_node_is_like_is_not(spec: Any) -> None:
     assert misplaced(deployment(**spec), NODES) is None
 
 
-def test_where_there_is_no_node_it_says_so_only_of_what_requires_one() -> None:
+def test_where_there_is_no_node_it_is_reported_only_for_what_requires_one() -> None:
     found = misplaced(deployment(nodeSelector={"site": "north"}), {})
     assert found is not None
     assert "(there are no nodes)" in found.message

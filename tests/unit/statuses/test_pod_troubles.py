@@ -58,7 +58,7 @@ def test_an_image_that_cannot_be_pulled_gives_the_same_words_at_each_attempt(sta
     assert logged(status) == ("ImagePullFailed", f"cannot pull image app:1: {CAUSE}")
 
 
-def test_an_image_whose_cause_is_not_told_is_named_with_the_kubelets_word() -> None:
+def test_an_image_whose_cause_is_not_reported_is_named_with_the_kubelets_word() -> None:
     back_off = waiting("ImagePullBackOff", 'Back-off pulling image "app:1"')
     assert logged(back_off) == ("ImagePullFailed", "cannot pull image app:1: ImagePullBackOff")
 
@@ -93,7 +93,7 @@ def test_a_container_that_is_ready_again_is_no_trouble() -> None:
     assert logged(container({"running": {}}, lastState={"terminated": ENDED}, ready=True)) is None
 
 
-def test_want_of_memory_and_a_containers_last_words_are_told() -> None:
+def test_want_of_memory_and_a_containers_last_words_are_reported() -> None:
     killed = container({"terminated": {"exitCode": 137, "reason": "OOMKilled"}})
     assert "exit code 137, killed for exceeding its memory limit" in str(logged(killed))
     speaks = container({"terminated": {**ENDED, "message": "no\nmap"}})
@@ -141,13 +141,13 @@ def test_a_pod_that_goes_is_no_trouble() -> None:
     assert trouble(going) is None
 
 
-def test_the_same_trouble_of_many_pods_is_told_once_and_the_most_telling_first() -> None:
+def test_the_same_trouble_of_many_pods_is_reported_once_and_the_most_specific_first() -> None:
     unschedulable = Trouble(TroubleReason.UNSCHEDULABLE, "no node")
     crashes = [Trouble(TroubleReason.CRASH_LOOP, "it crashes", f"log of {name}") for name in ("b", "a")]
     assert summary([unschedulable, *crashes]) == [crashes[1], unschedulable]
 
 
-def test_the_book_knows_an_instances_troubles_and_whether_news_change_them() -> None:
+def test_the_index_knows_an_instances_troubles_and_whether_events_change_them() -> None:
     index, of = PodIndex(), ("site", "app")
     assert not index.note(pod())
     assert index.note(pod(**waiting("ErrImagePull", "no")))
@@ -158,7 +158,7 @@ def test_the_book_knows_an_instances_troubles_and_whether_news_change_them() -> 
     assert index.troubles(of) == []
 
 
-def test_pods_of_every_workload_bear_the_label_by_which_they_are_found() -> None:
+def test_pods_of_every_workload_have_the_label_by_which_they_are_found() -> None:
     pods = DEPLOYMENT["spec"]["template"]
     job = {
         "apiVersion": "batch/v1",

@@ -48,7 +48,7 @@ class Kept:
         return self.keeper.latest
 
 
-def test_streams_are_told_with_rate_age_buffer_and_latency() -> None:
+def test_streams_are_reported_with_rate_age_buffer_and_latency() -> None:
     stamped = a_stream("speed", stamp="msg.t")
     kept = Kept(Drive(a_detector(a_stream("pose"), stamped), FAST))
     for second in range(10):
@@ -66,7 +66,7 @@ def test_streams_are_told_with_rate_age_buffer_and_latency() -> None:
     assert [(client.name, client.age) for client in status.clients] == [("car", 0.5)]
 
 
-def test_rules_are_told_with_what_was_unknown_failed_and_is_open() -> None:
+def test_rules_are_reported_with_what_was_unknown_failed_and_is_open() -> None:
     kept = Kept(Drive(a_detector(), FAST))
     status = kept.take(arrival(0.5, "car", {"v": 20}), arrival(0.6, "bus", {}), until=1)
     (rule,) = status.rules
@@ -114,7 +114,7 @@ def test_with_clock_data_latencies_are_from_the_stamp_to_the_receipt() -> None:
     assert status.streams[0].latency.sum == pytest.approx(100 + 100.25)
 
 
-def test_a_rule_that_is_refused_or_disabled_says_so() -> None:
+def test_a_rule_that_is_refused_or_disabled_reports_it() -> None:
     kept = Kept(Drive(a_detector(), a_rule("off", when="true", enabled=False)))
     kept.keeper.refused(
         [RefusedRule(a_rule("bad", when="1"), (RuleProblem(("spec", "when"), "no boolean"),), kept=False)]
@@ -127,7 +127,7 @@ def test_a_rule_that_is_refused_or_disabled_says_so() -> None:
     assert status.rules[0].message == "EventRule bad is refused: spec.when: no boolean"
 
 
-def test_drops_are_told_by_cause() -> None:
+def test_drops_are_reported_by_cause() -> None:
     kept = Kept(Drive(a_detector(), a_rule("r", signals=[SPEED], when="v > 1")))
     status = kept.take(arrival(0.5, "car", b"{"), arrival(0.6, "c%", {}), until=1)
     drops = {(drop.cause, drop.stream): drop.count for drop in status.drops if drop.count}
@@ -152,7 +152,7 @@ class _Nowhere:
     def demands(self, demands: object, ended: object) -> None: ...
 
 
-def test_what_is_asked_of_the_evaluation_is_done_on_its_thread_and_errors_are_the_askers() -> None:
+def test_what_is_requested_from_the_evaluation_is_done_on_its_thread_and_errors_are_the_callers() -> None:
     failures: list[BaseException] = []
     drive = Drive(a_detector())
     evaluator = Evaluator(
@@ -204,7 +204,7 @@ def test_questions_reach_a_detector_by_name_or_any_and_refusals_come_back(endpoi
 
 
 @pytest.mark.usefixtures("answering")
-def test_the_detectors_file_tells_where_it_listens(endpoint: str, tmp_path: Path) -> None:
+def test_the_detectors_file_contains_where_it_listens(endpoint: str, tmp_path: Path) -> None:
     file = tmp_path / "detector.yaml"
     file.write_text(a_detector(zenoh={"listen": [endpoint]}).model_dump_json(by_alias=True, exclude_none=True))
     (answer,) = query_selected("status", {}, file, None, None, 30)
@@ -221,7 +221,7 @@ def explained(
     return watching.future.result(0)
 
 
-def test_an_evaluation_tells_what_it_saw_and_why_a_signal_is_unknown() -> None:
+def test_an_evaluation_reports_what_it_saw_and_why_a_signal_is_unknown() -> None:
     gap = {"name": "gap", "stream": "pose", "value": "msg.gap"}
     rule = a_rule("r", signals=[SPEED, gap], when="v > 10 && gap < 5", **{"for": "2s"})
     drive = Drive(a_detector(a_stream("pose", staleAfter="2s"), a_stream("speed")), rule)
@@ -243,7 +243,7 @@ def test_an_evaluation_tells_what_it_saw_and_why_a_signal_is_unknown() -> None:
     assert drive.engine.rules["r"].witness is None
 
 
-def test_what_expressions_missed_or_failed_on_is_told() -> None:
+def test_what_expressions_missed_or_failed_on_is_reported() -> None:
     drive = Drive(a_detector(), a_rule("r", signals=[SPEED], when="v.x > 10"))
     explanation = explained(drive, "r", until=1, sent=[arrival(0.1, "a", {"v": 20}), arrival(0.2, "b", {})])
     assert explanation.notes == [
@@ -262,7 +262,7 @@ def test_what_expressions_missed_or_failed_on_is_told() -> None:
         ("a", "the rule is about pairs: write car1+car2"),
     ],
 )
-def test_a_subject_that_is_not_looked_at_is_told_why(subject: str, why: str) -> None:
+def test_a_subject_that_is_not_looked_at_is_reported_with_the_reason(subject: str, why: str) -> None:
     drive = Drive(a_detector(), a_rule("near", scope={"pairs": {"position": POSITION, "within": 100}}, when="true"))
     sent = [arrival(0.1, "a", {"x": 0, "y": 0}, "pose"), arrival(0.2, "b", {"x": 900, "y": 0}, "pose")]
     (reported,) = explained(drive, "near", subject, until=1, sent=sent).subjects
@@ -270,7 +270,7 @@ def test_a_subject_that_is_not_looked_at_is_told_why(subject: str, why: str) -> 
     assert reported.why == why
 
 
-def test_of_a_pair_each_ones_signals_are_told() -> None:
+def test_of_a_pair_each_ones_signals_are_reported() -> None:
     scope = {"pairs": {"position": POSITION, "within": 100}}
     drive = Drive(a_detector(), a_rule("near", scope=scope, signals=[SPEED], when="a.v + b.v > 1"))
     sent = [arrival(0.1, "a", {"x": 0, "y": 0}, "pose"), arrival(0.2, "b", {"x": 9, "y": 0}, "pose")]

@@ -82,12 +82,12 @@ def test_a_client_named_by_its_messages_is_lost_and_comes_back() -> None:
         ("${1 +}", "client: line 1, column 6: the expression ends too early"),
     ],
 )
-def test_a_template_that_does_not_compile_is_told_with_its_field(client: str, problem: str) -> None:
+def test_a_template_that_does_not_compile_is_reported_with_its_field(client: str, problem: str) -> None:
     with pytest.raises(DetectorError, match=r"spec.streams\[0\]." + problem):
         inlets(a_detector(a_stream(client)))
 
 
-def test_a_template_that_reads_a_member_of_a_number_is_told_with_the_number() -> None:
+def test_a_template_that_reads_a_member_of_a_number_is_reported_with_the_number() -> None:
     drive = Drive(a_detector(a_stream("${msg.hdr.id}")), a_rule(**FAST))
     drive.take(sent(0.5, '{"hdr": 3}'), until=1)
     reported = "`msg.hdr` is 3.0, which has no field `id`: correct the path"
@@ -99,7 +99,7 @@ def test_a_member_of_a_raw_message_is_refused() -> None:
         inlets(a_detector(a_stream(encoding="raw")))
 
 
-def test_a_field_that_the_message_type_does_not_have_is_told() -> None:
+def test_a_field_that_the_message_type_does_not_have_is_reported() -> None:
     stream = {"name": "o", "key": "odom", "encoding": "cdr", "type": "nav_msgs/msg/Odometry", "client": "${msg.child}"}
     with pytest.raises(DetectorError, match=r"spec.streams\[0\].client: msg has no field child; it has child_frame_id"):
         inlets(a_detector(stream))

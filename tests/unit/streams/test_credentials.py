@@ -74,7 +74,7 @@ def test_files_that_change_while_they_are_read_are_read_again(tmp_path: Path, mo
     assert material.key == (mounted / "tls.key").read_bytes()
 
 
-def test_files_that_never_hold_still_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_that_never_hold_still_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     authority, mounted = Authority(tmp_path), tmp_path / "own"
     authority.mount(mounted, "first")
     count = iter(range(1000))

@@ -20,7 +20,7 @@ def silent(**spec: Any) -> Any:
     return a_rule("silent", signals=[AGE, COUNT], **{"when": "age > 3.0 && labels.role == 'roadside'", **spec})
 
 
-def test_a_silent_station_is_told_from_the_start_on_and_its_episode_holds_beyond_the_timeout() -> None:
+def test_a_silent_station_is_reported_from_the_start_on_and_its_episode_holds_beyond_the_timeout() -> None:
     drive = Drive(detector(), silent())
     assert drive.take(until=60) == ["silent rsu started 4"]
     assert list(drive.engine.clients) == ["rsu"]

@@ -48,7 +48,7 @@ def test_the_files_become_a_config_map_of_the_instance_which_its_manifests_can_n
     assert deployment["spec"]["template"]["spec"]["volumes"][0]["configMap"] == {"name": "app-configuration"}
 
 
-def test_a_map_or_list_is_written_as_the_extension_says() -> None:
+def test_a_map_or_list_is_written_in_the_format_of_the_extension() -> None:
     content = {"sources": "${parameters.sources}", "rate": "${parameters.rate}"}
     files = files_of(render({"a.yaml": content, "b.yml": content, "c.json": content}, sources=["n", "2"], rate=5.0))
     expected = {"sources": ["n", "2"], "rate": 5}

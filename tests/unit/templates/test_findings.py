@@ -68,7 +68,7 @@ def test_what_the_rule_alone_has_is_a_problem_also_without_a_detector() -> None:
     ],
     ids=["record", "database", "pairs", "on sample", "a long window"],
 )  # fmt: skip
-def test_what_asks_something_of_a_detector_is_no_problem_of_the_rule_alone(spec: dict[str, Any]) -> None:
+def test_what_requires_something_from_a_detector_is_no_problem_of_the_rule_alone(spec: dict[str, Any]) -> None:
     assert not rule_findings(rule(**spec), []).problems
 
 
@@ -138,7 +138,7 @@ def test_what_no_task_can_put_right_is_a_problem_of_the_template(spec: dict[str,
     assert [part for part in parts if part not in found.problems[0]] == []
 
 
-def test_what_depends_on_what_tasks_give_is_a_remark_that_says_so() -> None:
+def test_what_depends_on_what_tasks_give_is_a_remark_that_reports_it() -> None:
     declared = {**REGION, "lane": {"type": "string"}}
     made = template(parameters=declared, manifests=[container(args=["l=${parameters.lane}"])])
     found = template_findings(made, Policy())
@@ -155,7 +155,7 @@ def test_what_depends_on_what_tasks_give_is_a_remark_that_says_so() -> None:
     [{"type": "string", "pattern": "^[0-9]+$"}, {"type": "array", "items": "string"}, {"type": "object"}],
     ids=["pattern", "array", "object"],
 )
-def test_of_values_whose_shape_cannot_be_guessed_nothing_is_said(parameter: dict[str, Any]) -> None:
+def test_of_values_whose_shape_cannot_be_guessed_nothing_is_reported(parameter: dict[str, Any]) -> None:
     expression = {
         "string": "${10 / double(parameters.x)}",
         "array": "${parameters.x[4]}",

@@ -48,7 +48,7 @@ def refusal(*manifests: dict[str, Any], **values: Any) -> str:
     return str(caught.value)
 
 
-def test_values_are_filled_in_and_labels_say_whose_the_object_is() -> None:
+def test_values_are_filled_in_and_labels_show_whose_the_object_is() -> None:
     declared = {"rate": {"type": "number"}}
     deployment, config = render(DEPLOYMENT, CONFIG, declared=declared, rate=10.0).manifests
     assert deployment["metadata"]["name"] == "app"
@@ -141,7 +141,7 @@ def test_a_listed_account_keeps_its_token() -> None:
         ),
     ],
 )
-def test_what_a_template_may_not_do_is_said_with_its_place(path: str, value: Any, parts: list[str]) -> None:
+def test_what_a_template_may_not_do_is_reported_with_its_place(path: str, value: Any, parts: list[str]) -> None:
     message = refusal(changed(DEPLOYMENT, path, value))
     for part in parts:
         assert part in message
@@ -184,7 +184,7 @@ def test_an_account_that_a_kind_names_outside_of_a_pod_has_to_be_listed_too() ->
     assert list(policy.pod_problems(CONFIG | {"data": {"serviceAccountName": "admin", "containers": "none"}})) == []
 
 
-def test_what_does_not_compile_and_what_there_is_not_are_told_together() -> None:
+def test_what_does_not_compile_and_what_there_is_not_are_reported_together() -> None:
     manifest = changed(DEPLOYMENT, "spec.replicas", "${parameters.n}")
     manifest = changed(manifest, "spec.template.spec.containers.0.args", ["${1 +}", "${instance.nam}"])
     message = refusal(manifest)
@@ -192,7 +192,7 @@ def test_what_does_not_compile_and_what_there_is_not_are_told_together() -> None
         assert part in message
 
 
-def test_all_problems_are_told_at_once() -> None:
+def test_all_problems_are_reported_at_once() -> None:
     message = refusal(
         changed(DEPLOYMENT, "spec.replicas", "${parameters.n}"),
         changed(CONFIG, "data", {"a": "${b}"}),
@@ -210,7 +210,7 @@ def test_a_secret_needs_leave_and_never_holds_a_service_accounts_token() -> None
     assert "service-account-token" in refusal(token, policy=allowed)
 
 
-def test_with_a_key_each_name_must_tell_the_instance() -> None:
+def test_with_a_key_each_name_must_identify_the_instance() -> None:
     assert render(DEPLOYMENT, key="north").manifests[0]["metadata"]["name"] == "app"
     message = refusal({**CONFIG, "metadata": {"name": "config"}, "data": {}}, key="north")
     assert "must contain ${instance.name}" in message
@@ -220,7 +220,7 @@ def test_two_objects_of_one_kind_and_name_are_refused() -> None:
     assert "Deployment 'app' is given twice" in refusal(DEPLOYMENT, DEPLOYMENT)
 
 
-def test_an_expression_that_fails_on_the_values_is_told_with_its_place() -> None:
+def test_an_expression_that_fails_on_the_values_is_reported_with_its_place() -> None:
     manifest = changed(DEPLOYMENT, "spec.replicas", "${parameters.list[3]}")
     message = refusal(manifest, declared={"list": {"type": "array"}}, list=[1])
     assert "spec.manifests[0].spec.replicas" in message

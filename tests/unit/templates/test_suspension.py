@@ -91,7 +91,7 @@ def live(replicas: int, pods: int) -> dict[str, Any]:
     return {**DEPLOYMENT, "metadata": {"name": "app"}, "spec": {"replicas": replicas}, "status": {"replicas": pods}}
 
 
-def test_the_instance_says_who_suspends_it_what_is_left_and_what_rests() -> None:
+def test_the_instance_reports_who_suspends_it_what_is_left_and_what_rests() -> None:
     stopped = instance(suspended=True)
     assert logged(instance(), live(1, 1)) is None
     assert logged(stopped, live(0, 2)) == (
@@ -105,7 +105,7 @@ def test_the_instance_says_who_suspends_it_what_is_left_and_what_rests() -> None
     )
 
 
-def test_phases_of_tasks_tell_of_the_suspension() -> None:
+def test_phases_of_tasks_describe_the_suspension() -> None:
     on, off = Service("app", True, False, suspended=True), Service("app", True, False, suspended=True, stopped=True)
     night = task("night", operation="Suspend")
     assert task_status(task("a"), COUNTS, off, NOW).phase == "Suspended"

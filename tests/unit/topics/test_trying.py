@@ -28,7 +28,7 @@ def test_a_number_has_its_extremes_its_mean_and_a_plot_for_each_client(tmp_path:
     assert lines[0].split()[1][-1] == "█"
 
 
-def test_a_boolean_says_how_long_it_is_true_and_a_text_what_it_is(tmp_path: Path) -> None:
+def test_a_boolean_shows_how_long_it_is_true_and_a_text_its_value(tmp_path: Path) -> None:
     messages = [(at / 10, "v/car1/state", {"v": at, "gear": "D" if at < 50 else "N"}) for at in range(101)]
     recording = drive(tmp_path, *messages)
     assert "true 50% of the time" in tried("msg.v >= 50", recording).output

@@ -110,7 +110,7 @@ def test_who_is_not_let_in_and_who_has_no_rights_is_in_the_routers_log(guarded: 
 
 
 @pytest.mark.parametrize("guarded", [SAY_ALL], indirect=True)
-def test_a_foreign_key_is_told_with_the_name_of_the_certificate(guarded: GuardedRouter) -> None:
+def test_a_foreign_key_is_reported_with_the_name_of_the_certificate(guarded: GuardedRouter) -> None:
     with guarded.connect(guarded.authority.sign("car1")) as car:
         car.put("vehicles/car1/pose", "own")
         car.put("vehicles/car2/pose", "foreign")
