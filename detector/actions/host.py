@@ -1,6 +1,6 @@
 """Runs the actions of all rules, follows changes of the rules, and stops them cleanly.
 
-engine ─▶ consequences ─▶ host ─▶ a worker for each action of each rule, with a thread of its own
+engine ─▶ consequences ─▶ host ─▶ a worker with a separate thread for each action of each rule
                                       └▶ outcomes: status, follow-ups on Zenoh
 """
 

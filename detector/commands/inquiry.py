@@ -118,7 +118,7 @@ def _inquire_all(
     Each network of the file's Detectors is queried separately: regions may have separate networks.
 
     Raises:
-        NoAnswerError: nobody answers.
+        NoAnswerError: no detector responds.
         NetworkError: without a file: no session.
         DocumentError: the file is wrong, or holds no Detector.
     """

@@ -79,7 +79,7 @@ def replay_files(
         detector: a file with one Detector; None: the intake file brings its own.
         rules: files or folders with EventRules.
         as_one: merge all recordings by time; otherwise each is replayed on its own.
-        kinds: the results to look at that are written as well.
+        kinds: the kinds of results to write in addition.
         sets: fields of rules with other values, as RULE.FIELD=VALUE: a variant that is compared with the rule; or
             RULE=OTHER: another rule that is compared with it.
         sweeps: the same with several values, each a variant: RULE.FIELD=FIRST:LAST:STEP.

@@ -1,1 +1,1 @@
-"""What a Detector finds wrong: the findings of `check`, and what is lost while it runs."""
+"""The problems that a Detector detects: the findings of `check`, and losses while it runs."""

@@ -43,7 +43,7 @@ class CutRecording(NamedTuple):
 
 
 def run_jobs(jobs: Iterable[tuple[MiningJob, int]], workers: Workers, cut: list[CutRecording]) -> Iterator[Done]:
-    """Run the jobs, each with the size of its recording in bytes; yields results as they are ready, by parts of the
+    """Run the jobs, each with the size of its recording in bytes; yields results when they are ready, by parts of the
     rules.
 
     Appends the recordings that were cut to `cut`.

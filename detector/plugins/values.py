@@ -1,4 +1,4 @@
-"""Converts plugins' values to those of expressions: numbers become doubles, and only plain data is accepted."""
+"""Converts plugins' values to values of expressions: numbers become doubles, and only plain data is accepted."""
 
 from __future__ import annotations
 

@@ -88,7 +88,7 @@ class KubernetesTaskStore:
             await self._client.delete(TASKS, self._namespace, metadata.name, metadata.uid)
 
     async def _set(self, stored: StoredTask, field: str, value: JsonValue) -> StoredTask:
-        # A JSON patch, since a merge patch would keep what is no longer in a nested map.
+        # A JSON patch, since a merge patch would keep removed entries of a nested map.
         metadata = stored.task.metadata
         add = {"op": "add", "path": f"/spec/{field}", "value": value}
         with _store_errors():

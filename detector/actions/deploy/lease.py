@@ -93,7 +93,7 @@ class HolderLease:
             identity: which process this is. Default: found out.
             duration: seconds for which a renewal holds; whole, at least 3. Renewed after each third of it.
             monotonic: seconds, for observing.
-            now: seconds since the epoch, for what is written; nothing is computed from it.
+            now: seconds since the epoch, only for the written times; nothing is computed from it.
         """
         self.name = lease_name(holder)
         self._client = client

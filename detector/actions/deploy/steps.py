@@ -26,7 +26,7 @@ def next_step(demand: Demand | None, stored: StoredTask | None, held: bool) -> S
     """The next change that brings the store closer to the demand.
 
     Args:
-        demand: what is demanded under the task's name; None: nothing (any more).
+        demand: the demand with the task's name; None: there is none (any more).
         stored: the task, if there is one and it is the holder's own.
         held: whether this process has seen the task live for this demand. If it has, and the task has ended, then
             another client ended it on purpose and it stays ended. If not, it is left from an earlier run over the same

@@ -1,6 +1,6 @@
 """The notify action: sends notifications about the episodes of a rule.
 
-Notify (the action's thread) ─▶ queue: EventQueue or AlertQueue ◀─ Sender (a thread of its own) ─▶ target
+Notify (the action's thread) ─▶ queue: EventQueue or AlertQueue ◀─ Sender (a separate thread) ─▶ target
                                   └▶ keeping: journal, dead letters
 
 Notifications wait in the queue. The sender sends one request at a time, so an endpoint that hangs delays only its own

@@ -103,7 +103,7 @@ class Record(Action[api.RecordAction]):
         return _FLUSH_SECONDS if waiting else _REPORT_SECONDS if self._open else _EXPIRE_SECONDS
 
     def close(self) -> None:
-        """Completes what is still open, marked as cut."""
+        """Completes the open recordings, marked as cut."""
         for current in [*self._open.values()]:
             current.series.finish("the detector stopped", 0)
             self._settle(current, over=True)

@@ -30,7 +30,7 @@ def draft(case: str, stream: str, name: str | None) -> str:
         name: the rule's name; None: the use case's.
 
     Raises:
-        DraftError: there is none of that case.
+        DraftError: no draft has this case.
     """
     known = drafts()
     if case not in known:

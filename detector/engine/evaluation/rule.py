@@ -256,7 +256,7 @@ class RuleRun:
         return {subject: each.statistics for subject, each in self._open.items() if each.statistics is not None}
 
     def statistics(self, subject: Subject) -> Statistics | None:
-        """Those of the subject's open episode, if it has any."""
+        """The statistics of the subject's open episode, if it has one."""
         episode = self._open.get(subject)
         return None if episode is None else episode.statistics
 

@@ -1,4 +1,4 @@
-"""Liveliness tokens: a client declares a token while it is there, and the network reports when the token is gone.
+"""Liveliness tokens: a client declares a token while it is present, and the network reports when the token is gone.
 
 Changes of tokens go through the intake like samples, on a separate stream name, so they are recorded and replayed in
 order with the samples. The payload is the change of the token with that key.

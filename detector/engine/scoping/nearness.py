@@ -75,7 +75,7 @@ def _fits(search: Search, a: str, b: str) -> bool:
 
 
 def _nearest(search: Search, pairs: Iterator[Pair], within: float, maximum: int) -> Near:
-    """Those of the pairs that are within reach, exactly."""
+    """The pairs among these that are within reach, exactly."""
     measured = [(search.distance(a, b), a, b) for a, b in pairs if _fits(search, a, b)]
     reached = [each for each in measured if each[0] <= within]
     if len(reached) <= maximum:

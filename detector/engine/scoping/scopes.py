@@ -112,7 +112,7 @@ class Views:
         return {**view, **self._values(self._common, client)}
 
     def _values(self, signals: Iterable[CompiledSignal], client: str) -> dict[str, Any]:
-        """Those of the signals that are known."""
+        """The known values of the signals."""
         computed = {
             signal.name: self._signals.value(self._rule.name, signal, client, self._now, self._counters)
             for signal in signals
