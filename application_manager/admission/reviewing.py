@@ -18,7 +18,6 @@ from typing import Any
 import msgspec
 from aiohttp import web
 
-from application_manager.cluster.certificate import follow
 from application_manager.core.findings.reviews import ReviewError
 from application_manager.core.findings.webhooks import certificate_secret
 from application_manager.measures import Measures
@@ -111,7 +110,7 @@ async def webhook(serving: Serving | None, desks: Mapping[str, Desk]) -> AsyncIt
         application, access_log=None, handle_signals=False, shutdown_timeout=1, handler_cancellation=True
     )
     await runner.setup()
-    following = asyncio.create_task(follow(certificate), name="certificate")
+    following = asyncio.create_task(certificate.follow(), name="certificate")
     try:
         try:
             await web.TCPSite(runner, port=serving.port, ssl_context=certificate.context).start()

@@ -11,7 +11,6 @@ from typing import Protocol
 
 from aiohttp import web
 
-from application_manager.cluster.certificate import follow
 from application_manager.measures import Measures
 from wayside.kubernetes.connection import ConfigurationError
 from wayside.process.servingcertificate import ServingCertificate
@@ -95,7 +94,7 @@ async def pages(
         application.router.add_get(path, page)
     runner = web.AppRunner(application, access_log=None, handle_signals=False, shutdown_timeout=1)
     await runner.setup()
-    following = None if certificate is None else asyncio.create_task(follow(certificate), name="metrics certificate")
+    following = None if certificate is None else asyncio.create_task(certificate.follow(), name="metrics certificate")
     try:
         try:
             await web.TCPSite(runner, port=port, ssl_context=certificate.context if certificate else None).start()

@@ -71,7 +71,7 @@ def test_a_user_who_may_not_list_rules_gets_one_line(control_plane: ControlPlane
     assert answer.returncode == 2
     assert answer.stdout == ""
     assert answer.stderr == (
-        f"detector: cannot list the EventRules of namespace {namespace}: 401 Unauthorized: Unauthorized. "
+        f"detector: cannot list the EventRules of namespace {namespace}: Unauthorized (HTTP 401). "
         "Check that KUBECONFIG points to the right cluster, and that its account may list "
         "eventrules.wayside.dev there\n"
     )

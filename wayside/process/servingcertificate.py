@@ -6,6 +6,7 @@ only if they are valid; until then the old ones stay.
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import logging
 import ssl
@@ -53,6 +54,12 @@ class ServingCertificate:
             self._logged = ""
             if changed:
                 log.info("%s: the certificate was renewed", self._option)
+
+    async def follow(self) -> None:
+        """Use the files' new contents whenever they change, until cancelled."""
+        while True:
+            await asyncio.sleep(EVERY)
+            self.refresh()
 
     def renewed(self) -> bool:
         """Use the files if they have changed; whether they have.
