@@ -42,15 +42,14 @@ class Trace:
 
     def __call__(self, frame: FrameType, event: str, argument: Any) -> None:
         """Note a call."""
-        if event != "call" or frame in self._frames or not _is_ours(frame):
+        if event != "call" or frame in self._frames:
+            return
+        if frame.f_code is WorkQueue._once.__code__ and frame.f_locals["self"].name == "instance":
+            _on_the_way.set(True)
+        if not _is_ours(frame) or not _on_the_way.get():
             return
         self._frames.add(frame)
-        begins = frame.f_code is WorkQueue._once.__code__ and frame.f_locals["self"].name == "instance"
-        if begins:
-            _on_the_way.set(True)
-        if not _on_the_way.get():
-            return
-        module, callers = _module(frame), [] if begins else list(_callers(frame))
+        module, callers = _module(frame), list(_callers(frame))
         source = callers[0] if callers else "the event loop"
         internal = _package(module) == "core" or (_package(source) == _package(module) == "cache")
         if module not in callers and not internal:
