@@ -6,9 +6,10 @@ as `detector replay` makes them, without the time to compile the rules. The base
 payload into a struct and does no more.
 
     python -m benchmarks.engine_speed [--clients 100] [--hz 100] [--seconds 10] [--repeat 3] [--rules 1 50]
-                                      [--file] [--esper]
+                                      [--file] [--mcap] [--esper]
 
-`--file` also measures `detector replay` as a process, from a file of JSON lines to events.jsonl. `--esper` also builds
+`--file` also measures `detector replay` as a process, from a file of JSON lines to events.jsonl, its start included.
+`--mcap` does so from an MCAP file of poses, beside the library mcap that only reads it. `--esper` also builds
 and measures the peer in `benchmarks/peers/esper`: Esper parses the same payloads and evaluates the same rules on one
 thread, with a window for each rule (plain, of up to five rules), with one for each length (tuned), and over maxima of
 100 ms (panes). Wayside makes events with ids, times and values; the peer only counts starts and ends.
@@ -26,11 +27,12 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
-from detector.memory import tune_garbage_collection
+from mcap.reader import SeekingReader
 
 from benchmarks.workloads import esper, speeds
 from benchmarks.workloads.driving import replayed
@@ -57,6 +59,7 @@ def main() -> int:
     parser.add_argument("--repeat", type=int, default=3, help="rounds (%(default)s)")
     parser.add_argument("--rules", type=int, nargs="+", default=[1, 50], help="numbers of rules (1 50)")
     parser.add_argument("--file", action="store_true", help="also measure detector replay as a process")
+    parser.add_argument("--mcap", action="store_true", help="the same from an MCAP file")
     parser.add_argument("--esper", action="store_true", help="also measure the peer")
     options = parser.parse_args()
     arrivals = list(speeds.arrivals(options.clients, options.hz, options.seconds))
@@ -69,12 +72,17 @@ def main() -> int:
     tune_garbage_collection()
     same = True
     with tempfile.TemporaryDirectory() as folder:
-        recording = Path(folder) / "recording.jsonl"
+        recording, mcap = Path(folder) / "recording.jsonl", Path(folder) / "recording.mcap"
         speeds.write_json_lines(recording, arrivals)
+        if options.mcap:
+            speeds.write_mcap(mcap, arrivals)
+            print(f"the library mcap reads {rate(len(arrivals), reading_time(mcap, options.repeat))}")
         for count in options.rules:
             seconds, events = measure(arrivals, speeds.rules(count), options.repeat)
             if options.file:
                 measure_replay(recording, count, len(arrivals), options.repeat)
+            if options.mcap:
+                measure_replay(mcap, count, len(arrivals), options.repeat)
             if options.esper:
                 same &= compare(recording, count, seconds, events, len(arrivals), options.repeat)
     return 0 if same else 1
@@ -115,7 +123,7 @@ def measure(arrivals: Sequence[Arrival], rules: Sequence[EventRule], rounds: int
 
 def measure_replay(recording: Path, count: int, samples: int, rounds: int) -> None:
     """Print what `detector replay` takes from its start to its end."""
-    detector, rules = speeds.write_documents(recording.parent, count)
+    detector, rules = speeds.write_documents(recording.parent, count, poses=recording.suffix == ".mcap")
     program = str(Path(sys.executable).with_name("detector"))
     command = [program, "replay", str(recording), "--output", str(recording.parent / "out")]
     found = [
@@ -123,7 +131,18 @@ def measure_replay(recording: Path, count: int, samples: int, rounds: int) -> No
         for _ in range(rounds)
     ]
     taken = statistics.median(found)
-    print(f"           detector replay, file to events.jsonl: {taken:.2f} s, {rate(samples, taken)}")
+    print(f"           detector replay, {recording.suffix[1:]} to events.jsonl: {taken:.2f} s, {rate(samples, taken)}")
+
+
+def reading_time(recording: Path, rounds: int) -> float:
+    """The median CPU time in which the library mcap reads a recording, in seconds."""
+    spent: list[float] = []
+    for _ in range(rounds):
+        begin = time.process_time()
+        with recording.open("rb") as file:
+            deque(SeekingReader(file).iter_messages(), maxlen=0)
+        spent.append(time.process_time() - begin)
+    return statistics.median(spent)
 
 
 def process_time(command: Sequence[str], log: Path) -> float:

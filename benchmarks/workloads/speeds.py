@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 import math
+import struct
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import yaml
+from mcap.writer import Writer
 
 from detector.engine.samples.sample import Arrival
+from tests.ros_messages import cdr, pose_stamped
 from wayside.api import Detector, EventRule
 
 START = 1_700_000_000_000_000_000
@@ -21,6 +24,11 @@ TICK = 100_000_000
 
 LONGEST = 5
 """Windows are of 1, 2, … seconds up to this."""
+
+POSE = "geometry_msgs/msg/PoseStamped"
+
+X = 1234.5
+"""A number that occurs once in a message."""
 
 MEAN, SWING, PACE = 27.0, 8.0, 0.7  # m/s, m/s, rad/s
 
@@ -88,11 +96,16 @@ def rules_on_sample(count: int) -> list[EventRule]:
     return [EventRule.model_validate(rule_document(each, {"onSample": "speed"})) for each in limits(count)]
 
 
-def write_documents(folder: Path, count: int) -> tuple[Path, Path]:
-    """The Detector and the rules as YAML files."""
+def write_documents(folder: Path, count: int, *, poses: bool = False) -> tuple[Path, Path]:
+    """The Detector and the rules as YAML files; `poses`: for the recording of `write_mcap`."""
     files = folder / "detector.yaml", folder / "rules.yaml"
-    files[0].write_text(yaml.safe_dump(detector_document()))
-    files[1].write_text(yaml.safe_dump_all(rule_document(each, {"every": "100ms"}) for each in limits(count)))
+    detector, rules = detector_document(), [rule_document(each, {"every": "100ms"}) for each in limits(count)]
+    if poses:
+        detector["spec"]["streams"][0] |= {"encoding": "cdr", "type": POSE}
+        for rule in rules:
+            rule["spec"]["signals"][0]["value"] = "msg.pose.position.x"
+    files[0].write_text(yaml.safe_dump(detector))
+    files[1].write_text(yaml.safe_dump_all(rules))
     return files
 
 
@@ -112,6 +125,23 @@ def write_json_lines(path: Path, of: Sequence[Arrival]) -> None:
     with path.open("w", encoding="utf-8") as file:
         for each in of:
             file.write(f'{{"t": {each.received}, "key": {json.dumps(each.key)}, "value": {each.payload.decode()}}}\n')
+
+
+def write_mcap(path: Path, of: Sequence[Arrival]) -> None:
+    """A recording of poses, compressed with zstd, of which x is the speed of these arrivals."""
+    pose = cdr(pose_stamped(x=X))
+    before, after = pose.split(struct.pack("<d", X))
+    channels: dict[str, int] = {}
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema(POSE, "ros2msg", b"")
+        for each in of:
+            if each.key not in channels:
+                channels[each.key] = writer.register_channel(f"/{each.key}", "cdr", schema)
+            payload = before + struct.pack("<d", json.loads(each.payload)["speed"]) + after
+            writer.add_message(channels[each.key], each.received, payload, each.received)
+        writer.finish()
 
 
 def write_limits(path: Path, count: int) -> None:
