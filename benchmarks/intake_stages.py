@@ -56,9 +56,9 @@ def clock_all() -> None:
     def clocked_putter(intake: Intake, stream: str) -> Callable[..., None]:
         return clocked("queue", "stream", putter(intake, stream))
 
-    def clocked_insert(ingest: Ingest, arrivals: Sequence[Arrival], times: Sequence[int] | None) -> None:
+    def clocked_insert(ingest: Ingest, arrivals: Sequence[Arrival], times: Sequence[int] | None, size: int) -> None:
         nonlocal last, wait
-        insert(ingest, arrivals, times)
+        insert(ingest, arrivals, times, size)
         last, wait = time.monotonic(), max(wait, (time.time_ns() - arrivals[0].received) / 1e9)
 
     def clocked_run(blocks: Blocks, *args: Any) -> Any:
