@@ -36,6 +36,7 @@ from mcap.reader import SeekingReader
 
 from benchmarks.workloads import esper, speeds
 from benchmarks.workloads.driving import replayed
+from detector.assembly.memory import tune_garbage_collection
 from detector.engine.episodes.events import Event
 from detector.engine.samples.sample import Arrival
 from wayside.api import EventRule

@@ -17,10 +17,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import msgspec
-from detector.memory import tune_garbage_collection
 
 from benchmarks.workloads import speeds
 from benchmarks.workloads.driving import Live, by_tick
+from detector.assembly.memory import tune_garbage_collection
 from detector.engine.samples.sample import Arrival
 from wayside.api import EventRule
 

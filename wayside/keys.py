@@ -127,7 +127,9 @@ def _capture(text: str, offset: int, part: str) -> tuple[str, int, str]:
         raise KeyPatternError(text, offset, f"a capture covers whole chunks: put slashes around ${{…}} in {part!r}")
     name, colon, pattern = part[2:-1].partition(":")
     if not _NAME.fullmatch(name):
-        raise KeyPatternError(text, offset + 2, f"{name!r} is no name: letters, digits and _, as in ${{client:*}}")
+        raise KeyPatternError(
+            text, offset + 2, f"{name!r} is not a name: use letters, digits and _, as in ${{client:*}}"
+        )
     if not colon or not pattern:
         raise KeyPatternError(text, offset, f"the capture has no pattern: write ${{{name}:*}}")
     return name, offset + len(name) + 3, pattern

@@ -42,7 +42,7 @@ def wait_injecting(api: Api) -> None:
     wait_until(
         lambda: sidecars(api.apply(pod("probe"), dry_run=True)),
         lambda found: len(found) == 1,
-        what="pods are asked about",
+        what="pods are reviewed",
     )
 
 

@@ -116,7 +116,7 @@ def test_history_that_the_server_no_longer_has_is_reported_as_such(
                 pass
             except ApiError as error:
                 if error.permanent:
-                    raise  # else it asks to come back while it reads what there is
+                    raise  # else the API server requests a retry while it fills its cache
 
     with pytest.raises(ApiError, match="too old resource version") as gone:
         loop.call(watch())

@@ -61,10 +61,13 @@ def test_bindings_follow_the_accounts_that_the_detector_names(
     settles(other)
     api.patch("Detector", HOLDER, {"spec": {"serviceAccountNames": []}})
     settles()
-    said = api.wait_for(
-        "Detector", HOLDER, lambda raw: condition(raw, "Running").get("reason") == "NoAccounts", what="it says so"
+    written = api.wait_for(
+        "Detector",
+        HOLDER,
+        lambda raw: condition(raw, "Running").get("reason") == "NoAccounts",
+        what="its reason is written",
     )
-    assert "spec.serviceAccountNames is empty" in condition(said, "Running")["message"]
+    assert "spec.serviceAccountNames is empty" in condition(written, "Running")["message"]
     # Who is named no more has no rights any more, be the rest of the Detector right or wrong.
     api.patch("Detector", HOLDER, {"spec": {"serviceAccountNames": ["vehicle"]}})
     settles(vehicle)
@@ -72,7 +75,10 @@ def test_bindings_follow_the_accounts_that_the_detector_names(
     api.patch("Detector", HOLDER, {"spec": {"serviceAccountNames": ["other"], "streams": [wrong]}})
     settles(other)
     api.wait_for(
-        "Detector", HOLDER, lambda raw: condition(raw, "Running").get("reason") == "NotAccepted", what="it says so"
+        "Detector",
+        HOLDER,
+        lambda raw: condition(raw, "Running").get("reason") == "NotAccepted",
+        what="its reason is written",
     )
 
 
@@ -103,7 +109,7 @@ def test_the_manager_puts_it_into_pods_with_the_rights_that_are_printed(
     put(api, manifests)
     wait_in_force(account, namespace, manifests)
     webhook = Webhook(processes, api, tmp_path / "certificates", options=(*RUNS, *ALLOWED), kubeconfig=account)
-    with webhook.asked():
+    with webhook.requested():
         api.create(sidecar_detector("vehicle"))
         wait_injecting(api)
         api.create(pod(account="other"))
@@ -150,10 +156,10 @@ def test_in_a_pod_it_holds_for_this_pod_alone_and_needs_its_rights_and_no_more(
             what="its Lease is renewed",
         )
         assert running.terminate() == 0
-        asked = set(used(proxy.seen, namespace))
-    assert asked <= granted(roles)
+        requested = set(used(proxy.seen, namespace))
+    assert requested <= granted(roles)
     seldom = {("applicationtasks", "get"), ("applicationtasks", "delete"), ("detectors", "hold-as-pod")}
-    assert {(resource, verb) for _, resource, verb in granted(roles) - asked} <= seldom
+    assert {(resource, verb) for _, resource, verb in granted(roles) - requested} <= seldom
 
 
 def status_of(folder: Path, endpoint: str) -> list[str]:

@@ -87,7 +87,8 @@ class MessageClients:
             return None
         if name is None or not CLIENT_NAME.fullmatch(name):
             self._unnamed(
-                stream, f"{key}: client: {name!r} is no name: it takes 1 to 63 of A-Z a-z 0-9 . _ : -, not dots alone"
+                stream,
+                f"{key}: client: {name!r} is not a name: use 1 to 63 of A-Z a-z 0-9 . _ : -, not dots alone",
             )
             return None
         return name

@@ -52,8 +52,8 @@ def test_messages_without_a_valid_name_are_dropped_and_counted_with_the_reason(c
     for index, (text, reason) in enumerate(
         [
             ('{"v": 50}', "all/speeds: client: "),
-            ('{"id": "a b", "v": 50}', "all/speeds: client: 'a b' is no name: it takes 1 to 63 of A-Z a-z 0-9 . _ : -"),
-            ('{"id": "", "v": 50}', "all/speeds: client: '' is no name"),
+            ('{"id": "a b", "v": 50}', "all/speeds: client: 'a b' is not a name: use 1 to 63 of A-Z a-z 0-9 . _ : -"),
+            ('{"id": "", "v": 50}', "all/speeds: client: '' is not a name"),
             ('{"id": {"x": 1}, "v": 50}', "is not a name"),
         ]
     ):
