@@ -61,7 +61,7 @@ class KeyPattern:
                 continue
             name, start, pattern = _capture(text, offset, part)
             if name in captures:
-                raise KeyPatternError(text, offset, f"{name} is captured twice: give each capture a name of its own")
+                raise KeyPatternError(text, offset, f"{name} is captured twice: names must be unique")
             inner = [_chunk(text, start + at, chunk) for at, chunk in _split(pattern)]
             if name == "client" and (len(inner) > 1 or inner[0].many):
                 raise KeyPatternError(text, offset, "a client's name is one chunk: write ${client:*}")
@@ -147,7 +147,7 @@ def _chunk(text: str, offset: int, chunk: str) -> _Element:
             remedy = (
                 "inside a chunk a wildcard is written $*" if bad[0] == "*" else "it has a meaning of its own in Zenoh"
             )
-            raise KeyPatternError(text, offset, f"{bad[0]!r} cannot stand in the chunk {chunk!r}: {remedy}")
+            raise KeyPatternError(text, offset, f"{bad[0]!r} is not allowed in the chunk {chunk!r}: {remedy}")
     guard = "(?!@)" if not pieces[0] else ""
     body = "[^/]*".join(map(re.escape, pieces))
     return _Element(f"{guard}(?=[^/]){body}")

@@ -45,5 +45,7 @@ def parse_subject(text: str) -> tuple[tuple[str, ...], str | None]:
     clients = () if is_fleet else tuple(map(decode, head.split("+")))
     element = decode(tail) if mark else None
     if subject_text(clients, element) != text or "" in clients or element == "":
-        raise ValueError(f"{text!r} is not a subject: expected car1, car1+car2 or {FLEET}, and perhaps ~element")
+        raise ValueError(
+            f"{text!r} is not a subject: write car1, car1+car2 or {FLEET}, with ~element if the rule has each"
+        )
     return clients, element

@@ -62,7 +62,7 @@ def _shapes(given: MapFile) -> Iterator[Shape]:
     elif path.suffix in (".geojson", ".json"):
         yield from _of_geojson(given, content)
     else:
-        raise MapError(f"{given.file} is no map: give a .geojson or .json file, or a lanelet2 map (.osm)")
+        raise MapError(f"{given.file} is not a map: give a .geojson or .json file, or a lanelet2 map (.osm)")
 
 
 # GeoJSON
@@ -72,10 +72,10 @@ def _of_geojson(given: MapFile, content: bytes) -> Iterator[Shape]:
     try:
         document = json.loads(content)
     except ValueError as error:
-        raise MapError(f"{given.file} is no JSON: {error}") from None
+        raise MapError(f"{given.file} is not JSON: {error}") from None
     features = document.get("features") if isinstance(document, Mapping) else None
     if not isinstance(features, list):
-        raise MapError(f"{given.file} is no FeatureCollection: it has no features")
+        raise MapError(f"{given.file} is not a FeatureCollection: it has no features")
     crs = ((document.get("crs") or {}).get("properties") or {}).get("name", _CRS84[0])
     if crs not in _CRS84:
         raise MapError(
@@ -143,9 +143,11 @@ def _of_lanelet2(given: MapFile, content: bytes) -> Iterator[Shape]:
     try:
         loaded, errors = lanelet2.io.loadRobust(given.file, projector)
     except RuntimeError as error:
-        raise MapError(f"{given.file} is no lanelet2 map: {error}") from None
+        raise MapError(f"{given.file} is not a lanelet2 map: {error}") from None
     if len(errors):
-        raise MapError(f"{given.file} is no sound lanelet2 map: {errors[0].strip()}; and {len(errors) - 1} more errors")
+        raise MapError(
+            f"{given.file} is not a valid lanelet2 map: {errors[0].strip()}; and {len(errors) - 1} more errors"
+        )
 
     def points(line: Any) -> tuple[Point, ...]:
         if given.origin is not None:
@@ -172,9 +174,9 @@ def _first_node(given: MapFile, content: bytes) -> tuple[float, float]:
     try:
         node = ElementTree.fromstring(content).find("node")  # noqa: S314  the operator's own file
     except ElementTree.ParseError as error:
-        raise MapError(f"{given.file} is no lanelet2 map: {error}") from None
+        raise MapError(f"{given.file} is not a lanelet2 map: {error}") from None
     if node is None:
-        raise MapError(f"{given.file} is no lanelet2 map: it has no nodes")
+        raise MapError(f"{given.file} is not a lanelet2 map: it has no nodes")
     return float(node.get("lat", "nan")), float(node.get("lon", "nan"))
 
 

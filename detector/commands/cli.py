@@ -236,7 +236,7 @@ def topics(
     connect: Annotated[
         list[str] | None,
         typer.Option(
-            help="With --live: Zenoh endpoints, e.g. tcp/127.0.0.1:7447; default: those of the local network."
+            help="With --live: Zenoh endpoints, e.g. tcp/127.0.0.1:7447. Default: discover them in the local network."
         ),
     ] = None,
     seconds: Annotated[float, typer.Option(help="With --live: how long to listen.", min=0.1)] = 5.0,
@@ -263,7 +263,9 @@ def try_(
     ],
     stream: Annotated[
         str | None,
-        typer.Option(help=("As `detector topics --yaml` names it. Default: the stream that has the fields.")),
+        typer.Option(
+            help=("The stream, as named by `detector topics --yaml`. Default: the stream that has the fields.")
+        ),
     ] = None,
     every: Annotated[str, typer.Option(help="Time between two evaluations.")] = "100ms",
 ) -> None:
@@ -278,7 +280,7 @@ def try_(
 def new(
     case: Annotated[str | None, typer.Argument(help="The use case; without it, all are listed.")] = None,
     stream: Annotated[str, typer.Option(help="The stream that the rule reads.")] = "odom",
-    name: Annotated[str | None, typer.Option(help="The rule's name; default: that of the use case.")] = None,
+    name: Annotated[str | None, typer.Option(help="The rule's name. Default: the name of the use case.")] = None,
 ) -> None:
     """Print a rule to begin with, made from a use case."""
     with importing():

@@ -27,10 +27,10 @@ DetectorFile = Annotated[
     Path | None, typer.Option("--detector", help=("The YAML file of the running detector, with its name and network."))
 ]
 Name = Annotated[
-    str | None, typer.Option(help=("The holder to query. Default: that of the file, else every detector."))
+    str | None, typer.Option(help=("The holder to query. Default: the holder in the file, else every detector."))
 ]
 Connect = Annotated[
-    list[str] | None, typer.Option(help="Zenoh endpoints, e.g. tcp/127.0.0.1:7447. Default: those of the file.")
+    list[str] | None, typer.Option(help="Zenoh endpoints, e.g. tcp/127.0.0.1:7447. Default: those in the file.")
 ]
 Timeout = Annotated[float, typer.Option(help="Seconds to wait for responses.", min=0.1)]
 
@@ -51,7 +51,7 @@ def status(
     everything: Annotated[
         bool,
         typer.Option(
-            "--all", help="Add up all detectors: those of the file, which may hold several, else every detector."
+            "--all", help="Add up all detectors: those in the file, which may contain several, else every detector."
         ),
     ] = False,
     as_json: Annotated[
@@ -62,7 +62,7 @@ def status(
     """Show what running detectors receive, evaluate and lose; for a rule also its values, and which are unknown."""
     if everything:
         if name is not None or subject is not None:
-            refuse(f"--all adds up every detector: leave out {'--name' if name is not None else '--subject'}")
+            refuse(f"--all adds up every detector: remove {'--name' if name is not None else '--subject'}")
         _show_total(detector, connect, rule, timeout, as_json)
         return
     if subject is not None and rule is None:

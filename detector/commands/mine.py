@@ -70,7 +70,7 @@ def mine_recordings(
     for warning in loaded.warnings:
         typer.echo(warning, err=True)
     if not loaded.rule_set.rules:
-        refuse("no rule is given that the Detector selects: give --rules FILE")
+        refuse("the Detector selects none of the rules: give --rules FILE")
     sources = sources_of(given)
     if sample is not None:
         sources = sampled(sources, sample)
@@ -132,7 +132,7 @@ def _workers(processes: int | None, dask: str | None) -> Workers:
     if dask is None:
         return LocalWorkers(processes or len(os.sched_getaffinity(0)))
     if processes is not None:
-        refuse("--processes is for this machine, and a Dask cluster has workers of its own: remove one of both")
+        refuse("give either --processes, for this machine, or --dask, whose cluster has its own workers")
     check_package("distributed", "--dask", "dask")
     from detector.mining.dask import DaskWorkers  # noqa: PLC0415  an extra
 

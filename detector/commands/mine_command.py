@@ -21,10 +21,10 @@ def mine(
     detector: Annotated[Path, typer.Option(help="A YAML file with one Detector.")],
     rules: Annotated[list[Path], typer.Option(help="YAML files or folders with EventRules; may be repeated.")],
     output: Annotated[
-        Path, typer.Option(help="The folder of the dataset. What is done there already is not done again.")
+        Path, typer.Option(help="The folder of the dataset. Recordings that it already contains are not mined again.")
     ],
     processes: Annotated[
-        int | None, typer.Option(min=1, help="How many recordings are mined at once. Default: one for each core.")
+        int | None, typer.Option(min=1, help="The number of recordings to mine at once. Default: one for each core.")
     ] = None,
     dask: Annotated[
         str | None,
@@ -35,15 +35,15 @@ def mine(
     ] = False,
     sample: Annotated[
         int | None,
-        typer.Option(min=1, help="Mine only this number of recordings, chosen by chance, the same ones each time."),
+        typer.Option(min=1, help="Mine only this number of recordings, chosen at random, but the same ones each time."),
     ] = None,
     limit: Annotated[int | None, typer.Option(min=1, help="Mine only the first recordings, by name.")] = None,
     share: Annotated[
         str | None,
         typer.Option(
             metavar="NUMBER/OF",
-            help="Do a part of the work, e.g. 0/8: others do 1/8 to 7/8 with the same output. The last one to finish "
-            "writes the dataset.",
+            help="Mine one share of the recordings, e.g. 0/8, while other machines mine 1/8 to 7/8 with the same "
+            "output. The last one to finish writes the dataset.",
         ),
     ] = None,
 ) -> None:

@@ -142,7 +142,7 @@ def _lines(outcome: Outcome, where: str) -> Iterator[str]:
     if outcome.cut:
         yield "the intake file ends in the middle: its detector was killed"
     if outcome.lost:
-        yield f"the intake file lacks {outcome.lost} samples, the disk being too slow: events may differ"
+        yield f"the intake file lacks {outcome.lost} samples, since the disk was too slow: events may differ"
 
 
 def _counted(outcomes: Sequence[Outcome], tried: Set[str]) -> str:
@@ -231,7 +231,7 @@ def _replayed(
         )
         return Played({name: outcome}, []), variants_of([*outcome.rules.values()], options.sets, ())
     if detector is None:
-        refuse("give --detector FILE and --rules FILE: only an intake file brings its own")
+        refuse("give --detector FILE and --rules FILE: only an intake file contains its own")
     loaded = load_rules(detector, rules, lasting_problems)
     for warning in loaded.warnings:
         typer.echo(warning, err=True)

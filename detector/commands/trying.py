@@ -45,7 +45,7 @@ def try_expression(expression: str, recordings: Sequence[Path], stream: str | No
     gathered = recordings_of(recordings)
     topics = survey(gathered).topics
     if not topics:
-        raise RecordingError(f"{recordings[0]} holds no message")
+        raise RecordingError(f"{recordings[0]} contains no message")
     found = proposals(topics)
     files = [path for recording in gathered for path in recording]
     detector = with_recorded_types(Detector.model_validate(detector_document(found)), files)
@@ -80,7 +80,7 @@ def _stream(expression: str, found: Sequence[Proposal], detector: Detector, want
     known = {**inlets(detector).fields, **fields_of(found)}
     names = [each.name for each in found]
     if wanted is not None and wanted not in names:
-        refuse(f"--stream {wanted}: there is none; there is {', '.join(names)}")
+        refuse(f"--stream {wanted}: there is no such stream; the streams are {', '.join(names)}")
     problems: dict[str, str] = {}
     for name in names if wanted is None else [wanted]:
         try:
@@ -99,7 +99,7 @@ def _lines(trace: Trace) -> Iterator[str]:
     width = max((len(each.subject) for each in trace.subjects), default=0)
     for each in trace.subjects:
         series = each.signals.get("value")
-        text = "a list or a map: name a member of it" if series is None else _summary(series, trace)
+        text = "a list or a map: name a field of it" if series is None else _summary(series, trace)
         yield f"  {each.subject:{width}}  {text}"
 
 

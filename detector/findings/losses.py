@@ -128,8 +128,8 @@ class Losses:
                     old = f"{use.old} of the {use.count} samples it used were older than {OLD * period / 1e9:.2g} s"
                     yield Finding(
                         OLD_SAMPLES.name,
-                        f"EventRule {name} used old samples of stream {stream_name}: they arrive {every}, and {old}. "
-                        "The last sample of a silent client stays valid until staleAfter: lower "
+                        f"EventRule {name} used old samples of stream {stream_name}: they arrive {every}, but "
+                        f"{old}. The last sample of a silent client stays valid until staleAfter: lower "
                         f"streams[{stream_name}].staleAfter"
                         + (", or maxAge of the position" if self._in_pairs(name) else ""),
                         name,

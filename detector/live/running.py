@@ -132,9 +132,9 @@ class Running:
         self._sources.follow(self._rule_set.detector)
         if self._server is not None:
             self._server.start()
-            _log.info("/metrics, /healthz and /readyz are served on port %d", self._server.port)
+            _log.info("serving /metrics, /healthz and /readyz on port %d", self._server.port)
         if self._view is not None:
-            _log.info("the live view is served on port %d", self._view.port)
+            _log.info("serving the live view on port %d", self._view.port)
         _log.info(
             "Detector %s runs with %d rules and %d restored demands",
             self._rule_set.detector.name,
@@ -177,7 +177,7 @@ class Running:
             detector, before = self._good(wanted.detector), self._rule_set.detector.spec
             self._rule_set = replace(wanted, detector=detector)
             self._evaluator.configure(self._rule_set)
-            _log.info("Detector %s runs with %d rules from now on", detector.name, len(wanted.rules))
+            _log.info("Detector %s now runs with %d rules", detector.name, len(wanted.rules))
             spec = detector.spec
             if spec.zenoh != before.zenoh or _subscribed(spec.streams) != _subscribed(before.streams):
                 await asyncio.to_thread(self._outlet.move, self._network(detector))
@@ -219,7 +219,7 @@ class Running:
     def _summarise(self) -> None:
         self._evaluator.losses.sum_up()
         if self._outlet.network.dropped_events:
-            _log.warning("in total, %d events not published", self._outlet.network.dropped_events)
+            _log.warning("in total, %d events were not published", self._outlet.network.dropped_events)
 
 
 def _writer(path: Path, detector: Detector, entries: Inlets) -> IntakeWriter:

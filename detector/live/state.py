@@ -81,7 +81,7 @@ class StateFile:
     def _read(self, text: bytes) -> list[OpenEpisode]:
         document: Any = json.loads(text)
         if not isinstance(document, dict) or document.get("version") != _VERSION:
-            raise ValueError(f"it is not of version {_VERSION}")
+            raise ValueError(f"its version is not {_VERSION}")
         if document.get("of") != self._whose:
             raise ValueError(f"it belongs to {document.get('of')}, not to {self._whose}")
         episodes = document.get("episodes")

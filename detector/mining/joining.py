@@ -37,7 +37,7 @@ def flaw_of(pieces: Sequence[Observed]) -> str | None:
     if not flaws and any(later.first - earlier.last > PAUSE for earlier, later in pairwise(there)):
         flaws.append("it pauses for more than an hour")
     if not flaws and not there:
-        flaws.append("it holds no sample")
+        flaws.append("it contains no sample")
     return flaws[0] if flaws else None
 
 

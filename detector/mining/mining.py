@@ -204,9 +204,9 @@ def _look_at(sources: Sequence[InputRecording], cache: Cache) -> dict[InputRecor
             known = cache.seen(source, stamp) if stamp is not None else None
             return stamp, known or look(source), known is None
         except FileNotFoundError:
-            return None, Flaw("unreadable", "it is not there: correct the name"), False
+            return None, Flaw("unreadable", "there is no such file: correct the name"), False
         except OSError as error:
-            return None, Flaw("unreadable", f"it cannot be read: {error.strerror or error}"), False
+            return None, Flaw("unreadable", f"cannot read it: {error.strerror or error}"), False
 
     with ThreadPoolExecutor(_READERS) as pool:
         looks = dict(zip(sources, pool.map(seen, sources), strict=True))

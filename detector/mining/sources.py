@@ -109,7 +109,7 @@ def _listed(item: str) -> list[str]:
     lines = Path(item[1:]).read_text(encoding="utf-8").splitlines()
     items = [line.strip() for line in lines if line.strip() and not line.lstrip().startswith("#")]
     if not items:
-        raise RecordingError(f"{item[1:]}: the list names no recording: write one a line")
+        raise RecordingError(f"{item[1:]}: the list is empty: write one recording on each line")
     return items
 
 
@@ -173,12 +173,12 @@ def _behind(url: str) -> Iterator[InputRecording]:
         is_pattern = any(sign in path for sign in "*[")
         paths = store.glob(path) if is_pattern else [path] if is_file else store.find(path)
     except OSError as error:
-        raise RecordingError(f"{url}: it cannot be listed: {error}") from error
+        raise RecordingError(f"{url}: cannot list it: {error}") from error
     bags = {str(PurePosixPath(each).parent) for each in paths if PurePosixPath(each).name == _BAG}
     files = [each for each in paths if PurePosixPath(each).suffix in (*BINARY, *TEXT)]
     found = [*bags, *(each for each in files if str(PurePosixPath(each).parent) not in bags)]
     if not found:
-        raise RecordingError(f"{url}: no recording is there: give one with {', '.join((*BINARY, *TEXT))}")
+        raise RecordingError(f"{url}: contains no recording: give one with {', '.join((*BINARY, *TEXT))}")
     prefix = "s3://" if url.startswith("s3://") else ""
     for each in found:
         whole = each if "://" in each else prefix + each

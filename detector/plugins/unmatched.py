@@ -159,7 +159,9 @@ def _frame(queries: Queries, of: ObjectList, sample: DecodedSample) -> Pose:
         return NO_MOTION
     source = frame_of(sample.message)
     if source is None:
-        raise ValueError(f"a message of stream {of.stream} has no header.frame_id, which frame: {of.frame} needs")
+        raise ValueError(
+            f"a message of stream {of.stream} has no header.frame_id, which is needed with frame: {of.frame}"
+        )
     return queries.transform(sample.client, of.frame, source, sample.stamp)
 
 

@@ -82,7 +82,7 @@ def _expanded(path: Path) -> Iterator[Path]:
         inside = list(_inside(path))
         if not inside:
             kinds = ", ".join((*BINARY, *TEXT))
-            raise RecordingError(f"{path}: the folder holds no recording: give one with {kinds} or rosbag2 folders")
+            raise RecordingError(f"{path}: the folder contains no recording: give one with {kinds} or rosbag2 folders")
         yield from inside
     else:
         yield path

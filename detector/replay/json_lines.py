@@ -68,7 +68,7 @@ def read_json_lines(path: Path, wanted: Wanted, on_cut: OnCut) -> Iterator[Batch
                 if not text.endswith(b"\n"):
                     on_cut(Cut(path, messages, f"line {where} has no end"))
                     return
-                raise RecordingError(f"{path}:{where}: {error}: a line reads {EXAMPLE}") from error
+                raise RecordingError(f"{path}:{where}: {error}: write each line as {EXAMPLE}") from error
 
 
 def json_lines_span(path: Path) -> tuple[int, int] | None:
@@ -116,7 +116,7 @@ def _first_wrong(lines: Sequence[_Line], last: int) -> _Wrong | None:
             back = f"t goes back from {previous} to {line.t}: sort the lines by t"
             return _Wrong(position, "t is negative" if line.t < 0 else back)
         if not topic_key(line.key):
-            return _Wrong(position, f"key is empty: a line reads {EXAMPLE}")
+            return _Wrong(position, f"key is empty: write each line as {EXAMPLE}")
     return None
 
 

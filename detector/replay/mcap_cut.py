@@ -62,7 +62,7 @@ def scan_mcap(file: BinaryIO) -> UnindexedMcap:
             return found
         opcode, length = _RECORD.unpack(head)
         if not opcode:
-            found.cut = f"nothing was written from byte {at} on"
+            found.cut = f"it has no data from byte {at} on"
             return found
         at += _RECORD.size
         there = min(length, size - at)

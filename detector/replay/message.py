@@ -47,7 +47,7 @@ class Cut(NamedTuple):
     reason: str
 
     def __str__(self) -> str:
-        return f"{self.path}: the recording is cut ({self.reason}): {self.messages} messages are read up to there"
+        return f"{self.path}: the recording is cut ({self.reason}): it contains {self.messages} messages up to there"
 
 
 OnCut = Callable[[Cut], None]

@@ -59,5 +59,7 @@ def _files(path: Path) -> list[Path]:
     files = [path / name for name in json.loads((path / DESCRIPTION).read_bytes()).get("files", [])]
     missing = [file.name for file in files if not file.is_file()]
     if missing:
-        raise RecordingError(f"{path}: {missing[0]} is missing, of the files that {DESCRIPTION} names")
+        raise RecordingError(
+            f"{path}: {missing[0]} is missing, although {DESCRIPTION} lists it: copy all files of the recording"
+        )
     return files

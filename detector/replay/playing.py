@@ -102,7 +102,7 @@ def _played(
     if not outcome.samples:
         keys = router.unrouted
         none = f"no message belongs to a stream of the Detector; keys: {_listed(keys)}"
-        outcome.notes.append(none if keys else "it holds no message")
+        outcome.notes.append(none if keys else "it contains no message")
     return outcome, router.unrouted
 
 
@@ -113,13 +113,13 @@ def _without_samples(
     for name, outcome in outcomes.items():
         if not unrouted[name]:
             cut = "".join(f": it is cut ({each.reason})" for each in outcome.cuts[:1])
-            yield RecordingError(f"{name} holds no message{cut}")
+            yield RecordingError(f"{name} contains no message{cut}")
     if keys := sorted({key for found in unrouted.values() for key in found}):
         cut = "".join(f"{each}; " for name, outcome in outcomes.items() if unrouted[name] for each in outcome.cuts)
         expected = _listed([stream.key for stream in detector.spec.streams])
         yield RecordingError(
-            f"{cut}no message belongs to a stream of the Detector: the recordings hold the keys "
-            f"{_listed(keys)}, the streams ask for {expected}: correct the streams' key"
+            f"{cut}no message belongs to a stream of the Detector: the recordings have the keys {_listed(keys)}, "
+            f"the streams request {expected}: correct the key of the streams"
         )
 
 

@@ -60,8 +60,8 @@ class Decoders:
             decode = DecoderFactory().decoder_for(ENCODING, schema)
         except (McapError, DecodeError, TypeError, KeyError) as error:
             raise RecordingError(
-                f"{self._path}: the definition of {schema.name}, as which {topic} is recorded, cannot be read: "
-                f"{error}; record it with a FileDescriptorSet that holds the type and all that it imports"
+                f"{self._path}: cannot read the definition of {schema.name}, the type of {topic}: {error}; record "
+                "it with a FileDescriptorSet that contains the type and all its imports"
             ) from error
 
         def plain(payload: bytes) -> object:

@@ -93,9 +93,9 @@ def _converter(path: Path, connections: Sequence[Connection]) -> Callable[[Conne
             cdr = bytes(types.ros1_to_cdr(payload, connection.msgtype))
         except (*DAMAGE, SerdeError) as error:
             raise RecordingError(
-                f"{path}: a message on {connection.topic} does not match {connection.msgtype} "
-                f"as the bag defines it: {error}: "
-                f"repair the bag with `rosbag fix {path}`, or take the topic out of the Detector's streams"
+                f"{path}: a message on {connection.topic} does not match {connection.msgtype} as the bag defines "
+                f"it: {error}: repair the bag with `rosbag fix {path}`, or remove the topic from the Detector's "
+                "streams"
             ) from error
         return Message(time, topic_key(connection.topic), cdr, "cdr", connection.msgtype)
 
@@ -147,8 +147,8 @@ def _order(reader: Reader, connections: Sequence[Connection]) -> None:
 def _damaged(path: Path, error: Exception) -> RecordingError:
     reason = str(error) or type(error).__name__
     return RecordingError(
-        f"{path}: the ROS 1 bag cannot be read, it is damaged or was not closed ({reason}): "
-        f"repair it with `rosbag reindex {path}`"
+        f"{path}: cannot read the ROS 1 bag: it is damaged or was not closed ({reason}): repair it with `rosbag "
+        f"reindex {path}`"
     )
 
 
@@ -171,8 +171,8 @@ def _compare(path: Path, types: Typestore, connections: Sequence[Connection]) ->
         name = connection.msgtype
         if name in known.fielddefs and _layout(types, name) != _layout(known, name):
             raise RecordingError(
-                f"{path}: {connection.topic} is recorded as {name}, which has other fields in ROS 1 than in ROS 2: "
-                "convert the bag with `rosbags-convert`, or take the topic out of the Detector's streams"
+                f"{path}: {connection.topic} is recorded as {name}, whose fields differ between ROS 1 and ROS 2: "
+                "convert the bag with `rosbags-convert`, or remove the topic from the Detector's streams"
             )
 
 

@@ -69,9 +69,7 @@ def _damaged(path: Path, error: Exception) -> RecordingError:
     files = sorted(file for kind in ("mcap", "db3") for file in path.glob(f"*.{kind}")) if path.is_dir() else [path]
     repairs = " and ".join(f"`{_repair(file)}`" for file in files)
     remedy = f"repair it with {repairs}" if repairs else "give the folder with its .mcap or .db3 files"
-    return RecordingError(
-        f"{path}: the rosbag2 cannot be read, it is damaged or of an unknown kind ({reason}): {remedy}"
-    )
+    return RecordingError(f"{path}: cannot read the rosbag2: it is damaged or of an unknown kind ({reason}): {remedy}")
 
 
 def _repair(file: Path) -> str:

@@ -134,7 +134,7 @@ class LiveView:
 
     def losses(self) -> Iterator[Loss]:
         """What was not shown."""
-        what = "seconds left out of the live view, its thread being too slow"
+        what = "seconds omitted from the live view because its thread is too slow"
         yield Loss(what, self._dropped, cause="view_dropped")
 
     # The evaluation
@@ -208,7 +208,7 @@ class LiveView:
             try:
                 self._show(each)
             except Exception:  # noqa: BLE001  an error here must only affect the view
-                _log.exception("a second is left out of the live view")
+                _log.exception("cannot show a second in the live view")
                 self._dropped += 1
 
     def _show(self, shown: _Slice) -> None:

@@ -10,7 +10,7 @@ from detector.engine.columns.block import Block, Track
 from wayside.expressions import Expression
 from wayside.rules import CompiledRule, PairSubject
 
-_OTHERWISE = "a value that it reads is not there"
+_OTHERWISE = "a value that it reads does not exist"
 
 
 def why_unknown(block: Block, point: int, track: Track, expression: Expression | None) -> str:
@@ -32,10 +32,10 @@ def of_stream(block: Block, stream: str, point: int) -> str:
     """Why a signal of a stream is unknown at a point."""
     latest = block.latest.get(stream)
     if latest is None or int(latest.flat[point]) == NEVER:
-        return f"no sample of stream {stream} has come"
+        return f"no sample of stream {stream} has arrived"
     if not block.fresh[stream].flat[point]:
         age = (int(block.times[point % len(block.ticks)]) - int(latest.flat[point])) / 1e9
-        return f"stream {stream} is stale, its newest sample is {age:.1f} s old"
+        return f"stream {stream} is stale: its newest sample is {age:.1f} s old"
     return f"stream {stream} has no such value in its window"
 
 

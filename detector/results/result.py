@@ -59,7 +59,7 @@ def result_of(name: str, outcome: Outcome, tracer: Tracer, arrivals: Arrivals) -
     """
     engine = tracer.engine
     if engine is None:
-        raise ValueError(f"{name} was not looked at")
+        raise ValueError(f"{name} was not read")
     trace = tracer.trace()
     rules = {rule: run.rule for rule, run in engine.rules.items()}
     terms = {

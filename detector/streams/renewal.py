@@ -175,7 +175,9 @@ class Renewal:
         """Run both until they have delivered the same samples. Raises NetworkError if the second one receives
         nothing."""
         if first.connections.any and not second.await_connection(self._stop, _AT_MOST):
-            raise NetworkError(f"zenoh: cannot connect with the new ones to {[*self._config.connect]}")
+            raise NetworkError(
+                f"zenoh: cannot connect to {[*self._config.connect]} with the new certificates or password"
+            )
         begin = time.monotonic()
         pairs = [*zip(self._inlets, second.subscriptions, strict=True)]
         while not self._stop.wait(_LOOK_AT_BOTH):
@@ -188,7 +190,8 @@ class Renewal:
                 break
         if not self._stop.is_set() and any(inlet.only_first for inlet in self._inlets):
             raise NetworkError(
-                "zenoh: with the new ones nothing is received: does the router permit the new name to subscribe?"
+                "zenoh: received nothing with the new certificates or password: permit the new name to subscribe "
+                "at the router"
             )
 
     def _reopen(self, material: Material) -> None:

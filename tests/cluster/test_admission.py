@@ -260,11 +260,11 @@ def test_a_renewed_certificate_is_shown_and_one_that_cannot_be_used_is_not(api: 
         key = webhook.folder / "tls.key"
         old = key.read_bytes()
         key.write_text("no key")
-        webhook.manager.wait_for_output("are no certificate and key .* the previous certificate stays")
+        webhook.manager.wait_for_output("are not a certificate and a key .* keeping the previous certificate")
         webhook.wait_answering()
         key.write_bytes(old)
         api.apply(webhook.certified())  # another authority: what it did not sign is not trusted
-        webhook.manager.wait_for_output("the certificate was renewed")
+        webhook.manager.wait_for_output("using the renewed certificate")
         webhook.wait_answering()
 
 

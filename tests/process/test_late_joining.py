@@ -90,6 +90,8 @@ def test_history_is_for_streams_over_zenoh() -> None:
         a_stream("speed", source="broker", recover=True),
         sources=[{"name": "broker", "plugin": "mqtt"}],
     )
-    with pytest.raises(DetectorError, match=re.escape("spec.streams[0].history: is for streams over Zenoh")) as caught:
+    with pytest.raises(
+        DetectorError, match=re.escape("spec.streams[0].history: is valid only for streams over Zenoh")
+    ) as caught:
         inlets(detector)
     assert "spec.streams[1].recover: is for streams over Zenoh" in str(caught.value)

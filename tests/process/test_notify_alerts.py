@@ -16,7 +16,7 @@ from tests.http_servers import Endpoint, answers, hangs, holds
 from tests.notifying import a_desk, an_episode
 from wayside.times import parse_time
 
-NOBODY = "alerts that reached nobody"
+NOBODY = "alerts that were accepted too late to notify"
 
 
 @pytest.fixture(autouse=True)
@@ -104,7 +104,7 @@ def test_an_alert_whose_end_comes_while_it_is_sent_as_firing_is_resolved_next(th
     first, second = posted(there, 2)
     assert parse_time(first["endsAt"]) > parse_time(second["endsAt"])
     failed = desk.outcome("e1", OutcomeState.FAILED)
-    assert "accepted only after the episode had ended" in failed.message
+    assert "accepted only after the end of the episode" in failed.message
     assert desk.lost[NOBODY] == 1
     desk.end()
 

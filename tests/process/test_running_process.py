@@ -165,7 +165,7 @@ def test_metrics_and_health_by_tls_follow_a_renewed_certificate(tmp_path: Path) 
     broken = {"tls.crt": b"none", "tls.key": b"none"}
     first.change(mounted, broken)
     log = tmp_path / "log"
-    wait_for(lambda: "--metrics-certificates: tls.crt and tls.key are no certificate and key" in log.read_text())
+    wait_for(lambda: "--metrics-certificates: tls.crt and tls.key are not a certificate and a key" in log.read_text())
     assert shown("/healthz", first), "the previous certificate stays"
     second.mount(mounted, "detector")
     wait_for(lambda: bool(shown("/healthz", second)))
@@ -180,7 +180,7 @@ def test_metrics_and_health_by_tls_follow_a_renewed_certificate(tmp_path: Path) 
         (["--metrics-certificates", "."], "--metrics-certificates requires --metrics-port"),
         (
             ["--metrics-port", "0", "--metrics-certificates", "."],
-            "tls.crt: No such file or directory: the folder must hold",
+            "tls.crt: No such file or directory: the folder must contain",
         ),
     ],
 )

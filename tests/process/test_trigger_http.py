@@ -215,7 +215,7 @@ def test_what_the_next_run_restores_continues_and_is_stopped_by_that_one(tmp_pat
         assert [request.method for request in there.requests] == ["PUT"]
 
         following = Driven(trigger, tmp_path)
-        unrendered = {"http": "what it needs is of before the detector's restart"}
+        unrendered = {"http": "it needs values from before the detector's restart"}
         resumed = an_episode(following.parameters, rendered={}, unrendered=unrendered, resumed=True)
         following.action.started(resumed)
         following.until(following.recording)

@@ -158,7 +158,7 @@ class Environment:
         _check_patterns(parsed, source)
         if growth(parsed) > MOST:
             raise ExpressionError(
-                f"a value in it would hold more than {MOST} copies of others", source=source, hint=_SMALLER
+                f"a value in it would contain more than {MOST} copies of others", source=source, hint=_SMALLER
             )
         _check_static(typed.return_type(), result, source)
         expression = Expression(source, program, read, leaves, result, self.variables, whole.shapes)
@@ -322,7 +322,7 @@ def _check_patterns(node: Node, source: str) -> None:
         pattern = call.arguments[-1] if call.arguments else None
         literal = pattern.value if isinstance(pattern, Constant) else None
         if not isinstance(literal, str):
-            message, hint = "the pattern of `matches` is no literal text", _LITERAL
+            message, hint = "the pattern of `matches` is not a literal text", _LITERAL
         elif (size := pattern_size(literal)) > LARGEST_PATTERN:
             cut = literal if len(literal) <= 80 else f"{literal[:79]}…"
             message = f"the pattern {cut!r} takes {size} steps, more than the {LARGEST_PATTERN} of `matches`"
@@ -362,7 +362,7 @@ def _plain(value: object) -> Value:
         return value.isoformat().replace("+00:00", "Z")
     if isinstance(value, datetime.timedelta):
         return value.total_seconds()
-    raise EvaluationError(f"yields {_describe(value)}, which is no data")
+    raise EvaluationError(f"yields {_describe(value)}, which is not data")
 
 
 def _describe(value: object) -> str:

@@ -102,7 +102,7 @@ def _undeclared(name: str, source: str, at: int, names: Collection[str]) -> tupl
     if close:
         return message, f"did you mean `{close[0]}`?"
     known = ", ".join(f"`{each}`" for each in sorted(names)[:12]) or "nothing"
-    return message, f"declared: {known}; a text needs quotes of its own, which YAML must not eat: '\"{name}\"'"
+    return message, f"declared: {known}; a text needs its own quotes inside those of YAML: '\"{name}\"'"
 
 
 def _overload(function: str, arguments: str) -> tuple[str, str | None]:

@@ -8,7 +8,7 @@ from typing import Final
 from wayside.expressions.functions import FUNCTIONS
 from wayside.expressions.numbers import DIGITS
 
-_NO_MEMBERS: Final = "a member is read of what has none"
+_NO_MEMBERS: Final = "it reads a field of a value without fields"
 NO_MEMBERS: Final = frozenset({_NO_MEMBERS})
 """The message of `clean` for reading a member of a number, a string or a list."""
 

@@ -61,7 +61,7 @@ def shape_of(key: str) -> Shape:
     try:
         return _SHAPES[key]
     except KeyError:
-        raise ValueError(f"there is no place {key.partition('#')[0]} any more") from None
+        raise ValueError(f"the place {key.partition('#')[0]} no longer exists") from None
 
 
 def contains(rings: Iterable[Sequence[Point]], point: Point) -> bool:

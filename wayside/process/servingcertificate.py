@@ -48,12 +48,12 @@ class ServingCertificate:
         except (OSError, ssl.SSLError) as error:
             reason = _reason(error)
             if reason != self._logged:
-                log.warning("%s: %s; the previous certificate stays", self._option, reason)
+                log.warning("%s: %s; keeping the previous certificate", self._option, reason)
             self._logged = reason
         else:
             self._logged = ""
             if changed:
-                log.info("%s: the certificate was renewed", self._option)
+                log.info("%s: using the renewed certificate", self._option)
 
     async def follow(self) -> None:
         """Use the files' new contents whenever they change, until cancelled."""
@@ -82,7 +82,7 @@ def _reason(error: OSError) -> str:
     """What is wrong with the files, in one line."""
     if isinstance(error, ssl.SSLError):
         if error.reason == "KEY_VALUES_MISMATCH":
-            return f"{KEY} is not the key of {CERTIFICATE}: give both of one pair"
-        return f"{CERTIFICATE} and {KEY} are no certificate and key ({error.reason or error}): give PEM files"
+            return f"{KEY} is not the key of {CERTIFICATE}: give a certificate and its own key"
+        return f"{CERTIFICATE} and {KEY} are not a certificate and a key ({error.reason or error}): give PEM files"
     where = f"{Path(error.filename).name}: " if error.filename else ""
-    return f"{where}{error.strerror or error}: the folder must hold {CERTIFICATE} and {KEY}, as a Secret has them"
+    return f"{where}{error.strerror or error}: the folder must contain {CERTIFICATE} and {KEY}, as in a TLS Secret"

@@ -81,7 +81,7 @@ def tracing(service: str, *, export: bool = True) -> Tracing | None:
     protocol = next((each for each in PROTOCOLS if environment.get(each)), None)
     if protocol is not None and environment[protocol] != PROTOCOL:
         log.warning(
-            "no traces are sent: %s is %s, and only %s is supported: set it, with the collector's port for HTTP (4318)",
+            "sending no traces: %s is %s, but only %s is supported: set it, with the collector's port for HTTP (4318)",
             protocol,
             environment[protocol],
             PROTOCOL,
@@ -91,7 +91,7 @@ def tracing(service: str, *, export: bool = True) -> Tracing | None:
         from wayside.process.spans import Exporting  # noqa: PLC0415  only who sends traces has the extra, and owes the time
     except ImportError as error:
         log.warning(
-            "no traces are sent, though %s is set: %s; pip install 'wayside[otel]', or unset it", endpoint, error
+            "sending no traces, although %s is set: %s; pip install 'wayside[otel]', or unset it", endpoint, error
         )
         return None
     return Tracing(Exporting(service, export=export))

@@ -71,7 +71,7 @@ class _Margin:
             names = " or ".join(sorted(unscaled[0].quantities)) or "a signal that it reads"
             raise MarginError(
                 ("spec", MARGIN),
-                f"the comparisons are of different quantities, and `{unscaled[0].text}` has no scale: give the "
+                f"`{unscaled[0].text}` needs a scale, since the comparisons are of different quantities: give the "
                 f"difference of {names} that counts as 1",
             )
 
@@ -93,8 +93,8 @@ class _Margin:
             written = self._text(text) or "an empty part"
             raise MarginError(
                 ("spec", "when"),
-                f"a margin needs comparisons of numbers that &&, || and ! join, and `{written}` is none: compare "
-                "numbers, or remove margin",
+                f"a margin needs comparisons of numbers, joined by &&, || and !, but `{written}` is not one: "
+                "compare numbers, or remove margin",
             )
         operator = next(token.text for token in _at_the_top(text) if token.text in _ORDER)
         names = frozenset(token.text for token in text if token.text in self._quantities)

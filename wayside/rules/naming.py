@@ -19,8 +19,8 @@ _PAIRS = {
     "a": "the first of the two",
     "b": "the second of the two",
     "position": "where a client is",
-    "distance": "the metres between the two",
-    "closingSpeed": "how fast the two come nearer",
+    "distance": "the distance of the two in metres",
+    "closingSpeed": "how fast the two approach each other",
 }
 _FLEET = {"members": "the list of the clients that belong to it"}
 _SAMPLE = {

@@ -55,8 +55,8 @@ def shape_problems(
         yield (
             ("area",),
             (
-                f"the edge from corner {one} to {(one + 1) % count} crosses or touches that from {other} to "
-                f"{(other + 1) % count}: order the corners along the outline, each once"
+                f"the edge from corner {one} to {(one + 1) % count} crosses or touches the edge from {other} to "
+                f"{(other + 1) % count}: list each corner once, in order along the outline"
             ),
         )
     if line is not None and all(_point(each) == _point(line[0]) for each in line):
@@ -67,10 +67,10 @@ def _out_of_range(geographic: bool, u: float, v: float) -> str | None:
     if not geographic:
         if math.isfinite(u) and math.isfinite(v) and max(abs(u), abs(v)) <= FARTHEST:
             return None
-        return f"[{u:g}, {v:g}] is no position in metres: give finite numbers"
+        return f"[{u:g}, {v:g}] is not a position in metres: give finite numbers"
     if abs(u) <= 90 and abs(v) <= 360:
         return None
-    return f"[{u:g}, {v:g}] is no [latitude, longitude] in degrees: correct the order, or set frame: Metres"
+    return f"[{u:g}, {v:g}] is not [latitude, longitude] in degrees: correct the order, or set frame: Metres"
 
 
 def places_of(detector: Detector) -> Mapping[str, Shape]:

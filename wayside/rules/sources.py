@@ -31,7 +31,7 @@ def source_problems(detector: Detector) -> Iterator[RuleProblem]:
                 field = "recover" if stream.history is None else "history"
                 yield RuleProblem(
                     ("spec", "streams", index, field),
-                    f"is for streams over Zenoh, not for source {stream.source}: remove it",
+                    f"is valid only for streams over Zenoh, not for source {stream.source}: remove it",
                 )
             continue
         close = difflib.get_close_matches(stream.source, names, n=1)

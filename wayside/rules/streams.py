@@ -64,7 +64,7 @@ def _sample_problems(path: FieldPath, source: str, stream: Stream, fields: Field
         yield from (RuleProblem(path, str(each)) for each in (error, *error.others))
         return
     if "parameters" in expression.names:
-        yield RuleProblem(path, "parameters belong to a rule, and a stream has none: write the number itself")
+        yield RuleProblem(path, "a stream cannot use parameters, which belong to a rule: write the number itself")
     for variable, known in (("msg", fields), ("item", item_fields(stream, fields))):
         if known is not None:
             yield from (RuleProblem(path, text) for text in unknown_fields(expression.paths, variable, known))
@@ -109,7 +109,7 @@ def _naming_problems(stream: Stream, path: FieldPath, fields: Fields | None) -> 
         yield from (RuleProblem(path, f"{each}{unlisted}") for each in (error, *error.others))
         return
     if of_items and "item" not in template.names:
-        yield RuleProblem(path, "each item needs a client of its own: read item, e.g. ${item.id}")
+        yield RuleProblem(path, "each item needs its own client: use item, e.g. ${item.id}")
     for variable, known in (("msg", fields), ("item", item_fields(stream, fields))):
         if known is not None:
             yield from (RuleProblem(path, text) for text in unknown_fields(template.paths, variable, known))

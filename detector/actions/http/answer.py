@@ -56,7 +56,7 @@ def judge(answer: Answer) -> tuple[Disposition, str]:
         return Disposition.DONE, f"answered {answer.status}"
     response = f"answered {answer.status}" + (f": {answer.excerpt}" if answer.excerpt else "")
     if 300 <= answer.status < 400:
-        return Disposition.FINAL, f"{response}: redirects are not followed, give the place where it is now"
+        return Disposition.FINAL, f"{response}: redirects are not followed: give the new URL"
     if answer.status in _AGAIN or answer.status >= 500:
         return Disposition.AGAIN, response
     return Disposition.FINAL, response

@@ -84,7 +84,8 @@ class AlertQueue:
                 self._report(
                     alert,
                     OutcomeState.DONE,
-                    "the episode had not ended: its alert expires, unless the next start takes it up",
+                    "the episode had not ended: its alert expires unless the detector restores the episode at its "
+                    "next start",
                 )
             else:
                 self._lose(alert, UNDELIVERED)
@@ -94,10 +95,10 @@ class AlertQueue:
             self._report(alert, OutcomeState.DONE, "")
         else:
             why = (
-                "it was accepted only after the episode had ended, because of failures: an Alertmanager "
-                "notifies nobody of such alerts"
+                "it was accepted only after the end of the episode, because of failures: an Alertmanager does not "
+                "notify about such alerts"
             )
-            self._setting.lose("alerts that reached nobody", 1, why)
+            self._setting.lose("alerts that were accepted too late to notify", 1, why)
             self._report(alert, OutcomeState.FAILED, why)
         self._episodes.pop(alert.episode, None)
 

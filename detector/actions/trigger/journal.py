@@ -36,7 +36,7 @@ class OrderJournal:
         try:
             document: Any = json.loads(self._path.read_bytes())
             if document["version"] != _VERSION:
-                raise ValueError(f"it is of version {document['version']}, not {_VERSION}")
+                raise ValueError(f"its version is {document['version']}, not {_VERSION}")
             return {each["id"]: Order(each["id"], each["rendered"], each["event"]) for each in document["orders"]}
         except FileNotFoundError:
             return {}

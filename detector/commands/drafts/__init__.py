@@ -34,7 +34,7 @@ def draft(case: str, stream: str, name: str | None) -> str:
     """
     known = drafts()
     if case not in known:
-        raise DraftError(f"there is no draft {case}; there is {', '.join(known)}")
+        raise DraftError(f"there is no use case {case}; the use cases are {', '.join(known)}")
     text = _text(f"{case}.yaml").replace(f"stream: {STREAM}", f"stream: {stream}")
     return text if name is None else text.replace(f"metadata: {{name: {case}}}", f"metadata: {{name: {name}}}")
 

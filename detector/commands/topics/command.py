@@ -30,13 +30,13 @@ def list_topics(recordings: Sequence[Path], *, as_yaml: bool) -> None:
         RecordingError: a recording is missing, damaged or empty.
     """
     if intake_file_of(recordings) is not None:
-        refuse("an intake file brings its Detector along: its streams are known; give another recording")
+        refuse("an intake file contains its Detector, so its streams are known: give another recording")
     gathered = recordings_of(recordings)
     found = survey(gathered)
     for cut in found.cuts:
         typer.echo(f"warning: {cut}", err=True)
     if not found.topics:
-        raise RecordingError(f"{recordings[0]} holds no message")
+        raise RecordingError(f"{recordings[0]} contains no message")
     _show(found, gathered, None, as_yaml=as_yaml)
 
 
@@ -57,7 +57,7 @@ def list_live_topics(connect: Sequence[str], seconds: float, *, as_yaml: bool) -
     if not found.topics:
         where = ", ".join(connect) or "the local network"
         raise NothingHeardError(
-            f"nothing came from {where} within {seconds:g} s: correct --connect, or raise --seconds"
+            f"received nothing from {where} within {seconds:g} s: correct --connect, or raise --seconds"
         )
     network = config.model_dump(mode="json", by_alias=True, include={"mode", "connect"}) if connect else None
     _show(found, (), network, as_yaml=as_yaml)

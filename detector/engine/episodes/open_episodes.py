@@ -62,10 +62,10 @@ def from_document(document: Mapping[str, Any]) -> OpenEpisode:
             raise ValueError(f"an episode's {field} must be a text, is {document.get(field)!r:.80}")
     values, classification = document.get("values"), document.get("classification")
     if not isinstance(values, dict) or not isinstance(classification, dict | None):
-        raise ValueError("an episode's values must be a map, and so its classification where it has one")
+        raise ValueError("the values of an episode, and its classification, must be maps")
     statistics = document.get("statistics")
     if not isinstance(statistics, dict | None):
-        raise ValueError("an episode's statistics must be a map, where it has any")
+        raise ValueError("the statistics of an episode must be a map")
     return OpenEpisode(
         rule=document["rule"],
         subject=Subject(*parse_subject(document["subject"])),

@@ -25,7 +25,7 @@ def render(action: CompiledAction, variables: Mapping[str, Any] | None) -> Rende
     problems: dict[str, str] = {}
     for name, template in action.templates.items():
         if variables is None:
-            problems[name] = "what it needs is of before the detector's restart"
+            problems[name] = "it needs values from before the detector's restart"
             continue
         try:
             rendered = template.render(variables)

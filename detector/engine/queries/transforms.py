@@ -246,6 +246,6 @@ def _text(stamp: int) -> str:
 
 def _hint(frame: str, frames: set[str]) -> str:
     if not frames:
-        return "no transforms of it have come (streams of type tf2_msgs/msg/TFMessage)"
+        return "no transforms of it have arrived (streams of type tf2_msgs/msg/TFMessage)"
     close = difflib.get_close_matches(frame, frames, n=1)
     return f"did you mean {close[0]!r}?" if close else f"it has {', '.join(sorted(frames)[:20])}"

@@ -134,7 +134,7 @@ class PluginSignals:
                 counters.note(failure.reason, f"signal {plugin.name}: plugin {plugin.plugin}: {failure}")
                 continue
             if value is None:
-                counters.note(Reason.ABSENT, f"signal {plugin.name}: plugin {plugin.plugin} gave no value")
+                counters.note(Reason.ABSENT, f"signal {plugin.name}: plugin {plugin.plugin} returned no value")
             else:
                 yield plugin.name, value
 

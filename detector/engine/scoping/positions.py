@@ -99,12 +99,12 @@ class Positions:
         for axis, expression in position.axes.items():
             value = self._evaluate(axis, expression, position, client, sample, counters)
             if not isinstance(value, int | float):
-                counters.misplace(f"{axis} of {client} is absent, NaN, no number, or cannot be read")
+                counters.misplace(f"{axis} of {client} is absent, NaN, not a number, or cannot be read")
                 return None
             if not abs(value) <= LIMITS.get(axis, FARTHEST):
                 counters.unknowns += 1
                 unit = "degrees" if position.geographic else "m"
-                counters.misplace(f"{axis} of {client} is {value:g} {unit}, where nobody is")
+                counters.misplace(f"{axis} of {client} is {value:g} {unit}, which is not on the Earth")
                 return None
             place.append(float(value))
         return tuple(place)

@@ -147,7 +147,7 @@ def test_renewed_files_are_taken_whole_or_not_at_all(folder: Path) -> None:
     ("spoil", "part"),
     [
         (lambda folder: (folder / "tls.key").unlink(), "tls.key: No such file or directory: the folder must"),
-        (lambda folder: (folder / "tls.crt").write_text("x"), "are no certificate and key"),
+        (lambda folder: (folder / "tls.crt").write_text("x"), "are not a certificate and a key"),
         (lambda folder: make_certificates(folder / "b", ["a"]) and (folder / "b/tls.key").replace(folder / "tls.key"),
          "tls.key is not the key of tls.crt"),
     ],

@@ -152,7 +152,7 @@ def test_while_a_stream_is_stale_nothing_is_known() -> None:
     started = driven.take(a_list(0.2, "a", "camera", (1, 0)), a_list(0.2, "a", "lidar"), until=0.5)
     assert started == ["r a started 0.5"]
     driven.take(until=2)
-    assert any("gave no value" in text for text in driven.engine.counters.rule("r").absences)
+    assert any("returned no value" in text for text in driven.engine.counters.rule("r").absences)
 
 
 @pytest.mark.parametrize(

@@ -105,7 +105,7 @@ def test_maps_come_back_sorted_in_every_process() -> None:
         ("a.region.hdr.id > 3", "`a.region` is 'north', which has no field `hdr`: correct the path$"),
         ("a.none.id", "`a.none` is null, which has no field `id`: "),
         ("msg.x > 3", "`msg` is a block of 2 bytes, which has no field `x`: read it with numberAt or utf8"),
-        ("int", "yields a value of type Type, which is no data"),
+        ("int", "yields a value of type Type, which is not data"),
     ],
 )
 def test_failures_report_what_is_wrong(source: str, message: str) -> None:

@@ -97,7 +97,7 @@ def test_a_wrong_call_does_not_compile(source: str, column: int, message: str, h
 @pytest.mark.parametrize(
     ("source", "values", "reason", "text"),
     [
-        ("inside(1, 2, area)", {"area": [[0, 0], [1, 1]]}, Reason.ERROR, "three corners or more, this one has 2"),
+        ("inside(1, 2, area)", {"area": [[0, 0], [1, 1]]}, Reason.ERROR, "three corners or more, but this one has 2"),
         ("inside(1, 2, area)", {"area": [[0, 0], [1, None], [2, 2]]}, Reason.ABSENT, "no value for polygon[1][1]"),
         ("inside(1, 2, area)", {"area": "here"}, Reason.ERROR, "number, list, was given number, number, text"),
         ("inside(msg.o, 2, area)", {"area": SQUARE, "msg": {"o": [1]}}, Reason.ERROR, "was given list, map or bytes"),
@@ -110,7 +110,7 @@ def test_a_wrong_call_does_not_compile(source: str, column: int, message: str, h
         ("nearest(msg.o, 0, 0)", {"msg": {"o": [{"x": "1", "y": 2}]}}, Reason.ERROR, "items[0].x must be a number"),
         ("minimum(msg.o)", {"msg": {"o": [None, float("nan")]}}, Reason.ABSENT, "none of the list is known"),
         ("sqrt(x)", {"x": -1.0}, Reason.ERROR, "from 0 on"),
-        ("yaw(msg.q)", {"msg": {"q": {"x": 0, "y": 0, "z": 0, "w": 0}}}, Reason.ERROR, "no rotation"),
+        ("yaw(msg.q)", {"msg": {"q": {"x": 0, "y": 0, "z": 0, "w": 0}}}, Reason.ERROR, "not a rotation"),
         ("numberAt(msg, 2, 'u16le')", {"msg": b"\0\1\2"}, Reason.ABSENT, "bytes 2 to 3: there are 3"),
         ("numberAt(msg, 2, 'u24')", {"msg": b"\0\1\2"}, Reason.ERROR, "'u24' is none of u8"),
         ("utf8(msg)", {"msg": b"\xff"}, Reason.ERROR, "not valid UTF-8"),

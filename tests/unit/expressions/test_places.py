@@ -232,8 +232,11 @@ def test_problems_of_a_rule_alone_are_none_of_places() -> None:
         ({"area": [[0, 0], [4, 4], [4, 0], [0, 4]]}, "places[0].area: the edge from corner 0 to 1 crosses or touches"),
         ({"area": [[0, 0], [4, 0], [4, 0], [0, 4]]}, "places[0].area: the edge from corner"),
         ({"line": [[1, 2], [1, 2]]}, "places[0].line: all points of the line are the same: give two or more different"),
-        ({"frame": "Wgs84", "line": [[10, 52], [100, 52]]}, "places[0].line[1]: [100, 52] is no [latitude, longitude]"),
-        ({"line": [[0, 0], [1e13, 0]]}, "places[0].line[1]: [1e+13, 0] is no position in metres"),
+        (
+            {"frame": "Wgs84", "line": [[10, 52], [100, 52]]},
+            "places[0].line[1]: [100, 52] is not [latitude, longitude]",
+        ),
+        ({"line": [[0, 0], [1e13, 0]]}, "places[0].line[1]: [1e+13, 0] is not a position in metres"),
     ],
 )
 def test_what_is_wrong_with_a_place_is_located(place: dict[str, Any], message: str) -> None:

@@ -207,7 +207,7 @@ def read_up_to_a_cut(path: Path, written: list[Message]) -> int:
     assert reported or len(read) == len(written)  # where only the index is missing, nothing is
     for cut in reported:
         assert cut.messages == len(read)
-        assert f"{len(read)} messages are read up to there" in str(cut)
+        assert f"it contains {len(read)} messages up to there" in str(cut)
     return len(read)
 
 

@@ -111,9 +111,7 @@ def test_an_error_of_a_condition_names_client_and_stream(desk: Desk) -> None:
 
 def test_samples_that_name_no_client_are_counted_with_a_key(desk: Desk) -> None:
     path = desk.drive("drive.jsonl", (0.5, {"v": 3}), (2.0, {"v": 3}), key="vehicles/no name/speed")
-    logged = (
-        "2 samples of stream speed dropped because neither key nor message names a client; the last: the key vehicles/"
-    )
+    logged = "2 samples of stream speed dropped because neither key nor message names a client; the last: vehicles/"
     assert logged in desk.replay(path).logged
 
 
@@ -226,7 +224,7 @@ def test_that_no_message_belongs_to_a_stream_is_an_error_with_both_keys(desk: De
     path = desk.drive("drive.jsonl", (0.5, {"v": 3}), key="veh/car/speed")
     ran = desk.replay(path)
     assert ran.code == 2
-    assert "the recordings hold the keys veh/car/speed, the streams ask for vehicles/${client:*}/speed" in ran.logged
+    assert "the recordings have the keys veh/car/speed, the streams request vehicles/${client:*}/speed" in ran.logged
     assert not (desk.folder / "out").exists()
     other = desk.drive("other.jsonl", (0.5, {"v": 3}), (2.0, {"v": 3}))
     ran = desk.replay(path, other)

@@ -130,7 +130,7 @@ def test_a_folder_stands_for_the_recordings_in_it(tmp_path: Path) -> None:
         recordings_of([tmp_path / "*.bag"])
     empty = tmp_path / "empty"
     empty.mkdir()
-    with pytest.raises(RecordingError, match="the folder holds no recording"):
+    with pytest.raises(RecordingError, match="the folder contains no recording"):
         recordings_of([empty])
 
 
@@ -139,7 +139,7 @@ def test_a_cut_recording_is_replayed_with_a_warning_and_a_count(desk: Desk) -> N
     path.write_bytes(path.read_bytes()[:-10])
     ran = desk.replay(path)
     assert (ran.code, len(ran.events)) == (0, 1)
-    cut = "drive.jsonl: the recording is cut (line 3 has no end): 2 messages are read up to there\n"
+    cut = "drive.jsonl: the recording is cut (line 3 has no end): it contains 2 messages up to there\n"
     assert f"warning: {path.parent}/{cut}" in ran.logged
     checked = desk.run("check", "detector.yaml", "rules.yaml", "--recording", str(path))
     assert f"{cut.rstrip()} [cut-recording]" in checked.logged
@@ -211,14 +211,14 @@ def test_a_recording_without_messages_is_named(desk: Desk) -> None:
     (desk.folder / "e.jsonl").touch()
     (desk.folder / "tiny8.mcap").write_bytes(write_mcap(desk.folder / "whole.mcap", MESSAGES).read_bytes()[:8])
     for name, logged in (
-        ("e.jsonl", "e.jsonl holds no message\n"),
-        ("tiny8.mcap", "tiny8.mcap holds no message: it is cut (it ends without a footer)\n"),
+        ("e.jsonl", "e.jsonl contains no message\n"),
+        ("tiny8.mcap", "tiny8.mcap contains no message: it is cut (it ends without a footer)\n"),
     ):
         ran = desk.replay(name)
         assert (ran.code, ran.logged) == (2, f"detector: {logged}")
     desk.drive("a.jsonl", *LEFT_OPEN)
     ran = desk.replay("a.jsonl", "e.jsonl")
-    assert (ran.code, "e.jsonl: it holds no message" in ran.logged) == (0, True)
+    assert (ran.code, "e.jsonl: it contains no message" in ran.logged) == (0, True)
 
 
 def an_intake_file(path: Path) -> None:

@@ -194,7 +194,7 @@ def test_the_mcap_file_has_the_conditions_and_why_they_are_unknown(results: Resu
     messages = results.messages["/wayside/too-fast/car2"]
     unknown = [(time, message) for time, message in messages if message["when"] == "unknown"]
     assert (unknown[0][0] - START) / SECOND == pytest.approx(21.1)
-    assert unknown[0][1]["when_reason"] == "speed: stream odom is stale, its newest sample is 1.1 s old"
+    assert unknown[0][1]["when_reason"] == "speed: stream odom is stale: its newest sample is 1.1 s old"
     assert {message["when"] for _, message in messages} == {"true", "false", "unknown"}
     assert messages[0][1]["threshold"] == {"when": {"speed": 21.0}, "until": {"speed": 18.0}}
 

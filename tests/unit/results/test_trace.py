@@ -79,7 +79,7 @@ def test_an_unknown_stretch_begins_when_the_stream_is_stale_and_has_its_reason(s
     at = int(np.flatnonzero(when.codes == UNKNOWN)[0])
     begin = (int(when.times[at]) - START) / SECOND
     assert begin == pytest.approx(SILENT[0] + 1.1)
-    assert when.reasons[at] == "speed: stream odom is stale, its newest sample is 1.1 s old"
+    assert when.reasons[at] == "speed: stream odom is stale: its newest sample is 1.1 s old"
     assert (int(when.times[at + 1]) - START) / SECOND == SILENT[1]
 
 

@@ -53,6 +53,6 @@ def test_a_draft_is_of_a_use_case_passes_the_check_and_finds_something(tmp_path:
 def test_without_a_case_the_drafts_are_listed_and_a_wrong_one_is_named() -> None:
     listed = CliRunner().invoke(app, ["new"])
     assert [line.split()[0] for line in listed.output.splitlines()] == [*drafts()]
-    assert "there is no draft potholes; there is battery-health" in str(
+    assert "there is no use case potholes; the use cases are battery-health" in str(
         CliRunner().invoke(app, ["new", "potholes"]).exception
     )

@@ -134,11 +134,11 @@ def test_rules_name_places_of_maps_and_the_manager_accepts_any(tmp_path: Path) -
     ("name", "content", "message"),
     [
         ("gone.geojson", None, "cannot read {}: No such file or directory; give the path as the detector sees it"),
-        ("a.shp", "x", "{} is no map: give a .geojson or .json file, or a lanelet2 map (.osm)"),
-        ("a.json", "{", "{} is no JSON: "),
-        ("a.json", "[]", "{} is no FeatureCollection: it has no features"),
-        ("a.osm", "<osm><node", "{} is no lanelet2 map: "),
-        ("a.osm", "<osm></osm>", "{} is no lanelet2 map: it has no nodes"),
+        ("a.shp", "x", "{} is not a map: give a .geojson or .json file, or a lanelet2 map (.osm)"),
+        ("a.json", "{", "{} is not JSON: "),
+        ("a.json", "[]", "{} is not a FeatureCollection: it has no features"),
+        ("a.osm", "<osm><node", "{} is not a lanelet2 map: "),
+        ("a.osm", "<osm></osm>", "{} is not a lanelet2 map: it has no nodes"),
         (
             "a.json",
             json.dumps({"features": [], "crs": {"properties": {"name": "urn:ogc:def:crs:EPSG::25832"}}}),
@@ -148,12 +148,12 @@ def test_rules_name_places_of_maps_and_the_manager_accepts_any(tmp_path: Path) -
         (
             "a.json",
             json.dumps({"features": [feature("n", "Polygon", [[[0, 0], [2, 2], [2, 0], [0, 2], [0, 0]]])]}),
-            "{}, place n: the edge from corner 0 to 1 crosses or touches that from 2 to 3",
+            "{}, place n: the edge from corner 0 to 1 crosses or touches the edge from 2 to 3",
         ),
         (
             "a.json",
             json.dumps({"features": [feature("n", "LineString", [[500000, 5760000], [500100, 5760000]])]}),
-            "{}, place n: [5.76e+06, 500000] is no [latitude, longitude] in degrees",
+            "{}, place n: [5.76e+06, 500000] is not [latitude, longitude] in degrees",
         ),
         ("a.json", json.dumps({"features": [feature("own", "LineString", RING)]}), "another place has this name"),
     ],

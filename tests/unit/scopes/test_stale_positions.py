@@ -214,7 +214,7 @@ def test_check_and_replay_warn_of_old_samples(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     detector, rules, drive, out = left_behind(tmp_path, stay=5.0, staleAfter="20s")
-    warning = "warning: EventRule fast used old samples of stream speed: they arrive every 0.1 s, and "
+    warning = "warning: EventRule fast used old samples of stream speed: they arrive every 0.1 s, but "
     remedy = "lower streams[speed].staleAfter\n"
     for arguments, code in (
         (["replay", drive, "--detector", detector, "--rules", rules, "--output", out], 0),

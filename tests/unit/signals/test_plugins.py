@@ -174,7 +174,7 @@ def test_no_value_is_unknown_and_no_error() -> None:
     assert driven.take(arrival(0.5, "a", {"x": 0, "y": 0}, "pose"), until=4) == []
     counters = driven.engine.counters.rule("r")
     assert counters.errors == 0
-    assert counters.absences["signal p: plugin counting gave no value"] == 4
+    assert counters.absences["signal p: plugin counting returned no value"] == 4
 
 
 def test_a_value_that_is_no_plain_data_is_an_error() -> None:

@@ -113,7 +113,7 @@ def test_unknown_and_unconnected_frames_are_distinguished() -> None:
         TransformError, match="'map' and 'chair' of client car are not connected: one chain ends at 'map'"
     ):
         place(drive, "map", "chair", 1.7)
-    with pytest.raises(TransformError, match="no transforms of it have come"):
+    with pytest.raises(TransformError, match="no transforms of it have arrived"):
         place(drive, "map", "base", 1.5, client="bus")
 
 

@@ -39,9 +39,9 @@ def test_the_first_loss_is_reported_with_its_reason_and_further_ones_after_a_min
 @pytest.mark.parametrize(
     ("payload", "logged"),
     [
-        (b'{"x": 1e13, "y": 0}', "x of car is 1e+13 m, where nobody is"),
-        (b'{"x": 0, "y": "far"}', "y of car is absent, NaN, no number, or cannot be read"),
-        (b'{"y": 0}', "x of car is absent, NaN, no number, or cannot be read"),
+        (b'{"x": 1e13, "y": 0}', "x of car is 1e+13 m, which is not on the Earth"),
+        (b'{"x": 0, "y": "far"}', "y of car is absent, NaN, not a number, or cannot be read"),
+        (b'{"y": 0}', "x of car is absent, NaN, not a number, or cannot be read"),
     ],
 )
 def test_a_sample_without_a_position_is_reported_with_client_and_axis(

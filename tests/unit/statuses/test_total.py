@@ -151,8 +151,8 @@ def test_a_detector_that_does_not_answer_is_an_error_beside_the_sum_of_the_other
 def test_what_cannot_be_added_up_is_refused_with_the_remedy(answers: Answers, tmp_path: Path) -> None:
     file = str(answers.file)
     for options, error in (
-        (("--name", "north"), "leave out --name"),
-        (("--rule", "fast", "--subject", "car1"), "leave out --subject"),
+        (("--name", "north"), "remove --name"),
+        (("--rule", "fast", "--subject", "car1"), "remove --subject"),
         (
             ("--detector", file, "--rule", "fats", "--timeout", "60"),
             "no detector has this rule; the rules are fast, slow",

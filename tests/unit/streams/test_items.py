@@ -253,7 +253,7 @@ def test_items_need_a_client_of_each(stream: Mapping[str, Any], problem: str) ->
         (a_list("msg.objects >"), r"items: line 1, column \d+: "),
         (a_list("msg.count > 1"), r"items: line 1, column 1: must be a list, is a boolean"),
         (a_list("item.objects"), r"items: line 1, column 1: `item` is not declared here"),
-        (a_list(client="${msg.id}"), r"client: each item needs a client of its own: read item, e.g. \$\{item.id\}"),
+        (a_list(client="${msg.id}"), r"client: each item needs its own client: use item, e.g. \$\{item.id\}"),
         (of_type("msg.object"), r"items: msg has no field object; did you mean objects\?"),
         (of_type("msg.origin"), r"items: msg.origin is not a list: name a field that holds a list"),
         (of_type(client="${item.name}"), r"client: item has no field name; it has id, labels, pose, v"),

@@ -53,7 +53,7 @@ def test_captures_are_as_in_zenohs_key_format(pattern: str, key: str, captures: 
         ("a/${client:*", 3, "not closed"),
         ("a/${client}/b", 3, "${client:*}"),
         ("a/${client:}/b", 3, "${client:*}"),
-        ("a/${1x:*}", 5, "no name"),
+        ("a/${1x:*}", 5, "not a name"),
         ("a/car-${client:*}", 3, "whole chunks"),
         ("a/${client:*}x", 3, "whole chunks"),
         ("a/${client:**}", 3, "one chunk"),

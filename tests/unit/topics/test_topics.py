@@ -135,7 +135,7 @@ def test_a_long_recording_is_looked_at_evenly() -> None:
 def test_a_recording_without_messages_is_an_error(tmp_path: Path) -> None:
     result = ran("topics", drive(tmp_path))
     assert result.exit_code != 0
-    assert "holds no message" in str(result.exception)
+    assert "contains no message" in str(result.exception)
 
 
 # detector check --recording

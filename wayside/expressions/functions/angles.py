@@ -50,7 +50,7 @@ def _wrapped(difference: float, whole: float) -> float:
 
 def _finite(angle: float, what: str) -> float:
     if math.isinf(angle):
-        raise ValueError(f"{what} is infinite: no angle")
+        raise ValueError(f"{what} is infinite: give a finite angle")
     return angle
 
 
@@ -60,7 +60,7 @@ def _quaternion(arguments: tuple[object, ...]) -> Quaternion:
     x, y, z, w = (number(part, f"{name} of the quaternion") for name, part in zip("xyzw", parts, strict=True))
     length = math.hypot(x, y, z, w)
     if length == 0 or math.isinf(length):
-        raise ValueError("a quaternion of length 0 or infinity is no rotation")
+        raise ValueError("a quaternion of length 0 or infinity is not a rotation")
     return x / length, y / length, z / length, w / length
 
 

@@ -65,21 +65,22 @@ FUNCTIONS = (
     function(
         "timeToCollision",
         Yields.NUMBER,
-        "seconds until the gap (m) is closed at closingSpeed (m/s), or until two bodies on straight ways are radius "
-        "(m) apart, the one at dx, dy (m) with vx, vy (m/s) as seen from the other; infinite where that never happens",
+        "seconds until the gap (m) is closed at closingSpeed (m/s), or until two bodies on straight paths are "
+        "radius (m) apart, where dx, dy (m) and vx, vy (m/s) are the relative position and velocity; infinite if "
+        "that never happens",
         (time_to_collision, "gap closingSpeed"),
         (time_to_contact, "dx dy vx vy radius"),
     ),
     function(
         "closing",
         Yields.NUMBER,
-        "how fast two bodies come nearer, m/s, negative where they part; arguments as for timeToCollision",
+        "how fast two bodies approach each other, m/s; negative if they separate; arguments as for timeToCollision",
         (closing, "dx dy vx vy"),
     ),
     function(
         "closestApproach",
         Yields.NUMBER,
-        "how near two bodies on straight ways will come, metres; arguments as for timeToCollision",
+        "the smallest distance that two bodies on straight paths will have, metres; arguments as for timeToCollision",
         (closest_approach, "dx dy vx vy"),
     ),
 )

@@ -54,14 +54,14 @@ def utf8(data: bytes) -> str:
 
 
 FUNCTIONS = (
-    function("allZero", Yields.BOOLEAN, "whether no byte is other than 0", (all_zero, "data:bytes")),
+    function("allZero", Yields.BOOLEAN, "whether all bytes are 0", (all_zero, "data:bytes")),
     function("checksum", Yields.NUMBER, "the CRC-32 of the bytes", (checksum, "data:bytes")),
-    function("byteCount", Yields.NUMBER, "how many bytes there are", (byte_count, "data:bytes")),
+    function("byteCount", Yields.NUMBER, "the number of bytes", (byte_count, "data:bytes")),
     function(
         "numberAt",
         Yields.NUMBER,
         "the number that begins at a byte (from 0 on): u8, i8, and u16, i16, u32, i32, f32, f64 followed by le or be",
         (number_at, "data:bytes offset format:text"),
     ),
-    function("utf8", Yields.TEXT, "the text that the bytes are", (utf8, "data:bytes")),
+    function("utf8", Yields.TEXT, "the bytes as UTF-8 text", (utf8, "data:bytes")),
 )
