@@ -177,7 +177,7 @@ class Running:
             detector, before = self._good(wanted.detector), self._rule_set.detector.spec
             self._rule_set = replace(wanted, detector=detector)
             self._evaluator.configure(self._rule_set)
-            _log.info("Detector %s now runs with %d rules", detector.name, len(wanted.rules))
+            _log.info("applied a change: Detector %s runs with %d rules", detector.name, len(wanted.rules))
             spec = detector.spec
             if spec.zenoh != before.zenoh or _subscribed(spec.streams) != _subscribed(before.streams):
                 await asyncio.to_thread(self._outlet.move, self._network(detector))

@@ -128,7 +128,7 @@ class Processes:
         """
         name = name or self._free_name(command[0])
         if name in self._all:
-            raise ValueError(f"a process {name!r} exists already: give another name, or restart that one")
+            raise ValueError(f"a process {name!r} already exists: give another name, or restart that one")
         script = BIN / command[0]
         argv = [str(script) if script.exists() and command[0] not in PROGRAMS else command[0], *command[1:]]
         # A program's own output must not sit in a buffer while a test waits for it.

@@ -280,7 +280,7 @@ def test_the_manager_lives_on_what_is_installed_and_the_test_pods_script_reports
             what="the new one is shown",
         )
         assert manager.terminate() == 0
-        assert "may not" not in manager.output()
+        assert "service account cannot" not in manager.output()
         for line in manager.output().splitlines():
             assert {"time", "level", "logger", "message"} <= json.loads(line).keys()
     finally:

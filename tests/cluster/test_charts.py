@@ -173,5 +173,5 @@ def test_a_chart_that_is_not_there_is_reported_and_outside_its_folder_refused(ap
     api.create(template("outside", {"chart": "/etc"}))
     for name in ("away", "outside"):
         api.create(demand(name, name, "car1"))
-    assert "app 1.0.0 of http://127.0.0.1:1 cannot be had" in wait_for_refusal(api, "away", "ChartUnavailable")
+    assert "cannot fetch chart app 1.0.0 of http://127.0.0.1:1" in wait_for_refusal(api, "away", "ChartUnavailable")
     assert "/etc is not in" in wait_for_refusal(api, "outside", "ChartUnavailable")

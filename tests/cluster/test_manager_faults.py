@@ -156,12 +156,12 @@ def test_an_object_of_somebody_else_is_left_alone(api: Api, manager: Process) ->
         what="the instance reports the obstacle",
     )
     message = condition(reported, "Applied")["message"]
-    assert f"Deployment {NORTH} exists already" in message
+    assert f"Deployment {NORTH} already exists" in message
     assert "delete or rename it" in message
     pending = api.wait_for(
         "ApplicationTask", "north", lambda raw: raw.get("status", {}).get("phase") == "Pending", what="the task waits"
     )
-    assert "exists already" in condition(pending, "Applied")["message"]
+    assert "already exists" in condition(pending, "Applied")["message"]
     now = api.get("Deployment", NORTH)
     assert now["metadata"]["generation"] == before["metadata"]["generation"]
     assert "ownerReferences" not in now["metadata"]

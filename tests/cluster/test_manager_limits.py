@@ -192,7 +192,7 @@ def test_an_instance_beyond_the_quota_is_reported_to_its_tasks(api: Api, process
     wait_task(api, "low", "Active")
     api.create(task("high"))
     reported = beyond_the_quota(api, "high")
-    assert f"instance {HIGH} cannot be made" in reported["status"]["message"]
+    assert f"cannot create instance {HIGH}" in reported["status"]["message"]
     assert reported["status"]["phase"] == "Pending"
     raise_quota(api, {"count/applicationinstances.wayside.dev": "2"})
     wait_task(api, "high", "Active")

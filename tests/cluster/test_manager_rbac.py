@@ -199,7 +199,7 @@ def test_a_whole_life_needs_all_that_is_printed_and_nothing_more(
         )
         assert manager.terminate() == 0
     assert "orbidden" not in manager.output()
-    assert "may not" not in manager.output()
+    assert "service account cannot" not in manager.output()
     watches = [each.path for each in proxy.seen if "/leases?" in each.path and "watch=true" in each.path]
     assert watches
     assert {tuple(parse_qs(urlsplit(each).query)["labelSelector"]) for each in watches} == {(HOLDER_LEASE_LABEL,)}

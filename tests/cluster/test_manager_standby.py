@@ -126,7 +126,7 @@ def test_one_that_stood_still_writes_nothing_when_it_continues(api: Api, pair: P
     for name in (*REGIONS[1:], "late"):
         end(api, name)
     os.kill(pair.active.pid, signal.SIGCONT)
-    pair.active.wait_for_output("not active any more|standby: manager_")
+    pair.active.wait_for_output("no longer active|standby: manager_")
     api.wait_list("Deployment", lambda found: not found, what="nothing runs that nobody demands")
     wait_settled(api)
     wait_until(
@@ -139,7 +139,7 @@ def test_one_that_stood_still_writes_nothing_when_it_continues(api: Api, pair: P
     pair.standby.kill9()
     end(api, "next")
     api.create(task("last"))
-    pair.active.wait_for_output(rf"(?s)(not active any more|standby: ).*{ACTIVE}")
+    pair.active.wait_for_output(rf"(?s)(no longer active|standby: ).*{ACTIVE}")
     only = [instance_name("app", "last")]
     api.wait_list("Deployment", lambda found: [each["metadata"]["name"] for each in found] == only, what="only it")
     wait_settled(api)
@@ -147,7 +147,7 @@ def test_one_that_stood_still_writes_nothing_when_it_continues(api: Api, pair: P
 
 def test_one_that_was_cut_off_comes_back_as_a_standby(api: Api, pair: Pair) -> None:
     interrupted(api, pair, cut_off)
-    pair.active.wait_for_output("not active any more")
+    pair.active.wait_for_output("no longer active")
     pair.old.cut = False
     pair.active.wait_for_output("standby: manager_")
     api.create(task("later"))

@@ -94,4 +94,4 @@ def test_history_is_for_streams_over_zenoh() -> None:
         DetectorError, match=re.escape("spec.streams[0].history: is valid only for streams over Zenoh")
     ) as caught:
         inlets(detector)
-    assert "spec.streams[1].recover: is for streams over Zenoh" in str(caught.value)
+    assert "spec.streams[1].recover: is valid only for streams over Zenoh" in str(caught.value)

@@ -120,7 +120,7 @@ def test_broken_recordings_are_set_apart_with_their_reason(fleet: Path) -> None:
     ]
     assert "is not a recording that Wayside can read" in found[0][2]
     assert "broken-001-drive.jsonl:" in found[1][2]
-    assert re.search(r"the recording is cut \(.*\): [1-9]\d* messages", found[2][2])
+    assert re.search(r"the recording is cut \(.*\): it contains [1-9]\d* messages", found[2][2])
     assert requested(fleet, "SELECT count(*) FROM 'out/recordings.parquet' WHERE samples > 0") == [(RECORDINGS + 1,)]
     assert requested(fleet, "SELECT count(*), sum(samples) > 0 FROM 'out/streams.parquet'") == [(RECORDINGS + 1, True)]
 
@@ -241,7 +241,7 @@ def test_recordings_behind_urls_are_mined_as_those_on_disk(fleet: Path, monkeypa
     with serving(fleet) as address:
         (fleet / "list.txt").write_text("".join(f"{address}/drives/{path.name}\n" for path in drives))
         (fleet / "list.txt").open("a").write(f"{address}/drives/none.mcap\n")
-        assert "none.mcap: it is not there" in mine(fleet, "http", drives="@list.txt")
+        assert "none.mcap: there is no such file" in mine(fleet, "http", drives="@list.txt")
         assert "nothing was left to do" in mine(fleet, "http", drives=f"{address}/drives/")
     assert requested(fleet, f"SELECT {columns} FROM 'http/episodes/*/*.parquet' ORDER BY ALL") == expected
 

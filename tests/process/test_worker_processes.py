@@ -38,7 +38,7 @@ def alive(pid: int) -> bool:
 def test_what_takes_too_much_cpu_time_is_ended_and_its_process_replaced() -> None:
     async def work(pool: Pool) -> None:
         before = await pool.run("a", Where())
-        with pytest.raises(ExceededError, match=r"takes more than 0\.5 s of CPU time and was ended"):
+        with pytest.raises(ExceededError, match=r"took more than 0\.5 s of CPU time and was stopped"):
             await pool.run("a", BOMB)
         after = await pool.run("a", Where())
         assert after != before
