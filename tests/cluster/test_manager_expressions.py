@@ -108,7 +108,7 @@ def test_a_key_that_takes_too_long_refuses_its_task_alone(api: Api, namespace: s
         lambda raw: condition(raw, "Accepted").get("reason") == "ExpressionLimit",
         what="the task with the large values is refused",
     )
-    assert "takes more than 0.5 s of CPU time" in condition(refused, "Accepted")["message"]
+    assert "took more than 0.5 s of CPU time" in condition(refused, "Accepted")["message"]
     south = f"{instance_name('bomb', 'south-0')}-config"
     api.wait_for("ConfigMap", south, lambda _: True, what="the other one is served")
 
