@@ -59,6 +59,12 @@ class Conditions:
         self._graph = Graph()
         self._of: list[dict[str, ClientCondition]] = [self._conditions(track) for track in tracks]
         """By track and field."""
+        fields = dict.fromkeys(field for each in self._of for field in each)
+        self._chosen_by_field = {
+            field: [(row, each[field]) for row, each in enumerate(self._of) if field in each] for field in fields
+        }
+        """By field, the tracks that have the condition, by their rows."""
+        self._has = {field: np.array([[field in each] for each in self._of]) for field in fields}
         roots = [each.node for conditions in self._of for each in conditions.values() if each.node is not None]
         self._program = Program(self._graph, roots, context.tables.texts)
         self._cache: dict[tuple[int, str], dict[str, tuple[Hashable, int, tuple[Reason, str] | None]]] = {}
@@ -79,7 +85,7 @@ class Conditions:
 
     def has(self, field: str) -> Truths:
         """Which tracks have the condition; shape (tracks, 1)."""
-        return np.array([[field in each] for each in self._of])
+        return self._has[field]
 
     def verdicts(self, block: Block) -> dict[str, Verdict]:
         """The verdicts, by field, shape (tracks, points); unknown in tracks without the field. Counts unknowns."""
@@ -89,14 +95,13 @@ class Conditions:
         values, tags = stacked([self._leaves.at_points(block, each) for each in self._program.leaves], points)
         results = self._program.run(values, tags)
         strange = tags is not None and bool((tags > Tag.NUMBER).any())
-        for field in dict.fromkeys(field for each in self._of for field in each):
-            chosen = [(row, self._of[row][field]) for row in range(len(self._tracks)) if field in self._of[row]]
+        for field, chosen in self._chosen_by_field.items():
             true, false = found[field] = Verdict(np.zeros(shape, bool), np.zeros(shape, bool))
             ours = [(row, each.node) for row, each in chosen if each.node is not None]
             if ours:
                 rows = [row for row, _ in ours]
                 true[rows], false[rows] = results.truths([node for _, node in ours])
-            for row, condition in chosen:
+            for row, condition in chosen if strange or len(ours) < len(chosen) else ():
                 foreign: Truths | None = None
                 if condition.node is None:
                     self._ask_cel(block, row, condition, true[row], false[row])
