@@ -67,7 +67,7 @@ def test_bindings_follow_the_accounts_that_the_detector_names(
         lambda raw: condition(raw, "Running").get("reason") == "NoAccounts",
         what="its reason is written",
     )
-    assert "spec.serviceAccountNames is empty" in condition(written, "Running")["message"]
+    assert "spec.serviceAccountNames: is empty" in condition(written, "Running")["message"]
     # Who is named no more has no rights any more, be the rest of the Detector right or wrong.
     api.patch("Detector", HOLDER, {"spec": {"serviceAccountNames": ["vehicle"]}})
     settles(vehicle)
@@ -119,7 +119,7 @@ def test_the_manager_puts_it_into_pods_with_the_rights_that_are_printed(
     )
     assert webhook.manager.terminate() == 0
     assert "orbidden" not in webhook.manager.output()
-    assert "may not" not in webhook.manager.output()
+    assert "service account cannot" not in webhook.manager.output()
 
 
 def test_in_a_pod_it_holds_for_this_pod_alone_and_needs_its_rights_and_no_more(

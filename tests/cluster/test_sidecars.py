@@ -237,4 +237,4 @@ def test_what_the_command_cannot_do_is_said_and_the_rest_is_printed(
     why = f"spec.serviceAccountName: serviceAccountNames of Detector {HOLDER} has only vehicle, not other: add it"
     assert (code, logged) == (1, f"Pod foreign: {why}\n")
     code, _, logged = injected(control_plane, namespace, given=yaml.safe_dump(pod()))
-    assert (code, "has no Detector 'town' that can be read: create it" in logged) == (1, True)
+    assert (code, "has no valid Detector 'town': create or correct it" in logged) == (1, True)

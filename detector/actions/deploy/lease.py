@@ -6,10 +6,9 @@ two machines are never compared. A process takes over at once
 
 - a released Lease: an orderly end clears only the identity, so that the manager keeps the demands for
   the usual time;
-- a Lease of its own predecessor: in a pod, one of the same pod (a container that was restarted); elsewhere, a process
-of
-  the same machine that is no longer alive. A restart after a crash thus finds its tasks while the manager still
-  counts them.
+- a Lease of its own predecessor: in a pod, one of the same pod (a container that was restarted); elsewhere, a
+  process of the same machine that is no longer alive. A restart after a crash thus finds its tasks while the manager
+  still counts them.
 
 A Standalone detector's next pod has a different name. It waits at most one duration if the previous pod was killed,
 unless the Lease was deleted with that pod, which owns it.
