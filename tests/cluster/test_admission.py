@@ -93,7 +93,7 @@ WRONG: list[tuple[Object, Object, list[str]]] = [
     (
         template("charted"),
         {"manifests": None, "helm": {"chart": "/charts/app", "values": {"rate": "${parameters.rate}"}}},
-        ["spec.helm.values.rate", "`parameters.rate` is not known"],
+        ["spec.helm.values.rate", "`parameters.rate` does not exist"],
     ),
     (
         template("incoherent"),

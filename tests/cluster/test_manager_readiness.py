@@ -136,7 +136,7 @@ def test_other_kinds_are_judged_by_their_conditions(api: Api, manager: Process) 
             what=f"Ready={status} contains {texts}",
         )
 
-    lacks_address = f"Service {NORTH}-out has no address"
+    lacks_address = f"Service {NORTH}-out has no load balancer address"
     wait_instance("has no running pod", f"PersistentVolumeClaim {NORTH}-data is not bound", lacks_address)
     pod = its_pod(api)
     api.patch("Pod", pod, {"status": running(api.get("Pod", pod))}, subresource="status")

@@ -211,12 +211,12 @@ def test_an_event_is_not_reported_again_by_the_next_manager(
     api: Api, processes: Processes, namespace: str, webhook: Webhook
 ) -> None:
     api.create(pod())
-    event_of(api, "car", "has no Detector")
+    event_of(api, "car", "has no valid Detector")
     assert webhook.manager.terminate() == 0
     start_manager(processes, namespace, *RUNS)
     api.create(pod("second"))
-    event_of(api, "second", "has no Detector")
-    event_of(api, "car", "has no Detector")
+    event_of(api, "second", "has no valid Detector")
+    event_of(api, "car", "has no valid Detector")
 
 
 def test_what_the_command_cannot_do_is_said_and_the_rest_is_printed(
