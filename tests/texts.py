@@ -23,7 +23,7 @@ from wayside.api import KINDS
 from wayside.api.schema import crd
 
 ROOT = Path(__file__).parents[1]
-PROGRAMS = {"detector": "detector.program", "application-manager": "application_manager.program"}
+PROGRAMS = ("detector", "application-manager")
 FOLDERS = ("wayside", "detector", "application_manager")
 LEVELS = {"debug", "info", "warning", "error", "exception", "critical", "log"}
 
@@ -81,14 +81,12 @@ def texts(tree: ast.AST) -> Iterator[tuple[int, Text]]:
 
 def commands(program: str, *names: str) -> Iterator[str]:
     """The help of a command and of all below it."""
-    call = f"import sys; from {PROGRAMS[program]} import main; sys.argv[0] = {program!r}; sys.exit(main())"
     done = subprocess.run(
-        [sys.executable, "-c", call, *names, "--help"],
+        [Path(sys.executable).with_name(program), *names, "--help"],
         check=True,
         capture_output=True,
         text=True,
         env={**os.environ, "TYPER_USE_RICH": "0"},
-        cwd=ROOT,
     )
     yield done.stdout
     for name in re.findall(r"^  ([a-z-]+)\b", done.stdout.partition("\nCommands:\n")[2], re.MULTILINE):
