@@ -47,7 +47,7 @@ class Child:
             stdin=asyncio.subprocess.PIPE,
             stdout=asyncio.subprocess.PIPE,
             limit=_ROOM,
-            start_new_session=True,  # a terminal's signals are the manager's
+            process_group=0,  # a terminal's signals are the manager's; a session would have its own share of the CPU
             env={**os.environ, "PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))},
         )
         child = cls(process)

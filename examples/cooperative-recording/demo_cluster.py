@@ -138,7 +138,7 @@ def _states(api: Api) -> dict[str, str]:
     for task in api.list("ApplicationTask"):
         event = task["spec"]["event"]
         phase = task.get("status", {}).get("phase", "new")
-        states[f"task {event['subject']} for {task['spec']['template']}, {event['startTime'][11:19]}"] = phase
+        states[f"task {event['subject']} for {task['spec']['templateName']}, {event['startTime'][11:19]}"] = phase
     for instance in api.list("ApplicationInstance"):
         parameters = " ".join(f"{key}={_text(value)}" for key, value in instance["spec"]["parameters"].items())
         phase = instance.get("status", {}).get("phase", "new")

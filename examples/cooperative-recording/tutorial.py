@@ -106,7 +106,7 @@ class Stage:
                 mark_pods_ready(self.api)
             made, running = sorted(self.tasks(), key=_start), self._instances()
             newest = {_about(each): each for each in made}
-            there = {f"{each['spec']['template']} {each['spec']['key']}": each for each in running}
+            there = {f"{each['spec']['templateName']} {each['spec']['key']}": each for each in running}
             return (
                 _have_come(newest, tasks)
                 and _have_come(there, instances)

@@ -148,7 +148,7 @@ def test_a_task_whose_instance_is_going_reports_it(processes: Processes, namespa
     waiting = api.wait_for(
         "ApplicationTask",
         "second",
-        lambda raw: "is being removed" in condition(raw, "Ready").get("message", ""),
+        lambda raw: "is being deleted" in condition(raw, "Ready").get("message", ""),
         what="the task's status reports what it waits for",
     )
     assert (waiting["status"]["phase"], condition(waiting, "Applied")["status"]) == ("Pending", "False")

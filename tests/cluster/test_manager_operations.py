@@ -241,7 +241,7 @@ def test_what_an_autoscaler_owns_is_paused_and_continues_where_it_was(api: Api, 
     )
     wait_replicas(api, NORTH, 0)
     instance = wait_suspended(api, NORTH, "True")
-    assert f"HorizontalPodAutoscaler {NORTH} rests" in condition(instance, "Suspended")["message"]
+    assert f"HorizontalPodAutoscaler {NORTH} is inactive" in condition(instance, "Suspended")["message"]
     wait_settled(api)
     end(api, "night")
     wait_replicas(api, NORTH, 3)

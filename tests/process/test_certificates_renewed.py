@@ -180,7 +180,7 @@ def test_a_certificate_to_which_the_router_gives_nothing_leaves_the_session_alon
     ):
         wait_for(lambda: bool(arrivals.seen))
         authority.mount(mounted, "renamed")
-        wait_for(lambda: "nothing is received" in running.certificate_state.problem)
+        wait_for(lambda: "received nothing" in running.certificate_state.problem)
         before = len(arrivals.seen)
         wait_for(lambda: len(arrivals.seen) > before + 10)
     for car in CARS:

@@ -86,7 +86,7 @@ def test_a_protocol_that_is_not_spoken_and_a_missing_extra_are_reported(
     monkeypatch.setenv("OTEL_EXPORTER_OTLP_ENDPOINT", "http://127.0.0.1:1")
     monkeypatch.setenv("OTEL_EXPORTER_OTLP_PROTOCOL", "grpc")
     assert tracing("x") is None
-    assert "OTEL_EXPORTER_OTLP_PROTOCOL is grpc, and only http/protobuf is supported" in caplog.text
+    assert "OTEL_EXPORTER_OTLP_PROTOCOL is grpc, but only http/protobuf is supported" in caplog.text
     monkeypatch.setenv("OTEL_EXPORTER_OTLP_PROTOCOL", "http/protobuf")
     monkeypatch.setitem(sys.modules, "wayside.process.spans", None)  # as if it could not be imported
     assert tracing("x") is None

@@ -90,8 +90,9 @@ def test_what_is_dropped_later_is_reported_when_its_time_has_come_though_no_furt
     async def trickle() -> None:
         running = asyncio.create_task(events.run())
         report(events, 0, 5)
-        while len(lines(caplog)) < 2:  # noqa: ASYNC110  a log has no event to wait for
-            await asyncio.sleep(0.01)
+        async with asyncio.timeout(30):
+            while len(lines(caplog)) < 2:  # noqa: ASYNC110  a log has no event to wait for
+                await asyncio.sleep(0.01)
         running.cancel()
 
     with caplog.at_level(logging.WARNING):
