@@ -1,7 +1,7 @@
 """The command line: `application-manager run`, `render`, `check`, `explain`, `inject`, and those that print manifests.
 
-Declared here; what a command runs is imported when it runs, so that `--help` need not.
-That the API server refuses us at the start is bad input as well: the account and its rights are given to us.
+Commands are declared here; a command imports its implementation when it runs, so that `--help` stays fast. A refusal by
+the API server at the start counts as bad input as well, because the user gives the account and its rights.
 """
 
 from __future__ import annotations

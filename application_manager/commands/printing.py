@@ -155,8 +155,8 @@ def inject(
     """Print manifests after injecting the detectors that pods request with the label wayside.dev/detector.
 
     Injects into Pods and workloads, e.g. Deployments. Detectors come from the files, else from the cluster of the
-    current kubeconfig. Other objects are printed unchanged. If a pod cannot
-    have its detector, an error gives the reason, the pod is printed unchanged, and the exit code is 1.
+    current kubeconfig. Other objects are printed unchanged. If a pod cannot have its detector, an error gives the
+    reason, the pod is printed unchanged, and the exit code is 1.
     """
     with importing():
         from application_manager.commands.injecting import print_injected

@@ -60,7 +60,8 @@ async def serve(options: Options) -> None:
     """
     measures, traced = Measures(), tracing("wayside-application-manager")
     client = manager_client(await load_configuration(), measures, pacing=Pacing(share=Share()))
-    renewals = manager_client(await load_configuration(), measures, timeout=RENEWAL_TIMEOUT)  # not held up by all else
+    # A separate client: other requests do not delay renewals of the Lease.
+    renewals = manager_client(await load_configuration(), measures, timeout=RENEWAL_TIMEOUT)
     leadership = Leadership(renewals, options.lease, measures)
     client.may_act = leadership.remaining
     try:

@@ -96,7 +96,7 @@ def stopped(pair: Pair) -> None:
     """Stop the active one while its requests are under way and it waits for answers.
 
     Between its last look at whether it may still write and the system call that writes, nothing can hold it back (it is
-    described in application_manager/cluster/fence.py): a stop within these microseconds would show nothing but that.
+    described in wayside/kubernetes/fence.py): a stop within these microseconds would show nothing but that.
     """
     wait_until(lambda: stopped_in(pair.active.pid), lambda call: call in WAITING, what="it is stopped while it waits")
 

@@ -1,11 +1,11 @@
 """The API server, as both programs need it: JSON objects in and out, over one shared client of kubernetes.aio.
 
-The generated model classes are left aside: they cost more time than the requests, and a manifest is JSON anyway.
+The generated model classes are not used: they cost more time than the requests, and a manifest is JSON anyway.
 
-What the API server did not do because it is overloaded or just starting (429, or 503 with Retry-After) is sent again
-here where the client is paced, after the time that it requests; nothing else is sent meanwhile. Only an active manager
-writes: each write has to be answered within the time for which it may act, and the API server itself gives up what
-takes longer.
+An API server that is overloaded or just starting rejects requests with 429, or with 503 and Retry-After. A paced client
+retries these after the requested time, and sends nothing else in the meantime. Only an active manager writes: each
+write needs its response within the time for which the manager may act, and the API server itself aborts writes that
+take longer.
 """
 
 from __future__ import annotations

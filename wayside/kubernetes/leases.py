@@ -1,4 +1,4 @@
-"""Leases: the names of holders' ones, and which of several processes holds one. Pure.
+"""Leases: the names of holders' Leases, and which of several processes holds one. Pure.
 
 Each process judges a Lease on its own monotonic clock. The holder renews the Lease and may act until a deadline after
 it *sent* its last renewal that was taken. Another process takes the Lease once it has itself *observed it unchanged*

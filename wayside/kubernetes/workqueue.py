@@ -56,7 +56,7 @@ class WorkQueue(Generic[Key]):
         measure: Measure | None = None,
         share: int | None = None,
     ) -> None:
-        """Make it.
+        """Create an empty queue.
 
         Args:
             name: for logs and metrics.

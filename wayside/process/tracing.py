@@ -88,7 +88,7 @@ def tracing(service: str, *, export: bool = True) -> Tracing | None:
         )
         return None
     try:
-        from wayside.process.spans import Exporting  # noqa: PLC0415  only who sends traces has the extra, and owes the time
+        from wayside.process.spans import Exporting  # noqa: PLC0415  a slow import of an extra
     except ImportError as error:
         log.warning(
             "sending no traces, although %s is set: %s; pip install 'wayside[otel]', or unset it", endpoint, error

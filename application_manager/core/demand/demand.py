@@ -169,7 +169,7 @@ class _Snapshot:
 
 
 class Decided(Protocol):
-    """What was decided of an instance, or of the tasks for all instances of a template, as far as verdicts go."""
+    """The part of a decision that verdicts need: for an instance, or for the tasks for all instances of a template."""
 
     @property
     def verdicts(self) -> Mapping[str, Verdict]:
@@ -177,7 +177,7 @@ class Decided(Protocol):
 
     @property
     def fallback(self) -> Fallback | None:
-        """What its tasks turn to while it is not ready."""
+        """The template that its tasks turn to while it is not ready."""
 
 
 @dataclass(frozen=True, slots=True)

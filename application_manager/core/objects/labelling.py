@@ -36,7 +36,7 @@ def labelled(manifest: Manifest, instance: ApplicationInstance) -> Manifest:
 
 
 def _labelled_pods(instance: str, template: Manifest) -> Manifest:
-    """The pod template with the instance's label; what is of a wrong shape the API server refuses, as it stands."""
+    """The pod template with the instance's label; one of a wrong shape is unchanged, and the API server rejects it."""
     metadata = template.get("metadata") or {}
     labels = (metadata.get("labels") or {}) if isinstance(metadata, dict) else None
     if not isinstance(labels, dict):

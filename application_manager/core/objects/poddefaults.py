@@ -26,8 +26,8 @@ class PodDefaults:
         environment: of the containers, e.g. where traces go; what a Detector gives itself wins.
         metrics_secret: the Secret with tls.crt and tls.key by which they serve metrics and health, in each namespace
             with detectors; None: without TLS.
-        user: the user that they run as, and the group of their volumes; None: as the cluster
-            chooses, as OpenShift does.
+        user: the user that they run as, and the group of their volumes; None: the cluster chooses, as
+            OpenShift does.
     """
 
     image: str

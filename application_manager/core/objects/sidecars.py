@@ -53,7 +53,7 @@ class SidecarError(ValueError):
 
 
 def addition(spec: Mapping[str, Any], detector: Detector, defaults: PodDefaults) -> Addition | None:
-    """What the spec of a pod lacks of the Detector's sidecar; None where it has one.
+    """The fields that the spec of a pod needs for the Detector's sidecar; None if it has the sidecar.
 
     Args:
         spec: of the pod.

@@ -53,7 +53,7 @@ wayside.dev/runs: {{ . }}
 {{- end -}}
 
 {{/* Where traces go, and more of OpenTelemetry's variables: by name. */}}
-{{- define "wayside.process.tracing" -}}
+{{- define "wayside.tracing" -}}
 {{- $variables := deepCopy .Values.tracing.variables -}}
 {{- with .Values.tracing.endpoint -}}{{- $_ := set $variables "OTEL_EXPORTER_OTLP_ENDPOINT" . -}}{{- end -}}
 {{- $variables | toJson -}}

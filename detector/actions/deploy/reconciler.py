@@ -4,9 +4,6 @@ The engine passes the full set of demands whenever it changes. The reconciler ma
 missed: it creates missing tasks (including tasks deleted by hand), sets the end of tasks that are over, and patches
 those that changed. It is level-triggered, not edge-triggered, so an outage of the store delays it and loses nothing; an
 episode that starts and ends within one outage leaves no task, because nothing is demanded any more.
-missed: it creates what is missing (a task deleted by hand comes back), sets the end of what is over, and patches what
-changed. It looks at levels, not at edges, so an outage of the store delays it and loses nothing; an episode that
-starts and ends within one outage leaves no task, since nothing is demanded any more.
 """
 
 from __future__ import annotations
@@ -168,9 +165,8 @@ class DemandReconciler:
         if self._permitted is not None:
             await self._permitted.wait()
         if self._away.failures:
-            async with self._probing:  # one task alone finds out whether the store is back
+            async with self._probing:  # a single task probes whether the store is back
                 if self._away.failures:
-                    # A single task probes whether the store is back.
                     with suppress(TimeoutError):
                         await asyncio.wait_for(self._reachable.wait(), self._pause)
                     await self._attend(name)

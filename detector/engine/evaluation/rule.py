@@ -48,8 +48,8 @@ class RuleRun:
 
     def __init__(self, rule: CompiledRule, identity: Identity, counters: RuleCounters) -> None:
         self.rule = rule
-        self._read = {field: signals_read(rule, each) for field, each in (("when", rule.when), ("until", rule.until))}
-        """By condition, the signals and streams that it reads, for errors."""
+        self.read = {field: signals_read(rule, each) for field, each in (("when", rule.when), ("until", rule.until))}
+        """By condition, the signals and streams that it reads, as a text for errors."""
         self.counters = counters
         self._identity = identity
         self._timing = Timing(rule.for_ns, rule.cooldown_ns, rule.unknown_timeout_ns)
@@ -69,7 +69,7 @@ class RuleRun:
         self.looked_at: list[Subject] = []
         """The subjects of the last evaluation."""
         self.disturbed = True
-        """Whether states changed outside `run`, so that every subject must be evaluated again."""
+        """Whether states changed outside the rule's group, so that every subject must be evaluated again."""
         self.journal: list[DemandChange] | None = None
         """Changes of demands, in time order; None while nobody reads them."""
 
@@ -114,11 +114,6 @@ class RuleRun:
         self.disturbed = True
         for state in self._states.values():
             state.gap()
-
-    @property
-    def read(self) -> Mapping[str, str]:
-        """By condition, the text about its inputs that errors contain."""
-        return self._read
 
     @property
     def alone(self) -> bool:
@@ -268,9 +263,7 @@ class RuleRun:
         return candidate._replace(variables={**candidate.variables, **found})
 
     def _subject(self, now: int, candidate: Candidate) -> Iterator[Event]:
-        state = self._states.get(candidate.subject)
-        if state is None:
-            state = self._states[candidate.subject] = SubjectState()
+        state = self._states.get(candidate.subject) or self.new_state(candidate.subject)
         when = self._truth("when", self.rule.when, candidate)
         until = negation(when) if self.rule.until is None else self._truth("until", self.rule.until, candidate)
         happened = state.step(now, self._timing, Observation(candidate.in_scope, candidate.near, when, until))
@@ -365,7 +358,7 @@ class RuleRun:
         )
 
     def _truth(self, field: str, expression: Expression, candidate: Candidate) -> Truth:
-        place = f"{field} of {candidate.subject.text}{self._read[field]}"
+        place = f"{field} of {candidate.subject.text}{self.read[field]}"
         return condition(expression, candidate.variables, place, candidate.never, self.counters)
 
     def _started(self, now: int, onset: int, candidate: Candidate) -> Event:
