@@ -285,7 +285,9 @@ class Evaluator:
 
     def _pause_rule(self, rule: str, paused: bool) -> None:
         if rule not in self._engine.rules:
-            raise NoAnswerError(f"there is no rule {rule}; there is {', '.join(sorted(self._engine.rules)) or 'none'}")
+            raise NoAnswerError(
+                f"there is no rule {rule}; the detector has {', '.join(sorted(self._engine.rules)) or 'none'}"
+            )
         names = self._engine.schedule.paused - {rule} | ({rule} if paused else set())
         self._record(self._engine.now, {"kind": "paused", "rules": sorted(names)})
         self._engine.set_paused(names)

@@ -117,7 +117,7 @@ class Environment:
             if not _NAME.fullmatch(name):
                 raise ValueError(f"variable {name!r}: not a CEL identifier; use letters, digits and `_`")
             if name in RESERVED_WORDS:
-                raise ValueError(f"variable {name!r}: a word that CEL reserves; choose another name")
+                raise ValueError(f"variable {name!r}: CEL reserves this word; choose another name")
         self.variables: Mapping[str, CelType] = MappingProxyType(dict(variables))
         self._members: Mapping[str, CelType] = MappingProxyType(dict(members or {}))
         self._env = _cel_environment(self.variables)
