@@ -34,7 +34,7 @@ app = typer.Typer(
     add_completion=False,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    help="Makes a cluster run what the live ApplicationTasks demand.",
+    help="Runs the applications that live ApplicationTasks demand.",
 )
 
 EXPECTED = (InputError,)
@@ -342,7 +342,9 @@ class Output(StrEnum):
 @app.command()
 def explain(
     subject: Annotated[str, typer.Argument(help="A task or an instance: its name, or task/NAME or instance/NAME.")],
-    namespace: Annotated[str | None, typer.Option("--namespace", "-n", help="Default: the kubeconfig's.")] = None,
+    namespace: Annotated[
+        str | None, typer.Option("--namespace", "-n", help="The namespace. Default: the kubeconfig's.")
+    ] = None,
     output: Annotated[Output, typer.Option("--output", "-o", help="For people or for programs.")] = Output.TEXT,
 ) -> None:
     """Explain the state of a task or instance, from the event to the pods."""

@@ -32,7 +32,7 @@ class Measures:
         self._ready = self._histogram("event_to_ready_seconds", "From an event's start to its task's Ready", _SERVICE)
         self._reconciled = self._histogram("reconcile_seconds", "Time that reconciling one object took", _WORK, "queue")
         self._failures = self._counter("reconcile_failures", "Reconciliations that failed and are retried", "queue")
-        self._refusals = self._counter("refusals", "Tasks that were refused, also again for another reason", "reason")
+        self._refusals = self._counter("refusals", "Refusals of tasks; each new reason counts again", "reason")
         self._requests = self._histogram("api_request_seconds", "Time to the API server's answer", _WORK, "method")
         self._errors = self._counter("api_errors", "Requests that the API server refused or did not answer", "code")
         self._events = self._counter("kubernetes_events", "Kubernetes Events that were posted", "reason")

@@ -129,9 +129,7 @@ class Admission:
                 if findings.remarks:
                     await self._look_up(TEMPLATE, rule.namespace)
         except (ApiError, Unreachable, TimeoutError) as error:
-            log.warning(
-                "EventRule %s/%s: reviewed with the objects in the cache only: %s", rule.namespace, rule.name, error
-            )
+            log.warning("EventRule %s/%s: reviewed against the cache only: %s", rule.namespace, rule.name, error)
             problems = (Finding(INVALID_RULE.name, each, rule.name) for each in findings.problems)
             return Findings((), (*problems, *findings.doubts), findings.remarks)
         return await self._judged(rule)

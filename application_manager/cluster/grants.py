@@ -43,7 +43,7 @@ class Grants:
             if namespace not in self._granted | self._refused and not await self._ask(namespace):
                 self._refused.add(namespace)
                 log.warning(
-                    "namespace %s is not granted to this manager, which does not manage it: apply the output of "
+                    "namespace %s is not granted to this manager, which ignores it: apply the output of "
                     "`application-manager rbac --grant %s`, or add it to manager.grant of the chart",
                     namespace,
                     namespace,

@@ -119,7 +119,7 @@ def rbac(
 
 def detector_rbac(
     name: Annotated[str, typer.Argument(help="The Detector.")],
-    namespace: Annotated[str, typer.Option("--namespace", "-n", help="Its namespace.")],
+    namespace: Annotated[str, typer.Option("--namespace", "-n", help="The namespace of the Detector.")],
     pod_account: Annotated[
         list[str] | None,
         typer.Option(
@@ -146,7 +146,7 @@ def inject(
     ],
     namespace: Annotated[
         str,
-        typer.Option("--namespace", "-n", help="The namespace of manifests without one, for Detectors of the cluster."),
+        typer.Option("--namespace", "-n", help="The namespace of Detectors for manifests that set no namespace."),
     ] = "default",
     detector_image: Annotated[
         str | None, typer.Option(help="As for `run`: the image of detectors without one.")

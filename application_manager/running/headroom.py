@@ -62,7 +62,9 @@ class Headroom(Collector):
         tight.add_metric((), float(self.tight()))
         yield from (used, tight)
         if self.limit is not None:
-            limit = GaugeMetricFamily(f"{PREFIX}memory_limit_bytes", "Memory that they may have together")
+            limit = GaugeMetricFamily(
+                f"{PREFIX}memory_limit_bytes", "Memory limit of the manager and its worker processes"
+            )
             limit.add_metric((), self.limit)
             yield limit
 

@@ -86,12 +86,16 @@ class Pulse(Collector):
         for (resource, _), (since, _) in self._beats.copy().items():
             ages[resource] = max(ages.get(resource, 0.0), now - since)
         family = GaugeMetricFamily(
-            f"{PREFIX}watch_age_seconds", "Since a watch's last event or bookmark, the oldest", labels=("resource",)
+            f"{PREFIX}watch_age_seconds",
+            "Seconds since the last event or bookmark of the quietest watch",
+            labels=("resource",),
         )
         for resource, age in sorted(ages.items()):
             family.add_metric((resource,), age)
         yield family
-        restarts = CounterMetricFamily(f"{PREFIX}watch_restarts", "Watches that were silent and restarted")
+        restarts = CounterMetricFamily(
+            f"{PREFIX}watch_restarts", "Watches that were restarted because they were silent"
+        )
         restarts.add_metric((), self._restarts)
         yield restarts
 

@@ -130,7 +130,7 @@ class DetectorWork:
                 known.pop(kind, None)  # to be read again
             return Aspect(RUNNING, False, raw.reason, raw.message)
         if live is None:
-            log.info("detector %s/%s: made %s %s", *name, kind, called)
+            log.info("detector %s/%s: created %s %s", *name, kind, called)
         known[kind] = raw
         self._applied[raw["metadata"]["uid"]] = digest, our_fields(raw)
         return None

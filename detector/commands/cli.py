@@ -196,7 +196,7 @@ def replay(
         typer.Option(
             "--sweep",
             metavar="RULE.FIELD=FIRST:LAST:STEP",
-            help="The same with several values in one pass, e.g. close.parameters.distance=80:200:20, or 80,120; "
+            help="Like --set, with several values in one pass, e.g. close.parameters.distance=80:200:20, or 80,120; "
             "may be repeated.",
         ),
     ] = None,
@@ -204,7 +204,7 @@ def replay(
         bool, typer.Option("--record", help="Run the rules' record actions, into the folder clips of the output.")
     ] = False,
 ) -> None:
-    """Run the same engine over recordings. An intake file brings its Detector and rules along."""
+    """Evaluate rules over recordings, with the engine of `run`. An intake file contains its Detector and rules."""
     with importing():
         from detector.assembly.memory import tune_garbage_collection
         from detector.commands.replay import replay_files
@@ -230,7 +230,7 @@ def topics(
         typer.Argument(help="Recordings of any kind that replay reads; folders and patterns of these."),
     ] = None,
     as_yaml: Annotated[
-        bool, typer.Option("--yaml", help="Print a Detector with streams that match all of it.")
+        bool, typer.Option("--yaml", help="Print a Detector whose streams match all keys found.")
     ] = False,
     live: Annotated[bool, typer.Option("--live", help="Listen on Zenoh instead of reading recordings.")] = False,
     connect: Annotated[
@@ -241,7 +241,7 @@ def topics(
     ] = None,
     seconds: Annotated[float, typer.Option(help="With --live: how long to listen.", min=0.1)] = 5.0,
 ) -> None:
-    """List what recordings hold: keys, types, rates, gaps, clients, and fields as paths to paste into rules."""
+    """List the contents of recordings: keys, types, rates, gaps, clients, and fields as paths to paste into rules."""
     if live == bool(recordings):
         refuse("give recordings, or --live")
     if connect and not live:
@@ -329,7 +329,7 @@ def check(
     ignore: commandline.IgnoredFindings = None,
     listing: commandline.ListFindings = False,
 ) -> None:
-    """Compile and type-check EventRules and Detectors; exit with 1 where something is wrong.
+    """Compile and type-check EventRules and Detectors; exit with 1 if there are errors.
 
     Each finding has a name. A classification that contradicts its rule is a warning.
     """

@@ -245,7 +245,7 @@ class Engine:
         """
         run = self._runs.get(name)
         if run is None:
-            raise NoAnswerError(f"there is no rule {name}; there is {', '.join(sorted(self._runs)) or 'none'}")
+            raise NoAnswerError(f"there is no rule {name}; the detector has {', '.join(sorted(self._runs)) or 'none'}")
         if not run.rule.on_demand:
             raise NoAnswerError(f"rule {name} is not evaluated on demand: write evaluation: {{onDemand: true}}")
         if not run.rule.enabled or name in self.schedule.paused:

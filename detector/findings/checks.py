@@ -6,7 +6,7 @@ from wayside.findings import INVALID_DETECTOR, UNREADABLE_FILE, Check, Severity
 from wayside.rules.contradictions import CONTRADICTIONS
 
 INVALID_RULE = Check("invalid-rule", Severity.ERROR, "an EventRule does not compile with a Detector that selects it")
-MISSING_DETECTOR = Check("missing-detector", Severity.ERROR, "the files have EventRules and no Detector")
+MISSING_DETECTOR = Check("missing-detector", Severity.ERROR, "the files have EventRules, but no Detector")
 RULE_NOT_SELECTED = Check("rule-not-selected", Severity.ERROR, "no Detector selects the EventRule")
 UNKNOWN_RULE = Check("unknown-rule", Severity.ERROR, "a Detector has parameters for an EventRule that does not exist")
 UNREADABLE_RECORDING = Check(
@@ -15,7 +15,7 @@ UNREADABLE_RECORDING = Check(
 STREAM_WITHOUT_STAMPS = Check(
     "stream-without-stamps",
     Severity.WARNING,
-    "with clock Data: a stream carries no stamps and others do, by its definition or by the samples of a recording",
+    "with clock Data: a stream has no stamps, but others do (by definition, or in a recording)",
 )
 UNMATCHED_STREAM = Check(
     "unmatched-stream", Severity.WARNING, "with --recording: no message belongs to a stream of the Detector"

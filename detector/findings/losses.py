@@ -121,7 +121,7 @@ class Losses:
                     yield Finding(
                         STALE_BETWEEN_SAMPLES.name,
                         f"samples of stream {stream_name} arrive {every} and go stale after {limit / 1e9:g} s, so "
-                        f"EventRule {name} finds them unknown in between; raise streams[{stream_name}].staleAfter",
+                        f"EventRule {name} has unknown values in between; raise streams[{stream_name}].staleAfter",
                         name,
                     )
                 elif use.old:

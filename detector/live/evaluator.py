@@ -285,7 +285,9 @@ class Evaluator:
 
     def _pause_rule(self, rule: str, paused: bool) -> None:
         if rule not in self._engine.rules:
-            raise NoAnswerError(f"there is no rule {rule}; there is {', '.join(sorted(self._engine.rules)) or 'none'}")
+            raise NoAnswerError(
+                f"there is no rule {rule}; the detector has {', '.join(sorted(self._engine.rules)) or 'none'}"
+            )
         names = self._engine.schedule.paused - {rule} | ({rule} if paused else set())
         self._record(self._engine.now, {"kind": "paused", "rules": sorted(names)})
         self._engine.set_paused(names)
@@ -296,7 +298,7 @@ class Evaluator:
         if self._overload.observe(self._now(), spent, self._engine.schedule.highest):
             level, highest = self._overload.level, self._engine.schedule.highest
             text = "the evaluation is overloaded" if spent > LONG else "the evaluation keeps up with the load"
-            _log.warning("%s: thinning evaluations of low priority at level %d of %d", text, level, highest)
+            _log.warning("%s: thinning of low-priority rules is now at level %d of %d", text, level, highest)
             self._record(self._engine.now, {"kind": "level", "level": level})
             self._engine.set_level(level)
 

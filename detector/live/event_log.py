@@ -51,4 +51,4 @@ class EventLog:
                     self._file.flush()
             except (OSError, ValueError) as error:  # a disk that refuses, a text that is not valid UTF-8
                 self.dropped += 1
-                _log.error("an event is missing in %s: %s", self._path, error)
+                _log.error("cannot write an event to %s: %s", self._path, error)

@@ -73,7 +73,7 @@ class LiveOutlet:
         try:
             self.network.start()
         except NetworkError as error:
-            _log.error("cannot join the network of the changed Detector; correct it: %s", error)
+            _log.error("cannot open the Zenoh session of the changed Detector; correct spec.zenoh: %s", error)
 
     def open_episodes(self, episodes: Callable[[], Sequence[OpenEpisode]]) -> None:
         """Write the open episodes to the state volume, if there is one."""

@@ -150,7 +150,9 @@ class Chunks:
         if self._between is not None:
             begin, end = index.message_start_time, index.message_end_time
             if len(rows) and not begin <= rows["time"][0] <= rows["time"][-1] <= end:
-                raise ValueError("a chunk has other times than its index")  # its other messages would be missed
+                raise ValueError(
+                    "the times of a chunk differ from those in its index"
+                )  # its other messages would be missed
             first, last = self._between
             rows = rows[(rows["time"] >= first) & (rows["time"] <= last)]
         return _Waiting(index.chunk_start_offset, rows, data)

@@ -141,7 +141,7 @@ def _pcapng(data: bytes) -> Iterator[_Frame]:
             interfaces = []
         (length,) = struct.unpack_from(order + "I", data, position + 4)
         if length < 12 or length % 4 or length > _LARGEST:
-            raise ValueError(f"a block of {length} bytes at byte {position}")
+            raise ValueError(f"a block of {length} bytes at byte {position}, which is not a valid length")
         if position + length > len(data):
             raise _CutError(f"a block of {length} bytes at byte {position} reaches beyond the end")
         body = data[position + 8 : position + length - 4]

@@ -83,7 +83,7 @@ def _as_msg(name: str, inside: Typesdict) -> str:
     try:
         return store.generate_msgdef(name, ros_version=2)[0]
     except KeyError as error:
-        raise ValueError(f"it lacks {error}") from error
+        raise ValueError(f"the definition of {error} is missing") from error
 
 
 def _like(one: Sequence[tuple[str, FieldDesc]], other: Sequence[tuple[str, FieldDesc]]) -> bool:

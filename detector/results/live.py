@@ -208,7 +208,7 @@ class LiveView:
             try:
                 self._show(each)
             except Exception:  # noqa: BLE001  an error here must only affect the view
-                _log.exception("cannot show a second in the live view")
+                _log.exception("cannot write one second of data to the live view")
                 self._dropped += 1
 
     def _show(self, shown: _Slice) -> None:
@@ -250,7 +250,7 @@ class LiveView:
         trace.subjects = [each for each in trace.subjects if each.rule in shown.rules]
         if len(self._channels) >= _MOST and not self._full:
             self._full = True
-            _log.warning("the live view has %d channels: further subjects have none", _MOST)
+            _log.warning("the live view has the maximum of %d channels: not showing further subjects", _MOST)
         rules = shown.rules
         terms = {(each.rule, each.subject): terms_of(rules[each.rule], each) for each in trace.subjects}
         return Result("live", trace, shown.events, (), rules, {}, terms, (), {}, (), 0)

@@ -48,7 +48,7 @@ def split(key: str) -> tuple[str, str]:
     if len(names) == 4 and names[2] == "dds_" and names[3].endswith("_"):
         names = [*names[:2], names[3][:-1]]
     if len(names) != 3 or not all(names):
-        raise MisfitError(f"{key} names no type: {mangled} is not of the form <package>::msg::dds_::<Type>_")
+        raise MisfitError(f"{key} contains no type: {mangled} is not of the form <package>::msg::dds_::<Type>_")
     return topic, "/".join(names)
 
 

@@ -137,7 +137,7 @@ class ApplicationTaskStatus(Model):
         default=0, description="The metadata.generation that the status was computed from."
     )
     applied_time: Time | None = Field(
-        default=None, description="The time at which the instance first had the task's values applied."
+        default=None, description="The time at which the task's values were first applied to the instance."
     )
     ready_time: Time | None = Field(
         default=None, description="The time at which the instance was first ready for the task."

@@ -36,7 +36,7 @@ class LossPolicy(StrEnum):
 
 
 class OnDetectorLoss(Model):
-    """The treatment of demands after their holder's Lease lapsed."""
+    """The policy for demands whose holder's Lease has expired."""
 
     policy: LossPolicy = Field(
         default=LossPolicy.RELEASE,
@@ -54,9 +54,7 @@ class FallbackTemplate(Model):
     template_name: TemplateName = Field(description="The name of another ApplicationTemplate, in the same namespace.")
 
 
-FALLBACK_WITHOUT_TIMEOUT = (
-    "fallback needs readyTimeout, after which an instance counts as not becoming ready: set it, e.g. 60s"
-)
+FALLBACK_WITHOUT_TIMEOUT = "fallback needs readyTimeout: set it, e.g. readyTimeout: 60s"
 
 
 class Lifecycle(Model):
@@ -71,12 +69,12 @@ class Lifecycle(Model):
     )
     minimum_uptime: Duration = Field(
         default=Duration("0s"),
-        description="The minimum lifetime of an instance, from its creation. The instance is neither released nor "
-        "preempted before.",
+        description="The minimum lifetime of an instance, from its creation. Until then, the instance is neither "
+        "released nor preempted.",
     )
     ready_timeout: PositiveDuration | None = Field(
         default=None,
-        description="How long an instance may continuously be not ready. After that, its condition TimedOut is True "
+        description="How long an instance may stay not ready. After that, its condition TimedOut is True "
         "until the instance has been ready for the same time. Default: no limit.",
     )
     fallback: FallbackTemplate | None = Field(
@@ -85,7 +83,7 @@ class Lifecycle(Model):
         "instance is ready again. It receives those task parameters that it defines. Needs readyTimeout.",
     )
     on_detector_loss: OnDetectorLoss = Field(
-        default=OnDetectorLoss(), description="The treatment of demands after their holder's Lease lapsed."
+        default=OnDetectorLoss(), description="The policy for demands whose holder's Lease has expired."
     )
 
     @model_validator(mode="after")
@@ -155,8 +153,8 @@ class ApplicationTemplateSpec(Model):
     configuration: dict[FileName, Value] = Field(
         default_factory=dict,
         max_length=64,
-        description="Files that the running application follows, by name, with ${…} as in manifests. They are stored "
-        "in a ConfigMap, named by ${instance.configMap}, which changes without a rollout. A text is written "
+        description="Files that can change while the application runs, by name, with ${…} as in manifests. They are "
+        "stored in a ConfigMap, named by ${instance.configMap}, which changes without a rollout. A text is written "
         "unchanged; a map or list is written in the format of the file extension, .yaml or .json.",
     )
     manifests: list[Manifest] = Field(

@@ -182,8 +182,8 @@ class DetectorSpec(Model):
     buffer: BufferLimits = Field(default=BufferLimits(), description="The limits of the buffer of samples.")
     client_timeout: PositiveDuration = Field(
         default=PositiveDuration("30s"),
-        description="A client is lost after this time without data: its episodes end with reason ClientLost. The time "
-        "counts from the start of the detector at the earliest.",
+        description="A client is lost after this time without data: its episodes end with reason ClientLost. Time "
+        "before the start of the detector does not count.",
     )
     clock: Clock = Field(
         default=Clock.WALL,
@@ -192,13 +192,13 @@ class DetectorSpec(Model):
     )
     lateness: Duration = Field(
         default=Duration("200ms"),
-        description="Only with clock Data: how late samples may arrive. Tick t runs once a stamp was received that "
-        "is later than t and at least t + lateness.",
+        description="Only with clock Data: how late samples may arrive. Tick t runs when the detector has received a "
+        "stamp that is later than t and not earlier than t + lateness.",
     )
     max_ahead: Duration = Field(
         default=Duration("1s"),
-        description="Only with clock Data: how far ahead of all others a stamp may be. A sample further ahead is "
-        "dropped and counted.",
+        description="Only with clock Data: the maximum time by which a stamp may be ahead of all others. A sample "
+        "further ahead is dropped and counted.",
     )
     state: State | None = Field(
         default=None,

@@ -39,7 +39,7 @@ class Evaluation(Model):
         default=0,
         ge=-1_000,
         le=1_000,
-        description="Under overload, rules with a lower priority are the first to be evaluated less often.",
+        description="Under overload, the detector evaluates rules of lower priority less often, the lowest first.",
     )
 
     @property

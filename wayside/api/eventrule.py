@@ -86,9 +86,9 @@ _OF = "a signal with of cannot have value, where, or the aggregates Age and Acti
 _LAG = "lag needs a signal with of, and is not valid with over: Episode"
 _EPISODE = (
     f"over: Episode needs a signal with of and one of the aggregates {', '.join(sorted(OF_AN_EPISODE))}; "
-    "only Age has no of"
+    "Age is used without of"
 )
-_QUANTILE = "aggregate Quantile needs quantile, e.g. quantile: 0.95, and other aggregates have none"
+_QUANTILE = "aggregate Quantile needs quantile, e.g. quantile: 0.95; with any other aggregate, remove quantile"
 _CLIENT = "client is valid only with stream or ruleName: remove it"
 _ENDS = "samples: Ends needs a signal with ruleName and an aggregate other than Active"
 
@@ -140,14 +140,14 @@ class Signal(Model):
     stream: ObjectName | None = Field(default=None, description="The name of a stream of the Detector.")
     rule_name: ObjectName | None = Field(
         default=None,
-        description="Instead of a stream: another rule that the Detector selects. Its samples are the starts of "
-        "episodes that have the client as a subject, or their ends: see samples. msg contains episode, subject, "
+        description="Instead of a stream: another rule that the Detector selects. Its samples are the starts "
+        "(or ends, see samples) of that rule's episodes with the client as a subject. msg contains episode, subject, "
         "subjects, onsetTime and startTime (seconds since the epoch), and the values at the start.",
     )
     samples: Samples = Field(
         default=Samples.STARTS,
-        description="Only with ruleName: whether the samples are the starts or the ends of its episodes. In an end, "
-        "msg also contains endTime, reason and the values at the end.",
+        description="Only with ruleName. Starts: the samples are the starts of episodes. Ends: the samples are the "
+        "ends of episodes; msg also contains endTime, reason and the values at the end.",
     )
     model: ModelSource | None = Field(
         default=None, description="Instead of a stream: an ONNX model over other signals, an image or a point cloud."
@@ -207,8 +207,8 @@ class Signal(Model):
         default=None,
         ge=0,
         le=1,
-        description="Of the aggregate Quantile: 0.5 is the median, 0.95 the value that 95 % of the values do not "
-        "exceed. Between two values, it is interpolated linearly.",
+        description="Only with aggregate Quantile: 0.5 for the median, 0.95 for the 95th percentile. Interpolated "
+        "linearly between two values.",
     )
 
     @property
@@ -284,10 +284,10 @@ class EventRuleSpec(Model):
         default=None,
         max_length=64,
         description="Adds the signal margin to the rule: how far `when` is from changing, positive while it holds "
-        "and negative while it does not. The margin of a comparison is the distance to its threshold; "
-        "&& has the smaller margin, || the larger, ! the negated one. If `when` compares several "
-        "quantities, each needs a scale here: the signal (or distance, closingSpeed) and the "
-        "difference that counts as 1. Results list the ten largest margins without an episode.",
+        "and negative while it does not. The margin of a comparison is the distance to its threshold. "
+        "&& has the smaller margin of its two sides, || the larger; ! negates the margin. If `when` compares "
+        "several quantities, each needs a scale here: the signal (or distance, closingSpeed) and the "
+        "difference that counts as 1. The results of a replay list the ten largest margins without an episode.",
     )
     until: Expression | None = Field(
         default=None,

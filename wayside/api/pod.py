@@ -268,7 +268,8 @@ class DetectorToleration(Model):
     effect: TaintEffect | None = Field(default=None, description="The taint effect. Default: every effect.")
     toleration_seconds: Annotated[int, Field(ge=0, le=2**31 - 1)] | None = Field(
         default=None,
-        description="How long the pod stays on a node with effect NoExecute, in seconds. Default: forever.",
+        description="With effect NoExecute: how long the pod stays on a node with the taint, in seconds. "
+        "Default: forever.",
     )
 
     @model_validator(mode="after")
@@ -341,8 +342,8 @@ class DetectorPod(Model):
     volume_mounts: list[DetectorVolumeMount] = Field(
         default_factory=list,
         max_length=16,
-        description="The mounts of the volumes, for the folders of the state, the recordings, the database spool and "
-        "the database files. A folder that is on none of them gets a volume that is removed with the pod.",
+        description="The mounts of the volumes, e.g. for the folders of the state, the recordings, the database spool "
+        "and the database files. A folder outside all mounts gets a volume that is removed with the pod.",
         json_schema_extra=map_list("mountPath"),
     )
     secret_names: list[ObjectName] = Field(

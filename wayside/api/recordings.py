@@ -64,7 +64,7 @@ class Recordings(Model):
     )
     reserve: Quantity = Field(
         default=Quantity("1Gi"),
-        description="The disk space that is left free, regardless of other writers. At the limit, whenFull applies.",
+        description="The minimum free disk space. Files of other programs count too. At the limit, whenFull applies.",
     )
     when_full: WhenFull = Field(
         default=WhenFull.DROP_OLDEST,

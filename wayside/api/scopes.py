@@ -33,8 +33,8 @@ class Position(Model):
     )
 
     stream: ObjectName = Field(
-        description="The stream whose newest sample contains the position. Without x and y, and without latitude and "
-        "longitude, it is the position that the Detector gives the stream."
+        description="The stream whose newest sample contains the position. If x, y, latitude and "
+        "longitude are all omitted, the stream's own position in the Detector is used."
     )
     x: Expression | None = Field(
         default=None, description="CEL over msg: the position on the first axis in metres, e.g. msg.pose.position.x."
@@ -108,19 +108,19 @@ class PairsScope(Model):
     )
     a: Role | None = Field(
         default=None,
-        description="Selects the clients that can be a. With a role, pairs are ordered, and each matching ordered "
-        "pair is a subject.",
+        description="Selects the clients that can be a. If a or b is set, pairs are ordered: car1+car2 and "
+        "car2+car1 are separate subjects if both match.",
     )
     b: Role | None = Field(
         default=None,
-        description="Selects the clients that can be b. With a role, pairs are ordered, and each matching ordered "
-        "pair is a subject.",
+        description="Selects the clients that can be b. If a or b is set, pairs are ordered: car1+car2 and "
+        "car2+car1 are separate subjects if both match.",
     )
     max_pairs: int = Field(
         default=10_000,
         ge=1,
         le=1_000_000,
-        description="The maximum number of pairs in reach per evaluation. At the limit, the nearest pairs are "
+        description="The maximum number of near pairs per evaluation. At the limit, the nearest pairs are "
         "evaluated; the others are skipped and counted. Pairs with an open episode, or whose condition already holds, "
         "are always evaluated.",
     )

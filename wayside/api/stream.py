@@ -47,8 +47,8 @@ class MessageDefinition(Model):
     name: MessageType = Field(description="The type, e.g. my_package/msg/Track.")
     definition: str = Field(
         max_length=65_536,
-        description="The definition in the format of .msg files. Types that it refers to need their own entry in "
-        "messages, or follow after a line of = and a line `MSG: <type>`, as `ros2 bag` records them.",
+        description="The definition in the format of .msg files. Each type that it refers to needs its own entry in "
+        "messages, or its definition here, after a line of = and a line `MSG: <type>`, as `ros2 bag` records it.",
     )
 
 

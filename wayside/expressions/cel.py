@@ -95,8 +95,8 @@ RESERVED_WORDS: Final = frozenset(_WORDS.split())
 """Words that CEL's grammar keeps for itself: no variable can have one as its name."""
 
 
-_LITERAL: Final = "write it in quotes, not as a parameter, a field or a sum"
-_SMALLER: Final = "a loop within a loop multiplies what it joins with `+`: join less"
+_LITERAL: Final = "write it in quotes; parameters, fields and sums are not allowed"
+_SMALLER: Final = "nested loops multiply the values that `+` joins: join fewer"
 
 
 class Environment:
@@ -117,7 +117,7 @@ class Environment:
             if not _NAME.fullmatch(name):
                 raise ValueError(f"variable {name!r}: not a CEL identifier; use letters, digits and `_`")
             if name in RESERVED_WORDS:
-                raise ValueError(f"variable {name!r}: a word that CEL reserves; choose another name")
+                raise ValueError(f"variable {name!r}: CEL reserves this word; choose another name")
         self.variables: Mapping[str, CelType] = MappingProxyType(dict(variables))
         self._members: Mapping[str, CelType] = MappingProxyType(dict(members or {}))
         self._env = _cel_environment(self.variables)
@@ -158,7 +158,7 @@ class Environment:
         _check_patterns(parsed, source)
         if growth(parsed) > MOST:
             raise ExpressionError(
-                f"a value in it would contain more than {MOST} copies of others", source=source, hint=_SMALLER
+                f"its value could contain more than {MOST} copies of other values", source=source, hint=_SMALLER
             )
         _check_static(typed.return_type(), result, source)
         expression = Expression(source, program, read, leaves, result, self.variables, whole.shapes)
@@ -326,7 +326,7 @@ def _check_patterns(node: Node, source: str) -> None:
         elif (size := pattern_size(literal)) > LARGEST_PATTERN:
             cut = literal if len(literal) <= 80 else f"{literal[:79]}…"
             message = f"the pattern {cut!r} takes {size} steps, more than the {LARGEST_PATTERN} of `matches`"
-            hint = "repeat less in it, or use smaller classes"
+            hint = "use fewer repetitions, or smaller character classes"
         else:
             continue
         line, column = position(source, names[index] if len(names) == len(found) else 0)

@@ -38,7 +38,7 @@ _SIGNS = {"=": "CEL compares with `==`", "&": "CEL writes `&&`", "|": "CEL write
 _QUOTE = (
     "a string is not closed, or YAML removed its quotes: quote the whole expression and use the other quotes inside"
 )
-_DEPTH = "at most 32 levels, where each operator of a chain like `a + b` is one: balance it with brackets"
+_DEPTH = "the maximum is 32 levels; each operator of a chain such as `a + b + c` adds one: group it with brackets"
 EMPTY = "YAML interprets a leading `!`, `#` or quote itself: put the whole expression in quotes, as in '!braking'"
 
 
@@ -144,7 +144,7 @@ def _after(source: str, at: int) -> str | None:
     if not before:
         return None
     if before[-1].kind in (TokenKind.INT, TokenKind.FLOAT):
-        return "a number takes no unit: metres, seconds and radians go without saying"
+        return "remove the unit: numbers are in metres, seconds and radians"
     return _WORDS.get(before[-1].text)
 
 

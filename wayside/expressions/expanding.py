@@ -38,7 +38,7 @@ FIELDS_AT: Final = {
 FIELDS_SEEN: Final = {
     "ahead": "metres to b along the direction of a; negative behind",
     "left": "metres to b across the direction of a, to the left; negative to the right",
-    "speedAhead": "the velocity of b less that of a, along the direction of a, m/s; negative where b falls back",
+    "speedAhead": "the velocity of b minus that of a, along the direction of a, m/s; negative if b falls back",
     "speedLeft": "the same to the left of a, m/s",
     "heading": "the direction of b against that of a, degrees in (-180, 180]; positive to the left",
 }

@@ -61,7 +61,7 @@ def _no_overload(operation: str) -> str:
     call = _CALL.search(operation)
     if call is not None and (function := FUNCTIONS.get(call[1])) is not None:
         given = ", ".join(_TYPES.get(kind, kind) for kind in call[2].split(", "))
-        return f"{function.usage()} takes {function.types()}, was given {given}"
+        return f"{function.usage()} takes {function.types()}, but got {given}"
     if call is None:
         return f"the operation does not take these types: {operation}"
     name = call[1].replace("_", "").lstrip("@") if not call[1].isalpha() else call[1]
@@ -70,7 +70,7 @@ def _no_overload(operation: str) -> str:
         text = f"`{name}` compares {kinds[0]} with {kinds[1]}"
     else:
         text = f"`{_NAMES.get(name, name)}` does not take {' and '.join(kinds)}"
-    return f"{text}: of bytes use {_OF_BYTES}" if "uint64" in operation else text
+    return f"{text}: for bytes, use {_OF_BYTES}" if "uint64" in operation else text
 
 
 def _a(kind: str) -> str:

@@ -182,7 +182,7 @@ class _RuleCompiler:
         over = None if signal.over is None else signal.over.ns
         only = None if stream is None or stream.names_by_message else stream.client
         if only is not None and signal.client not in (None, only):
-            self.problem((*at, "client"), f"stream {signal.stream} has no client but {only}: name that one")
+            self.problem((*at, "client"), f"stream {signal.stream} has only the client {only}: write client: {only}")
         if stream is not None and over is not None:
             kept = self.kept_ns(stream)
             if over > kept:

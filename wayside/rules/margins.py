@@ -39,7 +39,7 @@ def margin_of(spec: EventRuleSpec) -> str:
     for name in scales:
         if name not in quantities:
             known = ", ".join(sorted(quantities)) or "none"
-            raise MarginError(("spec", "margin", name), f"there is no signal {name} to scale; there is {known}")
+            raise MarginError(("spec", "margin", name), f"there is no signal {name} to scale; the rule has {known}")
     text = [token for token in tokens(spec.when) if token.kind not in _SPACE]
     found = _Margin(spec.when, scales, quantities)
     written = found.either(text)

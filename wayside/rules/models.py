@@ -92,7 +92,7 @@ def _signal_problems(names: Iterable[str], by_name: Mapping[str, Signal]) -> Ite
         elif signal.is_derived:
             yield (
                 ("signals", position),
-                f"{name} is computed from what conditions see and cannot be the input of a model",
+                f"{name} is not computed from a stream and cannot be the input of a model",
             )
 
 

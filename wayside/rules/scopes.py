@@ -183,6 +183,6 @@ def closing_speed_problem(stream: Stream | None, kept: int) -> str | None:
     if stream is None or kept > CLOSING_NS:
         return None
     return (
-        f"closingSpeed needs the samples of 1 s, but stream {stream.name} is kept for {kept / 1e9:g} s only: "
+        f"closingSpeed needs samples of the last second, but stream {stream.name} is kept for {kept / 1e9:g} s only: "
         "raise the stream's buffer.duration to 2s or more"
     )

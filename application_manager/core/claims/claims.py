@@ -152,7 +152,7 @@ def _on_what_runs(template: ApplicationTemplate, task: ApplicationTask, given: M
 
 
 def _which(of_key: frozenset[str]) -> str:
-    return f" ({', '.join(sorted(of_key))} of the key only identify the instance)" if of_key else ""
+    return f" (parameters of the key only identify the instance: {', '.join(sorted(of_key))})" if of_key else ""
 
 
 def _key_or_refusal(template: ApplicationTemplate, given: Mapping[str, Any]) -> str | Refusal:

@@ -21,7 +21,7 @@ def pattern_problem(pattern: str) -> str | None:
     """Why the pattern is none, or None if it is."""
     if (size := pattern_size(pattern)) > LARGEST_PATTERN:
         return (
-            f"{values.shown(pattern)} takes {size} steps, more than {LARGEST_PATTERN}: repeat less in it, or use "
+            f"{values.shown(pattern)} takes {size} steps, more than {LARGEST_PATTERN}: use fewer repetitions, or "
             "smaller classes"
         )
     try:

@@ -145,10 +145,10 @@ def turned(verdict: Verdict, task: str, to: Fallback | None, others: Mapping[str
     found = others.get(task)
     if refusal is None and found is not None and found.standing is Standing.COUNTS:
         message = (
-            f"instance {verdict.instance} is not ready: instance {found.instance} of template {to.template} serves "
-            "the task"
+            f"instance {verdict.instance} is not ready; until it is, instance {found.instance} of template "
+            f"{to.template} serves the task"
         )
-        return replace(found, reason=FALLEN_BACK, message=f"{message} until then")
+        return replace(found, reason=FALLEN_BACK, message=message)
     if refusal is None and found is None:
         return verdict
     why = refusal or (found.message if found else "")

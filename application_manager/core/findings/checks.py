@@ -5,7 +5,7 @@ from __future__ import annotations
 from wayside.findings import INVALID_DETECTOR, UNREADABLE_FILE, Check, Severity
 
 INVALID_TEMPLATE = Check("invalid-template", Severity.ERROR, "an ApplicationTemplate cannot be rendered")
-INVALID_RULE = Check("invalid-rule", Severity.ERROR, "an EventRule compiles with no Detector that selects it")
+INVALID_RULE = Check("invalid-rule", Severity.ERROR, "an EventRule does not compile with any Detector that selects it")
 RULE_NOT_SELECTED = Check("rule-not-selected", Severity.WARNING, "no valid Detector selects the EventRule")
 RULE_NOT_READY = Check(
     "rule-not-ready",

@@ -24,9 +24,10 @@ _SHOWN = 5  # values that there are, in a message
 
 @dataclass(frozen=True, slots=True)
 class _Required:
-    """One requirement: in words, and whether a node of this name and labels meets it."""
+    """A requirement: the message if no node meets it, its field and value, and whether a node meets it."""
 
     words: str
+    wanted: str
     key: str
     meets: Callable[[str, Labels], bool]
 
@@ -48,7 +49,7 @@ def misplaced(live: Mapping[str, Any], nodes: Nodes) -> Trouble | None:
     if unmet:
         words = "; ".join(f"{each.words}{_instead(each.key, nodes)}" for each in unmet)
     else:
-        words = f"{' and '.join(each.words for each in required)} at once"
+        words = f"no node meets all requirements: {'; '.join(each.wanted for each in required)}"
     what = f"{live['kind']} {live['metadata']['name']}"
     message = f"{what} fits no node: {words}. Correct the value, or label a node"
     return Trouble(TroubleReason.UNSCHEDULABLE, message)
@@ -62,15 +63,18 @@ def _at(value: Any, *path: str) -> Mapping[str, Any]:
 
 def _required(spec: Mapping[str, Any]) -> Iterator[_Required]:
     if name := spec.get("nodeName"):
-        yield _Required(f"nodeName: there is no node {name}", "", partial(_is_named, name))
+        yield _Required(f"nodeName: there is no node {name}", f"nodeName {name}", "", partial(_is_named, name))
     for key, value in sorted((spec.get("nodeSelector") or {}).items()):
-        yield _Required(f"nodeSelector: no node has the label {key}={value}", key, partial(_is_labelled, key, value))
+        label = f"{key}={value}"
+        words, wanted = f"nodeSelector: no node has the label {label}", f"nodeSelector {label}"
+        yield _Required(words, wanted, key, partial(_is_labelled, key, value))
     affinity = _at(spec, "affinity", "nodeAffinity", "requiredDuringSchedulingIgnoredDuringExecution")
     terms = [each for each in affinity.get("nodeSelectorTerms") or () if _expressions(each)]
     if terms:
-        words = "affinity.nodeAffinity: no node has " + ", or ".join(_words(each) for each in terms)
+        listed = ", or ".join(_words(each) for each in terms)
+        words, wanted = f"affinity.nodeAffinity: no node has {listed}", f"affinity.nodeAffinity {listed}"
         keys = {key for each in terms for key, _, _ in _expressions(each)}
-        yield _Required(words, keys.pop() if len(keys) == 1 else _SEVERAL, partial(_meets_any, terms))
+        yield _Required(words, wanted, keys.pop() if len(keys) == 1 else _SEVERAL, partial(_meets_any, terms))
 
 
 def _is_named(wanted: str, name: str, _: Labels) -> bool:

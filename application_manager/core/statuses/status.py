@@ -236,8 +236,8 @@ def suspension_aspect(
     whose = f"task {decision.suspender} suspends it" if decision.suspender else "spec.suspended is true"
     if left:
         return Aspect("Suspended", False, "Stopping", f"{whose}: {', '.join(left)} left")
-    resting = "".join(f"; HorizontalPodAutoscaler {each} is inactive until then" for each in autoscalers(there))
-    return Aspect("Suspended", True, "Suspended", f"{whose}, and its workloads are at zero{resting}")
+    resting = "".join(f"; HorizontalPodAutoscaler {each} is inactive until it resumes" for each in autoscalers(there))
+    return Aspect("Suspended", True, "Suspended", f"{whose}; its workloads are scaled to zero{resting}")
 
 
 def _stalled(phase: InstancePhase, applied: Aspect, ready: Aspect, decision: Decision) -> list[Aspect]:

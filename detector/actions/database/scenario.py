@@ -171,9 +171,9 @@ def why_incomplete(scenario: Scenario, episode: Episode | None, completion: Comp
     if completion.cut:
         reasons.append(completion.cut)
     if scenario.resumed:
-        reasons.append("an earlier run of the detector saw the start of the episode")
+        reasons.append("the episode started in an earlier run of the detector")
     if episode is not None and episode.end_time is None and not completion.cut:
-        reasons.append("this run did not see its end")
+        reasons.append("the episode did not end in this run")
     return "; ".join(reasons)
 
 

@@ -137,7 +137,7 @@ class DatabaseWriter:
             except Exception as error:  # noqa: BLE001  a defect, or a disk: the queue continues, since requests are idempotent
                 self._lose("times the database queue was restarted", 1, self._server.redact(error))
                 _log.error("database: restarting the queue: %s", type(error).__name__)
-                _log.debug("in the queue", exc_info=error)
+                _log.debug("the database queue failed", exc_info=error)
                 time.sleep(_RESTART_DELAY)
         self._leave()
 

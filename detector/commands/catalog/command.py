@@ -45,7 +45,7 @@ def command(
             ),
         ),
     ] = None,
-    form: Annotated[Format, typer.Option("--format", help="Markdown, JSON and HTML are text.")] = Format.TABLE,
+    form: Annotated[Format, typer.Option("--format", help="The output format.")] = Format.TABLE,
     output: Annotated[Path | None, typer.Option(help="Write into this file. Default: print.")] = None,
 ) -> None:
     """List rules by the dimensions and values of the classification scheme."""

@@ -50,7 +50,8 @@ def image(payload: bytes) -> NDArray[np.float32]:
     row = width * depth * number.itemsize
     step = int(message.step) or row
     if height == 0 or width == 0 or step < row or len(message.data) < step * (height - 1) + row:
-        raise DecodeError(f"image of {width} x {height} {message.encoding} with step {step}: {len(message.data)} bytes")
+        size = len(message.data)
+        raise DecodeError(f"image of {width} x {height} {message.encoding} with step {step} does not fit {size} bytes")
     rows = np.lib.stride_tricks.as_strided(message.data, (height, row), (step, 1))
     pixels = np.ascontiguousarray(rows).view(number).reshape(height, width, depth).astype(np.float32)
     return pixels if depth == 1 else pixels[:, :, [channels.index(name) for name in "rgb"]]
@@ -89,7 +90,8 @@ def points(payload: bytes, fields: list[str]) -> NDArray[np.float64]:
         return np.zeros((0, len(fields)))
     last = (height - 1) * row + (width - 1) * step
     if any(last + offset + kind.itemsize > len(message.data) for kind, offset in columns) or step == 0:
-        raise DecodeError(f"{width} x {height} points of {step} bytes in rows of {row}: {len(message.data)} bytes")
+        size = len(message.data)
+        raise DecodeError(f"{width} x {height} points of {step} bytes in rows of {row} do not fit {size} bytes")
     found = np.empty((height * width, len(read)))
     for index, (kind, offset) in enumerate(columns):
         at = np.ndarray((height, width), kind, message.data, offset, (row, step))

@@ -144,7 +144,7 @@ def test_the_fallback_serves_with_what_it_knows_and_the_first_one_tries_on() -> 
     verdict = outcome.verdicts["a"]
     assert (verdict.standing, verdict.reason, verdict.instance) == (Standing.COUNTS, "FallenBack", LITE_NORTH)
     assert verdict.message == (
-        f"instance {NORTH} is not ready: instance {LITE_NORTH} of template lite serves the task until then"
+        f"instance {NORTH} is not ready; until it is, instance {LITE_NORTH} of template lite serves the task"
     )
 
 

@@ -143,7 +143,7 @@ def test_on_demand_a_rule_is_evaluated_on_request_and_reports_each_subject() -> 
 
 def test_only_rules_with_on_demand_can_be_evaluated_on_demand() -> None:
     drive = Drive(a_detector(), fast(), fast("q", evaluation={"onDemand": True}))
-    with pytest.raises(NoAnswerError, match="there is no rule x; there is q, r"):
+    with pytest.raises(NoAnswerError, match="there is no rule x; the detector has q, r"):
         drive.engine.evaluate_now("x")
     with pytest.raises(NoAnswerError, match="rule r is not evaluated on demand"):
         drive.engine.evaluate_now("r")

@@ -237,7 +237,7 @@ def test_a_stream_that_goes_stale_between_its_samples_is_named(
     lines = [{"t": at(8.0 * n), "key": "vehicles/car/speed", "value": {"v": 3}} for n in range(10)]
     Path(drive).write_text("".join(json.dumps(line) + "\n" for line in lines))
     ran(monkeypatch, "check", detector, rules, "--recording", drive)
-    logged = "samples of stream speed arrive every 8 s and go stale after 5 s, so EventRule fast finds them unknown"
+    logged = "samples of stream speed arrive every 8 s and go stale after 5 s, so EventRule fast has unknown values"
     warned = capsys.readouterr().err
     assert logged in warned
     assert " [stale-between-samples]" in warned

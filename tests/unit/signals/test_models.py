@@ -234,7 +234,7 @@ def test_of_too_many_points_every_nth_is_taken(tmp_path: Path) -> None:
     ("payload", "logged"),
     [
         (an_image(np.uint8([[[1, 2, 3]]]), "yuv422"), "image encoding 'yuv422' is not supported; use one of mono8"),
-        (an_image(np.uint8([[[1, 2, 3]]]), height=9), "image of 1 x 9 rgb8 with step 3: 3 bytes"),
+        (an_image(np.uint8([[[1, 2, 3]]]), height=9), "image of 1 x 9 rgb8 with step 3 does not fit 3 bytes"),
         (b"\0\1\0\0nonsense", "not a valid sensor_msgs/msg/Image"),
     ],
 )

@@ -79,5 +79,7 @@ def test_a_client_is_named_for_a_stream_or_a_rule(signal: dict[str, Any], proble
 
 def test_another_client_than_the_only_one_of_a_stream_is_refused_at_its_field() -> None:
     detector = a_detector({"name": "state", "key": "lights/state", "encoding": "json", "client": "light-1"})
-    with pytest.raises(RuleError, match=r"signals\[0\].client: stream state has no client but light-1: name that one"):
+    with pytest.raises(
+        RuleError, match=r"signals\[0\].client: stream state has only the client light-1: write client: light-1"
+    ):
         compiled(detector, a_rule(signals=[LIGHT], when="light == 'red'"))

@@ -101,7 +101,8 @@ def test_the_instance_reports_who_suspends_it_what_is_left_and_what_rests() -> N
     assert logged(stopped, live(0, 0), scaler, None) == (
         "True",
         "Suspended",
-        "task night suspends it, and its workloads are at zero; HorizontalPodAutoscaler scaler is inactive until then",
+        "task night suspends it; its workloads are scaled to zero; "
+        "HorizontalPodAutoscaler scaler is inactive until it resumes",
     )
 
 

@@ -20,7 +20,7 @@ def of_list(calculate: Callable[[list[float]], float]) -> Callable[[object], flo
             if item is not None and item == item  # noqa: PLR0124 (NaN alone differs from itself)
         ]
         if not known:
-            raise ValueError("no value for values: none of the list is known")
+            raise ValueError("no value for values: no item of the list is known")
         return calculate(known)
 
     return calculated
@@ -29,7 +29,7 @@ def of_list(calculate: Callable[[list[float]], float]) -> Callable[[object], flo
 def square_root(x: float) -> float:
     """Of a number that is not negative."""
     if x < 0:
-        raise ValueError(f"sqrt of {x:g}: give a number from 0 on")
+        raise ValueError(f"sqrt of {x:g}: give 0 or a positive number")
     return math.sqrt(x)
 
 

@@ -157,7 +157,7 @@ def _algorithm(case: Case) -> Iterator[RuleProblem]:
     if case.only(DetectionAlgorithm.LEARNING_BASED) and not models and not plugins:
         yield case.against(
             DetectionAlgorithm.LEARNING_BASED,
-            "no signal that decides comes from a model or a plugin: write RuleBased, or add it if the rule's input "
+            "no signal that decides comes from a model or a plugin: write RuleBased, or both if the rule's input "
             "comes from a learnt algorithm",
         )
 
@@ -205,58 +205,58 @@ CONTRADICTIONS = (
     Contradiction(
         "classification-sender",
         TypeOfParticipants,
-        "the rule looks at a stream of VAM without VRU, or of SPATEM or MAPEM without RoadInfrastructure",
+        "the rule reads a stream of VAM, but VRU is missing; or of SPATEM or MAPEM, but RoadInfrastructure is missing",
         _senders,
     ),
     Contradiction(
         "classification-participants",
         NumberOfParticipants,
-        "One alone, and the scope is pairs or the fleet",
+        "only One, but the scope is pairs or the fleet",
         _one_of_several,
     ),
     Contradiction(
         "classification-detecting-entity",
         EventDetectionEntity,
-        "External alone, and numberOfParticipants One: two take part",
+        "only External, but numberOfParticipants is One: two entities take part",
         _one_and_external,
     ),
     Contradiction(
         "classification-acting-entity",
         ActingEntity,
-        "External alone, and all actions are record or database",
+        "only External, but all actions are record or database",
         _records_itself,
     ),
     Contradiction(
         "classification-observation-period",
         ObservationPeriod,
-        "no value fits the time that the rule looks back, with windows, for, models and the rules that it names: "
+        "no value fits the time that the rule looks back (by windows, for, models and the rules that it reads): "
         "Immediate is below 2 s, ShortTerm below 1 h and more than the newest samples, LongTerm is 1 h or more",
         _observed,
     ),
     Contradiction(
         "classification-time-sensitivity",
         TimeSensitivity,
-        "Immediate alone, and evaluation.every with the grouping of notifications delays the action by 2 s or more; "
-        "or without LongTerm by 1 h or more",
+        "only Immediate, but evaluation.every and notify.grouping delay the action by 2 s or more; or no LongTerm, but "
+        "they delay it by 1 h or more",
         _late,
     ),
-    Contradiction("classification-incidence", Incidence, "Rare or Unexpected, and when always holds", _always),
+    Contradiction("classification-incidence", Incidence, "Rare or Unexpected, but when always holds", _always),
     Contradiction(
         "classification-algorithm",
         DetectionAlgorithm,
-        "RuleBased alone with a model that decides, or LearningBased alone without a model or plugin that does",
+        "only RuleBased, but a model decides; or only LearningBased, but no model or plugin decides",
         _algorithm,
     ),
     Contradiction(
         "classification-missing-action-type",
         TypeOfAction,
-        "an action whose type is not named: deploy needs Deployment (Reconfigure: Reconfiguration; Suspend: "
+        "the type of an action is missing: deploy needs Deployment (Reconfigure: Reconfiguration; Suspend: "
         "Reconfiguration or Other), record, database and trigger.detector need DataCollection (but not beside a notify "
         "action with Notification: that is a report), notify.alertmanager needs Notification",
         _unnamed_action,
     ),
     Contradiction(
-        "classification-unused-action-type", TypeOfAction, "a type that no action of the rule can be", _unaccounted_type
+        "classification-unused-action-type", TypeOfAction, "no action of the rule has this type", _unaccounted_type
     ),
 )
 """All of them, in the order of the scheme."""
