@@ -248,8 +248,8 @@ def breaks(stage: Stage) -> None:
     stage.pod("registry.example/scene-fusion:2")
     stage.cannot_pull("registry.example/scene-fusion:2", NOT_FOUND)
     mark_pods_ready(stage.api, "app.kubernetes.io/name=scene-recorder")
-    tasks = {f"record {PAIR}": "Ready", f"fuse {PAIR}": "Active: cannot be pulled"} | both(OTHERS, OVER)
-    stage.wait(tasks, {RECORDER: "Ready", FUSION: "Applied: cannot be pulled"})
+    tasks = {f"record {PAIR}": "Ready", f"fuse {PAIR}": "Active: cannot pull image"} | both(OTHERS, OVER)
+    stage.wait(tasks, {RECORDER: "Ready", FUSION: "Applied: cannot pull image"})
 
 
 def mended(stage: Stage) -> None:
