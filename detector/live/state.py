@@ -97,7 +97,7 @@ class StateFile:
         try:
             self.path.rename(aside)
         except OSError as refused:
-            _log.error("cannot read %s, nor set it aside (%s): %s", self.path, refused, error)
+            _log.error("cannot read %s: %s; cannot set it aside either: %s", self.path, error, refused)
         else:
             _log.error("cannot read the state; set it aside as %s and restored nothing from it: %s", aside, error)
 

@@ -69,7 +69,7 @@ class Lifecycle(Model):
     )
     minimum_uptime: Duration = Field(
         default=Duration("0s"),
-        description="The minimum lifetime of an instance, from its creation. Until then, the instance is neither "
+        description="The minimum lifetime of an instance, from its creation. Before that, the instance is neither "
         "released nor preempted.",
     )
     ready_timeout: PositiveDuration | None = Field(

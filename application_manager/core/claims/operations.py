@@ -159,18 +159,15 @@ def _stop_verdict(name: str, each: Claim, served: Sequence[Claim], runs: bool) -
 
 
 def _waiting(name: str, each: Claim) -> Verdict:
-    message = (
-        f"no task deploys instance {name}, and a {each.operation} task starts nothing: it takes effect once a task "
-        "deploys it"
-    )
+    message = f"no task deploys instance {name}: this {each.operation} task waits until a Deploy task does"
     return Verdict(Standing.WAITING, NOTHING_RUNS, message)
 
 
 def waiting_for_any(claim: Claim) -> Verdict:
     """The verdict of a task that means all instances of a template that has none."""
     message = (
-        f"no task deploys an instance of template {template_of_all(claim.instance)}, and a {claim.operation} task "
-        "starts nothing: it takes effect once a task deploys one"
+        f"no task deploys an instance of template {template_of_all(claim.instance)}: this {claim.operation} task "
+        "waits until a Deploy task does"
     )
     return Verdict(Standing.WAITING, NOTHING_RUNS, message)
 

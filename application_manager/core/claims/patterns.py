@@ -22,7 +22,7 @@ def pattern_problem(pattern: str) -> str | None:
     if (size := pattern_size(pattern)) > LARGEST_PATTERN:
         return (
             f"{values.shown(pattern)} takes {size} steps, more than {LARGEST_PATTERN}: use fewer repetitions, or "
-            "smaller classes"
+            "smaller character classes"
         )
     try:
         _matcher(pattern).evaluate({"text": ""})

@@ -88,7 +88,7 @@ def test_a_reconfiguration_starts_nothing_and_waits_visibly() -> None:
         assert outcome.instances == {}
         verdict = outcome.verdicts["c"]
         assert (verdict.standing, verdict.reason, verdict.instance) == (Standing.WAITING, "NothingRuns", None)
-        assert "starts nothing" in verdict.message
+        assert "waits until a Deploy task does" in verdict.message
 
 
 def test_what_lingers_is_not_reconfigured() -> None:
