@@ -134,7 +134,7 @@ def test_explain_knows_what_has_no_place_and_what_replaces_what(
     api.wait_for("ApplicationTask", "south", lambda raw: raw.get("status", {}).get("phase") == "Waiting", what="waits")
 
     north = explain(control_plane, api, "task/north").stdout
-    assert f"Counts, FallenBack: instance {NORTH} is not ready: instance {instead} of template lite serves" in north
+    assert f"Counts, FallenBack: instance {NORTH} is not ready; until it is, instance {instead} of template" in north
     assert "\ntemplate app\n" in north
     assert f"\ninstance {instead} of template lite (" in north
     assert '"north" of north is it' in north

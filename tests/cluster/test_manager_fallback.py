@@ -73,7 +73,7 @@ def test_the_fallback_serves_until_the_first_one_is_ready_also_after_restarts(
     api.create(task("north"))
     fallen = wait_accepted(api, "north", "FallenBack")
     assert fallen["status"]["instanceName"] == LITE
-    assert f"instance {FULL} is not ready: instance {LITE} of template lite serves" in fallen["status"]["message"]
+    assert f"instance {FULL} is not ready; until it is, instance {LITE} of template lite" in fallen["status"]["message"]
     become_ready(api, LITE)
     api.wait_for("ApplicationTask", "north", lambda raw: raw["status"]["phase"] == "Ready", what="the fallback serves")
     wait_condition(api, FULL, "TimedOut", "True", LITE)
