@@ -33,7 +33,7 @@ def test_an_expression_that_multiplies_a_value_without_end_is_refused(start: str
     environment = Environment({"v": CelType.DYN, "client": CelType.STRING})
     with pytest.raises(ExpressionError, match="more than 1000 copies") as caught:
         environment.compile(f"size({multiplied(start, 4, 5)}) > 1")
-    assert "join less" in str(caught.value)
+    assert "join fewer" in str(caught.value)
     environment.compile(f"size({multiplied(start, 3, 3)}) > 1")
 
 
