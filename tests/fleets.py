@@ -64,6 +64,7 @@ spec:
     pairs: {position: {stream: odom, x: msg.x, y: msg.y}, within: 120}
   signals: [{name: speed, stream: odom, value: msg.speed}]
   when: distance < 50 && a.speed > 0
+  margin: {distance: 10, speed: 5}
   until: distance > 70
 """
 

@@ -88,6 +88,8 @@ def why_whole(engine: Engine, rule: CompiledRule) -> str | None:
         return "the fleet" if isinstance(rule.subject, FleetSubject) else "pairs"
     if any(signal.rule is not None for signal in signals_of(rule)):
         return "other rules' episodes"
+    if rule.has_margin:
+        return "margin"
     if rule.maximum_per_hour is not None:
         return "maxEpisodesPerHour"
     if rule.actions:

@@ -4,6 +4,7 @@
     recordings.parquet                  a row for each recording
     rules.parquet                       for each recording and rule: how its evaluations went
     streams.parquet                     for each recording and stream: the quality of the data
+    nearest.parquet                     for each recording and rule with a margin: its near misses
     errors.parquet                      what is wrong with recordings, and with rules over them
 
 The rows have a defined order, so the same results give the same bytes, however they were computed.
@@ -19,9 +20,10 @@ from typing import Any, NamedTuple
 
 from detector.mining.work import Mined
 from detector.results.episodes import EpisodeRow, merged_kind, table_of, value_kinds
+from detector.results.nearest import nearest_by_rule
 
 EPISODES = "episodes"
-TABLES = ("recordings", "rules", "streams", "errors")
+TABLES = ("recordings", "rules", "streams", "nearest", "errors")
 _ROWS = 50_000
 """Of a row group."""
 
@@ -117,6 +119,7 @@ def _tables(recordings: Iterable[MinedRecording]) -> dict[str, tuple[dict[str, A
     whole: list[tuple[object, ...]] = []
     counts: list[tuple[object, ...]] = []
     streams: list[tuple[object, ...]] = []
+    nearest: list[tuple[object, ...]] = []
     errors: list[tuple[object, ...]] = []
     for recording in recordings:
         parts = recording.parts()
@@ -126,6 +129,8 @@ def _tables(recordings: Iterable[MinedRecording]) -> dict[str, tuple[dict[str, A
             own = [episode.rule for episode in part.episodes]
             counts += [(name, c.rule, own.count(c.rule), c.evaluations, c.unknown, c.errors) for c in part.counts]
         streams += [(name, *row) for row in _stream_rows(parts)]
+        near = nearest_by_rule(each for part in parts for each in part.nearest)
+        nearest += [(name, each.rule, each.subject, each.time, each.margin) for each in near]
         flaws = {flaw for part in parts for flaw in part.flaws}
         errors += [(name, flaw.kind, flaw.rule, flaw.message) for flaw in sorted(flaws, key=_flaw_order)]
     return {
@@ -145,6 +150,7 @@ def _tables(recordings: Iterable[MinedRecording]) -> dict[str, tuple[dict[str, A
              "last_unreadable": text, "unnamed": number},
             streams,
         ),
+        "nearest": ({"recording": text, "rule": text, "subject": text, "time": time, "margin": double}, nearest),
         "errors": ({"recording": text, "kind": text, "rule": text, "message": text}, errors),
     }  # fmt: skip
 

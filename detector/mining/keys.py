@@ -11,7 +11,7 @@ from pathlib import Path
 from detector.replay.clips import RECORD
 from wayside.api import Detector, EventRule
 
-_LAYOUT = 1
+_LAYOUT = 2
 """The version of the cached layout: results of earlier versions are not read."""
 
 

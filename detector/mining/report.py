@@ -11,6 +11,7 @@ from urllib.parse import quote
 from detector.mining.dataset import EPISODES
 from detector.mining.summary import Summary
 from detector.results.report import html_page
+from wayside.times import format_time
 
 REPORT = "report.html"
 _EPISODES = 200
@@ -78,6 +79,16 @@ def _sections(folder: Path, summary: Summary) -> Iterator[str]:
         ],
         len(summary.recordings),
     )
+    if summary.nearest:
+        yield _section(
+            "Nearest without an episode",
+            "Of rules with a margin: at most 0 if the condition did not hold; more if it held for too short a time.",
+            ["rule", "recording", "subject", "time", "#margin"],
+            [
+                [each.rule, each.recording, each.subject, format_time(each.time), f"{each.margin:.3g}"]
+                for each in summary.nearest
+            ],
+        )
     if summary.errors:
         rows = [[each["recording"], each["kind"], each["rule"] or "", each["message"]] for each in summary.errors]
         yield _section("Errors", "", ["recording", "kind", "rule", "message"], rows[:_ROWS], len(rows))

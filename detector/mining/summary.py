@@ -1,4 +1,4 @@
-"""A summary of a dataset: episodes by rule and by recording, and the rarest ones."""
+"""A summary of a dataset: episodes by rule and by recording, the rarest ones, and the nearest moments without one."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from detector.mining.dataset import EPISODES
+from detector.results.nearest import NearMoment, nearest_by_rule, show_moments
 
 _RECORDINGS = 10
 """Maximum number of listed recordings."""
@@ -51,6 +52,8 @@ class Summary:
     recordings: list[tuple[str, dict[str, int]]]
     """Their episodes by rule; the recordings with most episodes first. Recordings without episodes are left out."""
     rarest: list[RareEpisode]
+    nearest: list[NearMoment]
+    """The near misses of all recordings, by rule."""
     errors: list[dict[str, Any]]
     """The rows of errors.parquet."""
     recordings_read: int
@@ -85,6 +88,7 @@ def summary_of(folder: Path) -> Summary:
         rules,
         sorted(by_recording.items(), key=lambda each: (-sum(each[1].values()), each[0])),
         _rarest(folder, rules),
+        _nearest(folder),
         pq.read_table(folder / "errors.parquet").to_pylist(),
         sum(row["samples"] > 0 for row in whole),
         sum(row["samples"] for row in whole),
@@ -105,6 +109,15 @@ def _rarest(folder: Path, rules: list[RuleSummary]) -> list[RareEpisode]:
             for row in batch.to_pylist():
                 found.append(RareEpisode(rule.rule, row["recording"], row["subject"], row["start_time"]))
     return found
+
+
+def _nearest(folder: Path) -> list[NearMoment]:
+    """The near misses of all recordings, by rule."""
+    import pyarrow.parquet as pq  # noqa: PLC0415
+
+    table = pq.read_table(folder / "nearest.parquet")
+    table = table.set_column(table.schema.get_field_index("time"), "time", table.column("time").cast("int64"))
+    return nearest_by_rule(NearMoment(**row) for row in table.to_pylist())
 
 
 def show(console: Console, summary: Summary) -> None:
@@ -130,6 +143,9 @@ def show(console: Console, summary: Summary) -> None:
         for each in summary.rarest:
             start = each.start.isoformat(sep=" ", timespec="milliseconds")
             console.print(f"  {each.rule}: {each.subject} in {each.recording} at {start}", highlight=False)
+    if summary.nearest:
+        console.print()
+        show_moments(console, summary.nearest)
 
 
 def _table(*names: str, justify_last: Any = "right") -> Table:

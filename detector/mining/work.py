@@ -23,6 +23,7 @@ from detector.replay.gathering import Recording
 from detector.replay.playing import play
 from detector.replay.replaying import Outcome
 from detector.results.episodes import EpisodeRow
+from detector.results.nearest import NearMoment
 from detector.results.quality import Arrivals, StreamQuality
 from detector.results.result import Result, result_of
 from detector.results.tracing import Tracer
@@ -61,6 +62,8 @@ class Mined(msgspec.Struct):
     counts: list[RuleCount] = []
     streams: list[StreamQuality] = []
     flaws: list[Flaw] = []
+    nearest: list[NearMoment] = []
+    """The near misses of rules with a margin; they name no recording."""
     clips: dict[str, list[str]] = {}
     """By episode, the folders of its clips, in the folder of the job."""
     samples: int = 0
@@ -163,6 +166,7 @@ def mined_of(result: Result, wanted: frozenset[str]) -> Mined:
         episodes=in_their_order(episodes),
         counts=[RuleCount(name, *counts) for name, counts in sorted(result.counts.items()) if name in wanted],
         streams=[*result.streams],
+        nearest=[each._replace(recording="") for each in result.nearest if each.rule in wanted],
         samples=result.samples,
     )
 

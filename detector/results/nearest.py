@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
+
+from rich.console import Console
+from rich.table import Table
 
 from detector.results.episodes import EpisodeRow
 from detector.results.series import SubjectTrace
@@ -28,7 +32,7 @@ class NearMoment(NamedTuple):
     time: int
     """Nanoseconds since the epoch."""
     margin: float
-    """At most 0 if the condition did not hold; more if it held for too short a time."""
+    """At most 0 if the condition did not hold; more if it held for too short a time. Finite."""
 
 
 def nearest_moments(
@@ -38,20 +42,24 @@ def nearest_moments(
     spans: dict[tuple[str, str], list[tuple[int, int | None]]] = {}
     for episode in episodes:
         spans.setdefault((episode.rule, episode.subject), []).append((episode.onset_time, episode.end_time))
-    found: dict[str, list[NearMoment]] = {}
+    found: list[NearMoment] = []
     for trace in subjects:
         rule = rules.get(trace.rule)
         if rule is not None and rule.has_margin and "margin" in trace.signals:
             series = trace.signals["margin"]
             times, values = series.times.tolist(), series.values.tolist()
             for time, margin in _peaks(times, values, spans.get((trace.rule, trace.subject), ())):
-                found.setdefault(trace.rule, []).append(NearMoment(recording, trace.rule, trace.subject, time, margin))
-    return [near for rule in sorted(found) for near in listed(found[rule])]
+                if math.isfinite(margin):
+                    found.append(NearMoment(recording, trace.rule, trace.subject, time, margin))
+    return nearest_by_rule(found)
 
 
-def listed(moments: Iterable[NearMoment]) -> list[NearMoment]:
-    """The nearest of these moments, in order."""
-    return sorted(moments, key=lambda each: (-each.margin, each.time, each.subject))[:MOST]
+def nearest_by_rule(moments: Iterable[NearMoment]) -> list[NearMoment]:
+    """The nearest of these moments by rule, those with the largest margin first."""
+    by_rule: dict[str, list[NearMoment]] = {}
+    for each in sorted(moments, key=lambda each: (each.rule, -each.margin, each.time, each.recording, each.subject)):
+        by_rule.setdefault(each.rule, []).append(each)
+    return [each for own in by_rule.values() for each in own[:MOST]]
 
 
 def _peaks(
@@ -96,3 +104,18 @@ def write_moments(path: Path, moments: Sequence[NearMoment]) -> None:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(NearMoment._fields)
         writer.writerows([each._replace(time=format_time(each.time)) for each in moments])  # type: ignore[arg-type]
+
+
+def show_moments(console: Console, moments: Sequence[NearMoment]) -> None:
+    """Print them as a table; the recordings have a column if there are several."""
+    several = len({each.recording for each in moments}) > 1
+    table = Table(
+        box=None, header_style="bold", pad_edge=False, title="nearest without an episode", title_justify="left"
+    )
+    for name in ("rule", *(["recording"] if several else []), "subject", "time"):
+        table.add_column(name, overflow="fold")
+    table.add_column("margin", justify="right")
+    for each in moments:
+        where = [each.recording] if several else []
+        table.add_row(each.rule, *where, each.subject, format_time(each.time), f"{each.margin:.3g}")
+    console.print(table)

@@ -119,11 +119,7 @@ def data_of(result: Result) -> dict[str, Any]:
         ],
         "deedCount": len(deeds),
         "demands": _demands(deeds, table),
-        "nearest": [
-            [each.rule, each.subject, table.seconds(each.time), each.margin]
-            for each in result.nearest
-            if math.isfinite(each.margin)
-        ],
+        "nearest": [[each.rule, each.subject, table.seconds(each.time), each.margin] for each in result.nearest],
         "streams": [
             {
                 "stream": each.stream, "key": each.key, "encoding": each.encoding, "samples": each.samples,

@@ -14,12 +14,11 @@ from detector.replay.replaying import Outcome
 from detector.results.episodes import EpisodeRow, write_csv, write_parquet
 from detector.results.installed import check_package
 from detector.results.kinds import ResultKind
-from detector.results.nearest import NearMoment, listed
+from detector.results.nearest import NearMoment, nearest_by_rule, show_moments
 from detector.results.nearest import write_moments as write_nearest
 from detector.results.quality import Arrivals
 from detector.results.result import Result, result_of
 from detector.results.tracing import Tracer
-from wayside.times import format_time
 
 _NEEDED = {ResultKind.REPORT: "bokeh", ResultKind.MCAP: "foxglove", ResultKind.EPISODES: "pyarrow"}
 
@@ -111,27 +110,12 @@ def show_summary(console: Console, results: Sequence[Result]) -> None:
         )
     console.print(table)
     if near := _nearest(results):
-        _show_nearest(console, near)
+        show_moments(console, near)
 
 
 def _nearest(results: Sequence[Result]) -> list[NearMoment]:
     """The near misses of all recordings, rule by rule."""
-    every = [each for result in results for each in result.nearest]
-    return [
-        each for rule in sorted({each.rule for each in every}) for each in listed(e for e in every if e.rule == rule)
-    ]
-
-
-def _show_nearest(console: Console, near: Sequence[NearMoment]) -> None:
-    table = Table(
-        box=None, header_style="bold", pad_edge=False, title="nearest without an episode", title_justify="left"
-    )
-    for name in ("rule", "subject", "time"):
-        table.add_column(name, overflow="fold")
-    table.add_column("margin", justify="right")
-    for each in near:
-        table.add_row(each.rule, each.subject, format_time(each.time), f"{each.margin:.3g}")
-    console.print(table)
+    return nearest_by_rule(each for result in results for each in result.nearest)
 
 
 def _is_open(episode: EpisodeRow) -> bool:

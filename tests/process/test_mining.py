@@ -98,6 +98,29 @@ def test_episodes_are_those_of_a_replay_of_each_recording(fleet: Path, monkeypat
     ]
 
 
+def test_near_misses_are_those_of_a_replay_and_are_printed(fleet: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(fleet)
+    path = sorted(Path("drives").glob("car-*"))[0]
+    replay_files(
+        [path],
+        Path("alone"),
+        Path("detector.yaml"),
+        [Path("rules.yaml")],
+        as_one=False,
+        kinds=frozenset({ResultKind.EPISODES}),
+    )
+    columns = "rule, subject, CAST(time AS TIMESTAMPTZ), margin"
+    expected = requested(fleet, f"SELECT {columns} FROM 'alone/nearest.csv'")
+    found = requested(fleet, f"SELECT {columns} FROM 'out/nearest.parquet' WHERE recording LIKE '%{path.name}'")
+    assert {rule for rule, *_ in expected} == {"close"}
+    assert found == expected
+    ((highest,),) = requested(fleet, "SELECT max(margin) FROM 'out/nearest.parquet'")
+    title, printed = mine(fleet, "out").partition("nearest without an episode")[1:]
+    assert title
+    assert f"{highest:.3g}" in printed
+    assert "Nearest without an episode" in (fleet / "out/report.html").read_text()
+
+
 def test_the_question_of_the_guide_is_answered(fleet: Path) -> None:
     guide = (Path(__file__).parents[2] / "docs/mining.md").read_text()
     (question,) = re.findall(r"```sql\n(.*?);\n```", guide, re.DOTALL)
