@@ -40,7 +40,7 @@ STEPS = st.lists(
 )
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(STEPS)
 def test_it_has_what_was_put_and_not_dropped_in_this_order_whatever_happens(
     tmp_path_factory: pytest.TempPathFactory, steps: list[tuple[str, str, bytes]]
