@@ -30,7 +30,8 @@ class EpisodeTraces:
 
     def event(self, event: Event) -> Event:
         """The event with the trace context of its episode."""
-        return msgspec.structs.replace(event, traceparent=str(self._context(event.rule, event.episode)))
+        context = self._context(event.episode.rule, event.episode.id)
+        return msgspec.structs.replace(event, traceparent=str(context))
 
     def consequences(self, consequences: Sequence[Consequence]) -> list[Consequence]:
         """The same for the consequences of actions."""
@@ -43,14 +44,15 @@ class EpisodeTraces:
         """An episode ended: export its span."""
         if event.end_time is None or event.reason is None:
             return
+        episode = event.episode
         self.tracing.emit(
             Span(
-                _name(event.rule),
-                start=event.start_time,
+                _name(episode.rule),
+                start=episode.start_time,
                 end=event.end_time,
-                context=self._context(event.rule, event.episode),
+                context=self._context(episode.rule, episode.id),
                 attributes={
-                    **_about(event.holder, event.rule, event.subject, event.subjects, event.episode),
+                    **_about(event.holder, episode.rule, episode.subject, episode.clients, episode.id),
                     "wayside.reason": event.reason.value,
                 },
             )

@@ -18,7 +18,6 @@ from detector.actions.base import Action, ActionError
 from detector.actions.episode import Completion, Episode, Outcome, OutcomeState
 from detector.actions.outcomes import Outcomes, Which
 from detector.engine.consequences.consequences import Begun, Completed, Consequence, Over, Run, Sampled
-from detector.engine.episodes.events import Event
 from detector.engine.samples.sample import SAMPLE_OVERHEAD
 
 _log = logging.getLogger(__name__)
@@ -221,17 +220,17 @@ def _text(error: Exception) -> str:
 
 
 def _episode(begun: Begun) -> Episode:
-    event: Event = begun.event
+    event, episode = begun.event, begun.event.episode
     return Episode(
-        id=event.episode,
-        rule=event.rule,
-        subject=event.subject,
-        clients=event.subjects,
-        element=event.element,
-        onset_time=event.onset_time,
-        start_time=event.start_time,
-        values=event.values,
-        classification=event.classification,
+        id=episode.id,
+        rule=episode.rule,
+        subject=episode.subject,
+        clients=episode.clients,
+        element=episode.element,
+        onset_time=episode.onset_time,
+        start_time=episode.start_time,
+        values=episode.values,
+        classification=episode.classification,
         rendered=begun.rendered.values,
         unrendered=begun.rendered.problems,
         started=event.cloud_event(),

@@ -136,7 +136,7 @@ def test_a_demand_is_held_from_the_start_of_its_episode_to_its_end() -> None:
     assert (demand.rule, demand.action, demand.template, demand.priority) == ("near", "x", "app", 3)
     assert demand.operation == "Suspend"
     assert (demand.holder, demand.subject, demand.subjects) == ("h", "a+b", ("a", "b"))
-    assert (demand.episode, demand.onset_time, demand.start_time) == (event.episode, at(1), at(1))
+    assert (demand.episode, demand.onset_time, demand.start_time) == (event.episode.id, at(1), at(1))
     assert demand.parameters == {"v": ["a", "b"]}
     assert demand.values["distance"] == 100
     drive.take(place(1.5, "b", 175), until=2)

@@ -32,7 +32,11 @@ def test_a_restored_episode_holds_its_demand_as_it_was_and_keeps_its_times() -> 
     assert list(drive.engine.demands().values()) == [demand]
     assert drive.take(speed(5.5, 9), until=6) == ["r car Until 6"]
     (event,) = drive.events
-    assert (event.episode, event.onset_time, event.start_time) == (demand.episode, at(-999), at(-999))
+    assert (event.episode.id, event.episode.onset_time, event.episode.start_time) == (
+        demand.episode,
+        at(-999),
+        at(-999),
+    )
 
 
 def test_a_restored_episode_does_not_start_again() -> None:
@@ -81,7 +85,7 @@ def test_an_episode_whose_rule_changed_while_the_detector_was_away_ends(rules: t
     demand = held_by(RECORD)
     drive = Drive(a_detector(), *rules)
     assert drive.note(drive.engine.restore([demand], at(0.5))) == ["r car RuleChanged 0.5"]
-    assert drive.events[0].episode == demand.episode
+    assert drive.events[0].episode.id == demand.episode
     assert drive.engine.demands() == {}
     assert "car" not in drive.engine.clients
 
@@ -144,5 +148,5 @@ def test_of_two_episodes_of_one_subject_the_second_is_no_episode() -> None:
     first, second = held_by(RECORD), held_by(RECORD, episode="zzz", start_time=at(-5))
     drive = Drive(a_detector(), RECORD)
     reported = drive.engine.restore([second, first], at(0))
-    assert [(event.episode, event.reason) for event in reported] == [("zzz", "RuleChanged")]
+    assert [(event.episode.id, event.reason) for event in reported] == [("zzz", "RuleChanged")]
     assert list(drive.engine.demands().values()) == [first]

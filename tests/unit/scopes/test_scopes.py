@@ -35,7 +35,7 @@ def test_with_roles_each_ordered_pair_that_fits_is_a_subject() -> None:
         "p car2+bus1 started 1",
         "p car2+bus2 started 1",
     ]
-    assert drive.events[0].subjects == ("car1", "bus1")
+    assert drive.events[0].episode.clients == ("car1", "bus1")
     assert drive.events[0].values["a"]["client"] == "car1"
 
 
@@ -176,7 +176,7 @@ def test_the_fleet_is_one_subject_and_its_members_are_those_that_are_known_to_be
     assert drive.take(speed(0.5, 1, "a"), speed(0.5, None, "b"), place(0.5, "c", 0), until=1) == []
     assert drive.take(speed(1.5, 3, "b"), until=2) == ["f ~fleet started 2"]
     (event,) = drive.events
-    assert event.subjects == ()
+    assert event.episode.clients == ()
     assert event.values == {"count": 2, "members": [{"client": "a", "speed": 1}, {"client": "b", "speed": 3}]}
     assert event.key == "wayside/events/h/f/~fleet"
     assert drive.take(speed(2.5, 0, "a"), until=3) == []
@@ -288,7 +288,7 @@ def test_elements_in_every_scope_and_its_conditions() -> None:
         when = "size(members) == 1" if "fleet" in scope else "true"
         drive = Drive(a_detector(clients=clients), a_rule(scope=scope, each=each, when=when))
         drive.take(*here, until=1)
-        reported[str(scope)] = [event.subject for event in drive.events]
+        reported[str(scope)] = [event.episode.subject for event in drive.events]
     assert list(reported.values()) == [
         ["n1~n", "n2~n", "s1~s"],
         ["n1+n2~n", "n1+s1~n", "n2+s1~n"],
