@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 
+import msgspec
+
 from detector.engine.buffering.messages import KeyReader
 from detector.engine.consequences.consequences import Consequences
 from detector.engine.counters import Counters
@@ -16,7 +18,7 @@ from detector.engine.episodes.current import Identity
 from detector.engine.episodes.demands import Demand
 from detector.engine.episodes.episodes import Reason
 from detector.engine.episodes.events import Event
-from detector.engine.episodes.open_episodes import OpenEpisode, record_of
+from detector.engine.episodes.open_episodes import OpenEpisode
 from detector.engine.episodes.record import EpisodeRecord
 from detector.engine.evaluation.executor import Executor
 from detector.engine.evaluation.knowledge import Knowledge
@@ -181,15 +183,17 @@ class Engine:
         """
         demanded: dict[tuple[str, str, str], list[Demand]] = {}
         for demand in demands:
-            demanded.setdefault((demand.rule, demand.subject, demand.episode), []).append(demand)
+            demanded.setdefault((demand.episode.rule, demand.episode.subject, demand.episode.id), []).append(demand)
         statistics = {episode.record.id: episode.statistics for episode in episodes}
         events: list[Event] = []
         for _, of_one in sorted(demanded.items()):
-            record = record_of(of_one[0])
-            whole = record.subject == of_one[0].subject
-            episode = OpenEpisode(record, statistics.get(record.id))
-            events += self._take_up(episode, of_one, now) if whole else [self._ended_while_away(record, now)]
-        known = {demand.episode for demand in demands}
+            record = of_one[0].episode
+            if record.subject == record.about.text:
+                events += self._take_up(OpenEpisode(record, statistics.get(record.id)), of_one, now)
+            else:  # the text is part of the event's key
+                record = msgspec.structs.replace(record, subject=record.about.text)
+                events.append(self._ended_while_away(record, now))
+        known = {demand.episode.id for demand in demands}
         for episode in sorted(episodes, key=lambda each: (each.record.rule, each.record.subject, each.record.id)):
             if episode.record.id not in known:
                 events += self._take_up(episode, (), now)

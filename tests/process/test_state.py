@@ -98,7 +98,7 @@ def test_an_episode_whose_task_was_never_made_demands_it_at_the_next_evaluation(
     drive.engine.restore([], at(0), open_in(rule))
     assert drive.engine.demands() == {}
     drive.take(speed(0.5, 8), until=1)
-    assert [(demand.start_time, demand.parameters) for demand in drive.engine.demands().values()] == [
+    assert [(demand.episode.start_time, demand.parameters) for demand in drive.engine.demands().values()] == [
         (at(-99), {"v": 8})
     ]
 
@@ -217,11 +217,11 @@ def test_an_episode_whose_task_has_ended_is_not_restored(tmp_path: Path) -> None
 
     async def look() -> Any:
         for demand in drive.engine.demands().values():
-            await store.create(to_task(demand, at(-50) if demand.subject == "bus" else None))
+            await store.create(to_task(demand, at(-50) if demand.episode.subject == "bus" else None))
         return await what_was_open(store, StateFile(tmp_path / "state", "default", "h"))
 
     restored = asyncio.run(look())
-    assert [demand.subject for demand in restored.demands] == ["car"]
+    assert [demand.episode.subject for demand in restored.demands] == ["car"]
     assert [episode.record.subject for episode in restored.episodes] == ["car"]
     assert state.failures == 0
 

@@ -139,9 +139,8 @@ class EpisodeState:
         return changes
 
     def _demand(self, identity: Identity, deploy: CompiledDeploy, parameters: Any) -> Demand:
-        record = self.record
         return Demand(
-            rule=record.rule,
+            self.record,
             action=deploy.action,
             template=deploy.template,
             operation=deploy.operation,
@@ -150,14 +149,6 @@ class EpisodeState:
             detector=identity.detector,
             holder=identity.holder,
             namespace=identity.namespace,
-            subject=record.subject,
-            subjects=record.clients,
-            episode=record.id,
-            onset_time=record.onset_time,
-            start_time=record.start_time,
-            classification=record.classification,
-            values=record.values,
-            rule_digest=record.rule_digest,
         )
 
     def _event(

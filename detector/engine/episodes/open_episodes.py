@@ -1,4 +1,4 @@
-"""Open episodes in the form that survives a restart, and the demands they are restored from."""
+"""Open episodes in the form that survives a restart."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from detector.engine.episodes.demands import Demand
 from detector.engine.episodes.plain import plain
 from detector.engine.episodes.record import EpisodeRecord
 from detector.engine.episodes.subjects import Subject
@@ -69,24 +68,3 @@ def from_document(document: Mapping[str, Any]) -> OpenEpisode:
         rule_digest=document["ruleDigest"],
     )
     return OpenEpisode(record, statistics)
-
-
-def record_of(demand: Demand) -> EpisodeRecord:
-    """The episode of a demand. Without an element, the subject's text may differ from the demand's."""
-    try:
-        _, element = parse_subject(demand.subject)
-    except ValueError:
-        element = None
-    subject = Subject(demand.subjects, element)
-    return EpisodeRecord(
-        id=demand.episode,
-        rule=demand.rule,
-        subject=subject.text,
-        clients=subject.clients,
-        element=subject.element,
-        onset_time=demand.onset_time,
-        start_time=demand.start_time,
-        values=demand.values,
-        classification=demand.classification,
-        rule_digest=demand.rule_digest,
-    )

@@ -157,7 +157,8 @@ class Executor:
         self._unsorted = None
         happened = self._blocks.run(self._instruments.stopwatch)
         if journal is not None:
-            journal[noted:] = sorted(journal[noted:], key=lambda change: (change.time, self._order[change.demand.rule]))
+            order = self._order
+            journal[noted:] = sorted(journal[noted:], key=lambda each: (each.time, order[each.demand.episode.rule]))
         return happened
 
     def _tick(self, tick: Tick) -> list[Event]:

@@ -229,7 +229,7 @@ def test_a_rule_with_elements_is_evaluated_once_for_each() -> None:
     drive = Drive(a_detector(), rule)
     assert drive.take(place(0.5, "car", 130), until=1) == ["r car~north started 1"]
     assert drive.take(place(1.5, "car", 510), until=2) == ["r car~south started 2"]
-    assert {demand.subject: demand.parameters for demand in drive.engine.demands().values()} == {
+    assert {demand.episode.subject: demand.parameters for demand in drive.engine.demands().values()} == {
         "car~north": {"node": "rsu-1", "at": 10},
         "car~south": {"node": "rsu-2", "at": 10},
     }
@@ -302,7 +302,7 @@ def test_an_episode_of_an_element_is_restored_and_one_of_an_element_that_is_gone
     drive = Drive(a_detector(), rule)
     drive.take(place(0.5, "car", 0), until=1)
     held = drive.engine.demands()
-    assert sorted(demand.subject for demand in held.values()) == ["car~north", "car~south"]
+    assert sorted(demand.episode.subject for demand in held.values()) == ["car~north", "car~south"]
     again = Drive(a_detector(), rule)
     assert again.note(again.engine.restore(list(held.values()), at(0))) == []
     assert again.engine.demands() == held
