@@ -11,8 +11,9 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
+
+from msgspec.structs import astuple, replace
 
 from detector.actions.base import Action, ActionError
 from detector.actions.episode import Completion, Episode, Outcome, OutcomeState
@@ -220,19 +221,10 @@ def _text(error: Exception) -> str:
 
 
 def _episode(begun: Begun) -> Episode:
-    event, episode = begun.event, begun.event.episode
     return Episode(
-        id=episode.id,
-        rule=episode.rule,
-        subject=episode.subject,
-        clients=episode.clients,
-        element=episode.element,
-        onset_time=episode.onset_time,
-        start_time=episode.start_time,
-        values=episode.values,
-        classification=episode.classification,
+        *astuple(begun.event.episode),
         rendered=begun.rendered.values,
         unrendered=begun.rendered.problems,
-        started=event.cloud_event(),
+        started=begun.event.cloud_event(),
         resumed=begun.resumed,
     )
