@@ -25,7 +25,7 @@ from wayside.rules import CompiledDeploy, CompiledRule
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """The holder, rule and subject of episodes."""
+    """Whose episodes they are."""
 
     detector: str
     holder: str
@@ -101,7 +101,10 @@ class EpisodeState:
         return not self.outdated and len(self.demands) >= len(rule.deploys)
 
     def change(self, rule: CompiledRule, changed: Collection[str], gone: Collection[str]) -> None:
-        """The rule's deploy actions changed: demands of removed actions end at once, the others stay valid for now."""
+        """The rule's deploy actions changed: demands of removed actions end at once, the others stay valid for now.
+
+        The end event has the rule's current classification.
+        """
         self.record = msgspec.structs.replace(self.record, classification=rule.classification)
         for action in gone:
             self.demands.pop(action, None)

@@ -71,26 +71,26 @@ class Event(msgspec.Struct, frozen=True, gc=False):
             TypeError: a value has no form in JSON.
         """
         # The text is built by hand: an encoder takes several times as long.
-        about = self.episode
+        known = self.episode
         kind, what = (STARTED, "started") if self.reason is None else (ENDED, "ended")
-        rule, episode, start = quote(about.rule), quote(about.id), format_time(about.start_time)
+        rule, episode, start = quote(known.rule), quote(known.id), format_time(known.start_time)
         time = start if self.end_time is None else format_time(self.end_time)
         trace = "" if self.traceparent is None else f',"traceparent":{quote(self.traceparent)}'
         recording = "" if self.recording is None else f',"recording":{quote(self.recording)}'
-        element = "" if about.element is None else f',"element":{quote(about.element)}'
+        element = "" if known.element is None else f',"element":{quote(known.element)}'
         reason = "" if self.end_time is None or self.reason is None else f',"endTime":"{time}","reason":"{self.reason}"'
         values = plain_text(self.values)
         models = f',"models":{to_text(dict(self.models))}' if self.models else ""
         classification = (
-            "" if about.classification is None else f',"classification":{to_text(dict(about.classification))}'
+            "" if known.classification is None else f',"classification":{to_text(dict(known.classification))}'
         )
         dry_run = ',"dryRun":true' if self.dry_run else ""
         return (
             f'{{"specversion":"1.0","id":{episode[:-1]}.{what}","source":{quote(f"/detectors/{self.holder}")}'
-            f',"type":"{kind}","subject":{quote(about.subject)},"time":"{time}","datacontenttype":"application/json"'
+            f',"type":"{kind}","subject":{quote(known.subject)},"time":"{time}","datacontenttype":"application/json"'
             f'{trace}{recording},"data":{{"rule":{rule},"episode":{episode}'
-            f',"subjects":[{",".join(map(quote, about.clients))}]{element}'
-            f',"onsetTime":"{format_time(about.onset_time)}","startTime":"{start}"{reason}'
+            f',"subjects":[{",".join(map(quote, known.clients))}]{element}'
+            f',"onsetTime":"{format_time(known.onset_time)}","startTime":"{start}"{reason}'
             f',"values":{values}{models}{classification}{dry_run}}}}}'
         )
 

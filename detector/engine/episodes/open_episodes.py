@@ -15,7 +15,7 @@ from wayside.times import format_time, parse_time
 
 @dataclass(frozen=True, slots=True)
 class OpenEpisode:
-    """An episode that has not ended."""
+    """An episode that has not ended, as it survives a restart."""
 
     record: EpisodeRecord
     statistics: Mapping[str, Any] | None = None

@@ -1,4 +1,4 @@
-"""The record of an episode: what is known of it from its start on. Events, demands and actions contain it."""
+"""The record of an episode: what is known of it from its start on. Events, demands and actions share it."""
 
 from __future__ import annotations
 

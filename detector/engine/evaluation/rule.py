@@ -39,10 +39,8 @@ class OnDemandResult:
     """None: unknown."""
     values: Mapping[str, JsonValue]
     """Signals, as in an event; unknown ones are left out."""
-    episode: str | None
+    episode: EpisodeRecord | None
     """The open episode, after this evaluation."""
-    start_time: int | None
-    """When it started; nanoseconds since the epoch."""
 
 
 class RuleRun:
@@ -354,8 +352,7 @@ class RuleRun:
             candidate.subject.text,
             None if isinstance(when, Unknown) else when,
             snapshot(self.rule, candidate),
-            None if episode is None else episode.record.id,
-            None if episode is None else episode.record.start_time,
+            None if episode is None else episode.record,
         )
 
     def _truth(self, field: str, expression: Expression, candidate: Candidate) -> Truth:
