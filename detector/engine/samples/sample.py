@@ -6,6 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 from wayside.expressions.columns.values import MISSING
 
@@ -134,11 +136,15 @@ class NearDecoder(Decoder, Protocol):
         """The sender's time nearest to the receive time; nanoseconds since the epoch. Used instead of `stamp`."""
 
 
+FieldColumn = Sequence[Any] | NDArray[np.float64]
+"""A value for each payload: plain as from `decode`, or MISSING. An array: all are doubles."""
+
+
 class Fields(NamedTuple):
     """Some fields of several messages."""
 
-    columns: Sequence[Sequence[Any]]
-    """By path, a value for each payload: plain as from `decode`, or MISSING."""
+    columns: Sequence[FieldColumn]
+    """By path."""
     errors: Mapping[int, DecodeError]
     """The payloads that cannot be read, by their indices; they are MISSING in all columns."""
     odd: Sequence[int]
