@@ -300,7 +300,7 @@ class Expression:
         wanted = _PYTHON[self.result]
         if isinstance(value, wanted) and not (isinstance(value, bool) and self.result is CelType.DOUBLE):
             return
-        raise EvaluationError(f"must be {self.result.value}, is {_describe(value)}", absent=value is None)
+        raise EvaluationError(f"must be {self.result.value}; got {_describe(value)}", absent=value is None)
 
 
 def _check_static(actual: cel.Type, wanted: CelType, source: str) -> None:
@@ -311,7 +311,7 @@ def _check_static(actual: cel.Type, wanted: CelType, source: str) -> None:
     start = len(source) - len(source.lstrip())
     line, column = position(source, start)
     is_text = kind.value if kind else name.lower()
-    raise ExpressionError(f"must be {wanted.value}, is {is_text}", source=source, line=line, column=column)
+    raise ExpressionError(f"must be {wanted.value}; got {is_text}", source=source, line=line, column=column)
 
 
 def _check_patterns(node: Node, source: str) -> None:
@@ -338,7 +338,7 @@ def _not_text(source: object) -> ExpressionError:
         return ExpressionError("the expression is empty", source="", hint=EMPTY)
     written = str(source).lower() if isinstance(source, bool) else str(source)
     return ExpressionError(
-        f"an expression must be a text, is {type(source).__name__} {written}",
+        f"an expression must be a text; got {type(source).__name__} {written}",
         source=written,
         hint=f'put it in quotes: "{written}"',
     )

@@ -102,8 +102,8 @@ class _Margin:
         if len(scales) > 1:
             raise MarginError(
                 ("spec", MARGIN),
-                f"`{self._text(text)}` reads {' and '.join(sorted(names))}, which have different scales: make it a "
-                "signal with of, and give that a scale",
+                f"`{self._text(text)}` reads {' and '.join(sorted(names))}, which have different scales: define "
+                "this part as a signal with of, and give that signal a scale",
             )
         self._comparisons.append(_Comparison(self._text(text), names, bool(scales)))
         left, right = (f"({self._text(side)})" for side in sides)

@@ -125,7 +125,7 @@ def test_a_change_of_parameters_is_a_change_of_the_rule_wherever_it_is_made() ->
             ["a.parameters has no field maxSped", "did you mean maxSpeed?"],
         ),
         ({"when": "v > 3 &&\n parameters.maxSpeed == 'x'"}, "spec.when", ["line 2, column 22", "(double, string)"]),
-        ({"when": "parameters.maxSpeed"}, "spec.when", ["must be a boolean, is a number"]),
+        ({"when": "parameters.maxSpeed"}, "spec.when", ["must be a boolean; got a number"]),
         ({"when": "allZero(parameters.maxSpeed)"}, "spec.when", ["`allZero` does not take (double)"]),
         (
             {"signals": [{**SPEED, "where": "sample.size > 'x'"}]},

@@ -208,7 +208,7 @@ class Results:
             return np.zeros((0, n), bool), np.zeros((0, n), bool)
         operand = self._program.operand(roots)
         if operand.source is not Source.TRUTHS:
-            raise ValueError("the roots are no truths: take the nodes that Graph.truth gives for them")
+            raise ValueError("the roots are not boolean: use the nodes that Graph.truth returns for them")
         true, false = self._frame.truth(operand)
         if operand.partial and not self._frame.tagged:  # nobody wrote where the others are false
             false = np.where(self._program.partial(roots), false, ~true)
