@@ -126,8 +126,8 @@ def _on_what_runs(template: ApplicationTemplate, task: ApplicationTask, given: M
         name, value = next(iter(rest.items()))
         return Refusal(
             Refused.INVALID_PARAMETERS,
-            f"spec.parameters.{name}: {values.shown(value)}: a Suspend task cannot change parameters: remove "
-            f"it{_which(of_key)}",
+            f"spec.parameters.{name}: {values.shown(value)} is given, but a Suspend task cannot change parameters: "
+            f"remove it{_which(of_key)}",
         )
     if operation is Operation.RECONFIGURE and not rest:
         return Refusal(
@@ -143,9 +143,8 @@ def _on_what_runs(template: ApplicationTemplate, task: ApplicationTask, given: M
     if missing:
         return Refusal(
             Refused.INVALID_KEY,
-            f"spec.parameters.{missing[0]}: is missing, and the key of template {template.name}, "
-            f"{template.spec.key}, needs it to identify the instance: give it, or omit all parameters of the key "
-            "to select all instances",
+            f"spec.parameters.{missing[0]}: is missing, but the key of template {template.name} ({template.spec.key}) "
+            "needs it to identify the instance: give it, or omit all parameters of the key to select all instances",
         )
     key = _key_or_refusal(template, given)
     return key if isinstance(key, Refusal) else Claim(task, instance_name(template.name, key), key, rest)
@@ -163,8 +162,8 @@ def _key_or_refusal(template: ApplicationTemplate, given: Mapping[str, Any]) -> 
     if len(key) > MAXIMUM_KEY_LENGTH:
         return Refusal(
             Refused.INVALID_KEY,
-            f"the key of template {template.name}, {template.spec.key}, has {len(key)} characters for this task, "
-            f"more than {MAXIMUM_KEY_LENGTH}: make it from shorter parameters",
+            f"the key of template {template.name} ({template.spec.key}) has {len(key)} characters for this task; at "
+            f"most {MAXIMUM_KEY_LENGTH} are allowed: use shorter parameters",
         )
     return key
 

@@ -40,7 +40,7 @@ class Conflict:
         whose, until = (f"task {self.other_task}", "wait until that task ends, ") if self.other_task else (BASELINE, "")
         return (
             f"spec.parameters.{self.parameter}: {values.shown(self.value)} differs from {values.shown(self.other)} of "
-            f"{whose}, and its merge strategy is Same: give the same value, {until}"
+            f"{whose}, but the parameter has merge strategy Same: give the same value, {until}"
             "or let the template's key distinguish the two"
         )
 
@@ -139,7 +139,7 @@ def _shown(total: Fraction) -> str:
     try:
         return f"{float(total):g}"
     except OverflowError:
-        return "more than any number can hold"
+        return "more than a number can represent"
 
 
 def _within(parameter: Parameter, total: Fraction) -> int | float:

@@ -45,12 +45,12 @@ def _of_tasks(declared: Mapping[str, Parameter]) -> tuple[Example, ...]:
     required = {name: example_of(each) for name, each in declared.items() if each.required}
     made_up = frozenset(name for name in required if not _is_real(declared[name]))
     given = f"only {', '.join(sorted(required))}" if required else "no parameters"
-    least = Example(required, made_up | optional, f"where tasks give {given}")
+    least = Example(required, made_up | optional, f"when tasks give {given}")
     if not optional:
         return (least,)
     every = {name: example_of(each) for name, each in declared.items() if each.default is None}
     made_up = frozenset(name for name in every if not _is_real(declared[name]))
-    return (least, Example(every, made_up, "where tasks give all parameters"))
+    return (least, Example(every, made_up, "when tasks give all parameters"))
 
 
 def example_of(parameter: Parameter) -> Any:

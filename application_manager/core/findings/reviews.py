@@ -32,7 +32,7 @@ class ReviewError(ValueError):
 class Weight(Enum):
     """What findings come to."""
 
-    NONE = "not looked at"
+    NONE = "not checked"
     WARNED = "warned of"
     REFUSED = "refused"
 

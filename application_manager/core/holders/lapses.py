@@ -60,7 +60,7 @@ def _lapse(
         return Verdict(Standing.FINISHED, "DetectorLost", message), None
     message = (
         f"holder {holder} is lost: its Lease {lease_name(holder)} was not renewed for {limit:g} s; the demand "
-        "counts again once it is renewed"
+        "counts again once the Lease is renewed"
     )
     return Verdict(Standing.LAPSED, HOLDER_LOST, message), since + FINISH_LOST_AFTER
 
