@@ -44,7 +44,7 @@ class Queue:
         if spool is not None and spool.damaged:
             lose("bytes of the database's spool", spool.damaged, "corrupted by a crash or by the disk")
         if spool is not None and spool.records:
-            _log.info("database: the spool holds %d requests of an earlier run", spool.records)
+            _log.info("database: the spool contains %d requests of an earlier run", spool.records)
 
     @property
     def inherited(self) -> bool:

@@ -270,7 +270,7 @@ class FleetGroup:
 
 
 _PLACE = "members,"
-"""For errors such as "members, of car1"."""
+"""For errors such as "members of car1"."""
 
 
 def _members(rule: CompiledRule) -> Mapping[str, Expression]:
