@@ -28,7 +28,7 @@ class NodeLook:
         self._client = client
         self._known: Nodes | None = None
         self._until = 0.0  # monotonic time until which what is known is used
-        self._told = False
+        self._reported = False
         self._asking = asyncio.Lock()
 
     async def labels(self) -> Nodes | None:
@@ -43,9 +43,9 @@ class NodeLook:
             found, _ = await self._client.list(NODES, None)
         except ApiError as error:
             self._until = time.monotonic() + (FORBIDDEN_FOR if error.code == 403 else FRESH)
-            if not self._told:
+            if not self._reported:
                 log.info("cannot list nodes (%s): only the scheduler reports why a pod fits no node", error)
-                self._told = True
+                self._reported = True
             return None
         except Unreachable:
             return None

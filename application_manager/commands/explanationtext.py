@@ -100,7 +100,7 @@ def _conditions(conditions: list[dict[str, object]], but: tuple[str, ...] = ()) 
 
 def _tasks(explanation: Explanation, instance: ExplainedInstance) -> Iterator[str]:
     yield f"tasks of instance {instance.name}" + ("" if explanation.tasks else ": none")
-    # What is over stays for an hour, and must not push what counts out of sight.
+    # A finished task stays for an hour, and must not displace one that counts.
     for task in sorted(explanation.tasks, key=lambda each: each.standing == "Finished")[:_TASKS_SHOWN]:
         about = f"{task.rule} of {task.subject}" if task.rule else "by a person" if not task.holder else task.holder
         why = "" if task.standing == "Counts" else f", {task.reason}: {task.message}"

@@ -1,4 +1,4 @@
-"""`application-manager webhooks`: what makes the API server ask the manager, as YAML to be applied."""
+"""`application-manager webhooks`: the webhook configurations that make the API server call the manager, as YAML."""
 
 from __future__ import annotations
 

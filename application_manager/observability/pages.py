@@ -38,7 +38,7 @@ class _Queue(Protocol):
 def stalled(measures: Measures, every: float, queues: Sequence[_Queue] = (), least: float = STALLED_AFTER) -> Lack:
     """Whether work has stalled: no resync has ended, or a worker was at one key, for too long.
 
-    A resync that fails, the API server being away, ends as well. Any thread may ask.
+    A resync that fails, the API server being away, ends as well. Any thread may call it.
 
     Args:
         measures: knows when the last resync ended.

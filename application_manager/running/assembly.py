@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable
 from application_manager.cache.cluster_cache import DETECTOR, INSTANCE, TASK, TEMPLATE, ClusterCache
 from application_manager.cache.detector_index import DetectorIndex
 from application_manager.charts.chartcache import ChartCache
-from application_manager.charts.chartdesk import ChartDesk
+from application_manager.charts.chartrenderer import ChartRenderer
 from application_manager.cluster.failedpods import FailedPodsLook
 from application_manager.cluster.nodes import NodeLook
 from application_manager.core.demand.decisions import Decision
@@ -93,7 +93,12 @@ class Assembly:
             "instance", self._reconcile_instance, _INSTANCE_WORKERS, measure=measure, share=_INSTANCE_SHARE
         )
         self._statuses: WorkQueue[Name] = WorkQueue(
-            "instance status", self._say_instance, _STATUS_WORKERS, self._instances, measure, share=_STATUS_SHARE
+            "instance status",
+            self._write_instance_status,
+            _STATUS_WORKERS,
+            self._instances,
+            measure,
+            share=_STATUS_SHARE,
         )
         self._tasks: WorkQueue[Name] = WorkQueue(
             "task", self._reconcile_task, _STATUS_WORKERS, self._instances, measure, share=_STATUS_SHARE
@@ -153,7 +158,7 @@ class Assembly:
             again=self._statuses.add_at,
         )
         cache = ChartCache(options.helm, options.chart_cache, options.chart_folder)
-        self.charts = ChartDesk(options.helm, cache, self._instances.add_at)
+        self.charts = ChartRenderer(options.helm, cache, self._instances.add_at)
         self._renderings = Renderings(
             self.cache,
             self._answers,
@@ -218,8 +223,11 @@ class Assembly:
     def _claimed(self, name: Name) -> None:
         self.router.claimed(name)
 
-    def begin_anew(self, children: Iterable[Resource]) -> None:
-        """Forget what we did: others may have acted since. `children` are the kinds of what templates create."""
+    def begin_term(self, children: Iterable[Resource]) -> None:
+        """Begin a term as the active manager: forget what this one did, since others may have acted meanwhile.
+
+        `children` are the kinds of what templates create.
+        """
         self.cache.forget_work()
         self.publisher.forget()
         self.applier.begin(
@@ -227,7 +235,7 @@ class Assembly:
         )
 
     def publish_all(self) -> None:
-        """Ask for the configurations of all instances to be published."""
+        """Enqueue the publication of the configurations of all instances."""
         for name, _ in self.cache.store.all(INSTANCE):
             self._configurations.add(name)
 
@@ -239,7 +247,7 @@ class Assembly:
         else:
             await self._traces.reconciling(name, self._instance_work.reconcile)
 
-    async def _say_instance(self, name: Name) -> None:
+    async def _write_instance_status(self, name: Name) -> None:
         if not self.cache.overlap.yields(name[0]):
             await self._status_work.reconcile(name)
 
@@ -259,7 +267,7 @@ class Assembly:
             await self._rule_work.reconcile(key)
 
     def _judge(self, key: RuleKey) -> None:
-        """Ask for a rule or Detector to be judged, soon; a Detector's objects are looked after before."""
+        """Enqueue the check of a rule or Detector; a Detector's objects are reconciled before."""
         self._rules.add_at(key, time.time() + _JUDGING_PAUSE)
         if key[0] == DETECTOR:
             self.detectors.add(key[1])

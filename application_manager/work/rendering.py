@@ -28,7 +28,7 @@ _JUDGED = 1024  # templates of which is known whether they are plain
 
 
 class Renderings:
-    """Takes requests. Only the event loop's thread uses it."""
+    """Renders charts in the background. Only the event loop's thread uses it."""
 
     def __init__(
         self,

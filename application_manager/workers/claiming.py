@@ -1,4 +1,4 @@
-"""What tasks ask for, worked out in a worker process where that runs an expression or a pattern of the template.
+"""What tasks request, computed in a worker process if that evaluates an expression or a pattern of the template.
 
 A key that only puts parameters together (`${parameters.region}-${parameters.lane}`) is worked out at once: it costs no
 more than to write it down.

@@ -22,7 +22,7 @@ from cel_expr_python import cel
 from wayside.expressions.diagnostics import EMPTY, diagnose
 from wayside.expressions.errors import EvaluationError, ExpressionError, position
 from wayside.expressions.expanding import NamedPlaces, expanded
-from wayside.expressions.failures import NO_MEMBERS, clean, says_absent
+from wayside.expressions.failures import NO_MEMBERS, clean, reports_absent
 from wayside.expressions.functions import DECLARATIONS, TAKING_HANDLES
 from wayside.expressions.functions.calls import drop_lost_references
 from wayside.expressions.growth import MOST, growth
@@ -290,7 +290,7 @@ class Expression:
             raise EvaluationError(clean(str(error))) from None
         if failed:
             message = clean(value)
-            raise EvaluationError(message, absent=says_absent(message) or (known and "null" in message))
+            raise EvaluationError(message, absent=reports_absent(message) or (known and "null" in message))
         result = _plain(value)
         if self.result is not CelType.DYN:
             self._check(result)

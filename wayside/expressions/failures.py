@@ -49,7 +49,7 @@ def clean(message: str) -> str:
     return message
 
 
-def says_absent(message: str) -> bool:
+def reports_absent(message: str) -> bool:
     """Whether a clean message reports an absent value."""
     return message.startswith(_ABSENT)
 

@@ -19,7 +19,7 @@ REVIEWED = {"ApplicationTemplate": "applicationtemplates", "Detector": "detector
 """The kinds that are looked at, and their resources. Never tasks and instances: an outage of ours, or a fault, must not
 keep a demand from ending."""
 
-MOST_TOLD = 16  # problems, and warnings, of one answer; an HTTP header holds each warning
+MOST_REPORTED = 16  # problems, and warnings, of one answer; an HTTP header holds each warning
 LONGEST = 1024  # characters of each
 
 Json = dict[str, Any]
@@ -124,7 +124,7 @@ def _cause(problem: str) -> Json:
 
 def shortened(texts: tuple[str, ...]) -> list[str]:
     """The texts as headers can hold them, the first of them where there are many."""
-    lines = [_line(each) for each in texts[:MOST_TOLD]]
+    lines = [_line(each) for each in texts[:MOST_REPORTED]]
     left = len(texts) - len(lines)
     return [*lines, f"and {left} more: correct these first"] if left else lines
 

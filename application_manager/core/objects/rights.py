@@ -20,7 +20,7 @@ _LEASES = "coordination.k8s.io"
 _RBAC = "rbac.authorization.k8s.io"
 _LOOKING = ("list", "watch")
 _READING = frozenset({"get", *_LOOKING})
-_TOLD_BY_EVENTS = frozenset({("apps/v1", "StatefulSet"), ("apps/v1", "DaemonSet"), ("batch/v1", "Job")})
+_REPORTED_BY_EVENTS = frozenset({("apps/v1", "StatefulSet"), ("apps/v1", "DaemonSet"), ("batch/v1", "Job")})
 """The kinds whose status does not show that their pods are refused (core/health/refusals.py)."""
 
 
@@ -186,7 +186,7 @@ def _children(plurals: Mapping[KindKey, str]) -> Iterator[Right]:
         yield Right(group, plural, others, f"no {kind} of a template is created, changed or deleted")
         if (api_version, kind) in SCALED:
             yield Right(group, f"{plural}/scale", ("patch",), f"no {kind} is suspended or resumed")
-    if _TOLD_BY_EVENTS & plurals.keys():
+    if _REPORTED_BY_EVENTS & plurals.keys():
         yield Right(
             "events.k8s.io",
             "events",

@@ -28,7 +28,7 @@ from application_manager.core.objects.poddefaults import PodDefaults
 from wayside.api import Detector
 
 SIDECAR_LABEL = "wayside.dev/detector"
-"""On pods: the Detector that they ask for."""
+"""On pods: the Detector that they request."""
 CONTAINER = "wayside-detector"
 """The name of the container. A pod that has one of this name has its detector."""
 

@@ -149,8 +149,8 @@ def test_a_parameter_that_is_not_there_or_does_not_fit_is_reported_where_it_is_u
 ) -> None:
     with pytest.raises(RuleError) as caught:
         compile_rule(too_fast(**spec), a_detector())
-    told_at = {str(problem).split(": ")[0]: str(problem) for problem in caught.value.problems}
-    assert all(part in told_at[field] for part in parts), told_at
+    reported_at = {str(problem).split(": ")[0]: str(problem) for problem in caught.value.problems}
+    assert all(part in reported_at[field] for part in parts), reported_at
 
 
 @pytest.mark.parametrize(
