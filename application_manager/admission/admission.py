@@ -57,8 +57,8 @@ class Admission:
     Attributes:
         resources: where EventRules and Detectors live.
         observe: takes an object that was read.
-        pool: where objects are judged.
-        namespaces: those that the manager looks after; empty: all.
+        pool: where objects are checked.
+        namespaces: those that are managed; empty: all.
         defaults: what holds for all detectors; None where the manager runs none.
     """
 

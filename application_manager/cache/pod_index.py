@@ -33,7 +33,7 @@ class PodIndex:
         return before != self.troubles(instance)
 
     def forget(self, pod: Object) -> bool:
-        """Forget a pod that is gone; whether that changes the `troubles` of its instance."""
+        """Forget a pod that is deleted; whether that changes the `troubles` of its instance."""
         instance = _instance_of(pod)
         if instance is None:
             return False

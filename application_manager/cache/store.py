@@ -92,7 +92,7 @@ class Store:
         return entry
 
     def remove(self, raw: Object) -> Entry | None:
-        """Note that an object is gone; what was known of it, or None where that is known."""
+        """Note that an object was deleted; what was known of it, or None where that is known."""
         uid = raw["metadata"]["uid"]
         self._deleted[uid] = None
         if len(self._deleted) > _TOMBSTONES:
@@ -105,7 +105,7 @@ class Store:
         return self._objects[kind_of(raw)].pop(name_of(raw))
 
     def missing(self, kind: KindKey, present: Set[Name], version: str, scope: str | None) -> list[Entry]:
-        """The entries that are gone, since a list (of the namespace `scope`, None for all) has only those `present`."""
+        """The deleted entries: a list (of the namespace `scope`, None for all) has only those `present`."""
         return [
             entry
             for name, entry in self.all(kind)

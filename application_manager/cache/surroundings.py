@@ -1,4 +1,4 @@
-"""What a rule is judged with: what the cache has beside it in its namespace."""
+"""What a rule is checked with: what the cache has beside it in its namespace."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""In which namespaces the account may write, where the manager looks after all of them.
+"""In which namespaces the account may write, for a manager of all namespaces.
 
 By its ClusterRole it may read everywhere. It writes where an administrator binds it to the role that allows writing
 (`application-manager rbac --grant`). What happens in other namespaces is seen and left alone: a request for each object

@@ -42,7 +42,7 @@ def option_bytes(option: str, written: str) -> int:
 
 
 def policy_of(kinds: list[str] | None, accounts: list[str] | None, *, everywhere: bool = False) -> Policy:
-    """The policy; `everywhere`: of a manager that looks after all namespaces."""
+    """The policy; `everywhere`: of a manager of all namespaces."""
     from application_manager.core.objects.policy import Policy
 
     try:

@@ -125,7 +125,7 @@ async def _first(wanted: Coroutine[None, None, None], stopping: asyncio.Task[boo
 
 
 async def _release(leadership: Leadership, client: Client) -> None:
-    """Release the Lease, unless a request that was given up may yet be done: then it lapses by itself."""
+    """Release the Lease, unless a request that was given up may yet be done: then it expires by itself."""
     if not leadership.active:
         return
     if client.open_until > time.monotonic():

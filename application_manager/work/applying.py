@@ -81,7 +81,7 @@ class Applier:
             self.note(raw)
 
     def forget(self, raw: Object) -> None:
-        """Note that an object is gone."""
+        """Note that an object was deleted."""
         uid = raw["metadata"]["uid"]
         self._fields.pop(uid, None)
         self._drifted.discard(uid)

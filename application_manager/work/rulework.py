@@ -32,7 +32,7 @@ class RuleWork:
 
     Attributes:
         resources: where EventRules and Detectors live.
-        pool: where they are judged.
+        pool: where they are checked.
         detectors: what is known of those that the manager runs.
     """
 

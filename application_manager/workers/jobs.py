@@ -122,7 +122,7 @@ class TemplateJob:
 
 @dataclass(frozen=True, slots=True)
 class RuleContext:
-    """What a rule is judged with: the valid objects of its namespace, and the names of the others."""
+    """What a rule is checked with: the valid objects of its namespace, and the names of the others."""
 
     detectors: Sequence[Detector] = ()
     invalid_detectors: Sequence[str] = ()

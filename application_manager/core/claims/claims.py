@@ -169,12 +169,12 @@ def _key_or_refusal(template: ApplicationTemplate, given: Mapping[str, Any]) -> 
 
 
 def all_instances(template: str) -> str:
-    """What stands for all instances of the template where an instance's name stands else; no instance has this name."""
+    """What means all instances of the template where an instance's name stands else; no instance has this name."""
     return f"{template}/*"
 
 
 def template_of_all(instance: str) -> str | None:
-    """The template, where the name stands for all its instances; else None."""
+    """The template, where the name means all its instances; else None."""
     return instance.removesuffix("/*") if instance.endswith("/*") else None
 
 

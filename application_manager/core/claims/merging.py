@@ -52,7 +52,7 @@ class Merged:
     Attributes:
         parameters: without defaults.
         conflicts: the tasks that could not take part, by name.
-        capped: a word about each sum that went beyond its parameter's bounds.
+        capped: a message about each sum that went beyond its parameter's bounds.
     """
 
     parameters: dict[str, Any]

@@ -73,7 +73,7 @@ class Decided:
 
 
 def decide(name: str, indexes: Indexes, now: float) -> Decided:
-    """What should become of an instance, or of tasks for all instances of a template by the name that stands for these.
+    """What should become of an instance, or of tasks for all instances of a template by the name that means these.
 
     `now` is in seconds since 1970.
     """

@@ -85,7 +85,7 @@ def webhook_configuration(
         place: where the manager is.
         authority: the certificate (PEM) of the authority that signed the manager's; None where somebody else writes it
             in, as cert-manager does.
-        namespaces: those that the manager looks after; empty: all.
+        namespaces: those that are managed; empty: all.
         name: the object's.
     """
     webhook: dict[str, Any] = {

@@ -1,1 +1,1 @@
-"""Whether those who demand, and those who manage, are still there: Leases, judged by our own clock."""
+"""Whether those who demand, and those who manage, are still there: Leases, determined by our own clock."""

@@ -1,4 +1,4 @@
-"""Demands that lapse: those of holders whose Lease is no longer renewed. Pure."""
+"""Demands that expire: those of holders whose Lease is no longer renewed. Pure."""
 
 from __future__ import annotations
 

@@ -60,7 +60,7 @@ REMEDY = "apply the output of `application-manager rbac`"
 
 
 def rights(plurals: Mapping[KindKey, str], *, detectors: bool = False) -> list[Right]:
-    """What is needed in each namespace that is looked after.
+    """The rights that are needed in each managed namespace.
 
     Args:
         plurals: of the kinds that are allowed.
@@ -216,7 +216,7 @@ def roles(
 
     Args:
         plurals: of the kinds that are allowed.
-        namespaces: those that are looked after; empty: all.
+        namespaces: those that are managed; empty: all.
         lease: namespace and name of the managers' Lease.
         account: namespace and name of the manager's service account.
         name: of all roles and bindings; those of the Lease end with `-lease`, of the webhook's certificate

@@ -18,7 +18,7 @@ Object = dict[str, Any]
 _CONTAINERS = frozenset({"containers", "initContainers", "ephemeralContainers", "volumes"})
 _SPEC_IS_READ = frozenset({"Deployment", "StatefulSet", "DaemonSet", "Job", "CronJob", "Pod", "Service"})
 _CONTENT = frozenset({"data", "binaryData", "stringData"})
-_OF_TASKS = ("templateName",)  # fields of a task's spec that are read beside its model
+_OF_TASKS = ("templateName",)  # fields of a task's spec that are read in addition to its model
 
 
 def own(raw: Object) -> Object:

@@ -194,7 +194,7 @@ class HolderLease:
         if not self.held.is_set():
             return
         self.held.clear()
-        with suppress(RequestError, TimeoutError):  # then it lapses
+        with suppress(RequestError, TimeoutError):  # then it expires
             async with asyncio.timeout(_RELEASE_DEADLINE):
                 self._candidate.observe(await self._client.get(LEASES, self._namespace, self.name), self._monotonic())
                 draft = self._candidate.released(self._now())
