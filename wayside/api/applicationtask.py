@@ -44,7 +44,7 @@ class Requester(Model):
     )
     holder: Holder | None = Field(
         default=None,
-        description="The holder that emitted the task. It keeps the task alive by renewing the Lease "
+        description="The holder that emitted the task. The holder keeps the task alive by renewing the Lease "
         "wayside-<holder>. A task without a holder never expires.",
     )
     subjects: list[Annotated[str, Field(max_length=256)]] = Field(
