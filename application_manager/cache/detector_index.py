@@ -1,4 +1,4 @@
-"""What is known of the detectors that the manager runs: their objects, and whether they run."""
+"""An index of the detectors that the manager runs: their objects, and whether they run."""
 
 from __future__ import annotations
 

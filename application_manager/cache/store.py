@@ -1,4 +1,4 @@
-"""What the manager knows of the cluster: the newest version of each object that it has seen.
+"""The store of the cache: the newest version of each object that the manager has received.
 
 Fed by watch events, by the answers to our own writes and by lists, in any order. An older version never replaces a
 newer one, and what was seen deleted does not come back from a list that is older than its deletion.

@@ -1,4 +1,4 @@
-"""What a rule is checked with: what the cache has beside it in its namespace."""
+"""The objects that a rule is checked against: those of its namespace in the cache."""
 
 from __future__ import annotations
 

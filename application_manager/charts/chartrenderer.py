@@ -1,4 +1,4 @@
-"""Renderings of charts: requested at once, done in the background, kept while they are of use.
+"""Renders charts in the background, and caches the results.
 
 An instance whose chart is not rendered yet reports it, and is enqueued once it is: no worker ever waits for Helm.
 Charts do not affect each other: each source has few runs at a time, and a chart that cannot be fetched, or takes too

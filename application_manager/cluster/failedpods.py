@@ -1,4 +1,4 @@
-"""A look at the Events about a workload whose pods cannot be made, where its own status does not give the reason.
+"""Reads the Events about a workload whose pods cannot be created, if its own status does not give the reason.
 
 They are not watched: a cluster has many Events, and these matter only while pods are missing.
 """

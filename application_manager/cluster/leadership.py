@@ -1,4 +1,4 @@
-"""Being the one active manager: the Lease is renewed, or looked at until it can be taken.
+"""Leader election: renews the Lease, or watches it until it can be acquired.
 
 It has a client of its own, so that no other request holds up a renewal. A time limits what may be done, never a
 flag: a process that was stopped finds its time over before anything had a chance to report it.

@@ -1,4 +1,4 @@
-"""A look at the cluster's nodes, where the account may list them: it shows what the scheduler does not report.
+"""Reads the cluster's nodes, if the account may list them: they show what the scheduler does not report.
 
 Nodes are not watched: they matter only while an application that is bound to some of them does not become ready.
 """

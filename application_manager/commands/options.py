@@ -1,4 +1,4 @@
-"""Options, read and checked: each names its option where it is wrong (typer.BadParameter).
+"""Parses and checks options; an error names its option (typer.BadParameter).
 
 What is read into is imported when it is read, as all that a command runs.
 """

@@ -1,4 +1,4 @@
-"""/metrics, /healthz and /readyz over HTTP(S), in the manager's own event loop: one that hangs does not answer."""
+"""Serves /metrics, /healthz and /readyz over HTTP(S), in the event loop: if that hangs, they do not respond."""
 
 from __future__ import annotations
 

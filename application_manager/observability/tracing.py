@@ -1,4 +1,4 @@
-"""The spans of what is done for tasks, where traces are on (see `wayside.process.tracing`), and the task has a trace.
+"""The spans of the work for tasks that have a trace, if tracing is on (see `wayside.process.tracing`).
 
 A task that an instance serves for the first time gets `reconcile`, with `apply` in it, and `ready` once its workloads
 are. Each is in the task's own trace; where an instance serves several tasks, `reconcile` is linked to the others.

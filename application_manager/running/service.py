@@ -1,4 +1,4 @@
-"""The running manager: what watches, what works and what answers, started in order and stopped at once.
+"""The running manager: starts watches, queues and servers in order, and stops them together.
 
 The order matters: all objects are listed before anything is decided, so that nothing is stopped for want of knowing
 what demands it. Then the watches and the periodic looks run side by side, and while this manager is the active one the

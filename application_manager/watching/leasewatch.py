@@ -1,4 +1,4 @@
-"""Looking at the API server's health, and at Leases that seem to have lapsed."""
+"""Checks the API server's health, and Leases that seem to have expired."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What only the active manager does: the queues work, Events are posted, configurations published.
+"""The work of the active manager only: reconciling, posting Events, publishing configurations.
 
 Several times over, if need be: a manager that cannot renew its Lease stops at once and becomes a standby, and may
 become active again. At the end of the process what is under way is finished, within a bound, and then the Lease is

@@ -1,4 +1,4 @@
-"""Making an instance's objects as rendered, without ever touching what is not ours.
+"""Applies an instance's rendered objects, and never touches objects of others.
 
 Before an object is applied for the first time it is looked for: one that exists and whose controller is not this
 instance is left alone. Every later apply carries the uid, so an object that was replaced meanwhile is a conflict and

@@ -1,4 +1,4 @@
-"""Reconciling one instance: decide, apply the instance, apply its objects. All the way in one go.
+"""Reconciles one instance: decides, applies the instance, applies its objects, in one pass.
 
 Nothing here waits for our own watch events: each answer of the API server enters the store, and the next step starts
 from it. What fails is tried again as a whole, from what is known then. How it went is noted in the cache's record of

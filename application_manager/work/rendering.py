@@ -1,4 +1,4 @@
-"""The objects of instances, computed in the worker processes; those of small templates that only read, here.
+"""Renders the objects of instances in worker processes; those of small templates that only read, in this one.
 
 What is not there yet is requested, and the instance enqueued once it is. A rendering that takes too much is a
 problem of its template, whose status gives it; what runs of the instance stays as it is.

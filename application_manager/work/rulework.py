@@ -1,4 +1,4 @@
-"""Reconciling EventRules and Detectors: their statuses. They run in detectors; here they are only judged."""
+"""Reconciles EventRules and Detectors: checks them and writes their statuses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reconciling one task: its status, and its deletion some time after it has finished."""
+"""Reconciles one task: writes its status, and deletes it some time after it has finished."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reconciling one template: whether it can be rendered, and how many instances it has."""
+"""Reconciles one template: whether it can be rendered, and the number of its instances."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Streams: one kind of data of every client, where it comes from, how it is read and how much of it is kept."""
+"""Streams: one kind of data of every client, with its source, encoding and buffer."""
 
 from __future__ import annotations
 

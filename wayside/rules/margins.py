@@ -1,4 +1,4 @@
-"""The margin of a condition: how nearly it holds, or by how much.
+"""The margin of a condition: how far it is from changing.
 
 It is the robustness of signal temporal logic: the signed distance of each comparison to its threshold in units of a
 scale, the smaller of both for `&&`, the larger for `||`, and the negative for `!`. It is written as an expression of

@@ -1,4 +1,4 @@
-"""What one task requests by itself: an instance and values for it, or why it cannot be had.
+"""What one task requests: an instance and values for it, or the reason for its refusal.
 
 Pure, and independent of all other tasks: it depends on the task's spec and on the template's parameters and key only.
 """

@@ -1,4 +1,4 @@
-"""Several demands made one: the values of tasks, merged parameter by parameter by the template's strategies.
+"""Merges the values of several tasks, parameter by parameter, by the template's strategies.
 
 Pure. The contributions come in their order of precedence, and nothing else about them matters: which of them arrived
 first, or how often, has no influence. A default counts only where nobody gives the parameter, so it is not added here.

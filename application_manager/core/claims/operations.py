@@ -1,4 +1,4 @@
-"""What the live tasks of one instance come to: Deploy merges, Reconfigure lies over it, Suspend stops it.
+"""The result of the live tasks of one instance: Deploy tasks merge, Reconfigure overrides, Suspend stops.
 
 Pure. `settle` looks at one instance; a task that means all instances of a template gets a verdict from each, and
 `gathered` makes one of them.

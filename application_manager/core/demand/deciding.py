@@ -1,4 +1,4 @@
-"""What should become of one instance, from indexes of its namespace and the time. Pure.
+"""Decides what should become of one instance, from indexes of its namespace and the time. Pure.
 
 `decide` is the one way to a decision: the operator calls it over the indexes of its cache, and `demand` over those of a
 snapshot. It changes nothing. Without limits, a decision follows from the tasks that claim the instance, its status and

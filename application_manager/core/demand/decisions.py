@@ -1,4 +1,4 @@
-"""What is decided of one instance."""
+"""The decision about one instance."""
 
 from __future__ import annotations
 

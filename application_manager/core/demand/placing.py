@@ -1,4 +1,4 @@
-"""Limits: what a decision by itself requests, and what becomes of it once places are given. Pure."""
+"""Applies limits: what a decision requests, and its result once places are assigned. Pure."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Values that a template is tried with before any task gives some. Pure.
+"""Example values to render a template with before any task exists. Pure.
 
 A default, a member of an enum and both booleans are values that will come; all others are made up. So what goes wrong
 on these is only a remark, and on those a fault of the template.

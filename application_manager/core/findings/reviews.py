@@ -1,4 +1,4 @@
-"""AdmissionReviews: the API server's requests before it stores an object of ours, and the answers. Pure.
+"""AdmissionReviews: the requests of the API server before it stores an object, and the responses. Pure.
 
 Only a new spec can be refused. Whatever leaves the spec as it is passes, also of an object that was wrong all along:
 else nobody could label it, and a finalizer could never be removed. Deleting passes, and so does what is going anyway.

@@ -1,4 +1,4 @@
-"""The configurations by which the API server requests the manager's review of objects before it stores them. Pure.
+"""The webhook configurations, by which the API server calls the manager before it stores objects. Pure.
 
 A ValidatingWebhookConfiguration for templates, rules and detectors, and a MutatingWebhookConfiguration for pods that
 request a detector. This module makes them safe: failurePolicy Ignore and a short timeout, so that a manager that is

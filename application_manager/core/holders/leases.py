@@ -1,4 +1,4 @@
-"""Whether the holders of demands are still there, determined by their Leases and by our own clock alone.
+"""Whether the holders of demands are alive, by their Leases and the manager's own clock alone.
 
 A Lease lapses when it has been *observed unchanged* for long enough, on a clock of ours that runs only while we reach
 the API server: the holder's clock may be wrong, and an outage stops its renewals as well as our looking. Pure: fed with

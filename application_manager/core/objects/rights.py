@@ -1,4 +1,4 @@
-"""What the manager's account must be allowed to do, from the kinds that templates may create. Pure.
+"""The rights that the manager's account needs, from the kinds that templates may create. Pure.
 
 One table, read three times: `application-manager rbac` prints it as roles, a manager that starts queries the API server
 for each of its entries, and the tests hold it against what a manager does. A verb that nothing needs is not in it.

@@ -1,4 +1,4 @@
-"""What of an object the cache keeps: the fields that decisions read, and none that people may fill at will. Pure.
+"""Trims objects for the cache to the fields that decisions read. Pure.
 
 An object may have 1.5 MB, and Python needs several times that. So neither the texts of ConfigMaps and Secrets are kept
 nor containers, managed fields of others, foreign annotations and the values of a task's event.

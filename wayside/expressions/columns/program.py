@@ -1,4 +1,4 @@
-"""Puts the nodes of a graph into steps, runs them over rows, and gives what the roots yield.
+"""Orders the nodes of a graph into steps, runs them over rows, and returns the results of the roots.
 
 Nodes of the same depth with the same operation are one step, whatever rule they belong to, so a run costs a few numpy
 calls for each depth and operation, however many rules and rows there are.
