@@ -1,4 +1,4 @@
-"""The objects that a rule is checked against: those of its namespace in the cache."""
+"""What a rule is judged with: what the cache has beside it in its namespace."""
 
 from __future__ import annotations
 

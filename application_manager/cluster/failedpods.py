@@ -1,4 +1,4 @@
-"""Reads the Events about a workload whose pods cannot be created, if its own status does not give the reason.
+"""A look at the Events about a workload whose pods cannot be made, where its own status does not give the reason.
 
 They are not watched: a cluster has many Events, and these matter only while pods are missing.
 """
@@ -25,7 +25,7 @@ class FailedPodsLook:
     def __init__(self, client: Client) -> None:
         self._client = client
         self._forbidden_until = 0.0  # monotonic
-        self._reported = False
+        self._told = False
 
     async def events(self, namespace: str, uid: str) -> list[Object]:
         """Those of the object with this uid; none where they may not be listed, or the API server does not answer."""
@@ -38,13 +38,13 @@ class FailedPodsLook:
         except ApiError as error:
             if error.code == 403:
                 self._forbidden_until = time.monotonic() + FORBIDDEN_FOR
-            if not self._reported:
+            if not self._told:
                 log.info(
                     "cannot list Events (%s): statuses do not give the reason why pods of a StatefulSet cannot be "
                     "created",
                     error,
                 )
-                self._reported = True
+                self._told = True
             return []
         except Unreachable:
             return []

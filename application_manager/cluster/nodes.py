@@ -1,4 +1,4 @@
-"""Reads the cluster's nodes, if the account may list them: they show what the scheduler does not report.
+"""A look at the cluster's nodes, where the account may list them: it shows what the scheduler does not report.
 
 Nodes are not watched: they matter only while an application that is bound to some of them does not become ready.
 """
@@ -28,7 +28,7 @@ class NodeLook:
         self._client = client
         self._known: Nodes | None = None
         self._until = 0.0  # monotonic time until which what is known is used
-        self._reported = False
+        self._told = False
         self._asking = asyncio.Lock()
 
     async def labels(self) -> Nodes | None:
@@ -43,9 +43,9 @@ class NodeLook:
             found, _ = await self._client.list(NODES, None)
         except ApiError as error:
             self._until = time.monotonic() + (FORBIDDEN_FOR if error.code == 403 else FRESH)
-            if not self._reported:
+            if not self._told:
                 log.info("cannot list nodes (%s): only the scheduler reports why a pod fits no node", error)
-                self._reported = True
+                self._told = True
             return None
         except Unreachable:
             return None

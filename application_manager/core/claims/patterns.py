@@ -1,4 +1,4 @@
-"""Matches texts against a parameter's pattern, by CEL's regular expressions (RE2), in linear time.
+"""Texts matched against a parameter's pattern, by CEL's regular expressions (RE2): their time is linear in the text.
 
 Pure. Python's own would let a template's pattern and a task's text hold up the manager for as long as they like.
 """

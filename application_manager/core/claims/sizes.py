@@ -1,4 +1,4 @@
-"""Limits the size of an instance's merged parameters, and names the tasks that exceed it. Pure.
+"""How large an instance's merged parameters may be, and who makes them too large. Pure.
 
 Each task is within its own bound, but a Union of many is not. What is too large is not applied: the instance keeps the
 values that it has, and every other instance is served.

@@ -1,4 +1,4 @@
-"""Rate limit of the Events about one object: a burst, then one a minute. Pure."""
+"""How often an Event may be posted about one object: a few times at once, then only now and then. Pure."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The summary conditions Ready and Stalled, which kstatus, kubectl and GitOps tools use. Pure.
+"""The conditions that conclude from others: Ready and Stalled, by which kstatus, kubectl and GitOps tools judge. Pure.
 
 kstatus takes an object with Ready=True as current, with Ready=False as in progress, and with Stalled=True as failed. So
 Stalled is there only while waiting alone helps nothing.
