@@ -1,4 +1,4 @@
-"""Rules to start from, each a short version of a use case. They read JSON of a stream `odom`, with comments to follow."""
+"""Rules to start from, each a short version of a use case. They read JSON of a stream `odom`; comments guide you."""
 
 from __future__ import annotations
 
