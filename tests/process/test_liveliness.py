@@ -110,10 +110,10 @@ def test_with_clock_data_a_token_counts_after_the_samples_up_to_the_newest_stamp
     drive.take(alive(100, "car1", Token.DECLARED), fast(0.5, "car1"), fast(0.6, "car2"), until=200)
     drive.take(fast(1.5, "car2"), fast(2.5, "car1"), alive(102.6, "car1", Token.DROPPED), fast(3.5, "car2"), until=200)
     assert drive.take(fast(4.5, "car2"), until=200) == []
-    assert [line for line in _told(drive) if "car1" in line] == ["fast car1 started 1", "fast car1 ClientLost 3"]
+    assert [line for line in _reported(drive) if "car1" in line] == ["fast car1 started 1", "fast car1 ClientLost 3"]
 
 
-def _told(drive: Drive) -> list[str]:
+def _reported(drive: Drive) -> list[str]:
     return Drive.note(drive, []) or [
         f"{e.episode.rule} {e.episode.subject} {e.reason or 'started'} {(e.time - START) / 1e9:g}" for e in drive.events
     ]

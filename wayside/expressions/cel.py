@@ -23,7 +23,7 @@ from cel_expr_python import cel
 from wayside.expressions.diagnostics import EMPTY, diagnose
 from wayside.expressions.errors import EvaluationError, ExpressionError, position
 from wayside.expressions.expanding import NamedPlaces, expanded
-from wayside.expressions.failures import NO_MEMBERS, clean, says_absent
+from wayside.expressions.failures import NO_MEMBERS, clean, reports_absent
 from wayside.expressions.functions import DECLARATIONS, TAKING_HANDLES
 from wayside.expressions.functions.calls import drop_lost_references
 from wayside.expressions.growth import MOST, growth
@@ -303,7 +303,7 @@ class Expression:
             raise EvaluationError(clean(str(error))) from None
         if failed:
             message = clean(value)
-            raise EvaluationError(message, absent=says_absent(message) or (known and "null" in message))
+            raise EvaluationError(message, absent=reports_absent(message) or (known and "null" in message))
         result = _plain(value)
         if self.result is not CelType.DYN:
             self._check(result)
@@ -313,7 +313,7 @@ class Expression:
         wanted = _PYTHON[self.result]
         if isinstance(value, wanted) and not (isinstance(value, bool) and self.result is CelType.DOUBLE):
             return
-        raise EvaluationError(f"must be {self.result.value}, is {_describe(value)}", absent=value is None)
+        raise EvaluationError(f"must be {self.result.value}; got {_describe(value)}", absent=value is None)
 
 
 def _check_static(actual: cel.Type, wanted: CelType, source: str) -> None:
@@ -324,7 +324,7 @@ def _check_static(actual: cel.Type, wanted: CelType, source: str) -> None:
     start = len(source) - len(source.lstrip())
     line, column = position(source, start)
     is_text = kind.value if kind else name.lower()
-    raise ExpressionError(f"must be {wanted.value}, is {is_text}", source=source, line=line, column=column)
+    raise ExpressionError(f"must be {wanted.value}; got {is_text}", source=source, line=line, column=column)
 
 
 def _check_patterns(node: Node, source: str) -> None:
@@ -351,7 +351,7 @@ def _not_text(source: object) -> ExpressionError:
         return ExpressionError("the expression is empty", source="", hint=EMPTY)
     written = str(source).lower() if isinstance(source, bool) else str(source)
     return ExpressionError(
-        f"an expression must be a text, is {type(source).__name__} {written}",
+        f"an expression must be a text; got {type(source).__name__} {written}",
         source=written,
         hint=f'put it in quotes: "{written}"',
     )

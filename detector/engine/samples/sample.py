@@ -14,7 +14,7 @@ from wayside.expressions.columns.values import MISSING
 __all__ = ["MISSING"]
 
 SAMPLE_OVERHEAD = 160
-"""The memory that a sample takes beside its payload, in bytes: its object, its numbers and its entries in queues."""
+"""The memory of a sample without its payload, in bytes: its object, its numbers and its entries in queues."""
 
 
 class Arrival(msgspec.Struct, frozen=True, gc=False, order=True):

@@ -76,7 +76,7 @@ class Walk:
         for place, (name, desc) in enumerate(fields):
             self.fields += 1
             if self.fields > _MOST_FIELDS:
-                raise UnwalkableError(f"{type_name} holds too much")
+                raise UnwalkableError(f"{type_name} has too many fields")
             if isinstance(wanted, bool):
                 value = self._field(desc, wanted)
                 if name != PADDING:

@@ -188,6 +188,6 @@ def value_at(column: Column, row: int, texts: Texts) -> Value | Unknown:
             return texts.text(int(double))
         case Tag.OTHER:
             if column.others is None:
-                raise ValueError(f"row {row} holds a value that this column cannot represent: evaluate it with CEL")
+                raise ValueError(f"row {row} has a value that this column cannot represent: evaluate it with CEL")
             return cast("Value", column.others[row])
     return UNKNOWN
