@@ -306,7 +306,7 @@ def check(
     Exits with 1 if the webhook would refuse an object; warnings are only printed.
     """
     with importing():
-        from application_manager.commands.checking import check_files
+        from application_manager.commands.checking import review_files
         from application_manager.core.findings.checks import CHECKS
         from wayside.api.documents import DocumentError
         from wayside.findings import UNREADABLE_FILE, check_lines, ignorable
@@ -318,7 +318,7 @@ def check(
         commandline.refuse("give YAML files or folders, or --list")
     ignored = ignorable(ignore or (), CHECKS)
     try:
-        checked = check_files(files, policy_of(allowed_kinds, service_accounts), ignored)
+        checked = review_files(files, policy_of(allowed_kinds, service_accounts), ignored)
     except DocumentError as error:
         for problem in error.problems:
             typer.echo(f"{problem} [{UNREADABLE_FILE.name}]", err=True)
@@ -369,7 +369,7 @@ app.command("detector-rbac")(detector_rbac)
 
 def main() -> None:
     """The console script."""
-    sys.exit(commandline.run(app, "application-manager", EXPECTED, sys.argv[1:]))
+    sys.exit(commandline.run_cli(app, "application-manager", EXPECTED, sys.argv[1:]))
 
 
 if __name__ == "__main__":

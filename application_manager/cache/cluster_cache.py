@@ -62,7 +62,7 @@ class Served:
 
 
 @dataclass(frozen=True, slots=True)
-class Record:
+class WorkRecord:
     """How the last work on an instance went.
 
     Attributes:
@@ -105,7 +105,7 @@ class ClusterCache:
     leases: LeaseIndex = field(default_factory=LeaseIndex)
     healthy: HealthyTime = field(default_factory=HealthyTime)
     served: dict[Name, Served] = field(default_factory=dict)
-    records: dict[Name, Record] = field(default_factory=dict)
+    records: dict[Name, WorkRecord] = field(default_factory=dict)
     deadlines: dict[Name, tuple[str, float | None]] = field(default_factory=dict)
     turns: FallbackIndex = field(default_factory=FallbackIndex)
     overlap: OverlapIndex = field(default_factory=OverlapIndex)

@@ -45,7 +45,7 @@ _NOTE_LENGTH = 1024  # characters, as events.k8s.io allows
 log = logging.getLogger(__name__)
 
 
-class Reason(StrEnum):
+class EventReason(StrEnum):
     """All reasons that Events can have."""
 
     ACCEPTED = "Accepted"
@@ -82,46 +82,46 @@ class Reason(StrEnum):
 
 
 _OF_CONDITION = {
-    ("Accepted", "True"): Reason.ACCEPTED,
-    ("Accepted", "False"): Reason.REFUSED,
-    ("Applied", "True"): Reason.APPLIED,
-    ("Applied", "False"): Reason.NOT_APPLIED,
-    ("Ready", "True"): Reason.READY,
-    ("Ready", "False"): Reason.NOT_READY,
-    ("Running", "True"): Reason.READY,
-    ("Running", "False"): Reason.NOT_READY,
-    ("Finished", "True"): Reason.FINISHED,
-    ("Paused", "True"): Reason.PAUSED,
-    ("Paused", "False"): Reason.RESUMED,
-    ("Held", "True"): Reason.HELD,
-    ("Suspended", "True"): Reason.SUSPENDED,
-    ("Held", "False"): Reason.NOT_HELD,
+    ("Accepted", "True"): EventReason.ACCEPTED,
+    ("Accepted", "False"): EventReason.REFUSED,
+    ("Applied", "True"): EventReason.APPLIED,
+    ("Applied", "False"): EventReason.NOT_APPLIED,
+    ("Ready", "True"): EventReason.READY,
+    ("Ready", "False"): EventReason.NOT_READY,
+    ("Running", "True"): EventReason.READY,
+    ("Running", "False"): EventReason.NOT_READY,
+    ("Finished", "True"): EventReason.FINISHED,
+    ("Paused", "True"): EventReason.PAUSED,
+    ("Paused", "False"): EventReason.RESUMED,
+    ("Held", "True"): EventReason.HELD,
+    ("Suspended", "True"): EventReason.SUSPENDED,
+    ("Held", "False"): EventReason.NOT_HELD,
 }
-_TROUBLES = frozenset(Reason(each.value) for each in TroubleReason)
+_TROUBLES = frozenset(EventReason(each.value) for each in TroubleReason)
 _OWN_REASONS = frozenset(
     {
-        Reason.PREEMPTED,
-        Reason.LIMIT_REACHED,
-        Reason.READY_TIMEOUT,
-        Reason.FALLEN_BACK,
-        Reason.FALLBACK_FAILED,
-        Reason.HOLDER_LOST,
-        Reason.TEMPLATE_INVALID,
-        Reason.NOT_INJECTED,
-        Reason.MANAGERS_OVERLAP,
+        EventReason.PREEMPTED,
+        EventReason.LIMIT_REACHED,
+        EventReason.READY_TIMEOUT,
+        EventReason.FALLEN_BACK,
+        EventReason.FALLBACK_FAILED,
+        EventReason.HOLDER_LOST,
+        EventReason.TEMPLATE_INVALID,
+        EventReason.NOT_INJECTED,
+        EventReason.MANAGERS_OVERLAP,
     }
     | _TROUBLES
 )
 """Reasons of conditions that are those of their Events too."""
 
-_WARNINGS = frozenset({Reason.REFUSED, Reason.NOT_APPLIED}) | _OWN_REASONS
+_WARNINGS = frozenset({EventReason.REFUSED, EventReason.NOT_APPLIED}) | _OWN_REASONS
 _EXPECTED = frozenset({"Waiting", "ChartPending", "NotApplied", "NotReady"})  # reasons that come with every start
 
 
 @dataclass(frozen=True, slots=True)
 class _Event:
     regarding: Kind
-    reason: Reason
+    reason: EventReason
     note: str
     now: float
     once: bool = False
@@ -181,7 +181,7 @@ class Recorder:
         self._drops = _Drops()
         self._series: OrderedDict[tuple[str, str, str], _Series] = OrderedDict()
 
-    def event(self, regarding: Kind, reason: Reason, note: str, now: float, *, once: bool = False) -> None:
+    def event(self, regarding: Kind, reason: EventReason, note: str, now: float, *, once: bool = False) -> None:
         """Post an Event about the object, unless there were too many of it.
 
         Args:
@@ -229,13 +229,13 @@ class Recorder:
         for each in changes:
             if each.type == STALLED or (each.type == READY and concludes) or (each.type == "Applied" and at_once):
                 continue
-            if (regarding.kind, each.reason) == ("ApplicationTask", Reason.ACCEPTED) and not old:
+            if (regarding.kind, each.reason) == ("ApplicationTask", EventReason.ACCEPTED) and not old:
                 continue
             reason = _OF_CONDITION.get((each.type, each.status))
             if each.reason in _OWN_REASONS:
-                reason = Reason(each.reason)
-            if each.reason == Reason.NOT_SUSPENDED:
-                reason = Reason.NOT_SUSPENDED
+                reason = EventReason(each.reason)
+            if each.reason == EventReason.NOT_SUSPENDED:
+                reason = EventReason.NOT_SUSPENDED
             expected = each.status == "False" and each.type not in was_true and each.reason in _EXPECTED
             if reason is not None and not expected:
                 self.event(regarding, reason, each.message, now)

@@ -26,7 +26,7 @@ DEPLOY = "deploy"
 """The one action without a class here: its tasks are reconciled (detector/actions/deploy)."""
 
 
-def prepare_action(action: api.Action, streams: Sequence[str] | None = None) -> tuple[type[Action[Any]], BaseModel]:
+def prepare_action(action: api.ActionSpec, streams: Sequence[str] | None = None) -> tuple[type[Action[Any]], BaseModel]:
     """The class of an action other than deploy, and its parameters; `streams` are those that parameters may name.
 
     Raises PluginError; the paths begin at the action.
@@ -39,7 +39,7 @@ def prepare_action(action: api.Action, streams: Sequence[str] | None = None) -> 
             raise PluginError(((action.field,), f"the installed action {action.kind} takes the parameters {wanted}"))
         return offered, given
     name = action.plugin.name
-    if name in api.Action.model_fields:
+    if name in api.ActionSpec.model_fields:
         raise PluginError(
             (
                 ("plugin", "name"),

@@ -116,7 +116,7 @@ def run(
         import asyncio
 
         from detector.live.service import Files, Named, RunOptions
-        from detector.live.service import run as run_service
+        from detector.live.service import run_detector as run_service
         from detector.status.server import PagesAddress
 
     pages = None if metrics_port is None else PagesAddress(metrics_port, metrics_certificates)
@@ -284,10 +284,10 @@ def new(
 ) -> None:
     """Print a rule to begin with, made from a use case."""
     with importing():
-        from detector.commands.drafts import draft, drafts
+        from detector.commands.drafts import drafts, rule_draft
 
     if case is not None:
-        typer.echo(draft(case, stream, name), nl=False)
+        typer.echo(rule_draft(case, stream, name), nl=False)
         return
     found = drafts()
     width = max(map(len, found))
@@ -353,7 +353,7 @@ for command in (inquiry.status, inquiry.evaluate, inquiry.pause, inquiry.resume,
 
 def main() -> None:
     """The entry point of the console script."""
-    sys.exit(commandline.run(app, "detector", _EXPECTED, sys.argv[1:]))
+    sys.exit(commandline.run_cli(app, "detector", _EXPECTED, sys.argv[1:]))
 
 
 if __name__ == "__main__":

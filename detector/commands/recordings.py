@@ -69,8 +69,8 @@ def stop(
     _print(_request_reports(_request(do="stop", id=identity, after=after), detector, name, connect, timeout), as_json)
 
 
-@app.command()
-def status(
+@app.command("status")
+def recordings_status(
     identity: Annotated[str | None, typer.Argument(help="Only this recording.")] = None,
     detector: DetectorFile = None,
     name: Name = None,

@@ -29,7 +29,7 @@ from detector.replay.intake_file import read_intake, recorded_outages
 from detector.replay.playing import Played, play
 from detector.replay.progress import ProgressLine
 from detector.replay.recordings import quick_span_of
-from detector.replay.replaying import Outcome, replay_intake
+from detector.replay.replaying import Replayed, replay_intake
 from detector.replay.variants import Variant, variants_of, with_variants
 from detector.resources.files import load_rules
 from detector.resources.selection import select
@@ -134,7 +134,7 @@ def _console() -> Console:
     return console if console.is_terminal else Console(stderr=True, width=_WIDTH)
 
 
-def _lines(outcome: Outcome, where: str) -> Iterator[str]:
+def _lines(outcome: Replayed, where: str) -> Iterator[str]:
     """Messages about a recording for the user."""
     yield from (f"warning: {cut}" for cut in outcome.cuts)  # these name their files
     yield from (f"warning: {where}{doubt}" for doubt in outcome.doubts)
@@ -145,7 +145,7 @@ def _lines(outcome: Outcome, where: str) -> Iterator[str]:
         yield f"the intake file lacks {outcome.lost} samples, since the disk was too slow: events may differ"
 
 
-def _counted(outcomes: Sequence[Outcome], tried: Set[str]) -> str:
+def _counted(outcomes: Sequence[Replayed], tried: Set[str]) -> str:
     events = [event for outcome in outcomes for event in outcome.events if event.rule not in tried]
     started = sum(event.started for event in events)
     several = f"{len(outcomes)} recordings, " if len(outcomes) > 1 else ""
@@ -260,7 +260,7 @@ def _intake_replayed(
     progress: ProgressLine,
     look: Look | None,
     clips: Clips | None,
-) -> Outcome:
+) -> Replayed:
     if detector is None and rules:
         refuse("give --detector as well: rules are compiled against their Detector")
     given = None if detector is None else load_rules(detector, rules, lasting_problems).rule_set
@@ -276,7 +276,7 @@ def _intake_replayed(
         )
 
 
-def _traced(outcome: Outcome) -> tuple[Iterable[Event], Iterable[ApplicationTask]]:
+def _traced(outcome: Replayed) -> tuple[Iterable[Event], Iterable[ApplicationTask]]:
     """The events and tasks, with their trace context if the environment requests traces."""
     with episode_traces(export=False) as traces:
         if traces is None:

@@ -15,7 +15,7 @@ from detector.engine.consequences.consequences import Consequences
 from detector.engine.counters import Counters
 from detector.engine.episodes.current import Identity
 from detector.engine.episodes.demands import Demand
-from detector.engine.episodes.episodes import Reason
+from detector.engine.episodes.episodes import EndReason
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.open_episodes import OpenEpisode, ended_while_away, episode_of
 from detector.engine.evaluation.executor import Executor
@@ -38,7 +38,7 @@ from wayside.rules import CompiledRule, in_order
 __all__ = ["Engine", "KeyReader"]
 
 
-class NoAnswerError(ValueError):
+class NotEvaluableError(ValueError):
     """A rule cannot be evaluated on demand; the text names the reason and the remedy."""
 
 
@@ -149,7 +149,7 @@ class Engine:
         for name, run in sorted(self._runs.items()):
             rule = new.get(name)
             if rule is None or not same_semantics(run, rule):
-                events += self._executor.noted(run, run.end_all(now, Reason.RULE_CHANGED))
+                events += self._executor.noted(run, run.end_all(now, EndReason.RULE_CHANGED))
                 self._starts.forget(name)
                 self.schedule.forget(name)
             else:
@@ -245,11 +245,13 @@ class Engine:
         """
         run = self._runs.get(name)
         if run is None:
-            raise NoAnswerError(f"there is no rule {name}; the detector has {', '.join(sorted(self._runs)) or 'none'}")
+            raise NotEvaluableError(
+                f"there is no rule {name}; the detector has {', '.join(sorted(self._runs)) or 'none'}"
+            )
         if not run.rule.on_demand:
-            raise NoAnswerError(f"rule {name} is not evaluated on demand: write evaluation: {{onDemand: true}}")
+            raise NotEvaluableError(f"rule {name} is not evaluated on demand: write evaluation: {{onDemand: true}}")
         if not run.rule.enabled or name in self.schedule.paused:
-            raise NoAnswerError(f"rule {name} is {'paused: resume it' if run.rule.enabled else 'not enabled'}")
+            raise NotEvaluableError(f"rule {name} is {'paused: resume it' if run.rule.enabled else 'not enabled'}")
         events, answers = run.answer(self.now, self._known.views(run, self.now), self.clients, self._plugins)
         self._executor.noted(run, events)
         self._known.looked(self.now)

@@ -7,7 +7,7 @@ from typing import Any
 
 from detector.engine.queries.queries import Queries
 from detector.engine.scoping.plugins import PluginCall, PluginFailedError
-from detector.plugins.base import Plugin, Subject
+from detector.plugins.base import Plugin, PluginSubject
 from detector.plugins.registry import prepare_plugin
 from detector.plugins.values import plain_value
 from wayside.expressions import Reason, Value
@@ -23,7 +23,7 @@ class Instances:
         self._plugin.warm_up()
         self._objects: dict[str, Plugin[Any]] = {}
 
-    def value(self, subject: Subject, clients: tuple[str, ...], queries: Queries) -> Value:
+    def value(self, subject: PluginSubject, clients: tuple[str, ...], queries: Queries) -> Value:
         """The signal's value. Raises the plugin's exceptions, and TypeError if its value is not plain data."""
         found = self._objects.get(subject.text)
         if found is None:
@@ -73,7 +73,7 @@ class LocalHost:
         """See PluginHost."""
         try:
             return self._signals[call.rule, call.signal].value(
-                Subject(call.subject, call.element), call.clients, queries
+                PluginSubject(call.subject, call.element), call.clients, queries
             )
         except Exception as error:  # a plugin may raise any exception
             raise PluginFailedError(Reason.ERROR, failure_text(error)) from error

@@ -20,7 +20,7 @@ from detector.engine.queries.transforms import TransformError
 from detector.engine.queries.tuples import matched
 from detector.plugins import assignment
 from detector.plugins.assignment import Point, assigned
-from detector.plugins.base import Plugin, PluginParameters, Seconds, StreamName, Subject
+from detector.plugins.base import Plugin, PluginParameters, PluginSubject, Seconds, StreamName
 from detector.plugins.tracking import Tracks
 from wayside.expressions import Value
 
@@ -92,7 +92,7 @@ class UnmatchedObjects(Plugin[UnmatchedParameters]):
 
     Parameters = UnmatchedParameters
 
-    def __init__(self, parameters: UnmatchedParameters, subject: Subject) -> None:
+    def __init__(self, parameters: UnmatchedParameters, subject: PluginSubject) -> None:
         super().__init__(parameters, subject)
         self._tracks = Tracks(parameters.within, parameters.speed, round(parameters.gap * 1e9))
         self._last: int | None = None

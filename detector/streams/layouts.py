@@ -36,4 +36,6 @@ def pump_for(stream: Stream, put: Put, tally: Tally) -> Pump:
         case Layout.PLAIN:
             return partial(plain.pump, put=put)
         case Layout.RMW_ZENOH:
-            return partial(rmw_zenoh.pump, put=put, reader=rmw_zenoh.RmwReader(stream.name, stream.type, tally))
+            return partial(
+                rmw_zenoh.pump_by_topic, put=put, reader=rmw_zenoh.RmwReader(stream.name, stream.type, tally)
+            )

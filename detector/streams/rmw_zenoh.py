@@ -100,8 +100,8 @@ class RmwReader:
             self._sequences.follow(*given, topic)
 
 
-def pump(bursts: Iterable[Sequence[zenoh.Sample]], put: Put, reader: RmwReader) -> None:
-    """Delivers every message by its topic, as `plain.pump` does by its key."""
+def pump_by_topic(bursts: Iterable[Sequence[zenoh.Sample]], put: Put, reader: RmwReader) -> None:
+    """Delivers every message by its topic, as the plain layout does by its key."""
     put_kind = zenoh.SampleKind.PUT
     for burst in bursts:
         messages = []

@@ -20,7 +20,7 @@ from detector.engine.samples.intake import Intake
 from detector.findings.losses import Losses
 from detector.replay.recordings import open_recordings
 from detector.replay.replaying import replay_arrivals
-from detector.replay.routing import Router
+from detector.replay.routing import MessageRouter
 from detector.streams.codecs.ros import standard
 from detector.streams.rmw_zenoh import MisfitError, numbered, split
 from detector.streams.sequences import MAXIMUM_PUBLISHERS, Sequences
@@ -205,7 +205,7 @@ def test_the_same_detector_gives_the_same_events_live_and_from_a_bag_of_topics(
         }
         for arrival in arrivals:
             bag.write(connections[arrival.key], arrival.received, arrival.payload)
-    router = Router(detector.spec.streams)
+    router = MessageRouter(detector.spec.streams)
     replayed = replay_arrivals(router.arrivals(open_recordings([tmp_path / "bag"])), detector, [MOVED])
     assert len(events) > 3
     assert lines(replayed.events) == lines(events)

@@ -46,7 +46,7 @@ _UsageError = cast("type[typer.BadParameter]", typer.BadParameter.__mro__[1])
 """The base class of all usage errors, which typer does not export."""
 
 
-def run(app: typer.Typer, program: str, expected: tuple[type[Exception], ...], arguments: Sequence[str]) -> int:
+def run_cli(app: typer.Typer, program: str, expected: tuple[type[Exception], ...], arguments: Sequence[str]) -> int:
     """Run the command line and report errors; return the exit code.
 
     Args:

@@ -8,11 +8,11 @@ from typing import Any
 
 from detector.engine.counters import RuleCounters
 from detector.engine.episodes.demands import Demand
-from detector.engine.episodes.episodes import Reason
+from detector.engine.episodes.episodes import EndReason
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.following import followed
 from detector.engine.episodes.open_episodes import OpenEpisode
-from detector.engine.episodes.rendering import Rendered, render
+from detector.engine.episodes.rendering import Rendered, render_templates
 from detector.engine.episodes.statistics import Statistics
 from detector.engine.episodes.subjects import Subject
 from wayside.expressions import InterpolationError
@@ -49,7 +49,9 @@ class Episode:
 
     def started(self, rule: CompiledRule, identity: Identity) -> Event:
         """The start event, with the texts rendered for the rule's current actions."""
-        rendered = {action.name: render(action, self.variables) for action in rule.actions} if rule.actions else {}
+        rendered = (
+            {action.name: render_templates(action, self.variables) for action in rule.actions} if rule.actions else {}
+        )
         return self._event(rule, identity, None, None, self.values, rendered)
 
     def ended(
@@ -57,7 +59,7 @@ class Episode:
         rule: CompiledRule,
         identity: Identity,
         now: int,
-        reason: Reason,
+        reason: EndReason,
         values: Mapping[str, Any],
         variables: Mapping[str, Any],
     ) -> Event:
@@ -70,7 +72,7 @@ class Episode:
             seen = {**(self.variables or {}), **variables}
             for action in rule.actions:
                 if any(names & template.names for template in action.templates.values()):
-                    rendered[action.name] = render(action, seen)
+                    rendered[action.name] = render_templates(action, seen)
         return self._event(rule, identity, now, reason, values, rendered)
 
     def kept(self, rule: CompiledRule) -> OpenEpisode:
@@ -147,7 +149,7 @@ class Episode:
         rule: CompiledRule,
         identity: Identity,
         end: int | None,
-        reason: Reason | None,
+        reason: EndReason | None,
         values: Mapping[str, Any],
         rendered: Mapping[str, Rendered],
     ) -> Event:

@@ -171,7 +171,7 @@ def rules(tmp_path: Path) -> Path:
 
 
 def run(*arguments: str) -> int:
-    return commandline.run(app, "detector", (DocumentError, ConfigurationError, OSError), ["catalog", *arguments])
+    return commandline.run_cli(app, "detector", (DocumentError, ConfigurationError, OSError), ["catalog", *arguments])
 
 
 def test_the_command_prints_a_table_of_all_values(rules: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -12,7 +12,7 @@ from wayside.expressions.columns.nodes import Holds, Nodes, Op
 from wayside.expressions.columns.values import Tag
 from wayside.expressions.projection import integer
 from wayside.expressions.syntax import Call, Collection, Node, Path, Select, path_of
-from wayside.expressions.syntax import Constant as Literal
+from wayside.expressions.syntax import Scalar as Literal
 from wayside.geo.geometry import shape_of
 
 _ARITHMETIC: Final = {"_+_": Op.ADD, "_-_": Op.SUBTRACT, "_*_": Op.MULTIPLY, "_/_": Op.DIVIDE}
