@@ -15,7 +15,7 @@ from detector.engine.consequences.consequences import Consequences
 from detector.engine.counters import Counters
 from detector.engine.episodes.current import Identity
 from detector.engine.episodes.demands import Demand
-from detector.engine.episodes.episodes import EndReason
+from detector.engine.episodes.episodes import Ending
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.open_episodes import OpenEpisode, ended_while_away, episode_of
 from detector.engine.evaluation.executor import Executor
@@ -149,7 +149,7 @@ class Engine:
         for name, run in sorted(self._runs.items()):
             rule = new.get(name)
             if rule is None or not same_semantics(run, rule):
-                events += self._executor.noted(run, run.end_all(now, EndReason.RULE_CHANGED))
+                events += self._executor.noted(run, run.end_all(now, Ending.RULE_CHANGED))
                 self._starts.forget(name)
                 self.schedule.forget(name)
             else:

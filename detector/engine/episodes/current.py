@@ -8,7 +8,7 @@ from typing import Any
 
 from detector.engine.counters import RuleCounters
 from detector.engine.episodes.demands import Demand
-from detector.engine.episodes.episodes import EndReason
+from detector.engine.episodes.episodes import Ending
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.following import followed
 from detector.engine.episodes.open_episodes import OpenEpisode
@@ -59,7 +59,7 @@ class Episode:
         rule: CompiledRule,
         identity: Identity,
         now: int,
-        reason: EndReason,
+        reason: Ending,
         values: Mapping[str, Any],
         variables: Mapping[str, Any],
     ) -> Event:
@@ -149,7 +149,7 @@ class Episode:
         rule: CompiledRule,
         identity: Identity,
         end: int | None,
-        reason: EndReason | None,
+        reason: Ending | None,
         values: Mapping[str, Any],
         rendered: Mapping[str, Rendered],
     ) -> Event:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from detector.engine.episodes.episodes import EndReason
+from detector.engine.episodes.episodes import Ending
 from detector.engine.episodes.plain import plain_text, quote, to_text
 from detector.engine.episodes.rendering import Rendered
 from wayside.api.base import JsonValue
@@ -29,7 +29,7 @@ class Event(msgspec.Struct, frozen=True, gc=False):
     onset_time: int
     start_time: int
     end_time: int | None
-    reason: EndReason | None
+    reason: Ending | None
     values: Mapping[str, JsonValue]
     classification: Mapping[str, JsonValue] | None
     models: Mapping[str, str] = msgspec.field(default_factory=dict)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from detector.engine.episodes.demands import Demand
-from detector.engine.episodes.episodes import EndReason
+from detector.engine.episodes.episodes import Ending
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.plain import plain
 from detector.engine.episodes.subjects import Subject
@@ -108,7 +108,7 @@ def ended_while_away(episode: OpenEpisode, holder: str, now: int) -> Event:
         onset_time=episode.onset_time,
         start_time=episode.start_time,
         end_time=now,
-        reason=EndReason.RULE_CHANGED,
+        reason=Ending.RULE_CHANGED,
         values={},
         classification=episode.classification,
         element=episode.subject.element,

@@ -16,7 +16,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from detector.engine.episodes.episodes import EndReason
+from detector.engine.episodes.episodes import Ending
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.identifiers import episode_id
 from detector.engine.episodes.plain import plain, plain_text
@@ -46,7 +46,7 @@ SCALARS = (
     | st.floats()
     | st.floats().map(Number)
     | TEXTS
-    | st.sampled_from(EndReason)
+    | st.sampled_from(Ending)
 )
 KEYS = TEXTS | st.integers(-2, 2) | st.booleans() | st.sampled_from(["1", "True", "None"]) | st.none()
 NESTED: st.SearchStrategy[Any] = st.recursive(
@@ -74,7 +74,7 @@ def events(times: st.SearchStrategy[int], values: st.SearchStrategy[dict[str, An
         onset_time=times,
         start_time=times,
         end_time=st.none() | times,
-        reason=st.none() | st.sampled_from(EndReason),
+        reason=st.none() | st.sampled_from(Ending),
         values=values,
         classification=st.none() | st.dictionaries(TEXTS, st.lists(TEXTS, max_size=2) | st.floats(), max_size=2),
         models=st.dictionaries(TEXTS, TEXTS, max_size=2),

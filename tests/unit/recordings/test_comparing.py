@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from detector.commands import cli
-from detector.engine.episodes.episodes import EndReason
+from detector.engine.episodes.episodes import Ending
 from detector.engine.episodes.events import Event
 from detector.replay.comparing import compare
 from tests import onnx_models
@@ -35,7 +35,7 @@ def episodes(rule: str, *spans: tuple[float, float | None], subject: str = "car"
                     "onset_time": at(first),
                     "start_time": at(first),
                     "end_time": None if end is None else at(end),
-                    "reason": None if end is None else EndReason.UNTIL,
+                    "reason": None if end is None else Ending.UNTIL,
                     "values": {},
                     "classification": None,
                 }
