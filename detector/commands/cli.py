@@ -137,7 +137,7 @@ def _view(address: str | None) -> View | None:
     if not port.isdecimal() or int(port) > 65535:
         refuse(f"--foxglove {address}: give a port, e.g. 8765, or host and port, e.g. 0.0.0.0:8765")
     with importing():
-        from detector.results.installed import check_package
+        from detector.results.kinds import check_package
 
         check_package("foxglove", "--foxglove")
         from detector.results.live import LiveView

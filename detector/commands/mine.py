@@ -19,7 +19,7 @@ from detector.mining.sources import sampled, sources_of
 from detector.mining.summary import Summary, show, summary_of
 from detector.mining.workers import LocalWorkers, Workers
 from detector.resources.files import load_rules
-from detector.results.installed import check_package
+from detector.results.kinds import check_package
 from wayside.process.commandline import refuse
 
 _WIDTH = 160

@@ -231,7 +231,7 @@ class Engine:
         self._executor.wake_all(self.now)
 
     def set_level(self, level: int) -> None:
-        """Set the level of thinning (see load.py); 0: evaluate everything."""
+        """Set the level of thinning (see schedule.py); 0: evaluate everything."""
         self.schedule.set_level(level)
         self._executor.plan()
 

@@ -12,8 +12,7 @@ from rich.table import Table
 from detector.engine.samples.sample import Arrival
 from detector.replay.replaying import Replayed
 from detector.results.episodes import EpisodeRow, write_csv, write_parquet
-from detector.results.installed import check_package
-from detector.results.kinds import ResultKind
+from detector.results.kinds import ResultKind, check_package
 from detector.results.nearest import NearMoment, nearest_by_rule, show_moments
 from detector.results.nearest import write_moments as write_nearest
 from detector.results.quality import Arrivals

@@ -22,8 +22,7 @@ from detector.replay.recordings import open_recordings
 from detector.replay.replaying import replay_arrivals
 from detector.replay.routing import MessageRouter
 from detector.streams.codecs.ros import standard
-from detector.streams.rmw_zenoh import MisfitError, numbered, split
-from detector.streams.sequences import MAXIMUM_PUBLISHERS, Sequences
+from detector.streams.rmw_zenoh import MAXIMUM_PUBLISHERS, MisfitError, Sequences, numbered, split
 from detector.streams.tally import Cause, Tally
 from detector.streams.zenoh import Network
 from tests.driving import Drive, a_detector, a_rule, at, compiled, lines

@@ -18,7 +18,7 @@ from detector.engine.columns.table import Truths
 from detector.engine.columns.verdicts import Ternary
 from detector.engine.episodes.episodes import FALSE, TRUE, UNSURE
 from wayside.expressions import Expression, Reason
-from wayside.expressions.columns.graph import Graph
+from wayside.expressions.columns.lowering import Graph
 from wayside.expressions.columns.program import Program
 from wayside.expressions.columns.values import Tag
 from wayside.rules import CompiledRule

@@ -24,8 +24,7 @@ from detector.engine.columns.verdicts import Codes, Ternary, observed
 from detector.engine.episodes.subjects import FLEET, Subject
 from wayside.expressions import Expression, Path
 from wayside.expressions.columns.folds import Fold, How, folded
-from wayside.expressions.columns.graph import Graph
-from wayside.expressions.columns.lowering import Constant
+from wayside.expressions.columns.lowering import Constant, Graph
 from wayside.expressions.columns.program import Program, Results
 from wayside.expressions.columns.values import Column, Tag
 from wayside.rules import CompiledRule, FleetSubject

@@ -12,8 +12,7 @@ from detector.engine.columns.leaves import stacked
 from detector.engine.columns.table import Truths
 from detector.engine.columns.verdicts import Ternary
 from wayside.expressions import Expression, Path, Reason
-from wayside.expressions.columns.graph import Graph
-from wayside.expressions.columns.lowering import Constant
+from wayside.expressions.columns.lowering import Constant, Graph
 from wayside.expressions.columns.nodes import Op
 from wayside.expressions.columns.program import Program
 from wayside.expressions.columns.values import Column, Tag, Texts, column_of
