@@ -65,16 +65,8 @@ MaxInstances = Annotated[
 
 
 @app.callback()
-def _main(
-    debug: Annotated[
-        bool, typer.Option(commandline.DEBUG, help="Show the stack trace of an error, and log more.")
-    ] = False,
-) -> None:
-    logging.basicConfig(
-        level=logging.DEBUG if debug else logging.INFO,
-        format="%(asctime)s %(levelname)-7s %(message)s",
-        stream=sys.stderr,
-    )
+def _main(debug: commandline.Debug = False) -> None:
+    commandline.log_to_stderr("%(asctime)s %(levelname)-7s %(message)s", debug=debug)
     for noisy in ("asyncio", "aiohttp", "kopf"):
         logging.getLogger(noisy).setLevel(logging.WARNING)
     if not debug:  # each watch logs each attempt to come back; we report once that the API server is away

@@ -60,6 +60,7 @@ class Assembly:
     """All queues of a manager.
 
     Attributes:
+        client, options, resources, measures: as given.
         cache: the objects of the cluster.
         detector_index: what is known of Detectors that are run.
         recorder: posts Events.
@@ -80,6 +81,7 @@ class Assembly:
         measures: Measures,
         traced: Tracing | None,
     ) -> None:
+        self.client, self.options, self.resources, self.measures = client, options, resources, measures
         headroom = Headroom(options.memory_limit)
         measures.registry.register(headroom)
         self.cache = ClusterCache(options.policy, options.max_instances, headroom.tight, options.tasks)

@@ -42,16 +42,8 @@ RuleFiles = Annotated[
 
 
 @app.callback()
-def _main(
-    debug: Annotated[
-        bool, typer.Option(commandline.DEBUG, help="Show the stack trace of an error, and log more.")
-    ] = False,
-) -> None:
-    logging.basicConfig(
-        level=logging.DEBUG if debug else logging.INFO,
-        format="%(asctime)s %(levelname)s %(name)s: %(message)s",
-        stream=sys.stderr,
-    )
+def _main(debug: commandline.Debug = False) -> None:
+    commandline.log_to_stderr("%(asctime)s %(levelname)s %(name)s: %(message)s", debug=debug)
     if not debug:
         logging.getLogger("kubernetes").setLevel(logging.WARNING)
 

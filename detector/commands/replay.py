@@ -39,13 +39,10 @@ from detector.results.writing import Look, Looking, check_installed, show_summar
 from wayside.api import ApplicationTask, Detector, EventRule
 from wayside.api.documents import Document, Problem
 from wayside.findings import Finding, ignored_by
-from wayside.process.commandline import refuse
+from wayside.process.commandline import refuse, table_console
 
 CLIPS = "clips"
 """The folder for the output of record actions, below the output folder."""
-
-_WIDTH = 160
-"""Width in columns of a table that goes into a pipe or a file."""
 
 
 class PlayOptions(NamedTuple):
@@ -119,19 +116,13 @@ def replay_files(
     if variants:
         compared_variants = comparisons(outcomes, variants)
         write_variants(output / "variants.json", variants, compared_variants)
-        show_variants(_console(), variants, compared_variants)
+        show_variants(table_console(stderr=True), variants, compared_variants)
     if results:
-        show_summary(_console(), results)
+        show_summary(table_console(stderr=True), results)
     clipped = "" if clips is None else f", {_number(clips.count, 'clip')}"
     typer.echo(f"{_counted(outcomes, tried)}{clipped}: {output}", err=True)
     if refusals or played.errors:
         raise typer.Exit(1)
-
-
-def _console() -> Console:
-    """For tables; in a pipe they keep their full width."""
-    console = Console(stderr=True)
-    return console if console.is_terminal else Console(stderr=True, width=_WIDTH)
 
 
 def _lines(outcome: Replayed, where: str) -> Iterator[str]:
