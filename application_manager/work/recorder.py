@@ -2,7 +2,8 @@
 
 The reasons are a fixed list. An Event follows from a change of a condition, which is stored in the cluster, so neither
 a restart nor a resync posts the same again. What is repeated is one Event with a series, as events.k8s.io has it.
-Namespaces take turns, and each has room for its own.
+Namespaces take turns, and each has room for its own. About one object a few Events may be posted at once, then only
+now and then.
 """
 
 from __future__ import annotations
@@ -15,16 +16,14 @@ import socket
 import time
 import uuid
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-from application_manager.core.conditions import changed
+from application_manager.core.conditions import READY, STALLED, changed
 from application_manager.core.health.pods import TroubleReason
-from application_manager.core.statuses.allowance import Allowance
-from application_manager.core.statuses.conclusions import READY, STALLED
 from application_manager.measures import Measures
 from wayside.api.base import Condition, Kind
 from wayside.kubernetes.client import Client
@@ -38,6 +37,14 @@ _WAITING = 1000  # Events of a namespace that may wait; further ones are dropped
 _SERIES = 360.0  # s after which a repetition is an Event of its own: as client-go has it
 _REFRESHED = 60.0  # s between two changes of a series
 _KEPT = 4096  # Events that are remembered, since they may be repeated
+
+BURST = 10
+"""Events of one object that may follow each other at once."""
+
+REFILL = 60.0
+"""Seconds after which one more may follow: an object that changes all the time has an Event a minute."""
+
+_KEPT_ALLOWANCES = 10_000  # objects that are remembered; the one with the oldest Event is forgotten, and starts over
 _REPORT_EVERY = 60.0  # s between two lines in the log about Events that were dropped
 _NAME_LENGTH = 236  # characters of the object's name, for a pod's may have as many as the Event's
 _NOTE_LENGTH = 1024  # characters, as events.k8s.io allows
@@ -327,3 +334,20 @@ class Recorder:
 def _microseconds(seconds: float) -> str:
     """A time since 1970 as the API wants it, with microseconds."""
     return format_seconds(seconds).replace("Z", "000Z")
+
+
+class Allowance:
+    """Tokens for each object: `BURST` at first, one more each `REFILL` seconds."""
+
+    def __init__(self) -> None:
+        self._left: OrderedDict[Hashable, tuple[float, float]] = OrderedDict()  # tokens, as of when
+
+    def takes(self, key: Hashable, now: float) -> bool:
+        """Whether one more may be posted about the object at `now`, in seconds; if so, it is counted."""
+        tokens, since = self._left.pop(key, (float(BURST), now))
+        tokens = min(float(BURST), tokens + max(0.0, now - since) / REFILL)
+        allowed = tokens >= 1
+        self._left[key] = (tokens - 1 if allowed else tokens, now)
+        if len(self._left) > _KEPT_ALLOWANCES:
+            self._left.popitem(last=False)
+        return allowed

@@ -13,7 +13,7 @@ from detector.sources.base import Feed, Putter
 from detector.sources.registry import Make, prepare_source
 from detector.streams.tally import Cause, Tally
 from wayside.api import Detector
-from wayside.api.source import DataSource
+from wayside.api.plugin import DataSource
 from wayside.api.stream import Stream
 from wayside.process.backoff import Backoff, retry
 

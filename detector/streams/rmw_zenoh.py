@@ -145,7 +145,7 @@ class RmwReader:
 
 
 def pump_by_topic(bursts: Iterable[Sequence[zenoh.Sample]], put: Put, reader: RmwReader) -> None:
-    """Delivers every message by its topic, as `layouts.pump_by_key` does by its key."""
+    """Delivers every message by its topic, as `subscribing.pump_by_key` does by its key."""
     put_kind = zenoh.SampleKind.PUT
     for burst in bursts:
         messages = []
