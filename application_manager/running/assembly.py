@@ -13,8 +13,7 @@ from application_manager.cache.cluster_cache import DETECTOR, INSTANCE, TASK, TE
 from application_manager.cache.detector_index import DetectorIndex
 from application_manager.charts.chartcache import ChartCache
 from application_manager.charts.chartdesk import ChartDesk
-from application_manager.cluster.failedpods import FailedPodsLook
-from application_manager.cluster.nodes import NodeLook
+from application_manager.cluster.looks import FailedPodsLook, NodeLook
 from application_manager.core.demand.decisions import Decision
 from application_manager.core.objects.policy import KindKey, Name
 from application_manager.measures import Measures

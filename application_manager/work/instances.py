@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 from application_manager.cache.cluster_cache import ClusterCache, WorkRecord
-from application_manager.core.claims.sizes import TOO_LARGE
+from application_manager.core.claims.merging import TOO_LARGE
 from application_manager.core.conditions import Aspect, find
 from application_manager.core.demand import drafting
 from application_manager.core.demand.decisions import Decision

@@ -12,8 +12,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from application_manager.cache.cluster_cache import ClusterCache, Served, WorkRecord
-from application_manager.cluster.failedpods import FailedPodsLook
-from application_manager.cluster.nodes import NodeLook
+from application_manager.cluster.looks import FailedPodsLook, NodeLook
 from application_manager.core.conditions import Aspect
 from application_manager.core.demand.byhand import PAUSE_ANNOTATION
 from application_manager.core.demand.decisions import Decision
