@@ -2,7 +2,7 @@
 
     python -m benchmarks.structure [REVISION]
 
-For each program and the package that they share:
+For each program and the package that they share, into which much of both has moved, and for all together:
 
 - lines and modules of Python, and the longest module;
 - lines and modules without later features: without the folders of `LATER`, which came with other work;
@@ -109,6 +109,11 @@ def counted(root: Path) -> dict[str, int]:
         found[f"{package}: loose modules"] = sum(each.name.count(".") == 1 and not each.is_package for each in modules)
         own = [each for each in layers if each.get("layers", [""])[0].startswith(f"{package}.")]
         found[f"{package}: floors"] = max((len(each["layers"]) for each in own), default=0)
+    kept = [each for each in every if not each.is_later]
+    found["all: lines"] = sum(each.lines for each in every)
+    found["all: modules"] = len(every)
+    found["all: lines without later features"] = sum(each.lines for each in kept)
+    found["all: modules without later features"] = len(kept)
     importers: Counter[str] = Counter(name for each in every for name in set(each.imports()))
     found["small modules with one importer"] = sum(
         each.lines < SMALL and not each.is_package and importers[each.name] == 1 for each in every

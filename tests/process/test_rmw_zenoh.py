@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from rosbags.rosbag2 import Writer as BagWriter
 
 from detector.assembly import inlets, make_engine
-from detector.assembly.checking import check_documents
+from detector.assembly.checking import findings
 from detector.engine.samples.intake import Intake
 from detector.findings.losses import Losses
 from detector.replay.recordings import open_recordings
@@ -283,7 +283,7 @@ spec:
 def test_what_does_not_go_together_is_reported_with_its_place(tmp_path: Path) -> None:
     (tmp_path / "detector.yaml").write_text(DETECTOR)
     with pytest.raises(DocumentError) as caught:
-        check_documents(load_documents([tmp_path / "detector.yaml"]))
+        findings(load_documents([tmp_path / "detector.yaml"]))
     first, second = caught.value.problems
     assert (first.line, first.field) == (6, "spec.streams[0]")
     assert "encoding must be cdr or raw, but is json" in first.message
