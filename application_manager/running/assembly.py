@@ -87,6 +87,7 @@ class Assembly:
         self._traces = None if traced is None else TaskTraces(traced, self.cache)
         if traced is not None:
             measures.registry.register(LostSpans(traced))
+        self._client = client
         self.recorder = Recorder(client, measures)
         applier = self.applier = Applier(client, self.cache.store, resources)
         measure = measures.reconciled
@@ -94,7 +95,12 @@ class Assembly:
             "instance", self._reconcile_instance, _INSTANCE_WORKERS, measure=measure, share=_INSTANCE_SHARE
         )
         self._statuses: WorkQueue[Name] = WorkQueue(
-            "instance status", self._say_instance, _STATUS_WORKERS, self._instances, measure, share=_STATUS_SHARE
+            "instance status",
+            self._reconcile_instance_status,
+            _STATUS_WORKERS,
+            self._instances,
+            measure,
+            share=_STATUS_SHARE,
         )
         self._tasks: WorkQueue[Name] = WorkQueue(
             "task", self._reconcile_task, _STATUS_WORKERS, self._instances, measure, share=_STATUS_SHARE
@@ -232,31 +238,37 @@ class Assembly:
         for name, _ in self.cache.store.all(INSTANCE):
             self._configurations.add(name)
 
+    async def _looks_after(self, namespace: str) -> bool:
+        """Whether this manager works in the namespace, and no older one does. Raises NotGranted if it may not write."""
+        await self._client.check_granted(namespace)  # before any read: otherwise each object there would cost one
+        return not self.cache.overlap.yields(namespace)
+
     async def _reconcile_instance(self, name: Name) -> None:
-        if self.cache.overlap.yields(name[0]):
+        if not await self._looks_after(name[0]):
             return
         if self._traces is None:
             await self._instance_work.reconcile(name)
         else:
             await self._traces.reconciling(name, self._instance_work.reconcile)
 
-    async def _say_instance(self, name: Name) -> None:
-        if not self.cache.overlap.yields(name[0]):
+    async def _reconcile_instance_status(self, name: Name) -> None:
+        if await self._looks_after(name[0]):
             await self._status_work.reconcile(name)
 
     async def _reconcile_task(self, name: Name) -> None:
-        if not self.cache.overlap.yields(name[0]):
+        if await self._looks_after(name[0]):
             await self._task_work.reconcile(name)
 
     async def _reconcile_template(self, name: Name) -> None:
+        await self._client.check_granted(name[0])
         await self._template_work.reconcile(name)
 
     async def _reconcile_detector(self, name: Name) -> None:
-        if not self.cache.overlap.yields(name[0]):
+        if await self._looks_after(name[0]):
             await self._detector_work.reconcile(name)
 
     async def _reconcile_rule(self, key: RuleKey) -> None:
-        if not self.cache.overlap.yields(key[1][0]):
+        if await self._looks_after(key[1][0]):
             await self._rule_work.reconcile(key)
 
     def _judge(self, key: RuleKey) -> None:

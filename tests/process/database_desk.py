@@ -6,7 +6,6 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -150,9 +149,5 @@ def wait_until(condition: Callable[[], bool], within: float = 60, pause: float =
 
 
 def spooled(folder: Path) -> int:
-    """Bytes in the segments of a spool; one that goes between the look at the folder and at itself has none."""
-    found = 0
-    for segment in folder.glob("*.spool"):
-        with suppress(FileNotFoundError):
-            found += segment.stat().st_size
-    return found
+    """Bytes in the file of a spool."""
+    return (folder / "spool.db").stat().st_size

@@ -216,7 +216,7 @@ def test_credentials_are_in_no_error_log_or_outcome(
         episode = keep.begin()
         keep.take(episode, speeds(3))
         keep.finish(episode)
-        wait_until(lambda: keep.action._store is not None and keep.action._store.away != "")
+        wait_until(lambda: keep.action._writer is not None and keep.action._writer.away != "")
     except ActionError as error:
         logged = f"{error!r} {error.__cause__!r} {error.__context__!r} {error}"
         assert "spec.database" in logged

@@ -40,7 +40,8 @@ def test_while_the_server_is_away_documents_wait_on_disk_and_follow_in_order_eac
     assert numbers(database) == list(range(4500))
     assert numbers(database, "e2.keep") == list(range(100))
     assert not keep.losses
-    wait_until(lambda: not list((tmp_path / "spool").glob("*.spool")))
+    keep.close()
+    assert not list((tmp_path / "spool").iterdir())
 
 
 def test_a_full_spool_drops_what_is_new_counts_it_and_keeps_earlier_scenarios_whole(
@@ -120,7 +121,7 @@ def test_a_server_that_hangs_holds_up_nothing_but_the_queue(
     way.hang()
     keep.take(episode, speeds(2000))
     keep.finish(episode)
-    wait_until(lambda: (keep.action._store is not None) and keep.action._store.away != "")
+    wait_until(lambda: (keep.action._writer is not None) and keep.action._writer.away != "")
     way.restore()
     assert keep.outcome().state is OutcomeState.DONE
     assert numbers(database) == list(range(2000))
@@ -141,29 +142,63 @@ def test_with_write_concern_one_a_scenario_that_lost_documents_afterwards_is_not
     assert scenario(database)["complete"] is False
 
 
-def test_what_somebody_removed_from_the_spool_costs_its_scenario_and_no_other(
-    desk: MakeDesk, database: Any, way: Way, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_damaged_request_in_the_spool_costs_its_scenario_and_no_other(
+    desk: MakeDesk, database: Any, way: Way
 ) -> None:
-    monkeypatch.setattr("detector.actions.database.spool.SEGMENT", 1000)
     keep = desk(spool=2**26)
     way.cut()
     first, second = keep.begin("e1"), keep.begin("e2")
     keep.take(first, speeds(2000))
+    assert keep.action._writer is not None
+    queue = keep.action._writer._queue
+    large = "SELECT id FROM records WHERE length(record) > 100000 ORDER BY id"
 
-    def of_a_thousand() -> list[Path]:
-        return sorted(each for each in (tmp_path / "spool").glob("*.spool") if each.stat().st_size > 100_000)
+    def of_a_thousand() -> list[tuple[int]]:
+        with queue._disk:
+            assert queue._spool is not None
+            return queue._spool._db.execute(large).fetchall()
 
     wait_until(lambda: len(of_a_thousand()) == 2)
     doomed = of_a_thousand()[0]  # the first thousand of the first episode, while nothing else is there
     keep.take(second, speeds(1000))
     keep.finish(second)
     keep.finish(first)
-    doomed.unlink()
+    with queue._disk:
+        assert queue._spool is not None
+        queue._spool._db.execute("UPDATE records SET record = zeroblob(length(record)) WHERE id = ?", doomed)
     way.restore()
     assert keep.outcome("e2").state is OutcomeState.DONE
     assert keep.outcome("e1").state is OutcomeState.FAILED
     assert scenario(database)["complete"] is False
+    assert keep.losses.total() == 1
+
+
+def test_a_spool_whose_disk_fails_holds_up_nothing_and_continues_at_the_next_start(
+    desk: MakeDesk, database: Any, way: Way, tmp_path: Path
+) -> None:
+    keep = desk(spool=2**26)
+    way.cut()
+    first = keep.begin("e1")
+    keep.take(first, speeds(2000))
+    wait_until(lambda: spooled(tmp_path / "spool") > 100_000)
+    assert keep.action._writer is not None
+    queue = keep.action._writer._queue
+    with queue._disk:
+        assert queue._spool is not None
+        queue._spool._db.close()  # like a disk that is gone: each further request fails
+    second = keep.begin("e2")
+    keep.take(second, speeds(1000))
+    keep.finish(second)
+    keep.finish(first)
+    way.restore()
+    assert keep.outcome("e2").state is OutcomeState.DONE
+    assert keep.outcome("e1").state is OutcomeState.FAILED
     assert keep.losses.total() > 0
+    keep.close()
+    after = desk(spool=2**26)
+    wait_until(lambda: len(numbers(database)) == 2000)
+    assert not scenario(database).get("complete")
+    assert not after.losses
 
 
 def test_open_episodes_report_that_the_database_is_away(desk: MakeDesk, way: Way) -> None:

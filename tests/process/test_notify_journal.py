@@ -1,4 +1,4 @@
-"""The journal and the dead letters: what a kill leaves, what is torn, what is shared, and how big they get."""
+"""The journal and the dead letters: what a kill leaves, what cannot be read, and how big they get."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 from detector.actions.notify.dead_letters import DeadLetters
-from detector.actions.notify.journal import Journal, JournalError
+from detector.actions.store import action_store
 from tests.http_servers import answers, endpoint, hangs
-from tests.notifying import a_desk
+from tests.notifying import a_desk, an_episode
 
 _KILLED = """
 import sys
@@ -51,72 +51,29 @@ def test_what_was_reported_before_a_kill_is_delivered_after_it_each_event_once(t
     assert not list((tmp_path / "notify").iterdir())
 
 
-def test_what_was_put_and_not_dropped_is_there_again(tmp_path: Path) -> None:
-    journal = Journal(tmp_path, "j")
-    for name in "abc":
-        journal.put(name, {"name": name})
-    journal.put("a", {"name": "A"})
-    journal.drop(["b", "unknown"])
-    journal.close()
-    again = Journal(tmp_path, "j")
-    assert again.live == {"a": {"name": "A"}, "c": {"name": "c"}}
-    again.drop(["a", "c"])
-    again.close()
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("torn", [b'{"put": "x", "docu', b'{"put": "x"', b"\xff"])
-def test_a_line_that_was_cut_takes_nothing_else_with_it(tmp_path: Path, torn: bytes) -> None:
-    journal = Journal(tmp_path, "j")
-    journal.put("a", {})
-    journal.close()
-    (file,) = tmp_path.iterdir()
-    with file.open("ab") as out:
-        out.write(torn)
-    again = Journal(tmp_path, "j")
-    assert (again.live, again.unreadable) == ({"a": {}}, 0)
-    again.put("b", {})
-    again.close()
-    assert Journal(tmp_path, "j").live == {"a": {}, "b": {}}
-
-
-def test_lines_that_are_no_entries_are_counted(tmp_path: Path) -> None:
-    (tmp_path / "j.0.jsonl").write_text('[1]\n{"put": "a", "document": 3}\n{"put": "b", "document": {}}\nnonsense\n')
-    journal = Journal(tmp_path, "j")
-    assert (journal.live, journal.unreadable) == ({"b": {}}, 3)
-
-
-def test_two_at_the_same_time_have_files_of_their_own_and_the_next_takes_both_over(tmp_path: Path) -> None:
-    first, second = Journal(tmp_path, "j"), Journal(tmp_path, "j")
-    first.put("a", {})
-    second.put("b", {})
-    assert (first.live, second.live) == ({"a": {}}, {"b": {}})
-    first.close()
-    second.close()
-    third = Journal(tmp_path, "j")
-    assert third.live == {"a": {}, "b": {}}
-    assert len(list(tmp_path.iterdir())) == 1
-
-
-def test_the_file_does_not_grow_with_what_is_dropped(tmp_path: Path) -> None:
-    journal = Journal(tmp_path, "j")
-    journal.put("kept", {"text": "x"})
-    for number in range(300):
-        journal.put(str(number), {"text": "x" * 20_000})
-        journal.drop([str(number)])
-    assert sum(file.stat().st_size for file in tmp_path.iterdir()) < 3_000_000
-    journal.close()
-    assert Journal(tmp_path, "j").live == {"kept": {"text": "x"}}
+def test_entries_that_are_no_events_are_counted_and_removed(tmp_path: Path) -> None:
+    store = action_store(tmp_path / "notify", "default_h_braking_notify", lambda *_: None)
+    store.put("notice/e1.started", b"3")
+    store.put("notice/e2.started", b"{}")
+    store.close()
+    with endpoint() as there:
+        desk = a_desk({"http": {"url": there.url}}, state=tmp_path)
+        assert desk.lost == {"journal entries that could not be read": 2}
+        desk.end()
+    assert not list((tmp_path / "notify").iterdir())
 
 
 def test_a_folder_that_cannot_be_written_is_reported_and_costs_only_the_keeping(tmp_path: Path) -> None:
     (tmp_path / "notify").write_text("a file where a folder should be")
-    with pytest.raises(JournalError, match="cannot write"):
-        Journal(tmp_path / "notify", "j")
     with endpoint() as there:
         desk = a_desk({"http": {"url": there.url}}, state=tmp_path)
         assert desk.lost["events that would not survive a restart"] == 1
+        desk.run(an_episode())
+        there.received(2)
         desk.end()
+    assert desk.lost.total() == 1
+    (why,) = desk.reasons
+    assert f"cannot use {tmp_path / 'notify'}" in why
 
 
 def test_dead_letters_are_bounded(tmp_path: Path) -> None:

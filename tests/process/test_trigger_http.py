@@ -225,7 +225,38 @@ def test_what_the_next_run_restores_continues_and_is_stopped_by_that_one(tmp_pat
         keys = [request.headers["idempotency-key"] for request in there.requests]
         assert keys[0] == keys[1]
         assert json.loads(there.requests[-1].body) == {"who": "car1"}
-    assert list((tmp_path / "triggers").glob("*.json")) == []
+    following.action.close()
+    assert not list((tmp_path / "triggers").iterdir())
+
+
+def test_a_changed_rule_leaves_the_recordings_of_its_running_episodes_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The action with its old rule ends them, though the one with the new rule has the same parameters."""
+    monkeypatch.setattr("detector.actions.trigger.action._CLAIM", 0.0)
+    with endpoint() as there:
+        before = Driven(http(there.url), tmp_path)
+        episode = an_episode(before.parameters)
+        before.action.started(episode)
+        before.until(before.recording)
+        after = Driven(http(there.url), tmp_path)
+        assert after.action.wake() is None
+        assert [request.method for request in there.requests] == ["PUT"]
+        before.action.ended(end(episode))
+        assert before.finished().state is OutcomeState.DONE
+        for each in (before, after):
+            each.action.close()
+    assert not list((tmp_path / "triggers").iterdir())
+
+
+def test_a_state_folder_that_cannot_be_written_is_counted_and_costs_nothing_else(tmp_path: Path) -> None:
+    (tmp_path / "triggers").write_text("a file where a folder should be")
+    with endpoint() as there:
+        driven = Driven(http(there.url), tmp_path)
+        driven.action.started(an_episode(driven.parameters))
+        driven.until(driven.recording)
+    (lost,) = driven.lost
+    assert lost.startswith(f"1 recordings on other systems that a restart would not stop: cannot use {tmp_path}")
 
 
 def test_one_dead_endpoint_costs_one_attempt_at_a_time() -> None:

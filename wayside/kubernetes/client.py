@@ -324,13 +324,18 @@ class Client:
             "Object", self._decode(await self._send(_Request(method, path, query or {}, body, content_type, changes)))
         )
 
+    async def check_granted(self, namespace: str) -> None:
+        """Raise NotGranted unless the client may write in the namespace; each write checks this by itself."""
+        if self.may_write is not None and not await self.may_write(namespace):
+            raise NotGranted(namespace)
+
     async def _send(self, request: _Request) -> bytes:
         """Send a request; where the client is paced, retry it for up to 30 s while it is rejected unprocessed."""
         deadline = time.monotonic() + _PATIENCE
         found = _NAMESPACE.search(request.path)
         namespace = found[1] if found is not None and request.writes else ""
-        if namespace and self.may_write is not None and not await self.may_write(namespace):
-            raise NotGranted(namespace)
+        if namespace:
+            await self.check_granted(namespace)
         pacing = self._pacing
         if pacing is None:
             return await self._send_once(request)

@@ -17,10 +17,9 @@ from detector.actions.database.documents import Documents, Made
 from detector.actions.database.episodes import Writing
 from detector.actions.database.folder import AttachmentFolder, FolderError
 from detector.actions.database.scenario import Scenario
-from detector.actions.database.store import DatabaseWriter
-from detector.actions.database.stores import acquire, release
 from detector.actions.database.values import bson_bytes
 from detector.actions.database.work import BATCH_BYTES, BATCH_DOCUMENTS, Write
+from detector.actions.database.writer import DatabaseWriter, acquire, release
 from detector.actions.episode import Completion, Episode, EpisodeSample, Outcome, OutcomeState
 from wayside.api.actions.database import Attachments, DatabaseAction
 from wayside.api.base import JsonValue
@@ -49,7 +48,7 @@ class Database(Action[DatabaseAction]):
     def __init__(self, parameters: DatabaseAction, setting: Setting) -> None:
         super().__init__(parameters, setting)
         self._place: Place | None = None
-        self._store: DatabaseWriter | None = None
+        self._writer: DatabaseWriter | None = None
         self._folder: AttachmentFolder | None = None
         self._writings: dict[str, Writing] = {}
         self._batches: dict[str, _Batch] = {}
@@ -80,10 +79,10 @@ class Database(Action[DatabaseAction]):
         if around.detector.spec.database is not None and around.detector.spec.database.files is not None:
             above = (self.parameters.files or Attachments()).above.bytes
         streams = {stream.name: stream for stream in around.detector.spec.streams}
-        if self._store is not None:
+        if self._writer is not None:
             metadata: Mapping[str, JsonValue] = episode.rendered.get("metadata") or {}
             for write in scenarios.start_scenario(scenario, episode, metadata):
-                self._store.put_change(write)
+                self._writer.put_change(write)
         return scenario, Documents(name, f"{database}/{rule.name}/{name}", streams, around.decoders, above)
 
     def samples(self, episode: Episode, samples: Sequence[EpisodeSample]) -> None:
@@ -150,17 +149,17 @@ class Database(Action[DatabaseAction]):
     def _flush(self, collection: str) -> None:
         """Enqueue the documents of a collection."""
         batch = self._batches.pop(collection)
-        if self._store is None:
+        if self._writer is None:
             return
 
         def losing(count: int, why: str) -> None:
             self.setting.lose("database documents", count, why)
 
         write = Write(self.parameters.database, collection, batch.documents, losing=losing)
-        if self._store.put(write, self.setting.closing):
+        if self._writer.put(write, self.setting.closing):
             return
         open_ones = {each.scenario.id: each.scenario for each in self._writings.values()}
-        why = "the queue is full" if not self._store.away else "the queue is full while the database is unavailable"
+        why = "the queue is full" if not self._writer.away else "the queue is full while the database is unavailable"
         for name, count in batch.owners.items():
             if name in open_ones:  # otherwise it failed in the meantime
                 self._lose(open_ones[name], count, why)
@@ -187,12 +186,12 @@ class Database(Action[DatabaseAction]):
                 message = writing.trouble or ("dryRun: nothing was written" if self.parameters.dry_run else "")
                 self._report(episode, state, message, writing, completion)
 
-        if self._store is None:
+        if self._writer is None:
             confirm(not incomplete, incomplete)
             return
         detector = self.setting.surroundings().detector
         for write in scenarios.finish(scenario, episode, completion, detector, incomplete):
-            self._store.put_change(write, confirm if write.completes else None)
+            self._writer.put_change(write, confirm if write.completes else None)
 
     def wake(self) -> float | None:
         """Enqueue documents that have waited long enough. The first call also resumes what an earlier run left."""
@@ -214,7 +213,7 @@ class Database(Action[DatabaseAction]):
 
     def _report_availability(self) -> None:
         """Report for each open episode whether its documents are waiting for the server."""
-        away = self._store.away if self._store is not None else ""
+        away = self._writer.away if self._writer is not None else ""
         if bool(away) != self._reported_away:
             self._reported_away = bool(away)
             for writing in self._writings.values():
@@ -226,17 +225,17 @@ class Database(Action[DatabaseAction]):
             self._flush(collection)
         if self._place is not None:
             release(self._place)
-            self._place = self._store = None
+            self._place = self._writer = None
 
     def _connect(self) -> None:
         """Connect to the Detector's current database. Raises ActionError."""
         place = self.setting.surroundings().detector.spec.database
         if self.parameters.dry_run or place is None or place == self._place:
             return
-        store = acquire(place, self.setting.lose)
+        writer = acquire(place, self.setting.lose)
         if self._place is not None:
             release(self._place)
-        self._place, self._store = place, store
+        self._place, self._writer = place, writer
         self._folder = None
         if place.files is not None:
             self._folder = AttachmentFolder(
@@ -244,8 +243,8 @@ class Database(Action[DatabaseAction]):
             )
         rule = self.setting.rule.name
         behind = (self.parameters.database, self.setting.holder, rule, self.setting.action)
-        if store.first_time(behind):
-            store.put_change(scenarios.leave_behind(*behind))
+        if writer.first_time(behind):
+            writer.put_change(scenarios.leave_behind(*behind))
 
     def _lose(self, scenario: Scenario, count: int, why: str) -> None:
         scenario.lost[why] += count
@@ -273,8 +272,8 @@ class Database(Action[DatabaseAction]):
         }
         if writing.undecoded:
             details["undecoded"] = writing.undecoded
-        if self._store is not None:
-            details["waitingBytes"] = self._store.waiting
+        if self._writer is not None:
+            details["waitingBytes"] = self._writer.waiting
         lost = writing.lost + sum(scenario.lost.values()) + (0 if completion is None else completion.missing)
         where = (str(self._folder.path / scenario.database / episode.rule),) if files and self._folder else ()
         size = writing.bytes + scenario.bytes

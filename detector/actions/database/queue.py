@@ -8,13 +8,17 @@ from __future__ import annotations
 
 import logging
 import threading
+import uuid
 from collections import deque
 from collections.abc import Callable
+from itertools import count
+from pathlib import Path
 
 import bson
 
-from detector.actions.database.spool import Spool
 from detector.actions.database.work import Write, unpacked
+from detector.actions.store import DurableStore, StoreError
+from wayside.api.database import DatabaseSpool
 
 _log = logging.getLogger(__name__)
 
@@ -25,26 +29,34 @@ MEMORY = 64 * 2**20
 class Queue:
     """Several threads add and move to disk, one takes."""
 
-    def __init__(self, spool: Spool | None, lose: Callable[[str, int, str], None]) -> None:
-        """`lose` receives the losses of unreadable spool records."""
+    def __init__(self, spool: DatabaseSpool | None, lose: Callable[[str, int, str], None]) -> None:
+        """`lose` receives the losses of unreadable spool records. Raises StoreError."""
         self.changed = threading.Condition()
         """Held briefly while the memory changes, and notified of changes."""
         self._disk = threading.Lock()
         """Held while records are moved, taken or removed; acquired before the other lock."""
-        self._spool = spool
         self._lose = lose
         self._capacity = MEMORY
-        self._memory: deque[Write] = deque()
+        self._memory: deque[tuple[str, Write]] = deque()
+        """Each with its key in the spool."""
         self._bytes = 0
-        self._inherited = 0 if spool is None else spool.records
-        self.full = spool is None
+        self.spools = spool is not None
+        """Whether there is a spool that can be used."""
+        self.full = not self.spools
         """The disk accepts nothing more for now."""
         self.damaged = False
         """Some record of the spool could not be read in this run."""
-        if spool is not None and spool.damaged:
-            lose("bytes of the database's spool", spool.damaged, "corrupted by a crash or by the disk")
-        if spool is not None and spool.records:
-            _log.info("database: the spool holds %d requests of an earlier run", spool.records)
+        self._inherited = 0
+        """Number of requests of an earlier run."""
+        self._spool = (
+            None if spool is None else DurableStore(Path(spool.path) / "spool.db", self._lose_record, spool.bytes.bytes)
+        )
+        self._keys = map(f"{uuid.uuid4().hex}-{{}}".format, count())
+        self._taken = ""
+        """The key of the request that `first` returned."""
+        if self._spool is not None and self._spool.count:
+            self._inherited = self._spool.count
+            _log.info("database: the spool holds %d requests of an earlier run", self._inherited)
 
     @property
     def inherited(self) -> bool:
@@ -62,7 +74,7 @@ class Queue:
 
     def add(self, write: Write) -> None:
         """Append it, in memory; `changed` is held."""
-        self._memory.append(write)
+        self._memory.append((next(self._keys), write))
         self._bytes += write.size
         self.changed.notify_all()
 
@@ -72,31 +84,54 @@ class Queue:
             if (write := self._from_disk()) is not None:
                 return write
             with self.changed:
-                return self._memory[0] if self._memory else None
+                if not self._memory:
+                    return None
+                self._taken, write = self._memory[0]
+                return write
 
     def _from_disk(self) -> Write | None:
         """The oldest in the spool. Unreadable records are skipped: their scenarios then lack documents."""
         while self._spool is not None:
             try:
-                record = self._spool.first()
-                return None if record is None else unpacked(record)
-            except (OSError, bson.errors.BSONError, KeyError) as error:
-                lost = self._spool.give_up()
-                self._inherited = max(0, self._inherited - lost)
-                self.damaged = True
-                self._lose("requests in the database's spool", lost, f"unreadable: {type(error).__name__}")
+                found = self._spool.first()
+                if found is None:
+                    return None
+                self._taken, record = found
+                return unpacked(record)
+            except StoreError as error:
+                _log.error("database: continuing without the spool until the next start: %s", error)
+                self._lose_record(self._spool.count, str(error))
+                self._spool, self.spools, self.full = None, False, True
+            except (bson.errors.BSONError, KeyError) as error:
+                self._lose_record(1, f"unreadable: {type(error).__name__}")
+                self._drop(self._taken)
         return None
+
+    def _lose_record(self, count: int, why: str) -> None:
+        self.damaged = True
+        self._inherited = max(0, self._inherited - count)
+        self._lose("requests in the database's spool", count, why)
 
     def done(self) -> None:
         """Remove the oldest request."""
         with self._disk, self.changed:
-            if self._spool is not None and self._spool.records:
-                self._spool.done()
-                self.full = False
+            if self._memory and self._memory[0][0] == self._taken:
+                self._bytes -= self._memory.popleft()[1].size
+            else:
                 self._inherited = max(0, self._inherited - 1)
-            elif self._memory:
-                self._bytes -= self._memory.popleft().size
+                self._drop(self._taken)
             self.changed.notify_all()
+
+    def _drop(self, key: str) -> None:
+        if self._spool is None:
+            return
+        try:
+            self._spool.drop(key)
+            self.full = False
+        except StoreError as error:
+            if not self.full:
+                _log.warning("database: a request stays in the spool, and is repeated after a restart: %s", error)
+            self.full = True
 
     def spill(self) -> None:
         """Move requests from memory to disk, oldest first, as far as there is room."""
@@ -105,19 +140,17 @@ class Queue:
         with self._disk:
             try:
                 self.full = not self._move(self._spool)
-            except OSError as error:
+            except StoreError as error:
                 if not self.full:
-                    _log.warning(
-                        "database: the spool accepts no more requests: %s", error.strerror or type(error).__name__
-                    )
+                    _log.warning("database: the spool accepts no more requests: %s", error)
                 self.full = True
 
-    def _move(self, spool: Spool) -> bool:
+    def _move(self, spool: DurableStore) -> bool:
         """False if there is no more room."""
         moved = 0
         while self._memory:
-            write = self._memory[0]
-            if not spool.append(write.packed()):
+            key, write = self._memory[0]
+            if not spool.put(key, write.packed()):
                 break
             with self.changed:
                 self._memory.popleft()
@@ -129,13 +162,16 @@ class Queue:
         return not self._memory
 
     def close(self) -> list[Write]:
-        """Returns the bytes that do not fit on the disk and are lost with the process."""
+        """Returns the requests that do not fit on the disk and are lost with the process."""
         self.spill()
         with self._disk, self.changed:
-            left = list(self._memory)
+            left = [write for _, write in self._memory]
             self._memory.clear()
             self._bytes = 0
             if self._spool is not None:
-                self._spool.close()
+                try:
+                    self._spool.close()
+                except StoreError as error:
+                    _log.error("database: cannot close the spool: %s", error)
                 self._spool = None
             return left

@@ -11,16 +11,15 @@ import json
 import logging
 import time
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 from typing import Any
 
 from detector.actions.base import Action, ActionError, Setting
 from detector.actions.episode import Completion, Episode, Outcome, OutcomeState
+from detector.actions.journal import Journal
 from detector.actions.trigger.course import FOREVER, Course, CourseStep, Timeouts
 from detector.actions.trigger.detectors import OtherDetector
 from detector.actions.trigger.endpoints import HttpEndpoint
-from detector.actions.trigger.journal import OrderJournal
-from detector.actions.trigger.orders import Order, Report, System
+from detector.actions.trigger.orders import Order, Report, System, order_from
 from detector.actions.trigger.ros2 import Ros2Services, call_problems
 from wayside.api import Detector
 from wayside.api.actions import trigger as api
@@ -67,8 +66,10 @@ class Trigger(Action[api.TriggerAction]):
         self._silent: dict[str, tuple[int, float]] = {}
         """Places that did not respond: the number of consecutive failures, and the time of the next attempt."""
         self._digest = _digest(parameters)
-        self._journal = self._make_journal()
-        self._left = {} if self._journal is None else self._journal.load()
+        self._journal = Journal(
+            setting, "triggers", "recordings on other systems that a restart would not stop", version=self._digest
+        )
+        self._left = self._journal.load_all("", order_from)
         """Orders of the previous run that no episode has claimed yet."""
         self._claim = time.monotonic() + _CLAIM
 
@@ -84,7 +85,7 @@ class Trigger(Action[api.TriggerAction]):
         onset = now - (0.0 if episode.resumed else self._ago(episode.onset_time, episode.start_time))
         self._courses[identity] = Course(order, self._limits, now, onset, resumed=episode.resumed)
         self._episodes[identity] = episode
-        self._save()
+        self._journal.put(identity, order.to_json(), sync=True)
 
     def ended(self, episode: Episode) -> None:
         """Stop the recording of the episode."""
@@ -142,7 +143,7 @@ class Trigger(Action[api.TriggerAction]):
                 break
             self._request(stops[0], CourseStep.STOP)
             self._forget_finished()
-        if self._journal is None:
+        if not self._journal.keeps:
             for course in self._courses.values():
                 if course.step in (CourseStep.START, CourseStep.STOP):
                     self._lose(course, "the detector is stopping")
@@ -151,6 +152,7 @@ class Trigger(Action[api.TriggerAction]):
             problem = course.problem or f"the detector stopped before its {course.step.value} was confirmed"
             state = OutcomeState.DONE if course.step is CourseStep.AWAIT else OutcomeState.FAILED
             self._report(identity, self._outcome(state, course, problem if state is OutcomeState.FAILED else ""))
+        self._journal.close()
 
     @property
     def _prefix(self) -> str:
@@ -163,12 +165,6 @@ class Trigger(Action[api.TriggerAction]):
         if self.parameters.http is not None:
             return HttpEndpoint(self.parameters, self.setting.closing)
         return Ros2Services(self.parameters, self.setting.messenger, lambda: self.setting.surroundings().types)
-
-    def _make_journal(self) -> OrderJournal | None:
-        state = self.setting.surroundings().detector.spec.state
-        if state is None:
-            return None
-        return OrderJournal(Path(state.path) / "triggers" / f"{self._prefix}.json")
 
     def _rendered(self, episode: Episode) -> Mapping[str, Any]:
         """The rendered templates; for a resumed episode, those that need no values of its start."""
@@ -242,7 +238,7 @@ class Trigger(Action[api.TriggerAction]):
             self._episodes.pop(identity, None)
             self._reported.pop(identity, None)
         if finished:
-            self._save()
+            self._journal.drop(finished)
 
     def _lose(self, course: Course, why: str) -> None:
         what = "recordings on other systems whose stop was not confirmed: their maximumDuration ends them"
@@ -263,10 +259,6 @@ class Trigger(Action[api.TriggerAction]):
         if episode is not None and self._reported.get(identity) != outcome:
             self._reported[identity] = outcome
             self.setting.report(episode, outcome)
-
-    def _save(self) -> None:
-        if self._journal is not None:
-            self._journal.save([*self._left.values(), *(course.order for course in self._courses.values())])
 
 
 def _digest(parameters: api.TriggerAction) -> str:

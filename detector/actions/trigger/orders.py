@@ -52,6 +52,15 @@ class Order:
     event: Mapping[str, Any] = field(default_factory=dict)
     """The CloudEvent of the start."""
 
+    def to_json(self) -> dict[str, Any]:
+        """As a JSON object for the journal."""
+        return {"id": self.id, "rendered": self.rendered, "event": self.event}
+
+
+def order_from(document: Mapping[str, Any]) -> Order:
+    """The order from what `to_json` returned."""
+    return Order(**document)
+
 
 class System(Protocol):
     """Another system that records. Its methods wait for the network, and raise ActionError if there is no response."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,7 +17,7 @@ from detector.engine.columns.past import Evaluations
 from detector.engine.columns.places import Places, Whereabouts
 from detector.engine.columns.reading import constant
 from detector.engine.columns.signals import SignalColumns
-from detector.engine.columns.table import Integers, Truths
+from detector.engine.columns.table import Integers, Truths, distinct
 from detector.engine.columns.tables import Tables
 from detector.engine.columns.verdicts import Codes, Ternary, observed
 from detector.engine.episodes.subjects import Subject
@@ -85,6 +85,8 @@ class PairColumns:
         self._signals = SignalColumns(context, [track], shared=False)
         if _reads_streams(rule):
             self._signals.watch_all_streams()
+        self._plain = not rule.has_actions
+        """Its events contain only signals, and it renders nothing."""
         self._reads_streams = bool(rule.signals) or _reads_streams(rule)
         self._where_abouts = Whereabouts(rule.subject.position, context, track.counters, self._signals.ages)
         self._leaves = ClientLeaves(context, [track])
@@ -116,7 +118,8 @@ class PairColumns:
         self._track.counters.crowded_pairs += near.left_out
         count = len(clients)
         keys = near.first * count + near.second
-        added = np.setdiff1d(more[0] * count + more[1], keys)
+        added = distinct(more[0] * count + more[1])
+        added = added[~np.isin(added, keys, assume_unique=True)]
         order = np.argsort(np.concatenate((keys, added)), kind="stable")
         is_near = (order < len(keys)).astype(bool)
         first, second = np.divmod(np.concatenate((keys, added))[order], count)
@@ -160,24 +163,30 @@ class PairColumns:
 
     def variables(self, these: PairBlock, row: int) -> dict[str, Any]:
         """The variables of expressions about a pair, as in `scopes`."""
-        found: dict[str, Any] = {
-            "a": self._member(these, int(these.first[row])),
-            "b": self._member(these, int(these.second[row])),
-            "parameters": self._track.rule.parameters.own,
-            **self._track.element.variables,
-        }
+        found = self._pair(these, row, lambda at: these.seen.view(self._track, at))
+        return {"parameters": self._track.rule.parameters.own, **self._track.element.variables, **found}
+
+    def happened(self, these: PairBlock, row: int) -> dict[str, Any]:
+        """The variables that the event of a pair, and the rule's actions, read."""
+        if not self._plain:
+            return self.variables(these, row)
+        seen, track = these.seen, self._track
+        return self._pair(these, row, lambda at: {"client": seen.clients[at], **seen.values(track, at)})
+
+    def _pair(self, these: PairBlock, row: int, view: Callable[[int], dict[str, Any]]) -> dict[str, Any]:
+        """What is known of a pair; `view` gives the variables of a client, by its index in `these.seen`."""
+        found: dict[str, Any] = {}
+        for role, each in (("a", these.first), ("b", these.second)):
+            index = int(each[row])
+            found[role] = view(int(these.at[index]))
+            if these.places.known[index]:
+                found[role]["position"] = described(self._subject.position, these.places.place(index))
         if these.placed[row]:
             found["distance"] = float(these.distance[row])
         if these.closing is not None and these.closing_known is not None and these.closing_known[row]:
             found["closingSpeed"] = float(these.closing[row])
         found.update(self._known(these.derived, row))
         return found
-
-    def _member(self, these: PairBlock, index: int) -> dict[str, Any]:
-        view = these.seen.view(self._track, int(these.at[index]))
-        if these.places.known[index]:
-            view["position"] = described(self._subject.position, these.places.place(index))
-        return view
 
     def _distances(self, places: Places, one: Integers, other: Integers) -> Doubles:
         return self._where_abouts.distances(places.of(one), places.of(other))

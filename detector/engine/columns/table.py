@@ -74,9 +74,9 @@ class Table:
         return len(self.end)
 
     def grow(self, clients: int) -> None:
-        """Make room for at least this number of clients."""
-        more = clients - len(self.end)
-        if more > 0:
+        """Make room for at least this number of clients; for twice as many as before, since clients come one by one."""
+        if clients > len(self.end):
+            more = max(clients, 2 * len(self.end)) - len(self.end)
             size = len(self.keys)
             self.start, self.first, self.end = (
                 np.append(each, np.full(more, size)) for each in (self.start, self.first, self.end)
@@ -217,3 +217,13 @@ def rows_between(begin: Integers, end: Integers) -> Integers:
     total = int(ends[-1]) if len(ends) else 0
     places: Integers = np.arange(total) + np.repeat(begin - (ends - counts), counts)
     return places
+
+
+def distinct(rows: Integers) -> Integers:
+    """The rows in ascending order, each once.
+
+    Sorts: numpy's unique hashes integers, which takes 25 times as long for ten thousand of them (numpy 2.4).
+    """
+    ordered = np.sort(rows)
+    first: Truths = np.concatenate((ordered[:1] == ordered[:1], ordered[1:] != ordered[:-1]))
+    return ordered[first]

@@ -98,8 +98,9 @@ class SubjectState:
         nanoseconds."""
         times = []
         if self.is_open:
-            if self.unknown_since is not None:
-                times.append(self.unknown_since + timing.unknown_timeout)
+            if self.unknown_since is None:
+                return None
+            times.append(self.unknown_since + timing.unknown_timeout)
         elif self.onset is not None:
             times.append(self.onset + timing.hold)
             if self.unknown_since is not None:

@@ -173,12 +173,17 @@ class Blocks:
         return happened
 
     def run_with_samples(
-        self, stream: str, time: int, only: Mapping[str, Only], stopwatch: Callable[[], int]
+        self,
+        stream: str,
+        time: int,
+        clients: Sequence[str],
+        only: Mapping[str, Only],
+        stopwatch: Callable[[], int],
     ) -> list[Happened]:
-        """Evaluate the rules that are triggered by the samples of a stream; `only` has the subjects of each rule."""
+        """Evaluate the rules that are triggered by the samples of a stream, about these clients; `only` has the
+        subjects of each rule."""
         group = self._on_sample[stream]
-        present = sorted({client for each in only.values() for client in each.present(self._context.clients)})
-        return self._noted(_timed(group, (time,), stopwatch, group.evaluate((time,), present, self._floor(), only)))
+        return self._noted(_timed(group, (time,), stopwatch, group.evaluate((time,), clients, self._floor(), only)))
 
 
 def _timed(

@@ -244,19 +244,14 @@ class Executor:
                 run.counters.skipped += thinned
                 if only.clients or only.subjects:
                     chosen[name] = only
+            present = {only: only.present(self._clients) for only in set(chosen.values())}  # mostly the same for all
+            clients = sorted({client for each in present.values() for client in each})
             if chosen:
-                for each in self._blocks.run_with_samples(stream, time, chosen, self._instruments.stopwatch):
+                for each in self._blocks.run_with_samples(stream, time, clients, chosen, self._instruments.stopwatch):
                     happened[each.event.rule].append(each.event)
                 for name, only in chosen.items():
-                    self._wake(self._runs[name], time, self._looked_at(self._runs[name], only))
+                    self._wake(self._runs[name], time, _looked_at(self._runs[name], only, present[only]))
         return happened
-
-    def _looked_at(self, run: RuleRun, only: Only) -> list[Subject]:
-        """The subjects of a rule about clients that were evaluated."""
-        subjects = (
-            Subject((client,), element.name) for element in run.rule.elements for client in only.present(self._clients)
-        )
-        return [subject for subject in subjects if only.takes(subject)]
 
     def _seen(self, events: list[Event]) -> list[Event]:
         """Return the events, after making them visible to rules that read episodes of other rules."""
@@ -326,3 +321,9 @@ class Executor:
         for run in self._runs.values():
             run.gap(time)
         self.wake_all(time)
+
+
+def _looked_at(run: RuleRun, only: Only, present: Sequence[str]) -> list[Subject]:
+    """The subjects of a rule about clients that were evaluated; `present`: the clients that `only` selects."""
+    subjects = [Subject((client,), element.name) for element in run.rule.elements for client in present]
+    return [subject for subject in subjects if only.takes(subject)] if only.subjects else subjects

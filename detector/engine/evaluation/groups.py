@@ -112,10 +112,17 @@ class RuleGroup:
     def _looked(self, clients: Sequence[str], only: Mapping[str, Only]) -> Truths:
         """Which track evaluates which client."""
         looked = np.zeros((len(self._of), len(clients)), bool)
+        of_clients: dict[frozenset[str], list[bool]] = {}  # most rules look at the same clients, with all elements
         for row, (run, track) in enumerate(zip(self._of, self.columns.tracks, strict=True)):
             chosen = only.get(run.rule.name)
-            if chosen is not None:
+            if chosen is None:
+                continue
+            if chosen.subjects:
                 looked[row] = [chosen.takes(track.subject(client)) for client in clients]
+                continue
+            if chosen.clients not in of_clients:
+                of_clients[chosen.clients] = [client in chosen.clients for client in clients]
+            looked[row] = of_clients[chosen.clients]
         return looked
 
     def _follow(self) -> None:

@@ -184,7 +184,7 @@ class PairGroup:
         _, what, wakes = state.run((tick,), 0, 1, run.timing, code)
         if what is not None or stays:
             measured = self._columns.measured(these, row)
-            variables = self._columns.variables(these, row)
+            variables = self._columns.happened(these, row)
             candidate = Candidate(subject, variables, in_scope=True, near=True, measured=measured)
             if what is None:
                 run.stays(tick, candidate)

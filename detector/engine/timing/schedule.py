@@ -54,8 +54,8 @@ class Only:
 
     def present(self, clients: Clients) -> list[str]:
         """The clients that can form its single-client subjects, in order of their names."""
-        named = {*self.clients, *(client for subject in self.subjects for client in subject.clients)}
-        return sorted(client for client in named if client in clients)
+        named = self.clients.union(*(subject.clients for subject in self.subjects))
+        return sorted([client for client in named if client in clients])
 
 
 class Schedule:
@@ -116,10 +116,11 @@ class Schedule:
         if clients:
             count = self._samples[rule.name] = self._samples.get(rule.name, -1) + 1
             thinned = count % self.thinning(rule) != 0
-        wakes = self._wakes.get(rule.name, {})
-        due = frozenset(subject for subject, time in wakes.items() if time <= now)
-        for subject in due:  # an evaluation sets the next wake; a subject that no longer exists needs none
-            del wakes[subject]
+        due: frozenset[Subject] = frozenset()
+        if wakes := self._wakes.get(rule.name):
+            due = frozenset(subject for subject, time in wakes.items() if time <= now)
+            for subject in due:  # an evaluation sets the next wake; a subject that no longer exists needs none
+                del wakes[subject]
         return Only(frozenset() if thinned else clients, due), thinned
 
     def forget(self, rule: str) -> None:

@@ -80,7 +80,8 @@ class TableMachine(RuleBasedStateMachine):
     @rule(data=st.data())
     def drop(self, data: st.DataObject) -> None:
         counts = [data.draw(st.integers(0, len(rows))) for rows in self.rows]
-        self.table.drop(np.array(counts, np.int64))
+        room = self.table.clients - len(counts)  # for clients to come
+        self.table.drop(np.array(counts + [0] * room, np.int64))
         self.forget([rows[count:] for rows, count in zip(self.rows, counts, strict=True)])
 
     def forget(self, kept: list[list[Arrival]]) -> None:

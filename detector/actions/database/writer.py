@@ -14,11 +14,14 @@ from typing import Any
 
 import bson
 
+from detector.access.mounted import AccessError, database_uri
+from detector.actions.base import ActionError
 from detector.actions.database import scenario as scenarios
 from detector.actions.database.queue import Queue
 from detector.actions.database.server import DatabaseUnavailableError, Server, WriteRefusedError
-from detector.actions.database.spool import Spool
 from detector.actions.database.work import Write
+from detector.actions.store import StoreError
+from wayside.api.database import DatabaseConnection, DatabaseSpool, WriteConcern
 from wayside.process.backoff import Backoff, retry
 
 _log = logging.getLogger(__name__)
@@ -38,6 +41,10 @@ _LAST_TRY = 0.5
 _RESTART_DELAY = 1.0
 """Seconds that the queue pauses after an unexpected error."""
 
+_FIELD = "spec.database"
+_CLOSING = 3.0
+"""Seconds at the end to write the queued requests."""
+
 Confirm = Callable[[bool, str], None]
 """Called with whether a scenario is complete in the database, and the reason if it is not."""
 
@@ -45,20 +52,19 @@ Confirm = Callable[[bool, str], None]
 class DatabaseWriter:
     """The queue, and the thread that empties it."""
 
-    def __init__(self, server: Server, spool: Spool | None, lose: Callable[[str, int, str], None]) -> None:
-        """`lose` receives the losses among the records of an earlier run."""
+    def __init__(self, server: Server, spool: DatabaseSpool | None, lose: Callable[[str, int, str], None]) -> None:
+        """`lose` receives the losses among the records of an earlier run. Raises StoreError."""
         self._server = server
         self._lose = lose
         self._queue = Queue(spool, lose)
         self._lock = self._queue.changed
         self._left = False
-        self._spooling = spool is not None
         self._away = ""
         self._closing = False
         self._deadline = 0.0
         self._confirms: dict[str, Confirm] = {}
         self._seen: set[Any] = set()
-        self._doubts = not server.sure or (spool is not None and spool.damaged > 0)
+        self._doubts = not server.sure
         """Documents may be missing without notice: each scenario's are counted before it is completed."""
         self.written = 0
         """Number of documents in the database."""
@@ -251,18 +257,63 @@ class DatabaseWriter:
             confirm(False, self._end_text())
 
     def _end_text(self) -> str:
-        where = "unwritten requests stay in the spool" if self._spooling else "there is no spool"
+        where = "unwritten requests stay in the spool" if self._queue.spools else "there is no spool"
         return f"the detector stopped before the database stored it ({self._away or 'it was busy'}); {where}"
 
     def _note_away(self, why: str) -> None:
         if not self._away:
-            where = (
-                "is queued in the spool on disk" if self._spooling else "is queued in memory, because there is no spool"
-            )
-            _log.warning("database: cannot write: %s; new data %s", why, where)
+            where = "in the spool on disk" if self._queue.spools else "in memory, because there is no spool"
+            _log.warning("database: cannot write: %s; new data is queued %s", why, where)
         self._away = why
 
     def _note_back(self) -> None:
         if self._away:
             _log.info("database: writing again; %d bytes are queued", self.waiting)
             self._away = ""
+
+
+_lock = threading.Lock()
+_writers: dict[DatabaseConnection, tuple[DatabaseWriter, int]] = {}
+"""The writers of the process with the number of their users, each for one database."""
+
+
+def acquire(database: DatabaseConnection, lose: Callable[[str, int, str], None]) -> DatabaseWriter:
+    """The database's writer. Raises ActionError if it cannot be created, without showing secrets."""
+    key = _key(database)
+    with _lock:
+        writer, users = _writers.get(key, (None, 0))
+        if writer is None:
+            writer = _made(database, lose)
+        _writers[key] = (writer, users + 1)
+        return writer
+
+
+def release(database: DatabaseConnection) -> None:
+    """The caller no longer needs the writer, which ends with its last user."""
+    key = _key(database)
+    with _lock:
+        writer, users = _writers[key]
+        if users > 1:
+            _writers[key] = (writer, users - 1)
+            return
+        del _writers[key]
+        writer.close(_CLOSING)  # before another one can open the same spool
+
+
+def _key(database: DatabaseConnection) -> DatabaseConnection:
+    return database.model_copy(update={"files": None})
+
+
+def _made(database: DatabaseConnection, lose: Callable[[str, int, str], None]) -> DatabaseWriter:
+    try:
+        uri = database_uri(database, _FIELD)
+        server = Server(uri, majority=database.write_concern is WriteConcern.MAJORITY)
+    except AccessError as error:
+        raise ActionError(str(error)) from None
+    except ValueError as error:
+        raise ActionError(f"{_FIELD}: the connection string is wrong: {error}: write mongodb://…") from None
+    try:
+        return DatabaseWriter(server, database.spool, lose)
+    except StoreError as error:
+        server.close()
+        raise ActionError(f"{_FIELD}.spool.path: {error}") from None
