@@ -17,7 +17,7 @@ from detector.engine.columns.past import Evaluations
 from detector.engine.columns.places import Places, Whereabouts
 from detector.engine.columns.reading import constant
 from detector.engine.columns.signals import SignalColumns
-from detector.engine.columns.table import Integers, Truths, distinct
+from detector.engine.columns.table import Integers, Truths, sorted_rows
 from detector.engine.columns.tables import Tables
 from detector.engine.columns.verdicts import Codes, Ternary, observed
 from detector.engine.episodes.subjects import Subject
@@ -118,7 +118,7 @@ class PairColumns:
         self._track.counters.crowded_pairs += near.left_out
         count = len(clients)
         keys = near.first * count + near.second
-        added = distinct(more[0] * count + more[1])
+        added = sorted_rows(more[0] * count + more[1])
         added = added[~np.isin(added, keys, assume_unique=True)]
         order = np.argsort(np.concatenate((keys, added)), kind="stable")
         is_near = (order < len(keys)).astype(bool)
