@@ -93,8 +93,8 @@ def secret_problems(rule: EventRule, detector: Detector) -> Iterator[RuleProblem
                 yield RuleProblem(
                     place,
                     (
-                        f"the Secret {name} holds the network access of the Detector itself: name another one, "
-                        "or share it with rules in spec.pod.secretNames"
+                        f"the Secret {name} contains the network credentials of the Detector itself: use another "
+                        "Secret, or share this one with rules in spec.pod.secretNames"
                     ),
                 )
 

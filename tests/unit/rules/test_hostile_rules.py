@@ -93,11 +93,11 @@ def test_a_rule_cannot_have_the_detectors_own_secret_sent_anywhere(http: dict[st
     rule = a_rule(when="true", actions=[{"name": "send", "notify": {"http": http}}])
     (problem,) = secret_problems(rule, a_detector(**OWN))
     assert str(problem).startswith(
-        f"spec.actions[0].notify.http.{place}: the Secret own holds the network access of the Detector"
+        f"spec.actions[0].notify.http.{place}: the Secret own contains the network credentials of the Detector"
     )
     assert [*secret_problems(rule, a_detector(**OWN, mode="Standalone", pod={"secretNames": ["own"]}))] == []
     assert [*secret_problems(rule, a_detector())] == []
     detector = a_detector(**OWN)
     evaluated, (refusal,) = RuleIndex().compile([rule], detector, inlets(detector).fields)
     assert evaluated == []
-    assert "the Secret own holds the network access of the Detector" in str(refusal)
+    assert "the Secret own contains the network credentials of the Detector" in str(refusal)

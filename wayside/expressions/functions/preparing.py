@@ -14,7 +14,7 @@ from wayside.expressions.regex import BOUNDED, LONGEST_INPUT
 def _bounded(arguments: Arguments) -> object:
     (text,) = arguments
     if isinstance(text, str) and len(text) * 4 > LONGEST_INPUT and (size := len(text.encode())) > LONGEST_INPUT:
-        raise ValueError(f"matches takes texts of at most {LONGEST_INPUT} bytes, but this one has {size}")
+        raise ValueError(f"matches takes texts of at most {LONGEST_INPUT} bytes; got {size}")
     return text
 
 
