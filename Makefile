@@ -87,7 +87,7 @@ mutants: $(BIN)/.installed-dev ## mutation tests: for each small wrong change, a
 	@$(BIN)/python -m tests.mutants
 
 load: $(BIN)/.installed-dev ## attacks on the manager from one namespace, while a task of another is measured
-	@$(BIN)/python -m benchmarks.attacks.load
+	@$(BIN)/python -m benchmarks.attacks.load --unserved; $(BIN)/python -m benchmarks.attacks.load
 
 soak: $(BIN)/.installed-dev ## an hour of traffic, faster than it happens: nothing grows, every loss is counted
 	@$(BIN)/python -m benchmarks.soak

@@ -15,12 +15,12 @@ import statistics
 import threading
 import time
 import uuid
-from dataclasses import replace
 from typing import Any
 
 import bson
 import numpy as np
 import pymongo
+from msgspec.structs import replace
 
 from detector.actions import Completion, Episode, EpisodeSample, Outcome, OutcomeState, Setting, Surroundings
 from detector.actions.database import Database
@@ -97,7 +97,9 @@ def with_the_action(detector: Detector, samples: list[EpisodeSample], name: str)
     setting = Setting(rule, "keep", "h", lambda: around, Nobody(), report, lose, threading.Event())
     action = Database(DatabaseAction(database=name), setting)
     action.wake()
-    episode = Episode("e", "bench", "car1", ("car1",), None, START, START, {}, None, {}, {}, {})
+    episode = Episode(
+        "e", "bench", "car1", ("car1",), None, START, START, {}, None, rendered={}, unrendered={}, started={}
+    )
     begin = time.perf_counter()
     action.started(episode)
     for first in range(0, len(samples), 100):  # as the host passes them on

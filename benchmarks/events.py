@@ -18,9 +18,8 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
-from detector.engine.episodes.current import Episode, Identity
+from detector.engine.episodes.current import EpisodeState, Identity, new_record
 from detector.engine.episodes.events import Event
-from detector.engine.episodes.identifiers import episode_id
 from detector.engine.episodes.subjects import Subject
 from wayside.api import Detector, EventRule
 from wayside.rules import CompiledRule, compile_rule
@@ -60,9 +59,8 @@ def make(rule: CompiledRule, number: int) -> Event:
     """As an evaluation makes the event of a start."""
     now = START + number * STEP
     subject = Subject((f"car-{number % CLIENTS}",))
-    identifier = episode_id(IDENTITY.holder, rule.name, subject.text, now)
-    episode = Episode(identifier, subject, now, now, {"speed": number / 7}, {})
-    return episode.started(rule, IDENTITY)
+    record = new_record(rule, IDENTITY, subject, now, now, {"speed": number / 7})
+    return EpisodeState(record, {}).started(rule, IDENTITY)
 
 
 def cost(work: Callable[[Any], object], given: Sequence[Any]) -> float:

@@ -2,7 +2,7 @@
 
     from detector.testing import run
     events = run("rules.yaml", "detector.yaml", "drive.mcap")
-    assert [event.subject for event in events if event.started] == ["car1"]
+    assert [event.episode.subject for event in events if event.started] == ["car1"]
 
 The engine is the same as in live operation. Plugins run in the test's process, so breakpoints and coverage see them.
 """

@@ -109,8 +109,7 @@ class Drive:
 def reported(events: Sequence[Event]) -> list[str]:
     """Events in a few words: `r car1 started 3`, `r car1 Until 5`; times in seconds after the start."""
     return [
-        f"{event.rule} {event.subject} {event.reason or 'started'} "
-        f"{((event.end_time if event.end_time is not None else event.start_time) - START) / 1e9:g}"
+        f"{event.episode.rule} {event.episode.subject} {event.reason or 'started'} {(event.time - START) / 1e9:g}"
         for event in events
     ]
 

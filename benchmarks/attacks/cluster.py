@@ -20,8 +20,9 @@ from tests.cluster.waiting import wait_until
 from tests.helm import ensure_tools
 from tests.helm.wayside_chart import Helm
 
-SYSTEM, QUIET, LOUD = "system", "quiet", "loud"
-"""The namespaces of the manager, of who is measured, and of who attacks."""
+SYSTEM, QUIET, LOUD, UNSERVED = "system", "quiet", "loud", "unserved"
+"""The namespaces of the manager, of the tenant that is measured and of the attacker, and one that the manager does not
+serve."""
 
 SITE = replace(
     LOOPBACK,
@@ -80,13 +81,13 @@ def small_cluster(folder: Path) -> Iterator[Cluster]:
     tools = ensure_tools()
     with ControlPlane(crds=CRDS, site=SITE) as plane:
         api = plane.api()
-        for namespace in (SYSTEM, QUIET, LOUD):
+        for namespace in (SYSTEM, QUIET, LOUD, UNSERVED):
             api.create({"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": namespace}})
         values = {"manager": {"grant": [QUIET, LOUD]}, "webhook": {"enabled": False}}
         for manifest in Helm(tools.helm, folder / "home").rendered(values, namespace=SYSTEM).of(*_INSTALLED):
             manifest["metadata"].setdefault("namespace", SYSTEM)
             api.apply(manifest)
-        tenants = {namespace: _tenant(plane, namespace) for namespace in (QUIET, LOUD)}
+        tenants = {namespace: _tenant(plane, namespace) for namespace in (QUIET, LOUD, UNSERVED)}
         manager = plane.kubeconfig_of_service_account(SYSTEM, "wayside-manager")
         yield Cluster(api, manager, tenants, plane.processes)
 

@@ -2,10 +2,13 @@
 
 The attack, all from one namespace (see `attacker`): templates whose expressions take too long, whose values change all
 the time; a flood of tasks; and large tasks. Prints the times from a task to its Deployment and to its status, alone and
-under attack, beside those of its creation alone and of three raw calls, which the API server alone makes slower; where
-requests waited; what each program used; and the manager's largest resident set. Exits with 1 where a target is missed.
+under attack, beside those of its creation alone and of three raw calls; where requests waited; what each program used;
+and the manager's largest resident set. Exits with 1 where a target is missed.
 
-    python -m benchmarks.attacks.load [--tasks 30] [--bombs 8] [--flood 10000] [--large 40]
+With `--unserved`, the attack comes from a namespace that the manager does not serve: the API server and the machine
+alone make the other tasks slower then.
+
+    python -m benchmarks.attacks.load [--tasks 30] [--bombs 8] [--flood 10000] [--large 40] [--unserved]
 
 Everybody has an account of its own and the rights that the chart gives: an administrator goes past API Priority and
 Fairness. The control plane is its own, and shares the machine's cores with all else here, so the machine must be idle.
@@ -27,7 +30,7 @@ from pathlib import Path
 
 from application_manager.cluster.client import manager_client
 from application_manager.core.claims.claims import instance_name
-from benchmarks.attacks.cluster import LOUD, QUIET, SYSTEM, Cluster, small_cluster
+from benchmarks.attacks.cluster import LOUD, QUIET, SYSTEM, UNSERVED, Cluster, small_cluster
 from benchmarks.task_to_deployment import PATIENCE, TASKS, TEMPLATE, Seen, cpu_seconds, task
 from wayside.kubernetes.client import Client
 from wayside.kubernetes.connection import load_configuration
@@ -192,8 +195,8 @@ def attack(options: argparse.Namespace, cluster: Cluster) -> subprocess.Popen[by
     """Start the attacks."""
     given = [f"--{name}={getattr(options, name)}" for name in ("bombs", "flood", "large")]
     return subprocess.Popen(
-        [sys.executable, "-m", "benchmarks.attacks.attacker", LOUD, *given],
-        env=os.environ | {"KUBECONFIG": str(cluster.tenants[LOUD])},
+        [sys.executable, "-m", "benchmarks.attacks.attacker", options.attacker, *given],
+        env=os.environ | {"KUBECONFIG": str(cluster.tenants[options.attacker])},
     )
 
 
@@ -202,13 +205,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     for name, default in (("tasks", 30), ("bombs", 8), ("flood", 10_000), ("large", 40)):
         parser.add_argument(f"--{name}", type=int, default=default)
+    parser.add_argument("--unserved", dest="attacker", action="store_const", const=UNSERVED, default=LOUD)
     options = parser.parse_args()
     with (
         tempfile.TemporaryDirectory() as folder,
         small_cluster(Path(folder)) as cluster,
         tempfile.TemporaryFile() as log,
     ):
-        for namespace in (QUIET, LOUD):
+        for namespace in (QUIET, options.attacker):
             cluster.api.create({**TEMPLATE, "metadata": {"name": "app", "namespace": namespace}})
         manager = subprocess.Popen(
             [sys.executable, "-m", "application_manager.cli", "run", f"--lease={SYSTEM}/application-manager"],

@@ -8,27 +8,15 @@ from enum import StrEnum
 from typing import Any
 
 from detector.engine.consequences.excerpts import EpisodeSample
+from detector.engine.episodes.record import EpisodeRecord
 from wayside.api.base import JsonValue
 
 __all__ = ["Completion", "Episode", "EpisodeSample", "Outcome", "OutcomeState"]
 
 
-@dataclass(frozen=True)
-class Episode:
-    """One occurrence of a rule's event, for one subject. Times are nanoseconds since the epoch."""
+class Episode(EpisodeRecord, frozen=True, gc=False, kw_only=True):
+    """The record of an episode, with what one action needs beside it. Times are nanoseconds since the epoch."""
 
-    id: str
-    rule: str
-    subject: str
-    """The text in events: `car1`, `car1+car2`, `~fleet`, followed by `~` and the element of `each` if there is one."""
-    clients: tuple[str, ...]
-    """The clients of the subject."""
-    element: str | None
-    onset_time: int
-    start_time: int
-    values: Mapping[str, JsonValue]
-    """The rule's variables at the start; unknown ones are left out."""
-    classification: Mapping[str, JsonValue] | None
     rendered: Mapping[str, JsonValue]
     """The action's templates, rendered at the start, or see `rendered_again`; those that could not be rendered are
     missing."""

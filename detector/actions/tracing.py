@@ -16,6 +16,7 @@ import msgspec
 from detector.engine.consequences.consequences import Begun, Consequence, Over
 from detector.engine.episodes.demands import Demand
 from detector.engine.episodes.events import Event
+from detector.engine.episodes.record import EpisodeRecord
 from wayside.api import ApplicationTask
 from wayside.api.applicationtask import TRACEPARENT_ANNOTATION
 from wayside.process.tracecontext import Attribute, Span, TraceContext, episode_context
@@ -30,7 +31,7 @@ class EpisodeTraces:
 
     def event(self, event: Event) -> Event:
         """The event with the trace context of its episode."""
-        return msgspec.structs.replace(event, traceparent=str(self._context(event.rule, event.episode)))
+        return msgspec.structs.replace(event, traceparent=str(self._context(event.episode)))
 
     def consequences(self, consequences: Sequence[Consequence]) -> list[Consequence]:
         """The same for the consequences of actions."""
@@ -43,14 +44,15 @@ class EpisodeTraces:
         """An episode ended: export its span."""
         if event.end_time is None or event.reason is None:
             return
+        episode = event.episode
         self.tracing.emit(
             Span(
-                _name(event.rule),
-                start=event.start_time,
+                _name(episode),
+                start=episode.start_time,
                 end=event.end_time,
-                context=self._context(event.rule, event.episode),
+                context=self._context(episode),
                 attributes={
-                    **_about(event.holder, event.rule, event.subject, event.subjects, event.episode),
+                    **_about(event.holder, episode),
                     "wayside.reason": event.reason.value,
                 },
             )
@@ -69,10 +71,10 @@ class EpisodeTraces:
                 f"create task {demand.action}",
                 start=began,
                 end=time.time_ns(),
-                parent=self._context(demand.rule, demand.episode),
+                parent=self._context(demand.episode),
                 context=self._of_demand(demand),
                 attributes={
-                    **_about(demand.holder, demand.rule, demand.subject, demand.subjects, demand.episode),
+                    **_about(demand.holder, demand.episode),
                     "wayside.action": demand.action,
                     "wayside.task": demand.name,
                     "wayside.template": demand.template,
@@ -83,11 +85,11 @@ class EpisodeTraces:
         )
 
     def _of_demand(self, demand: Demand) -> TraceContext:
-        return self._context(demand.rule, demand.episode).child(demand.name)
+        return self._context(demand.episode).child(demand.name)
 
-    def _context(self, rule: str, episode: str) -> TraceContext:
-        context = episode_context(episode)
-        return replace(context, sampled=self.tracing.sampled(context, _name(rule)))
+    def _context(self, episode: EpisodeRecord) -> TraceContext:
+        context = episode_context(episode.id)
+        return replace(context, sampled=self.tracing.sampled(context, _name(episode)))
 
 
 @contextmanager
@@ -106,15 +108,15 @@ def episode_traces(*, export: bool = True) -> Iterator[EpisodeTraces | None]:
         exporter.close()
 
 
-def _name(rule: str) -> str:
-    return f"episode {rule}"
+def _name(episode: EpisodeRecord) -> str:
+    return f"episode {episode.rule}"
 
 
-def _about(holder: str, rule: str, subject: str, subjects: Sequence[str], episode: str) -> dict[str, Attribute]:
+def _about(holder: str, episode: EpisodeRecord) -> dict[str, Attribute]:
     return {
         "wayside.holder": holder,
-        "wayside.rule": rule,
-        "wayside.subject": subject,
-        "wayside.subjects": list(subjects),
-        "wayside.episode": episode,
+        "wayside.rule": episode.rule,
+        "wayside.subject": episode.subject,
+        "wayside.subjects": list(episode.clients),
+        "wayside.episode": episode.id,
     }

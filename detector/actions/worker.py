@@ -11,14 +11,14 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
+
+from msgspec.structs import astuple, replace
 
 from detector.actions.base import Action, ActionError
 from detector.actions.episode import Completion, Episode, Outcome, OutcomeState
 from detector.actions.outcomes import Outcomes, Which
 from detector.engine.consequences.consequences import Begun, Completed, Consequence, Over, Run, Sampled
-from detector.engine.episodes.events import Event
 from detector.engine.samples.sample import SAMPLE_OVERHEAD
 
 _log = logging.getLogger(__name__)
@@ -221,19 +221,10 @@ def _text(error: Exception) -> str:
 
 
 def _episode(begun: Begun) -> Episode:
-    event: Event = begun.event
     return Episode(
-        id=event.episode,
-        rule=event.rule,
-        subject=event.subject,
-        clients=event.subjects,
-        element=event.element,
-        onset_time=event.onset_time,
-        start_time=event.start_time,
-        values=event.values,
-        classification=event.classification,
+        *astuple(begun.event.episode),
         rendered=begun.rendered.values,
         unrendered=begun.rendered.problems,
-        started=event.cloud_event(),
+        started=begun.event.cloud_event(),
         resumed=begun.resumed,
     )

@@ -102,7 +102,9 @@ def replay_files(
     tried = {variant.rule.name for variant in variants if not variant.is_written}
     traced = [_traced(outcome) for outcome in outcomes]
     with (output / "events.jsonl").open("w", encoding="utf-8") as file:
-        file.writelines(event.to_json() + "\n" for events, _ in traced for event in events if event.rule not in tried)
+        file.writelines(
+            event.to_json() + "\n" for events, _ in traced for event in events if event.episode.rule not in tried
+        )
     write_tasks_yaml(output / "tasks.yaml", [task for _, tasks in traced for task in tasks])
     refusals = dict.fromkeys(str(refusal) for outcome in outcomes for refusal in outcome.refusals)
     for refusal in refusals:
@@ -137,7 +139,7 @@ def _lines(outcome: Replayed, where: str) -> Iterator[str]:
 
 
 def _counted(outcomes: Sequence[Replayed], tried: Set[str]) -> str:
-    events = [event for outcome in outcomes for event in outcome.events if event.rule not in tried]
+    events = [event for outcome in outcomes for event in outcome.events if event.episode.rule not in tried]
     started = sum(event.started for event in events)
     several = f"{len(outcomes)} recordings, " if len(outcomes) > 1 else ""
     samples = _number(sum(outcome.samples for outcome in outcomes), "sample")

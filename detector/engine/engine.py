@@ -8,7 +8,8 @@ included.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import replace
+
+import msgspec
 
 from detector.engine.buffering.messages import KeyReader
 from detector.engine.consequences.consequences import Consequences
@@ -17,7 +18,8 @@ from detector.engine.episodes.current import Identity
 from detector.engine.episodes.demands import Demand
 from detector.engine.episodes.episodes import Ending
 from detector.engine.episodes.events import Event
-from detector.engine.episodes.open_episodes import OpenEpisode, ended_while_away, episode_of
+from detector.engine.episodes.open_episodes import OpenEpisode
+from detector.engine.episodes.record import EpisodeRecord
 from detector.engine.evaluation.executor import Executor
 from detector.engine.evaluation.knowledge import Knowledge
 from detector.engine.evaluation.observing import Instruments
@@ -181,34 +183,38 @@ class Engine:
         """
         demanded: dict[tuple[str, str, str], list[Demand]] = {}
         for demand in demands:
-            demanded.setdefault((demand.rule, demand.subject, demand.episode), []).append(demand)
-        statistics = {episode.episode: episode.statistics for episode in episodes}
+            demanded.setdefault((demand.episode.rule, demand.episode.subject, demand.episode.id), []).append(demand)
+        statistics = {episode.record.id: episode.statistics for episode in episodes}
         events: list[Event] = []
         for _, of_one in sorted(demanded.items()):
-            episode = episode_of(of_one[0])
-            episode = replace(episode, statistics=statistics.get(episode.episode))
-            whole = episode.subject.text == of_one[0].subject
-            events += self._take_up(episode, of_one, now) if whole else [self._ended_while_away(episode, now)]
-        known = {demand.episode for demand in demands}
-        for episode in sorted(episodes, key=lambda each: (each.rule, each.subject.text, each.episode)):
-            if episode.episode not in known:
+            record = of_one[0].episode
+            if record.subject == record.about.text:
+                events += self._take_up(OpenEpisode(record, statistics.get(record.id)), of_one, now)
+            else:  # the text is part of the event's key
+                record = msgspec.structs.replace(record, subject=record.about.text)
+                events.append(self._ended_while_away(record, now))
+        known = {demand.episode.id for demand in demands}
+        for episode in sorted(episodes, key=lambda each: (each.record.rule, each.record.subject, each.record.id)):
+            if episode.record.id not in known:
                 events += self._take_up(episode, (), now)
         self._rules_version += 1
         return events
 
     def _take_up(self, episode: OpenEpisode, demands: Sequence[Demand], now: int) -> list[Event]:
-        run = self._runs.get(episode.rule)
-        if run is None or not run.can_restore(episode):
-            return [self._ended_while_away(episode, now)]
+        record = episode.record
+        run = self._runs.get(record.rule)
+        if run is None or not run.can_restore(record):
+            return [self._ended_while_away(record, now)]
         event = run.restore(episode, demands)
         self._starts.started(event)
         self.consequences.begin(run.rule.actions, run.rule, event, resumed=True)
-        for client in episode.subject.clients:
+        for client in record.clients:
             self.clients.restore(client, now)
         return []
 
-    def _ended_while_away(self, episode: OpenEpisode, now: int) -> Event:
-        return ended_while_away(episode, self.identity.holder, now)
+    def _ended_while_away(self, record: EpisodeRecord, now: int) -> Event:
+        """The end of an episode whose rule changed or was removed while the detector was not running."""
+        return Event(self.identity.holder, record, {}, now, Ending.RULE_CHANGED)
 
     def open_episodes(self) -> list[OpenEpisode]:
         """All episodes that have not ended."""

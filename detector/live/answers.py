@@ -144,8 +144,8 @@ class Answers:
                     "subject": answer.subject,
                     "when": answer.when,
                     "values": plain(answer.values),
-                    "episode": answer.episode,
-                    "startTime": None if answer.start_time is None else format_time(answer.start_time),
+                    "episode": None if answer.episode is None else answer.episode.id,
+                    "startTime": None if answer.episode is None else format_time(answer.episode.start_time),
                 }
                 for answer in answers
             ]

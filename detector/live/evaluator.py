@@ -367,9 +367,9 @@ class Evaluator:
         if version != self._version:
             self._version = version
             demands = self._engine.demands()
-            ends = {event.episode: event.end_time for event in events if event.end_time is not None}
+            ends = {event.episode.id: event.end_time for event in events if event.end_time is not None}
             ended = {
-                name: ends.get(demand.episode, self._engine.now)
+                name: ends.get(demand.episode.id, self._engine.now)
                 for name, demand in self._demands.items()
                 if name not in demands
             }

@@ -56,8 +56,8 @@ class LiveOutlet:
                 self._log.write(line)
             _log.info(
                 "%s %s %s%s",
-                event.rule,
-                event.subject,
+                event.episode.rule,
+                event.episode.subject,
                 "started" if event.started else "ended",
                 "" if event.reason is None else f" ({event.reason})",
             )

@@ -30,7 +30,7 @@ async def what_was_open(store: TaskStore, state: StateFile | None) -> Restored:
             if isinstance(change, Snapshot):
                 episodes = [] if state is None else state.load()
                 over = _ended(change)
-                return Restored(live_demands(change), [each for each in episodes if each.episode not in over])
+                return Restored(live_demands(change), [each for each in episodes if each.record.id not in over])
     raise AssertionError("the stream of a store's changes ended")
 
 

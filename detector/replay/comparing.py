@@ -96,19 +96,22 @@ class Comparison:
 def compare(events: Iterable[Event], first: str, second: str, end: int) -> Comparison:
     """Compare the episodes of two rules; the recording ends at `end`, in nanoseconds since the epoch."""
     of_rule: dict[str, list[EpisodeTimes]] = {first: [], second: []}
-    open_spans: dict[str, tuple[str, Event]] = {}
+    open_spans: dict[str, Event] = {}
     for event in events:
-        if event.rule not in of_rule:
+        episode = event.episode
+        if episode.rule not in of_rule:
             continue
         if event.end_time is None:
-            open_spans[event.episode] = (event.rule, event)
+            open_spans[episode.id] = event
         else:
-            open_spans.pop(event.episode, None)
-            span = EpisodeTimes(event.start_time, event.end_time, event.subject, recording=event.recording)
-            of_rule[event.rule].append(span)
-    for rule, event in open_spans.values():
-        last = max(end, event.start_time)
-        of_rule[rule].append(EpisodeTimes(event.start_time, last, event.subject, open=True, recording=event.recording))
+            open_spans.pop(episode.id, None)
+            span = EpisodeTimes(episode.start_time, event.end_time, episode.subject, recording=event.recording)
+            of_rule[episode.rule].append(span)
+    for event in open_spans.values():
+        episode = event.episode
+        last = max(end, episode.start_time)
+        span = EpisodeTimes(episode.start_time, last, episode.subject, open=True, recording=event.recording)
+        of_rule[episode.rule].append(span)
     return _matched(first, second, sorted(of_rule[first]), sorted(of_rule[second]))
 
 

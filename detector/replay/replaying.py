@@ -186,10 +186,10 @@ class Replay:
             return
         self._demands_version = self._engine.demands_version
         demands = self._engine.demands()
-        ends = {event.episode: event.end_time for event in events if event.end_time is not None}
+        ends = {event.episode.id: event.end_time for event in events if event.end_time is not None}
         for name in self._demands.keys() - demands.keys():
             demand = self._demands[name]
-            self.outcome.tasks[name] = to_task(demand, ends.get(demand.episode, self._engine.now))
+            self.outcome.tasks[name] = to_task(demand, ends.get(demand.episode.id, self._engine.now))
         for name, demand in demands.items():
             if self._demands.get(name) != demand:
                 self.outcome.tasks[name] = to_task(demand)

@@ -143,12 +143,13 @@ EPISODE: dict[str, Any] = {
 
 def episode_message(event: Event) -> dict[str, Any]:
     """The message of the channel of episodes."""
+    episode = event.episode
     found: dict[str, Any] = {
-        "rule": event.rule,
-        "subject": event.subject,
-        "episode": event.episode,
+        "rule": episode.rule,
+        "subject": episode.subject,
+        "episode": episode.id,
         "state": "started" if event.started else "ended",
-        "start": format_time(event.start_time),
+        "start": format_time(episode.start_time),
     }
     if event.end_time is not None:
         found |= {"end": format_time(event.end_time), "reason": str(event.reason)}
@@ -161,8 +162,8 @@ def log_message(event: Event, time: int) -> Log:
     return Log(
         timestamp=Timestamp(sec=time // 1_000_000_000, nsec=time % 1_000_000_000),
         level=LogLevel.Info,
-        name=event.rule,
-        message=f"{event.rule} of {event.subject} {'started' if event.started else 'ended'}{ended}",
+        name=event.episode.rule,
+        message=f"{event.episode.rule} of {event.episode.subject} {'started' if event.started else 'ended'}{ended}",
         file="",
         line=0,
     )

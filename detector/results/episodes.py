@@ -60,9 +60,9 @@ def episodes_of(recording: str, events: Iterable[Event], trace: Trace) -> list[E
     traces = {(each.rule, each.subject): each for each in trace.subjects}
     found: dict[str, EpisodeRow] = {}
     for event in events:
-        episode = found.get(event.episode)
+        episode = found.get(event.episode.id)
         if episode is None:
-            episode = found[event.episode] = _episode(recording, event)
+            episode = found[event.episode.id] = _episode(recording, event)
         if event.started:
             episode.values |= {f"{name}.start": value for name, value in flat(event.values)}
         else:
@@ -76,9 +76,10 @@ def episodes_of(recording: str, events: Iterable[Event], trace: Trace) -> list[E
 
 
 def _episode(recording: str, event: Event) -> EpisodeRow:
+    episode = event.episode
     return EpisodeRow(
-        recording, event.rule, event.subject, event.subjects, event.element, event.episode, event.onset_time,
-        event.start_time, None, None, event.dry_run,
+        recording, episode.rule, episode.subject, episode.clients, episode.element, episode.id, episode.onset_time,
+        episode.start_time, None, None, event.dry_run,
     )  # fmt: skip
 
 

@@ -45,7 +45,7 @@ def write_mcap(path: Path, result: Result) -> None:
         log, scene = LogChannel(LOG, context=context), SceneUpdateChannel(SCENE, context=context)
         writers += [episodes, log, scene]
         for event in result.events:
-            time = event.start_time if event.end_time is None else event.end_time
+            time = event.time
             messages.append((time, len(writers) - 3, msgspec.json.encode(episode_message(event))))
             messages.append((time, len(writers) - 2, log_message(event, time)))
         messages += ((time, len(writers) - 1, update) for time, update in Scene().updates(result))

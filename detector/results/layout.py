@@ -45,7 +45,8 @@ def _chosen(result: Result) -> list[SubjectTrace]:
     counts: dict[tuple[str, str], int] = {}
     for event in result.events:
         if event.started:
-            counts[event.rule, event.subject] = counts.get((event.rule, event.subject), 0) + 1
+            key = event.episode.rule, event.episode.subject
+            counts[key] = counts.get(key, 0) + 1
     found: list[SubjectTrace] = []
     for rule in dict.fromkeys(each.rule for each in result.trace.subjects):
         own = [each for each in result.trace.subjects if each.rule == rule]

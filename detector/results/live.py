@@ -223,7 +223,7 @@ class LiveView:
                 for time, payload in messages:
                     channel.log(payload, log_time=time)
         for event in shown.events:
-            time = event.start_time if event.end_time is None else event.end_time
+            time = event.time
             if EPISODES in topics:
                 self._episodes.log(msgspec.json.encode(episode_message(event)), log_time=time)
             if LOG in topics:

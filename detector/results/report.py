@@ -207,7 +207,7 @@ def _unit(times: Iterable[Integers], begin: int) -> int:
 
 
 def _event_times(result: Result) -> list[Integers]:
-    return [np.array([event.start_time, event.onset_time], np.int64) for event in result.events]
+    return [np.array([event.episode.start_time, event.episode.onset_time], np.int64) for event in result.events]
 
 
 def _subject(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from foxglove.messages import (
@@ -24,6 +24,8 @@ from foxglove.messages import (
     Vector3,
 )
 
+from detector.engine.episodes.events import Event
+from detector.engine.episodes.record import EpisodeRecord
 from detector.results.places import polygons_of
 from detector.results.result import Result
 from detector.results.series import Doubles
@@ -41,42 +43,32 @@ _EARTH = 6_371_000.0
 _CLIENT, _OPEN, _PLACE = (0.15, 0.45, 0.8, 1.0), (0.85, 0.25, 0.2, 1.0), (0.4, 0.6, 0.3, 0.9)
 
 
-class _Edge(NamedTuple):
-    """The start or end of an episode."""
-
-    time: int
-    starts: bool
-    episode: str
-    rule: str
-    clients: tuple[str, ...]
-
-
 class Scene:
     """The scene over time. Degrees are converted to metres from the first place."""
 
     def __init__(self) -> None:
         self._origin: Doubles | None = None
-        self._busy: dict[str, _Edge] = {}
+        self._busy: dict[str, EpisodeRecord] = {}
         """The open episodes."""
 
     def updates(self, result: Result) -> Iterator[tuple[int, SceneUpdate]]:
         """The updates of a result, which follows the previous one; nothing if no position is known."""
-        trace, edges = result.trace, _edges(result)
+        trace, events = result.trace, deque(result.events)
         if not trace.ways:
-            self._pass(edges, trace.end)
+            self._pass(events, trace.end)
             return
         if self._origin is None:
             self._origin = next(iter(trace.ways.values())).axes[:, 0]
         origin = self._origin
         step = max(_STEP, (trace.end - trace.begin) // _MOST)
-        at_edges = np.array([edge.time for edge in edges], np.int64)
-        times = np.unique(np.concatenate((np.arange(trace.begin, trace.end + 1, step), at_edges)))
+        at_events = np.array([event.time for event in events], np.int64)
+        times = np.unique(np.concatenate((np.arange(trace.begin, trace.end + 1, step), at_events)))
         flat = {name: _metres(way.axes, origin, geographic=trace.geographic) for name, way in trace.ways.items()}
         rows = {name: np.searchsorted(way.times, times, "right") - 1 for name, way in trace.ways.items()}
         last = {name: int(way.times[-1]) for name, way in trace.ways.items()}
         yield int(times[0]), SceneUpdate(entities=[*_polygons(result, int(times[0]), origin)])
         for at, time in enumerate(times.tolist()):
-            self._pass(edges, time)
+            self._pass(events, time)
             there: dict[str, tuple[float, float]] = {}
             for name, axes in flat.items():
                 row = int(rows[name][at])
@@ -86,16 +78,16 @@ class Scene:
 
     def skip(self, result: Result) -> None:
         """Skip this result: only track which episodes are open after it."""
-        self._pass(_edges(result), result.trace.end)
+        self._pass(deque(result.events), result.trace.end)
 
-    def _pass(self, edges: deque[_Edge], time: int) -> None:
+    def _pass(self, events: deque[Event], time: int) -> None:
         """Update the open episodes to this time."""
-        while edges and edges[0].time <= time:
-            edge = edges.popleft()
-            if edge.starts:
-                self._busy[edge.episode] = edge
+        while events and events[0].time <= time:
+            event = events.popleft()
+            if event.started:
+                self._busy[event.episode.id] = event.episode
             else:
-                self._busy.pop(edge.episode, None)
+                self._busy.pop(event.episode.id, None)
 
     def _entities(self, there: Mapping[str, tuple[float, float]], time: int) -> list[SceneEntity]:
         named: dict[str, list[str]] = {}
@@ -106,20 +98,6 @@ class Scene:
             elif len(each.clients) == 2 and there.keys() >= {*each.clients}:
                 pairs.append(_pair(each.rule, each.clients, there, time))
         return [_client(name, place, named.get(name, ()), time) for name, place in there.items()] + pairs
-
-
-def _edges(result: Result) -> deque[_Edge]:
-    """Starts and ends of episodes, in time order."""
-    return deque(
-        _Edge(
-            event.start_time if event.end_time is None else event.end_time,
-            event.started,
-            event.episode,
-            event.rule,
-            event.subjects,
-        )
-        for event in result.events
-    )
 
 
 def _metres(axes: Doubles, origin: Doubles, *, geographic: bool) -> Doubles:

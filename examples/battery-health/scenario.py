@@ -128,16 +128,17 @@ def check(played: Played, sent: list[Message]) -> Iterator[str]:
     """The operator received the right health, and each recording contains a minute and a half of that bus."""
     reported = {each.content["subject"]: each.content["data"]["notification"] for each in played.notices}
     for event in played.events:
-        if event.rule == "battery-health" and event.started:
-            at = seconds(event.start_time)
-            truth = np.mean([TRUTH[event.subject](t) for t in np.arange(max(0.0, at - WINDOW_S), at, 0.5)])
-            logged = float(reported[event.subject]["labels"]["health"]) if event.subject in reported else math.nan
+        if event.episode.rule == "battery-health" and event.started:
+            bus, at = event.episode.subject, seconds(event.time)
+            truth = np.mean([TRUTH[bus](t) for t in np.arange(max(0.0, at - WINDOW_S), at, 0.5)])
+            logged = float(reported[bus]["labels"]["health"]) if bus in reported else math.nan
             if not abs(logged - truth) < 0.005:
-                yield f"the operator was notified that the health of {event.subject} is {logged}; it is {truth:.3f}"
-    spans = {event.subject: event for event in played.events if event.rule == "battery-report" and not event.started}
+                yield f"the operator was notified that the health of {bus} is {logged}; it is {truth:.3f}"
+    ends = [event for event in played.events if event.episode.rule == "battery-report" and not event.started]
+    spans = {event.episode.subject: event for event in ends}
     for folder in played.recordings("battery-report"):
         (bus,) = (each for each in spans if f"_{each}_" in folder.name)
-        first, last = seconds(spans[bus].onset_time) - 60, seconds(spans[bus].end_time or 0)
+        first, last = seconds(spans[bus].episode.onset_time) - 60, seconds(spans[bus].end_time or 0)
         must = within(sent, [bus], first, last)
         yield from missing_messages(must, read_recording(folder), f"the report of {bus}")
 

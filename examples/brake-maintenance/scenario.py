@@ -110,10 +110,11 @@ def check(played: Played) -> Iterator[str]:
     """The workshop is notified of the brakes' remaining time."""
     reported = {each.content["subject"]: each.content["data"]["notification"]["labels"] for each in played.notices}
     for event in played.events:
-        logged, at = float(reported[event.subject]["hours"]), seconds(event.start_time) / HOUR_S
-        truth = (gives(event.subject, at - RECENT_H / 2) - LEAST) / WEAR_PER_HOUR
+        van = event.episode.subject
+        logged, at = float(reported[van]["hours"]), seconds(event.episode.start_time) / HOUR_S
+        truth = (gives(van, at - RECENT_H / 2) - LEAST) / WEAR_PER_HOUR
         if not abs(logged - truth) < 0.15 * truth:
-            yield f"the workshop was notified that {event.subject} has {logged:.1f} hours left; they are {truth:.1f}"
+            yield f"the workshop was notified that {van} has {logged:.1f} hours left; they are {truth:.1f}"
 
 
 def picture(seed: int, due: Sequence[Episode]) -> str:

@@ -168,11 +168,11 @@ def episodes() -> list[Episode]:
 
 def check(played: Played, sent: list[Message]) -> Iterator[str]:
     """Each recording holds what both vehicles sent, from three seconds before until two seconds after."""
-    ended = {(event.subject, event.start_time): event for event in played.events if not event.started}
+    ended = {(event.episode.subject, event.episode.start_time): event for event in played.events if not event.started}
     folders = played.recordings("collective-learning")
-    for (subject, start), event in sorted(ended.items(), key=lambda each: each[1].start_time):
-        first, last = seconds(event.onset_time) - BEFORE_S, seconds(event.end_time or 0) + AFTER_S
-        recorded = [each for each in folders if event.episode in each.name]
+    for (subject, start), event in sorted(ended.items(), key=lambda each: each[1].episode.start_time):
+        first, last = seconds(event.episode.onset_time) - BEFORE_S, seconds(event.end_time or 0) + AFTER_S
+        recorded = [each for each in folders if event.episode.id in each.name]
         if len(recorded) != 1:
             yield f"{subject} from {seconds(start):g} s on: {len(recorded)} recordings; expected: one"
             continue

@@ -113,9 +113,9 @@ def check(played: Played) -> Iterator[str]:
     """From its first moment on, each vehicle is wanted in exactly one place: what the one ends, the other begins."""
     for vehicle in TRUTH:
         changes = [
-            (seconds(event.start_time if event.end_time is None else event.end_time), event.rule, event.started)
+            (seconds(event.time), event.episode.rule, event.started)
             for event in played.events
-            if event.subject == vehicle
+            if event.episode.subject == vehicle
         ]
         for at in sorted({each[0] for each in changes}):
             wanted = sum(1 if started else -1 for when, _, started in changes if when <= at)

@@ -126,7 +126,7 @@ def episodes() -> list[Episode]:
 
 def check(played: Played) -> Iterator[str]:
     """Each driver received the distance, and each display the end."""
-    starts = {event.subject: seconds(event.start_time) for event in played.events if event.started}
+    starts = {event.episode.subject: seconds(event.episode.start_time) for event in played.events if event.started}
     reported: dict[str, list[str]] = {}
     for notice in played.notices:
         vehicle, kind = notice.content["subject"], notice.content["type"].rpartition(".")[2]

@@ -188,7 +188,7 @@ def check(played: Played, sent: list[Message]) -> Iterator[str]:
     for event, (_, number), folder in zip(
         ended, known_better(), folders, strict=False
     ):  # their number is checked already
-        first, last = seconds(event.onset_time) - BEFORE_S, seconds(event.end_time or 0) + AFTER_S
+        first, last = seconds(event.episode.onset_time) - BEFORE_S, seconds(event.end_time or 0) + AFTER_S
         yield from missing_messages(
             within(sent, ["ego"], first, last), read_recording(folder), f"the recording {folder.name}"
         )

@@ -116,9 +116,8 @@ def check(played: Played, sent: list[Message]) -> Iterator[str]:
     for (car, logged), (_, truth) in zip(reported, must, strict=False):  # their number is checked already
         if not abs(logged - truth) < 2 * SPEED:
             yield f"the road operator received a pothole of {car} at {logged}; it is at {truth:.5f}"
-    spans = sorted(
-        ((each.onset_time, each.end_time or 0, each.subject) for each in played.events if not each.started),
-    )
+    ends = [each for each in played.events if not each.started]
+    spans = sorted((each.episode.onset_time, each.time, each.episode.subject) for each in ends)
     for folder, (onset, end, car) in zip(played.recordings("pothole-detection"), spans, strict=False):
         around = [
             each for each in sent

@@ -56,13 +56,13 @@ def _episodes(expected: Iterable[Episode], events: Iterable[Event]) -> Iterator[
     found: dict[tuple[str, str], list[list[Event]]] = defaultdict(list)
     for event in events:
         if event.started:
-            found[event.rule, event.subject].append([event])
+            found[event.episode.rule, event.episode.subject].append([event])
         else:
-            found[event.rule, event.subject][-1].append(event)
+            found[event.episode.rule, event.episode.subject][-1].append(event)
     for rule, subject in sorted({*wanted, *found}):
         must, there = wanted[rule, subject], found[rule, subject]
         if len(must) != len(there):
-            starts = ", ".join(f"{seconds(each[0].start_time):g} s" for each in there) or "never"
+            starts = ", ".join(f"{seconds(each[0].episode.start_time):g} s" for each in there) or "never"
             due = ", ".join(f"{each.start_s:g} s" for each in must) or "never"
             yield f"{rule} of {subject} starts {starts}; expected: {due}"
             continue
@@ -72,7 +72,7 @@ def _episodes(expected: Iterable[Episode], events: Iterable[Event]) -> Iterator[
 
 def _episode(episode: Episode, events: list[Event]) -> Iterator[str]:
     who = f"{episode.rule} of {episode.subject}"
-    start = seconds(events[0].start_time)
+    start = seconds(events[0].episode.start_time)
     if not episode.start_s - _EARLY_S <= start <= episode.start_s + episode.within_s + _EARLY_S:
         yield f"{who} starts at {start:g} s; expected: {episode.start_s:g} s, and {episode.within_s:g} s later at most"
     if episode.end_s is None:

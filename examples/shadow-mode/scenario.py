@@ -138,7 +138,7 @@ def check(played: Played, sent: list[Message]) -> Iterator[str]:
     """Each recording holds the inputs and outputs of both, from three seconds before until two seconds after."""
     ended = [event for event in played.events if not event.started]
     for event, folder in zip(ended, played.recordings("shadow-mode"), strict=False):  # their number is checked already
-        first, last = seconds(event.onset_time) - BEFORE_S, seconds(event.end_time or 0) + AFTER_S
+        first, last = seconds(event.episode.onset_time) - BEFORE_S, seconds(event.end_time or 0) + AFTER_S
         yield from missing_messages(
             within(sent, ["ego"], first, last), read_recording(folder), f"the recording {folder.name}"
         )

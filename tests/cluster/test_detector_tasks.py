@@ -14,6 +14,7 @@ from detector.actions.deploy.kubernetes_store import KubernetesTaskStore
 from detector.actions.deploy.reconciler import DemandReconciler, DeployCounts
 from detector.actions.deploy.stores import TaskExistsError, restore, task_manifest
 from detector.engine.episodes.demands import Demand, to_task
+from detector.engine.episodes.record import EpisodeRecord
 from tests.cluster.api import Api, Object, Objects
 from tests.cluster.background import Background, background
 from tests.cluster.controlplane import ControlPlane
@@ -27,7 +28,18 @@ RARELY = 600.0  # s between two resyncs: what a test sees comes by the watch
 
 def demand(namespace: str, subject: str = "car1+car2", **changes: Any) -> Demand:
     made = Demand(
-        rule="lidar-vehicles-close",
+        EpisodeRecord(
+            id=f"episode-{subject}",
+            rule="lidar-vehicles-close",
+            subject=subject,
+            clients=tuple(subject.split("+")),
+            element=None,
+            onset_time=START - 2 * SECOND,
+            start_time=START,
+            values={},
+            classification={"overarchingPurpose": ["Safety"]},
+            rule_digest="0123456789abcdef",
+        ),
         action="record",
         template="scene-recorder",
         priority=0,
@@ -35,14 +47,6 @@ def demand(namespace: str, subject: str = "car1+car2", **changes: Any) -> Demand
         detector="intersection-a",
         holder=HOLDER,
         namespace=namespace,
-        subject=subject,
-        subjects=tuple(subject.split("+")),
-        episode=f"episode-{subject}",
-        onset_time=START - 2 * SECOND,
-        start_time=START,
-        classification={"overarchingPurpose": ["Safety"]},
-        values={},
-        rule_digest="0123456789abcdef",
     )
     return dataclasses.replace(made, **changes)
 

@@ -6,9 +6,10 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+from msgspec.structs import replace
 
 from detector.actions import Completion, Episode, EpisodeSample, Outcome, OutcomeState, Setting, Surroundings
 from detector.actions.database import Database

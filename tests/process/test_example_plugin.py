@@ -31,7 +31,7 @@ def test_before_it_is_installed_it_is_missed() -> None:
 def test_the_rule_is_tested_in_three_lines(site: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(site)
     events = run(RULES, DETECTOR, DRIVE)
-    assert [event.subject for event in events if event.started] == ["jammed"]
+    assert [event.episode.subject for event in events if event.started] == ["jammed"]
     assert events[0].values == {"stops": 3.0}
 
 

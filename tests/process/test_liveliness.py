@@ -117,8 +117,7 @@ def test_with_clock_data_a_token_counts_after_the_samples_up_to_the_newest_stamp
 
 def _told(drive: Drive) -> list[str]:
     return Drive.note(drive, []) or [
-        f"{e.rule} {e.subject} {e.reason or 'started'} {((e.end_time or e.start_time) - START) / 1e9:g}"
-        for e in drive.events
+        f"{e.episode.rule} {e.episode.subject} {e.reason or 'started'} {(e.time - START) / 1e9:g}" for e in drive.events
     ]
 
 

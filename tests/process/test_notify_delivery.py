@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import zenoh
 from cloudevents.core.bindings.http import HTTPMessage, from_http_event
+from msgspec.structs import replace
 
 from detector.actions import Completion, OutcomeState
 from detector.actions.notify import outbox
@@ -311,8 +312,7 @@ def test_a_text_that_could_not_be_rendered_is_missing_and_reported(there: Endpoi
 
 def test_an_episode_that_does_not_end_is_done_when_its_start_is_reported(there: Endpoint) -> None:
     desk = a_desk({"http": http(there)})
-    episode = an_episode()
-    open_ = type(episode)(**{**episode.__dict__, "ended": None, "end_time": None, "reason": None})
+    open_ = replace(an_episode(), ended=None, end_time=None, reason=None)
     desk.action.started(open_)
     there.received(1)
     desk.action.completed(open_, Completion(cut="the detector stops"))

@@ -91,7 +91,7 @@ def test_killed_and_started_again_the_replay_gives_the_same_events(tmp_path: Pat
             put([("vehicles/a/speed", b'{"v": 1}')])
 
         def started(rule: str) -> int:
-            return sum(event.rule == rule and event.started for event in kept.all)
+            return sum(event.episode.rule == rule and event.started for event in kept.all)
 
         wait_until(lambda: started("r") >= 1 and started("other") >= 1, feed)
         process = host._signals["r", "p"]._process

@@ -30,6 +30,7 @@ from detector.actions.record.salvage import contents_of, salvage
 from detector.actions.worker import Worker
 from detector.engine.consequences.consequences import Begun, Completed, Run, Sampled
 from detector.engine.episodes.events import Event
+from detector.engine.episodes.record import EpisodeRecord
 from detector.engine.episodes.rendering import Rendered
 from tests.driving import at
 from tests.recording_bench import (
@@ -286,7 +287,7 @@ def test_a_slow_disk_costs_samples_that_are_counted_and_nobody_waits(
     bench.action.setting = replace(bench.action.setting, report=partial(outcomes.report, which))
     worker = Worker(which, lambda: bench.action, outcomes, maximum_bytes=5_500_000)
     run = Run("r", "bag", "episode1")
-    begun = Event("h", "r", "car1", ("car1",), "episode1", at(1), at(1), None, None, {}, None)
+    begun = Event("h", EpisodeRecord("episode1", "r", "car1", ("car1",), None, at(1), at(1), {}, None), {})
     points = [a_sample(1 + k / 10, "points", MEGABYTE) for k in range(8)]
     begin = time.monotonic()
     worker.enqueue(Begun(run, begun, Rendered(), resumed=False))

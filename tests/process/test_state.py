@@ -21,6 +21,7 @@ from hypothesis import strategies as st
 from detector.actions.deploy.file_store import FileTaskStore
 from detector.engine.episodes.demands import to_task
 from detector.engine.episodes.open_episodes import OpenEpisode, from_document
+from detector.engine.episodes.record import EpisodeRecord
 from detector.engine.episodes.subjects import Subject
 from detector.live.restoring import what_was_open
 from detector.live.state import StateFile, state_file
@@ -48,6 +49,10 @@ def open_in(rule: Any) -> list[OpenEpisode]:
     return drive.engine.open_episodes()
 
 
+def by_subject(episodes: list[OpenEpisode]) -> list[OpenEpisode]:
+    return sorted(episodes, key=lambda each: each.record.subject)
+
+
 def saved(folder: Path, episodes: list[OpenEpisode]) -> StateFile:
     state = StateFile(folder, "default", "h")
     state.save(episodes)
@@ -62,10 +67,10 @@ def test_an_episode_without_a_task_continues_after_a_restart() -> None:
     episodes = open_in(speeding())
     drive = Drive(a_detector(), speeding())
     assert drive.note(drive.engine.restore([], at(0), episodes)) == []
-    assert sorted(drive.engine.open_episodes(), key=lambda e: e.subject) == sorted(episodes, key=lambda e: e.subject)
+    assert by_subject(drive.engine.open_episodes()) == by_subject(episodes)
     assert drive.take(speed(0.5, 7), speed(0.6, 3, "bus"), until=1) == ["r bus Until 1"]
-    assert drive.events[0].episode == next(each.episode for each in episodes if each.subject.text == "bus")
-    assert drive.events[0].start_time == at(-99)
+    assert drive.events[0].episode.id == next(each.record.id for each in episodes if each.record.subject == "bus")
+    assert drive.events[0].episode.start_time == at(-99)
 
 
 def test_one_whose_rule_changed_meanwhile_ends() -> None:
@@ -93,7 +98,7 @@ def test_an_episode_whose_task_was_never_made_demands_it_at_the_next_evaluation(
     drive.engine.restore([], at(0), open_in(rule))
     assert drive.engine.demands() == {}
     drive.take(speed(0.5, 8), until=1)
-    assert [(demand.start_time, demand.parameters) for demand in drive.engine.demands().values()] == [
+    assert [(demand.episode.start_time, demand.parameters) for demand in drive.engine.demands().values()] == [
         (at(-99), {"v": 8})
     ]
 
@@ -107,11 +112,17 @@ values = st.recursive(
     max_leaves=5,
 )
 times = st.integers(0, 4 * 10**18)
+
+
+def open_episode(subject: Subject, **fields: Any) -> OpenEpisode:
+    return OpenEpisode(EpisodeRecord(subject=subject.text, clients=subject.clients, element=subject.element, **fields))
+
+
 episodes = st.builds(
-    OpenEpisode,
+    open_episode,
+    st.builds(Subject, st.lists(names, max_size=2).map(tuple), st.none() | names),
+    id=names,
     rule=names,
-    subject=st.builds(Subject, st.lists(names, max_size=2).map(tuple), st.none() | names),
-    episode=names,
     onset_time=times,
     start_time=times,
     values=st.dictionaries(names, values.filter(lambda value: value is not None), max_size=3),
@@ -206,12 +217,12 @@ def test_an_episode_whose_task_has_ended_is_not_restored(tmp_path: Path) -> None
 
     async def look() -> Any:
         for demand in drive.engine.demands().values():
-            await store.create(to_task(demand, at(-50) if demand.subject == "bus" else None))
+            await store.create(to_task(demand, at(-50) if demand.episode.subject == "bus" else None))
         return await what_was_open(store, StateFile(tmp_path / "state", "default", "h"))
 
     restored = asyncio.run(look())
-    assert [demand.subject for demand in restored.demands] == ["car"]
-    assert [episode.subject.text for episode in restored.episodes] == ["car"]
+    assert [demand.episode.subject for demand in restored.demands] == ["car"]
+    assert [episode.record.subject for episode in restored.episodes] == ["car"]
     assert state.failures == 0
 
 

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from detector.actions.tracing import episode_traces
 from detector.engine.consequences.consequences import Begun, Completed, Run
 from detector.engine.episodes.events import Event
+from detector.engine.episodes.record import EpisodeRecord
 from detector.engine.episodes.rendering import Rendered
 from tests.otlp import Receiver
 from tests.ports import free_ports
@@ -154,7 +155,7 @@ def test_an_endpoint_that_is_away_costs_its_spans_and_they_are_counted(monkeypat
 
 def test_events_and_the_input_of_actions_have_the_trace_of_their_episode(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OTEL_EXPORTER_OTLP_ENDPOINT", "http://127.0.0.1:1")
-    event = Event("town", "close", "a+b", ("a", "b"), "e", 1, 2, None, None, {}, None)
+    event = Event("town", EpisodeRecord("e", "close", "a+b", ("a", "b"), None, 1, 2, {}, None), {})
     run = Run("close", "notify", "e")
     with episode_traces(export=False) as traces:
         assert traces is not None

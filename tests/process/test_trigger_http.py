@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 import threading
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 from detector.actions import ActionError, Completion, Episode, Outcome, OutcomeState, Setting, Surroundings
 from detector.actions.trigger.action import Trigger

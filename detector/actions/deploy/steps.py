@@ -56,11 +56,11 @@ def differences(demand: Demand, stored: StoredTask) -> list[str]:
         "operation": (demand.operation, spec.operation),
         "priority": (demand.priority, spec.priority),
         "requester.detectorName": (demand.detector, spec.requester.detector_name),
-        "requester.subjects": (list(demand.subjects), spec.requester.subjects),
+        "requester.subjects": (list(demand.episode.clients), spec.requester.subjects),
     }
     if event is not None:
         pairs |= {
-            "event.id": (demand.episode, event.id),
-            "event.onsetTime": (format_time(demand.onset_time), event.onset_time),
+            "event.id": (demand.episode.id, event.id),
+            "event.onsetTime": (format_time(demand.episode.onset_time), event.onset_time),
         }
     return [field for field, (wanted, found) in pairs.items() if wanted != found]

@@ -111,7 +111,7 @@ async def restore(store: TaskStore) -> list[Demand]:
 def live_demands(snapshot: Snapshot) -> list[Demand]:
     """The demands of the tasks that have not ended, oldest first."""
     live = (from_task(each.task) for each in snapshot.tasks.values() if each.live and not each.leaving)
-    return sorted((demand for demand in live if demand), key=lambda each: (each.start_time, each.name))
+    return sorted((demand for demand in live if demand), key=lambda each: (each.episode.start_time, each.name))
 
 
 def belongs_to(task: ApplicationTask, holder: str) -> bool:

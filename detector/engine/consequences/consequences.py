@@ -99,7 +99,8 @@ class Consequences:
         if event.started:
             self.begin(rule.actions, rule, event, resumed=False)
             return
-        for run in [run for run in self._running if (run.rule, run.episode) == (event.rule, event.episode)]:
+        ended = (event.episode.rule, event.episode.id)
+        for run in [run for run in self._running if (run.rule, run.episode) == ended]:
             self._end(run, event)
 
     def begin(self, actions: Iterable[CompiledAction], rule: CompiledRule, event: Event, *, resumed: bool) -> None:
@@ -107,13 +108,13 @@ class Consequences:
         if rule.dry_run or not self.wanted:
             return
         for action in actions:
-            run = Run(rule.name, action.name, event.episode)
+            run = Run(rule.name, action.name, event.episode.id)
             window = action.window
             excerpt = None
             self._noted.append(Begun(run, event, event.rendered.get(action.name, Rendered()), resumed))
             if window is not None:
-                clients = None if window.clients is None else window.clients | frozenset(event.subjects)
-                excerpt = self._excerpts.begin(window, clients, event.onset_time - window.before_ns)
+                clients = None if window.clients is None else window.clients | frozenset(event.episode.clients)
+                excerpt = self._excerpts.begin(window, clients, event.episode.onset_time - window.before_ns)
             self._running[run] = excerpt
 
     def request(

@@ -1,4 +1,4 @@
-"""One open episode of a rule: the contents of its events, and the demands that its deploy actions hold."""
+"""The state of an open episode of a rule: its record, and the demands that its deploy actions hold."""
 
 from __future__ import annotations
 
@@ -6,12 +6,16 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import msgspec
+
 from detector.engine.counters import RuleCounters
 from detector.engine.episodes.demands import Demand
 from detector.engine.episodes.episodes import Ending
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.following import followed
+from detector.engine.episodes.identifiers import episode_id
 from detector.engine.episodes.open_episodes import OpenEpisode
+from detector.engine.episodes.record import EpisodeRecord
 from detector.engine.episodes.rendering import Rendered, render_templates
 from detector.engine.episodes.statistics import Statistics
 from detector.engine.episodes.subjects import Subject
@@ -21,22 +25,37 @@ from wayside.rules import CompiledDeploy, CompiledRule
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """The holder, rule and subject of episodes."""
+    """Whose episodes they are."""
 
     detector: str
     holder: str
     namespace: str
 
 
-@dataclass(slots=True)
-class Episode:
-    """An open episode. Times are nanoseconds since the epoch."""
+def new_record(
+    rule: CompiledRule, identity: Identity, subject: Subject, onset: int, now: int, values: Mapping[str, Any]
+) -> EpisodeRecord:
+    """The record of an episode that starts `now`; times are nanoseconds since the epoch."""
+    text = subject.text
+    return EpisodeRecord(
+        id=episode_id(identity.holder, rule.name, text, now),
+        rule=rule.name,
+        subject=text,
+        clients=subject.clients,
+        element=subject.element,
+        onset_time=onset,
+        start_time=now,
+        values=values,
+        classification=rule.classification,
+        rule_digest=rule.digest,
+    )
 
-    id: str
-    subject: Subject
-    onset: int
-    start: int
-    values: Mapping[str, Any]
+
+@dataclass(slots=True)
+class EpisodeState:
+    """The state of an open episode."""
+
+    record: EpisodeRecord
     variables: Mapping[str, Any] | None
     """The variables of the conditions at the start; None until the next evaluation if the episode was restored, or
     started while the rule had no actions."""
@@ -52,7 +71,7 @@ class Episode:
         rendered = (
             {action.name: render_templates(action, self.variables) for action in rule.actions} if rule.actions else {}
         )
-        return self._event(rule, identity, None, None, self.values, rendered)
+        return self._event(rule, identity, self.record.values, rendered)
 
     def ended(
         self,
@@ -73,21 +92,22 @@ class Episode:
             for action in rule.actions:
                 if any(names & template.names for template in action.templates.values()):
                     rendered[action.name] = render_templates(action, seen)
-        return self._event(rule, identity, now, reason, values, rendered)
+        return self._event(rule, identity, values, rendered, now, reason)
 
-    def kept(self, rule: CompiledRule) -> OpenEpisode:
+    def kept(self) -> OpenEpisode:
         """The episode in the form that survives a restart."""
-        return OpenEpisode(
-            rule.name, self.subject, self.id, self.onset, self.start, self.values, rule.classification, rule.digest,
-            None if self.statistics is None else self.statistics.to_document(),
-        )  # fmt: skip
+        return OpenEpisode(self.record, None if self.statistics is None else self.statistics.to_document())
 
     def is_complete(self, rule: CompiledRule) -> bool:
         """Whether all demands are up to date with the rule."""
         return not self.outdated and len(self.demands) >= len(rule.deploys)
 
-    def change(self, changed: Collection[str], gone: Collection[str]) -> None:
-        """The rule's deploy actions changed: demands of removed actions end at once, the others stay valid for now."""
+    def change(self, rule: CompiledRule, changed: Collection[str], gone: Collection[str]) -> None:
+        """The rule's deploy actions changed: demands of removed actions end at once, the others stay valid for now.
+
+        The end event has the rule's current classification.
+        """
+        self.record = msgspec.structs.replace(self.record, classification=rule.classification)
         for action in gone:
             self.demands.pop(action, None)
         self.outdated = (self.outdated | set(changed)) - set(gone)
@@ -104,9 +124,9 @@ class Episode:
                     parameters = deploy.parameters.render(self.variables or {})
                 except InterpolationError as error:
                     counters.errors += 1
-                    counters.last_error = f"action {deploy.action} of {self.subject.text}: {error}"
+                    counters.last_error = f"action {deploy.action} of {self.record.subject}: {error}"
                     continue
-                self.demands[deploy.action] = self._demand(rule, identity, deploy, parameters)
+                self.demands[deploy.action] = self._demand(identity, deploy, parameters)
                 self.outdated.discard(deploy.action)
                 changes += 1
         return changes
@@ -117,15 +137,15 @@ class Episode:
         for deploy in rule.deploys:
             demand = self.demands.get(deploy.action)
             if deploy.follow and demand is not None and deploy.action not in self.outdated:
-                parameters = followed(deploy, self.subject, demand.parameters, variables, counters)
+                parameters = followed(deploy, self.record.subject, demand.parameters, variables, counters)
                 if parameters != demand.parameters:
                     self.demands[deploy.action] = replace(demand, parameters=parameters)
                     changes += 1
         return changes
 
-    def _demand(self, rule: CompiledRule, identity: Identity, deploy: CompiledDeploy, parameters: Any) -> Demand:
+    def _demand(self, identity: Identity, deploy: CompiledDeploy, parameters: Any) -> Demand:
         return Demand(
-            rule=rule.name,
+            self.record,
             action=deploy.action,
             template=deploy.template,
             operation=deploy.operation,
@@ -134,39 +154,24 @@ class Episode:
             detector=identity.detector,
             holder=identity.holder,
             namespace=identity.namespace,
-            subject=self.subject.text,
-            subjects=self.subject.clients,
-            episode=self.id,
-            onset_time=self.onset,
-            start_time=self.start,
-            classification=rule.classification,
-            values=self.values,
-            rule_digest=rule.digest,
         )
 
     def _event(
         self,
         rule: CompiledRule,
         identity: Identity,
-        end: int | None,
-        reason: Ending | None,
         values: Mapping[str, Any],
         rendered: Mapping[str, Rendered],
+        end: int | None = None,
+        reason: Ending | None = None,
     ) -> Event:
         return Event(
             holder=identity.holder,
-            rule=rule.name,
-            subject=self.subject.text,
-            subjects=self.subject.clients,
-            episode=self.id,
-            onset_time=self.onset,
-            start_time=self.start,
+            episode=self.record,
+            values=values,
             end_time=end,
             reason=reason,
-            values=values,
-            classification=rule.classification,
             models=_models(rule) if rule.models else {},
-            element=self.subject.element,
             dry_run=rule.dry_run,
             rendered=rendered,
         )

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 from detector.engine.episodes.identifiers import identifier
 from detector.engine.episodes.plain import plain
+from detector.engine.episodes.record import EpisodeRecord
 from wayside.api.applicationtask import (
     HOLDER_LABEL,
     RULE_DIGEST_ANNOTATION,
@@ -25,6 +26,7 @@ from wayside.api.base import JsonValue, Metadata
 from wayside.api.classification import Classification
 from wayside.api.freedata import fitting
 from wayside.api.operation import Operation
+from wayside.names import parse_subject
 from wayside.times import format_time, parse_time
 
 _LABEL_LIMIT = 63
@@ -34,7 +36,7 @@ _LABEL_LIMIT = 63
 class Demand:
     """The application that one deploy action of one open episode requests."""
 
-    rule: str
+    episode: EpisodeRecord
     action: str
     template: str
     priority: int
@@ -43,21 +45,6 @@ class Demand:
     detector: str
     holder: str
     namespace: str
-    subject: str
-    """As in the event's key, e.g. ``car1+car2``."""
-    subjects: tuple[str, ...]
-    """The clients that the episode is about."""
-    episode: str
-    """The id of the episode."""
-    onset_time: int
-    """Nanoseconds since the epoch."""
-    start_time: int
-    """Nanoseconds since the epoch."""
-    classification: Mapping[str, JsonValue] | None
-    values: Mapping[str, JsonValue]
-    """The rule's variables at the start."""
-    rule_digest: str
-    """Digest of the rule's semantics under which the episode started."""
     operation: Operation = Operation.DEPLOY
 
     @property
@@ -68,8 +55,9 @@ class Demand:
     @cached_property
     def name(self) -> str:
         """The name of the task: the same demand always has the same one. At most 63 characters."""
-        parts = (self.holder, self.rule, self.action, self.subject, str(self.start_time))
-        return f"{self.rule[:46]}-{_digest(*parts)}"
+        episode = self.episode
+        parts = (self.holder, episode.rule, self.action, episode.subject, str(episode.start_time))
+        return f"{episode.rule[:46]}-{_digest(*parts)}"
 
 
 class DemandChange(NamedTuple):
@@ -100,30 +88,31 @@ def to_task(demand: Demand, end_time: int | None = None) -> ApplicationTask:
     Raises:
         ValueError: a part does not fit into an ApplicationTask, e.g. a subject that is too long.
     """
+    episode = demand.episode
     return ApplicationTask(
         metadata=Metadata(
             name=demand.name,
             namespace=demand.namespace,
             labels={HOLDER_LABEL: holder_label(demand.holder)},
-            annotations={RULE_DIGEST_ANNOTATION: demand.rule_digest} if demand.rule_digest else {},
+            annotations={RULE_DIGEST_ANNOTATION: episode.rule_digest} if episode.rule_digest else {},
         ),
         spec=ApplicationTaskSpec(
             template_name=demand.template,
             operation=demand.operation,
             priority=demand.priority,
             parameters=plain(demand.parameters),
-            requester=Requester(detector_name=demand.detector, holder=demand.holder, subjects=list(demand.subjects)),
+            requester=Requester(detector_name=demand.detector, holder=demand.holder, subjects=list(episode.clients)),
             event=TaskEvent(
-                id=demand.episode,
-                rule=demand.rule,
+                id=episode.id,
+                rule=episode.rule,
                 action=demand.action,
-                subject=demand.subject,
-                onset_time=format_time(demand.onset_time),
-                start_time=format_time(demand.start_time),
+                subject=episode.subject,
+                onset_time=format_time(episode.onset_time),
+                start_time=format_time(episode.start_time),
                 classification=None
-                if demand.classification is None
-                else Classification.model_validate(demand.classification),
-                values=fitting(plain(demand.values)),
+                if episode.classification is None
+                else Classification.model_validate(episode.classification),
+                values=fitting(plain(episode.values)),
             ),
             end_time=None if end_time is None else format_time(end_time),
         ),
@@ -136,8 +125,24 @@ def from_task(task: ApplicationTask) -> Demand | None:
     if spec.event is None or spec.requester.holder is None or spec.requester.detector_name is None:
         return None
     event = spec.event
-    return Demand(
+    try:
+        _, element = parse_subject(event.subject)
+    except ValueError:
+        element = None
+    episode = EpisodeRecord(
+        id=event.id,
         rule=event.rule,
+        subject=event.subject,
+        clients=tuple(spec.requester.subjects),
+        element=element,
+        onset_time=parse_time(event.onset_time),
+        start_time=parse_time(event.start_time),
+        values=event.values,
+        classification=None if event.classification is None else event.classification.to_json(),
+        rule_digest=task.metadata.annotations.get(RULE_DIGEST_ANNOTATION, ""),
+    )
+    return Demand(
+        episode,
         action=event.action,
         template=spec.template_name,
         priority=spec.priority,
@@ -145,14 +150,6 @@ def from_task(task: ApplicationTask) -> Demand | None:
         detector=spec.requester.detector_name,
         holder=spec.requester.holder,
         namespace=task.metadata.namespace,
-        subject=event.subject,
-        subjects=tuple(spec.requester.subjects),
-        episode=event.id,
-        onset_time=parse_time(event.onset_time),
-        start_time=parse_time(event.start_time),
-        classification=None if event.classification is None else event.classification.to_json(),
-        values=event.values,
-        rule_digest=task.metadata.annotations.get(RULE_DIGEST_ANNOTATION, ""),
         operation=spec.operation,
     )
 

@@ -10,6 +10,7 @@ import msgspec
 
 from detector.engine.episodes.episodes import Ending
 from detector.engine.episodes.plain import plain_text, quote, to_text
+from detector.engine.episodes.record import EpisodeRecord
 from detector.engine.episodes.rendering import Rendered
 from wayside.api.base import JsonValue
 from wayside.times import format_time
@@ -22,21 +23,13 @@ class Event(msgspec.Struct, frozen=True, gc=False):
     """The start of an episode, or its end if there is a reason. Times are nanoseconds since the epoch."""
 
     holder: str
-    rule: str
-    subject: str
-    subjects: tuple[str, ...]
-    episode: str
-    onset_time: int
-    start_time: int
-    end_time: int | None
-    reason: Ending | None
+    episode: EpisodeRecord
     values: Mapping[str, JsonValue]
-    classification: Mapping[str, JsonValue] | None
+    """The rule's variables at the start or at the end; unknown ones are left out."""
+    end_time: int | None = None
+    reason: Ending | None = None
     models: Mapping[str, str] = msgspec.field(default_factory=dict)
     """By signal, the sha256 of the model that computes it."""
-    element: str | None = None
-    """The element of `each` for which the rule was evaluated."""
-
     dry_run: bool = False
     """No action of the rule runs."""
 
@@ -56,9 +49,14 @@ class Event(msgspec.Struct, frozen=True, gc=False):
         return self.reason is None
 
     @property
+    def time(self) -> int:
+        """When the episode started or ended."""
+        return self.episode.start_time if self.end_time is None else self.end_time
+
+    @property
     def key(self) -> str:
         """The Zenoh key on which the event is published."""
-        return f"wayside/events/{self.holder}/{self.rule}/{self.subject}"
+        return f"wayside/events/{self.holder}/{self.episode.rule}/{self.episode.subject}"
 
     def cloud_event(self) -> dict[str, Any]:
         """The event as a CloudEvent in JSON."""
@@ -73,25 +71,26 @@ class Event(msgspec.Struct, frozen=True, gc=False):
             TypeError: a value has no form in JSON.
         """
         # The text is built by hand: an encoder takes several times as long.
+        known = self.episode
         kind, what = (STARTED, "started") if self.reason is None else (ENDED, "ended")
-        rule, episode, start = quote(self.rule), quote(self.episode), format_time(self.start_time)
+        rule, episode, start = quote(known.rule), quote(known.id), format_time(known.start_time)
         time = start if self.end_time is None else format_time(self.end_time)
         trace = "" if self.traceparent is None else f',"traceparent":{quote(self.traceparent)}'
         recording = "" if self.recording is None else f',"recording":{quote(self.recording)}'
-        element = "" if self.element is None else f',"element":{quote(self.element)}'
+        element = "" if known.element is None else f',"element":{quote(known.element)}'
         reason = "" if self.end_time is None or self.reason is None else f',"endTime":"{time}","reason":"{self.reason}"'
         values = plain_text(self.values)
         models = f',"models":{to_text(dict(self.models))}' if self.models else ""
         classification = (
-            "" if self.classification is None else f',"classification":{to_text(dict(self.classification))}'
+            "" if known.classification is None else f',"classification":{to_text(dict(known.classification))}'
         )
         dry_run = ',"dryRun":true' if self.dry_run else ""
         return (
             f'{{"specversion":"1.0","id":{episode[:-1]}.{what}","source":{quote(f"/detectors/{self.holder}")}'
-            f',"type":"{kind}","subject":{quote(self.subject)},"time":"{time}","datacontenttype":"application/json"'
+            f',"type":"{kind}","subject":{quote(known.subject)},"time":"{time}","datacontenttype":"application/json"'
             f'{trace}{recording},"data":{{"rule":{rule},"episode":{episode}'
-            f',"subjects":[{",".join(map(quote, self.subjects))}]{element}'
-            f',"onsetTime":"{format_time(self.onset_time)}","startTime":"{start}"{reason}'
+            f',"subjects":[{",".join(map(quote, known.clients))}]{element}'
+            f',"onsetTime":"{format_time(known.onset_time)}","startTime":"{start}"{reason}'
             f',"values":{values}{models}{classification}{dry_run}}}}}'
         )
 

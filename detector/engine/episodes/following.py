@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import Any
 
 from detector.engine.counters import RuleCounters
-from detector.engine.episodes.subjects import Subject
 from wayside.api.base import JsonValue
 from wayside.expressions import InterpolationError
 from wayside.rules import CompiledDeploy
@@ -14,7 +13,7 @@ from wayside.rules import CompiledDeploy
 
 def followed(
     deploy: CompiledDeploy,
-    subject: Subject,
+    subject: str,
     before: Mapping[str, JsonValue],
     variables: Mapping[str, Any],
     counters: RuleCounters,
@@ -30,7 +29,7 @@ def followed(
             value = template.render(variables)
         except InterpolationError as error:
             counters.unfollowed += 1
-            counters.last_unfollowed = f"action {deploy.action} of {subject.text}: {error}"
+            counters.last_unfollowed = f"action {deploy.action} of {subject}: {error}"
             if name in before:
                 now[name] = before[name]
         else:

@@ -25,7 +25,7 @@ _POINTS = 2_000_000
 """Maximum number of points, for all rules, ticks and clients, in a block: the columns of all rules are in memory."""
 
 
-_place = attrgetter("time", "order", "event.subject")
+_place = attrgetter("time", "order", "event.episode.subject")
 
 
 class Blocks:

@@ -147,7 +147,7 @@ class Executor:
         events = [each.event for each in happened]
         if self._consequences.wanted:
             for event in events:
-                self._consequences.note(self._runs[event.rule].rule, event)
+                self._consequences.note(self._runs[event.episode.rule].rule, event)
         return events
 
     def _in_columns(self) -> list[Happened]:
@@ -157,7 +157,8 @@ class Executor:
         self._unsorted = None
         happened = self._blocks.run(self._instruments.stopwatch)
         if journal is not None:
-            journal[noted:] = sorted(journal[noted:], key=lambda change: (change.time, self._order[change.demand.rule]))
+            order = self._order
+            journal[noted:] = sorted(journal[noted:], key=lambda each: (each.time, order[each.demand.episode.rule]))
         return happened
 
     def _tick(self, tick: Tick) -> list[Event]:
@@ -206,7 +207,7 @@ class Executor:
         happened: dict[str, list[Event]] = {name: self._lost(name, time) for name in due}
         self._blocks.wait(time, groups)
         for each in self._in_columns():
-            happened[each.event.rule].append(each.event)
+            happened[each.event.episode.rule].append(each.event)
         happened |= self._with_samples(time, regular, sampled)
         events: list[Event] = []
         for name, run in self._runs.items():
@@ -215,7 +216,7 @@ class Executor:
                 if own is None and name not in self._blocks.names:
                     self._losing.discard(name)
                     own = self._seen(self._turn(run, time, sampled, regular))
-                for event in sorted(own or (), key=lambda event: event.subject):
+                for event in sorted(own or (), key=lambda event: event.episode.subject):
                     self._consequences.note(run.rule, event)
                     events.append(event)
         self._starts.settle(time)
@@ -248,7 +249,7 @@ class Executor:
             clients = sorted({client for each in present.values() for client in each})
             if chosen:
                 for each in self._blocks.run_with_samples(stream, time, clients, chosen, self._instruments.stopwatch):
-                    happened[each.event.rule].append(each.event)
+                    happened[each.event.episode.rule].append(each.event)
                 for name, only in chosen.items():
                     self._wake(self._runs[name], time, _looked_at(self._runs[name], only, present[only]))
         return happened
@@ -284,7 +285,7 @@ class Executor:
         if only.clients or only.subjects:
             events += self._evaluated(run, time, only)
             self._wake(run, time, run.looked_at)
-        return sorted(events, key=lambda event: event.subject)
+        return sorted(events, key=lambda event: event.episode.subject)
 
     def _evaluated(self, run: RuleRun, time: int, only: Only | None = None) -> list[Event]:
         begin = self._instruments.stopwatch()

@@ -6,16 +6,18 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import msgspec
+
 from detector.engine.buffering.clients import Clients
 from detector.engine.columns.past import Past
 from detector.engine.counters import RuleCounters
 from detector.engine.episodes.budget import Budget
-from detector.engine.episodes.current import Episode, Identity
+from detector.engine.episodes.current import EpisodeState, Identity, new_record
 from detector.engine.episodes.demands import Demand, DemandChange
 from detector.engine.episodes.episodes import Ended, Ending, Observation, Started, SubjectState, Timing, Truth, negation
 from detector.engine.episodes.events import Event
-from detector.engine.episodes.identifiers import episode_id
 from detector.engine.episodes.open_episodes import OpenEpisode
+from detector.engine.episodes.record import EpisodeRecord
 from detector.engine.episodes.statistics import Statistics
 from detector.engine.episodes.subjects import Subject, fits
 from detector.engine.evaluation.derived import with_derived
@@ -37,10 +39,8 @@ class OnDemandResult:
     """None: unknown."""
     values: Mapping[str, JsonValue]
     """Signals, as in an event; unknown ones are left out."""
-    episode: str | None
+    episode: EpisodeRecord | None
     """The open episode, after this evaluation."""
-    start_time: int | None
-    """When it started; nanoseconds since the epoch."""
 
 
 class RuleRun:
@@ -61,7 +61,7 @@ class RuleRun:
         self.version = 0
         """Changes whenever the demands do."""
         self._states: dict[Subject, SubjectState] = {}
-        self._open: dict[Subject, Episode] = {}
+        self._open: dict[Subject, EpisodeState] = {}
         self._muted: set[Subject] = set()
         """Subjects with an episode beyond the budget: the episode continues, without events."""
         self._budget = Budget()
@@ -91,14 +91,14 @@ class RuleRun:
             events += self._subject(now, candidate)
         if only is None:
             self.tidy(now)
-        return sorted(events, key=lambda event: event.subject)
+        return sorted(events, key=lambda event: event.episode.subject)
 
     def lose(self, now: int, clients: Clients) -> list[Event]:
         """For a rule without a period: end the episodes of lost clients, and forget states that have expired."""
         self.disturbed = True
         events = [*self._lost(now, clients)]
         self.tidy(now)
-        return sorted(events, key=lambda event: event.subject)
+        return sorted(events, key=lambda event: event.episode.subject)
 
     def answer(
         self, now: int, views: Views, clients: Clients, plugins: PluginSignals
@@ -154,13 +154,13 @@ class RuleRun:
             state.gap()
             state.rests_until = min(state.rests_until, time + self._timing.cooldown)
 
-    def can_restore(self, episode: OpenEpisode) -> bool:
+    def can_restore(self, record: EpisodeRecord) -> bool:
         """Whether the episode belongs to this rule in its current version."""
         return (
             self.rule.enabled
-            and self.rule.digest == episode.rule_digest
-            and fits(self.rule, episode.subject)
-            and episode.subject not in self._open
+            and self.rule.digest == record.rule_digest
+            and fits(self.rule, record.about)
+            and record.about not in self._open
         )
 
     def restore(self, episode: OpenEpisode, demands: Sequence[Demand]) -> Event:
@@ -170,26 +170,23 @@ class RuleRun:
         next evaluation.
         """
         self.disturbed = True
+        record, subject = episode.record, episode.record.about
         deploys = {deploy.action: deploy.fixed for deploy in self.rule.deploys}
-        self._states[episode.subject] = SubjectState(is_open=True)
-        self._open[episode.subject] = Episode(
-            episode.episode,
-            episode.subject,
-            episode.onset_time,
-            episode.start_time,
-            episode.values,
+        self._states[subject] = SubjectState(is_open=True)
+        state = self._open[subject] = EpisodeState(
+            msgspec.structs.replace(record, classification=self.rule.classification),
             None,
             {d.action: d for d in demands if d.action in deploys},
             {d.action for d in demands if d.action in deploys and deploys[d.action] != d.fixed},
-            Statistics.of(self.rule, episode.start_time),
+            Statistics.of(self.rule, record.start_time),
         )
-        if (statistics := self._open[episode.subject].statistics) is not None and episode.statistics is not None:
-            statistics.restore(episode.statistics)
-        return self._open[episode.subject].started(self.rule, self._identity)
+        if state.statistics is not None and episode.statistics is not None:
+            state.statistics.restore(episode.statistics)
+        return state.started(self.rule, self._identity)
 
     def episodes(self) -> Iterator[OpenEpisode]:
         """The episodes that have not ended."""
-        return (episode.kept(self.rule) for episode in self._open.values())
+        return (episode.kept() for episode in self._open.values())
 
     def change_actions(self, rule: CompiledRule) -> None:
         """Switch to a rule with the same conditions but other actions.
@@ -203,7 +200,7 @@ class RuleRun:
         self._timing = Timing(rule.for_ns, rule.cooldown_ns, rule.unknown_timeout_ns)
         self._follows = any(deploy.follow for deploy in rule.deploys)
         for episode in self._open.values():
-            episode.change(changed, gone)
+            episode.change(rule, changed, gone)
             self._render(episode)
 
     def end_all(self, now: int, reason: Ending) -> Iterator[Event]:
@@ -240,7 +237,7 @@ class RuleRun:
             else:
                 state.gap()
 
-    def _cut_off(self, now: int, episode: Episode, reason: Ending) -> Event:
+    def _cut_off(self, now: int, episode: EpisodeState, reason: Ending) -> Event:
         """End an episode without an evaluation: only the statistics of the episode are known."""
         known = {} if episode.statistics is None else episode.statistics.values(now)
         return self._ended(now, episode, reason, known, known)
@@ -255,11 +252,11 @@ class RuleRun:
         episode = self._open.get(subject)
         return None if episode is None else episode.statistics
 
-    def _measured(self, now: int, episode: Episode, candidate: Candidate) -> Candidate:
+    def _measured(self, now: int, statistics: Statistics | None, candidate: Candidate) -> Candidate:
         """The candidate, with the statistics of its episode up to this evaluation."""
-        if episode.statistics is None:
+        if statistics is None:
             return candidate
-        found = episode.statistics.up_to(now, candidate.measured, self.counters)
+        found = statistics.up_to(now, candidate.measured, self.counters)
         return candidate._replace(variables={**candidate.variables, **found})
 
     def _subject(self, now: int, candidate: Candidate) -> Iterator[Event]:
@@ -317,7 +314,7 @@ class RuleRun:
                 self._muted.discard(subject)
                 return None
             ended = self._open.pop(subject)
-            candidate = self._measured(now, ended, candidate)
+            candidate = self._measured(now, ended.statistics, candidate)
             return self._ended(now, ended, what.reason, snapshot(self.rule, candidate), candidate.variables)
         limit = self.rule.maximum_per_hour
         if limit is None or self._budget.takes(subject.clients, now, limit):
@@ -331,7 +328,7 @@ class RuleRun:
         episode = self._open.get(candidate.subject)
         if episode is None:
             return
-        candidate = self._measured(now, episode, candidate)
+        candidate = self._measured(now, episode.statistics, candidate)
         before = dict(episode.demands) if self.journal is not None else {}
         if not episode.is_complete(self.rule):
             episode.variables = candidate.variables
@@ -339,7 +336,9 @@ class RuleRun:
         self.version += episode.follow(self.rule, candidate.variables, self.counters)
         self._note_demands(now, episode, before)
 
-    def _note_demands(self, now: int, episode: Episode, before: Mapping[str, Demand], end: int | None = None) -> None:
+    def _note_demands(
+        self, now: int, episode: EpisodeState, before: Mapping[str, Demand], end: int | None = None
+    ) -> None:
         """Note which demands differ from `before`; if they end, all of them."""
         if self.journal is None or self.rule.dry_run:
             return
@@ -353,8 +352,7 @@ class RuleRun:
             candidate.subject.text,
             None if isinstance(when, Unknown) else when,
             snapshot(self.rule, candidate),
-            None if episode is None else episode.id,
-            None if episode is None else episode.start,
+            None if episode is None else episode.record,
         )
 
     def _truth(self, field: str, expression: Expression, candidate: Candidate) -> Truth:
@@ -363,13 +361,12 @@ class RuleRun:
 
     def _started(self, now: int, onset: int, candidate: Candidate) -> Event:
         subject, rule = candidate.subject, self.rule
-        identifier = episode_id(self._identity.holder, rule.name, subject.text, now)
-        episode = Episode(identifier, subject, onset, now, {}, None)
+        statistics = None
         if rule.derived:
-            episode.statistics = Statistics.of(rule, now)
-            candidate = self._measured(now, episode, candidate)
-        episode.values = snapshot(rule, candidate)
-        episode.variables = candidate.variables if rule.has_actions else None
+            statistics = Statistics.of(rule, now)
+            candidate = self._measured(now, statistics, candidate)
+        record = new_record(rule, self._identity, subject, onset, now, snapshot(rule, candidate))
+        episode = EpisodeState(record, candidate.variables if rule.has_actions else None, statistics=statistics)
         self._open[subject] = episode
         self.counters.started += 1
         if rule.deploys:
@@ -378,14 +375,14 @@ class RuleRun:
         return episode.started(rule, self._identity)
 
     def _ended(
-        self, now: int, episode: Episode, reason: Ending, values: Mapping[str, Any], variables: Mapping[str, Any]
+        self, now: int, episode: EpisodeState, reason: Ending, values: Mapping[str, Any], variables: Mapping[str, Any]
     ) -> Event:
         self.counters.ended += 1
         self.version += 1
         self._note_demands(now, episode, {}, now)
         return episode.ended(self.rule, self._identity, now, reason, values, variables)
 
-    def _render(self, episode: Episode) -> None:
+    def _render(self, episode: EpisodeState) -> None:
         self.version += episode.render(self.rule, self._identity, self.counters)
 
 

@@ -76,29 +76,31 @@ class Starts:
 
     def note(self, event: Event) -> None:
         """An episode started or ended."""
+        episode = event.episode
         if event.started:
-            self.started(event, event.start_time)
+            self.started(event, episode.start_time)
         elif event.end_time is not None:
-            stream = episode_stream(event.rule)
+            stream = episode_stream(episode.rule)
             open_episodes = self._open.get(stream, {})
-            for client in event.subjects or (FLEET,):
-                since = open_episodes.get(client, {}).pop(event.episode, None)
+            for client in episode.clients or (FLEET,):
+                since = open_episodes.get(client, {}).pop(episode.id, None)
                 if since is not None:
                     self._ended.setdefault(stream, {}).setdefault(client, []).append((since, event.end_time))
                 if not open_episodes.get(client):
                     open_episodes.pop(client, None)
-            clients = [client for client in event.subjects if self.is_known(client)] if event.subjects else [FLEET]
-            self._put(episode_stream(event.rule, ends=True), event.end_time, event, clients)
+            clients = [client for client in episode.clients if self.is_known(client)] if episode.clients else [FLEET]
+            self._put(episode_stream(episode.rule, ends=True), event.end_time, event, clients)
 
     def started(self, event: Event, since: int = NEVER) -> None:
         """An episode started, now or, if it was restored, earlier; `since`: when rules can first see it."""
-        stream = episode_stream(event.rule)
+        episode = event.episode
+        stream = episode_stream(episode.rule)
         if stream not in self._durations:
             return
-        clients = event.subjects or (FLEET,)
+        clients = episode.clients or (FLEET,)
         for client in clients:
-            self._open.setdefault(stream, {}).setdefault(client, {})[event.episode] = since
-        self._put(stream, event.start_time, event, clients)
+            self._open.setdefault(stream, {}).setdefault(client, {})[episode.id] = since
+        self._put(stream, episode.start_time, event, clients)
 
     def _put(self, stream: str, time: int, event: Event, clients: Iterable[str]) -> None:
         """Store a start or an end for these clients, if any rule reads it."""
@@ -169,13 +171,14 @@ class Starts:
 
 
 def _payload(event: Event) -> bytes:
+    episode = event.episode
     message: Mapping[str, Any] = {
-        "episode": event.episode,
-        "subject": event.subject,
-        "subjects": list(event.subjects),
-        **({} if event.element is None else {"element": event.element}),
-        "onsetTime": event.onset_time / 10**9,
-        "startTime": event.start_time / 10**9,
+        "episode": episode.id,
+        "subject": episode.subject,
+        "subjects": list(episode.clients),
+        **({} if episode.element is None else {"element": episode.element}),
+        "onsetTime": episode.onset_time / 10**9,
+        "startTime": episode.start_time / 10**9,
         **({} if event.end_time is None else {"endTime": event.end_time / 10**9, "reason": event.reason}),
         "values": plain(event.values),
     }

@@ -9,6 +9,7 @@ from detector.actions.outcomes import Which
 from detector.engine.consequences.consequences import Consequences, Run
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.identifiers import identifier
+from detector.engine.episodes.record import EpisodeRecord
 from detector.live.requested.index import RequestedRecording
 from wayside.api import API_VERSION, Detector, EventRule
 from wayside.names import FLEET, parse_subject
@@ -57,23 +58,22 @@ def begin_recording(
     data = cause.get("data")
     classification = data.get("classification") if isinstance(data, dict) else None
     run = run_of(entry.id)
-    event = Event(
-        holder=holder,
+    episode = EpisodeRecord(
+        id=run.episode,
         rule=run.rule,
         subject=subject,
-        subjects=subjects,
-        episode=run.episode,
+        clients=subjects,
+        element=None,
         onset_time=now if entry.since is None else min(now, entry.since),
         start_time=now,
-        end_time=None,
-        reason=None,
         values={"request": entry.id, "event": cause},
         classification=classification if isinstance(classification, dict) else None,
     )
     streams = [stream for stream in detector.spec.streams if stream.name in entry.streams]
     wanted = None if clients is None else frozenset(clients)
     window = window_of(detector.spec, streams, wanted)
-    consequences.request(run, event, window, wanted, event.onset_time, entry.until or now)
+    event = Event(holder, episode, episode.values)
+    consequences.request(run, event, window, wanted, episode.onset_time, entry.until or now)
 
 
 def _about(cause: dict[str, Any]) -> tuple[str, tuple[str, ...]]:

@@ -136,8 +136,10 @@ def test_each_sample_of_a_window_is_passed_on_once_and_no_other(
 def in_window(begun: Begun, client: str, stream: str, time: int, end: int | None) -> bool:
     until = 2**63 if end is None else end
     if begun.run.action == "all":
-        return stream == "load" and begun.event.onset_time < time <= until + 200_000_000
-    return client in begun.event.subjects and begun.event.onset_time - 10**9 < time <= until + 700_000_000
+        return stream == "load" and begun.event.episode.onset_time < time <= until + 200_000_000
+    return (
+        client in begun.event.episode.clients and begun.event.episode.onset_time - 10**9 < time <= until + 700_000_000
+    )
 
 
 def completed(reported: Sequence[Consequence], run: Run) -> bool:

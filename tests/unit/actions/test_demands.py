@@ -7,17 +7,30 @@ import json
 import re
 from typing import Any
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from detector.engine.episodes.demands import Demand, from_task, holder_label, to_task
+from detector.engine.episodes.record import EpisodeRecord
 from wayside.api import ApplicationTask
 from wayside.api.applicationtask import HOLDER_LABEL
 from wayside.api.operation import Operation
 
 DEMAND = Demand(
-    rule="lidar-vehicles-close",
+    EpisodeRecord(
+        id="abc",
+        rule="lidar-vehicles-close",
+        subject="car1+car2",
+        clients=("car1", "car2"),
+        element=None,
+        onset_time=1_767_225_600_000_000_001,
+        start_time=1_767_225_602_000_000_002,
+        values={"distance": 149.5, "a": {"client": "car1"}},
+        classification={"overarchingPurpose": ["Safety"]},
+        rule_digest="0123",
+    ),
     action="record",
     template="scene-recorder",
     priority=3,
@@ -25,21 +38,15 @@ DEMAND = Demand(
     detector="intersection-a",
     holder="intersection-a",
     namespace="default",
-    subject="car1+car2",
-    subjects=("car1", "car2"),
-    episode="abc",
-    onset_time=1_767_225_600_000_000_001,
-    start_time=1_767_225_602_000_000_002,
-    classification={"overarchingPurpose": ["Safety"]},
-    values={"distance": 149.5, "a": {"client": "car1"}},
-    rule_digest="0123",
     operation=Operation.RECONFIGURE,
 )
 NAME = re.compile(r"[a-z0-9]([-a-z0-9]*[a-z0-9])?")
 
 
 def changed(**fields: Any) -> Demand:
-    return dataclasses.replace(DEMAND, **fields)
+    """The demand with other fields: its own, or its episode's."""
+    of_episode = {name: fields.pop(name) for name in EpisodeRecord.__struct_fields__ if name in fields}
+    return dataclasses.replace(DEMAND, episode=msgspec.structs.replace(DEMAND.episode, **of_episode), **fields)
 
 
 def test_comes_back_from_its_task_through_json() -> None:

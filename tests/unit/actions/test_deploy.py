@@ -19,7 +19,7 @@ from detector.actions.deploy.file_store import FileTaskStore, write_tasks_yaml
 from detector.actions.deploy.reconciler import DemandReconciler, DeployCounts
 from detector.actions.deploy.stores import restore, task_manifest
 from detector.engine.episodes.demands import Demand, to_task
-from tests.unit.actions.test_demands import DEMAND
+from tests.unit.actions.test_demands import DEMAND, changed
 from wayside.api.documents import load_documents
 from wayside.times import format_time
 
@@ -28,7 +28,7 @@ NEVER = 3600.0  # seconds between two looks at the folder: what is there is foun
 
 
 def demand(subject: str, **changes: Any) -> Demand:
-    return dataclasses.replace(DEMAND, subject=subject, subjects=tuple(subject.split("+")), **changes)
+    return changed(subject=subject, clients=tuple(subject.split("+")), **changes)
 
 
 A, B, C = demand("a+b"), demand("c+d"), demand("e+f")
@@ -83,12 +83,12 @@ def test_a_demand_is_a_task_from_its_start_to_its_end(tmp_path: Path) -> None:
             reconciler.update(by_name(A, B), {})
             await eventually(lambda: ends(tmp_path) == {A.name: None, B.name: None}, "both live")
             assert await restore(FileTaskStore(tmp_path, HOLDER)) == sorted([A, B], key=lambda each: each.name)
-            reconciler.update(by_name(B), {A.name: A.start_time + 5})
+            reconciler.update(by_name(B), {A.name: A.episode.start_time + 5})
             await eventually(lambda: ends(tmp_path)[A.name] is not None, "the first has ended")
         return reconciler.counts
 
     assert asyncio.run(drive()) == DeployCounts(created=2, ended=1)
-    assert ends(tmp_path) == {A.name: format_time(A.start_time + 5), B.name: None}
+    assert ends(tmp_path) == {A.name: format_time(A.episode.start_time + 5), B.name: None}
     assert stored(tmp_path)[B.name]["metadata"]["creationTimestamp"] == "2026-01-01T00:00:02Z"
 
 
@@ -277,7 +277,7 @@ def test_only_the_newest_demands_count_however_they_came(moves: list[dict[str, i
 
 
 def test_tasks_of_a_replay_go_into_one_file_in_the_order_of_their_starts(tmp_path: Path) -> None:
-    late = dataclasses.replace(A, start_time=A.start_time + 10)
+    late = demand("a+b", start_time=A.episode.start_time + 10)
     write_tasks_yaml(tmp_path / "tasks.yaml", [to_task(late), to_task(C, 9), to_task(B)])
     documents = load_documents([tmp_path / "tasks.yaml"])
     assert [each.object.name for each in documents] == [*sorted([B.name, C.name]), late.name]

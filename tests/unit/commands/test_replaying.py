@@ -114,7 +114,7 @@ def test_an_intake_file_replays_with_the_defaults_of_its_time() -> None:
     for version, expected in (({}, ["near a+b", "old a"]), ({"version": 2}, [])):
         records = [Control(START, {**start, **version}), *arrivals, Control(at(25), {"kind": "end"})]
         outcome = replay_intake(records, None, None)
-        assert [f"{event.rule} {event.subject}" for event in outcome.events] == expected
+        assert [f"{event.episode.rule} {event.episode.subject}" for event in outcome.events] == expected
     changed = Control(at(2), {"kind": "rules", "detector": a_detector().to_json(), "rules": start["rules"]})
     outcome = replay_intake([Control(START, start), *arrivals[:2], changed, arrivals[2], records[-1]], None, None)
-    assert [f"{event.rule} {event.subject}" for event in outcome.events] == ["near a+b", "old a"]
+    assert [f"{event.episode.rule} {event.episode.subject}" for event in outcome.events] == ["near a+b", "old a"]

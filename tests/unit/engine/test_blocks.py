@@ -206,9 +206,9 @@ def test_events_of_a_tick_are_in_the_order_of_rules_whichever_way_those_are_eval
     engine = an_engine(detector, *rules)
     order = [rule.name for rule in in_order([run.rule for run in engine.rules.values()])]
     events = engine.advance(arrivals, at(8))
-    keys = [(event.end_time or event.start_time, order.index(event.rule), event.subject) for event in events]
+    keys = [(event.time, order.index(event.episode.rule), event.episode.subject) for event in events]
     assert keys == sorted(keys)
-    assert {event.rule for event in events if event.start_time == at(1.2)} == set("abcdefgh")
+    assert {event.episode.rule for event in events if event.episode.start_time == at(1.2)} == set("abcdefgh")
     whole, seconds = lines(events), an_engine(detector, *rules)
     cut = [arrivals[begin : begin + 6] for begin in range(0, len(arrivals), 6)]
     assert whole == lines(

@@ -12,10 +12,10 @@ def test_an_episode_reports_when_its_condition_began_to_hold_and_when_it_started
     reported = drive.take(*(speed(n + 0.5, 20 if n in (1, 2, 3, 5, 6, 7, 8, 9) else 5) for n in range(12)), until=12)
     assert reported == ["r car started 4", "r car Until 5", "r car started 10", "r car Until 11"]
     first, last, second, _ = drive.events
-    assert (first.onset_time, first.start_time, first.end_time) == (at(2), at(4), None)
-    assert (last.onset_time, last.start_time, last.end_time) == (at(2), at(4), at(5))
+    assert (first.episode.onset_time, first.episode.start_time, first.end_time) == (at(2), at(4), None)
+    assert (last.episode.onset_time, last.episode.start_time, last.end_time) == (at(2), at(4), at(5))
     assert first.episode == last.episode != second.episode
-    assert second.onset_time == at(8)  # the cooldown lasts to 8
+    assert second.episode.onset_time == at(8)  # the cooldown lasts to 8
     assert first.values == {"speed": 20}
     assert last.values == {"speed": 5}
 
@@ -26,7 +26,7 @@ def test_two_detectors_that_see_the_same_have_episodes_of_their_own() -> None:
         engine = make_engine(a_detector(), inlets(a_detector()), holder=holder, start=at(0))
         engine.set_rules(compiled(a_detector(), speeding()))
         (event,) = engine.advance([speed(0.5, 20)], at(1))
-        episodes.add(event.episode)
+        episodes.add(event.episode.id)
     assert len(episodes) == 2
 
 
@@ -48,7 +48,7 @@ def test_a_pair_is_looked_at_once_with_the_smaller_name_first() -> None:
         "near car10+car2 started 1"
     ]
     (event,) = drive.events
-    assert event.subjects == ("car10", "car2")
+    assert event.episode.clients == ("car10", "car2")
     assert event.values["distance"] == 100
     assert event.values["a"] == {"client": "car10", "position": {"x": 100, "y": 0, "z": 0}}
 
@@ -81,7 +81,7 @@ def test_a_position_that_is_unknown_for_no_longer_than_for_does_not_restart_the_
         until=5,
     )
     assert reported == ["near a+b started 5"]
-    assert drive.events[0].onset_time == at(1)
+    assert drive.events[0].episode.onset_time == at(1)
 
 
 def test_a_pair_in_three_dimensions() -> None:

@@ -133,12 +133,12 @@ def test_a_demand_is_held_from_the_start_of_its_episode_to_its_end() -> None:
     drive.take(place(0.5, "a", 0), place(0.5, "b", 100), until=1)
     (demand,) = drive.engine.demands().values()
     event = drive.events[0]
-    assert (demand.rule, demand.action, demand.template, demand.priority) == ("near", "x", "app", 3)
+    assert (demand.episode.rule, demand.action, demand.template, demand.priority) == ("near", "x", "app", 3)
     assert demand.operation == "Suspend"
-    assert (demand.holder, demand.subject, demand.subjects) == ("h", "a+b", ("a", "b"))
-    assert (demand.episode, demand.onset_time, demand.start_time) == (event.episode, at(1), at(1))
+    assert (demand.holder, demand.episode.subject, demand.episode.clients) == ("h", "a+b", ("a", "b"))
+    assert (demand.episode.id, demand.episode.onset_time, demand.episode.start_time) == (event.episode.id, at(1), at(1))
     assert demand.parameters == {"v": ["a", "b"]}
-    assert demand.values["distance"] == 100
+    assert demand.episode.values["distance"] == 100
     drive.take(place(1.5, "b", 175), until=2)
     assert list(drive.engine.demands().values()) == [demand]
     drive.take(place(2.5, "b", 250), until=3)

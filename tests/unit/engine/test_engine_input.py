@@ -153,7 +153,7 @@ def test_an_expression_that_fails_on_what_is_there_is_an_error_and_what_is_missi
     assert counters.errors == 1
     assert "`+` does not take a text and a number" in counters.last_error
     assert counters.unknowns >= 1
-    assert [event.subject for event in drive.events] == ["good"]
+    assert [event.episode.subject for event in drive.events] == ["good"]
 
 
 def test_keys_that_name_no_client_are_counted_and_leave_nothing_behind() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+import msgspec
 import pytest
 
 from detector.engine.episodes.demands import Demand
@@ -16,8 +17,8 @@ def held_by(rule: Any, client: str = "car", **fields: Any) -> Demand:
     """A demand that was held before a restart: an episode of the rule that started long ago."""
     drive = Drive(a_detector(), rule, start=-1_000)
     drive.take(speed(-999.5, 20, client), place(-999.5, client, 0), place(-999.4, "zz", 0), until=-999)
-    demand = next(demand for demand in drive.engine.demands().values() if client in demand.subjects)
-    return dataclasses.replace(demand, **fields)
+    demand = next(demand for demand in drive.engine.demands().values() if client in demand.episode.clients)
+    return dataclasses.replace(demand, episode=msgspec.structs.replace(demand.episode, **fields))
 
 
 RECORD = speeding(actions=[a_deploy("x", parameters={"v": "${speed}"})])
@@ -32,7 +33,11 @@ def test_a_restored_episode_holds_its_demand_as_it_was_and_keeps_its_times() -> 
     assert list(drive.engine.demands().values()) == [demand]
     assert drive.take(speed(5.5, 9), until=6) == ["r car Until 6"]
     (event,) = drive.events
-    assert (event.episode, event.onset_time, event.start_time) == (demand.episode, at(-999), at(-999))
+    assert (event.episode.id, event.episode.onset_time, event.episode.start_time) == (
+        demand.episode.id,
+        at(-999),
+        at(-999),
+    )
 
 
 def test_a_restored_episode_does_not_start_again() -> None:
@@ -81,7 +86,7 @@ def test_an_episode_whose_rule_changed_while_the_detector_was_away_ends(rules: t
     demand = held_by(RECORD)
     drive = Drive(a_detector(), *rules)
     assert drive.note(drive.engine.restore([demand], at(0.5))) == ["r car RuleChanged 0.5"]
-    assert drive.events[0].episode == demand.episode
+    assert drive.events[0].episode.id == demand.episode.id
     assert drive.engine.demands() == {}
     assert "car" not in drive.engine.clients
 
@@ -99,7 +104,7 @@ def test_actions_that_changed_while_the_detector_was_away_are_applied_at_the_nex
     assert demanded(drive) == {"same": ("app", {}), "moved": ("old", {})}
     drive.take(speed(0.5, 15), until=1)
     assert demanded(drive) == {"same": ("app", {}), "moved": ("new", {}), "added": ("app", {"v": 15})}
-    assert {demand.start_time for demand in drive.engine.demands().values()} == {at(-999)}
+    assert {demand.episode.start_time for demand in drive.engine.demands().values()} == {at(-999)}
 
 
 def test_actions_that_change_after_a_restart_let_no_demand_go_before_it_is_rendered_again() -> None:
@@ -112,19 +117,19 @@ def test_actions_that_change_after_a_restart_let_no_demand_go_before_it_is_rende
     assert demanded(drive) == {"x": ("app", {"v": 16, "w": 1})}
 
 
-@pytest.mark.parametrize("subjects", [(), ("a", "b"), ("a", "a", "b")])
-def test_a_task_whose_subjects_are_none_of_its_rule_is_no_open_episode(subjects: tuple[str, ...]) -> None:
+@pytest.mark.parametrize("clients", [(), ("a", "b"), ("a", "a", "b")])
+def test_a_task_whose_subjects_are_none_of_its_rule_is_no_open_episode(clients: tuple[str, ...]) -> None:
     drive = Drive(a_detector(), RECORD)
-    demand = held_by(RECORD, subjects=subjects)
+    demand = held_by(RECORD, clients=clients)
     assert [event.reason for event in drive.engine.restore([demand], at(0))] == ["RuleChanged"]
     assert drive.take(speed(0.5, 20), until=1) == ["r car started 1"]
 
 
 def test_restored_episodes_of_pairs_need_two_clients_in_order() -> None:
     rule = near(actions=[a_deploy("x")])
-    for subjects in (("zz", "car"), ("car", "car"), ("car",)):
+    for clients in (("zz", "car"), ("car", "car"), ("car",)):
         drive = Drive(a_detector(), rule)
-        demand = held_by(rule, subjects=subjects)
+        demand = held_by(rule, clients=clients)
         assert len(drive.engine.restore([demand], at(0))) == 1
         assert drive.take(place(0.5, "car", 0), place(0.5, "zz", 175), until=1) == []
 
@@ -141,8 +146,8 @@ def test_the_two_tasks_of_one_episode_restore_one_episode() -> None:
 
 
 def test_of_two_episodes_of_one_subject_the_second_is_no_episode() -> None:
-    first, second = held_by(RECORD), held_by(RECORD, episode="zzz", start_time=at(-5))
+    first, second = held_by(RECORD), held_by(RECORD, id="zzz", start_time=at(-5))
     drive = Drive(a_detector(), RECORD)
     reported = drive.engine.restore([second, first], at(0))
-    assert [(event.episode, event.reason) for event in reported] == [("zzz", "RuleChanged")]
+    assert [(event.episode.id, event.reason) for event in reported] == [("zzz", "RuleChanged")]
     assert list(drive.engine.demands().values()) == [first]

@@ -162,7 +162,7 @@ def test_a_tick_sees_no_sample_beyond_it() -> None:
     drive = data_drive(newest, age)
     drive.take(sent(10.8), sent(11.3), sent(11.6, "other"), until=0)
     assert drive.take(sent(11.7), until=0) == []
-    assert [(event.subject, event.values) for event in drive.events] == [
+    assert [(event.episode.subject, event.values) for event in drive.events] == [
         ("car", {"t": at(10.8) / SECOND}),
         ("car", {"age": 0.2}),
     ]
@@ -203,7 +203,7 @@ def test_time_that_really_jumped_holds_once_two_clients_agree() -> None:
     assert "c" in drive.engine.clients  # it waited for its tick, which the second jump took away
     reported = drive.take(*(sent(900.3 + n / 5, client) for n in range(6) for client in ("a", "b")), until=0)
     assert reported == []  # open since before the jump, and the windows have filled again
-    assert [event.subject for event in drive.events] == ["a", "b"]
+    assert [event.episode.subject for event in drive.events] == ["a", "b"]
 
 
 def test_one_client_alone_jumps_with_its_second_sample() -> None:

@@ -160,10 +160,10 @@ def rounded(value: Any) -> Any:
 def plainly(events: list[Event]) -> list[Reported]:
     return [
         Reported(
-            event.rule,
-            event.subject,
-            event.start_time if event.end_time is None else event.end_time,
-            event.onset_time,
+            event.episode.rule,
+            event.episode.subject,
+            event.time,
+            event.episode.onset_time,
             "" if event.reason is None else event.reason.value,
             rounded(event.values),
         )

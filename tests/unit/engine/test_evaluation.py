@@ -236,7 +236,7 @@ def test_the_replay_of_pauses_questions_and_left_out_evaluations_gives_the_same_
             live.evaluator.pause_rule("p", n == 10).result(10)
         assert [each.subject for each in live.evaluator.ask("q").result(10)] == ["a", "b"]
     recording = live.stop()
-    assert {event.rule for event in recording.logged} == {"r", "q", "p"}
+    assert {event.episode.rule for event in recording.logged} == {"r", "q", "p"}
     levels = [
         each.document["level"] for each in recording.records if isinstance(each, Control) and each.kind == "level"
     ]
@@ -271,4 +271,4 @@ def test_a_sample_that_rules_are_evaluated_with_is_looked_at_at_once(monkeypatch
     live.now += SECOND // 4
     live.put([("vehicles/a/speed", b'{"v": 20}')])
     wait_for(lambda: bool(live.recording.logged))
-    assert [event.subject for event in live.stop().logged] == ["a"]
+    assert [event.episode.subject for event in live.stop().logged] == ["a"]

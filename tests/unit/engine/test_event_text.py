@@ -20,6 +20,7 @@ from detector.engine.episodes.episodes import Ending
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.identifiers import episode_id
 from detector.engine.episodes.plain import plain, plain_text
+from detector.engine.episodes.record import EpisodeRecord
 from tests.driving import START
 
 YEAR_1 = -62_135_596_800 * 10**9
@@ -67,18 +68,22 @@ def events(times: st.SearchStrategy[int], values: st.SearchStrategy[dict[str, An
     return st.builds(
         Event,
         holder=TEXTS,
-        rule=TEXTS,
-        subject=TEXTS,
-        subjects=st.lists(TEXTS, max_size=3).map(tuple),
-        episode=TEXTS,
-        onset_time=times,
-        start_time=times,
+        episode=st.builds(
+            EpisodeRecord,
+            id=TEXTS,
+            rule=TEXTS,
+            subject=TEXTS,
+            clients=st.lists(TEXTS, max_size=3).map(tuple),
+            element=st.none() | TEXTS,
+            onset_time=times,
+            start_time=times,
+            values=values,
+            classification=st.none() | st.dictionaries(TEXTS, st.lists(TEXTS, max_size=2) | st.floats(), max_size=2),
+        ),
+        values=values,
         end_time=st.none() | times,
         reason=st.none() | st.sampled_from(Ending),
-        values=values,
-        classification=st.none() | st.dictionaries(TEXTS, st.lists(TEXTS, max_size=2) | st.floats(), max_size=2),
         models=st.dictionaries(TEXTS, TEXTS, max_size=2),
-        element=st.none() | TEXTS,
         dry_run=st.booleans(),
         traceparent=st.none() | TEXTS,
         recording=st.none() | TEXTS,
@@ -108,12 +113,12 @@ def reference_plain(value: Any) -> Any:
 def reference_document(event: Event) -> dict[str, Any]:
     """The CloudEvent as a dict, key by key."""
     data: dict[str, Any] = {
-        "rule": event.rule,
-        "episode": event.episode,
-        "subjects": list(event.subjects),
-        **({} if event.element is None else {"element": event.element}),
-        "onsetTime": reference_time(event.onset_time),
-        "startTime": reference_time(event.start_time),
+        "rule": event.episode.rule,
+        "episode": event.episode.id,
+        "subjects": list(event.episode.clients),
+        **({} if event.episode.element is None else {"element": event.episode.element}),
+        "onsetTime": reference_time(event.episode.onset_time),
+        "startTime": reference_time(event.episode.start_time),
     }
     if event.end_time is not None and event.reason is not None:
         data["endTime"] = reference_time(event.end_time)
@@ -121,17 +126,17 @@ def reference_document(event: Event) -> dict[str, Any]:
     data["values"] = reference_plain(event.values)
     if event.models:
         data["models"] = dict(event.models)
-    if event.classification is not None:
-        data["classification"] = dict(event.classification)
+    if event.episode.classification is not None:
+        data["classification"] = dict(event.episode.classification)
     if event.dry_run:
         data["dryRun"] = True
     return {
         "specversion": "1.0",
-        "id": f"{event.episode}.{'started' if event.reason is None else 'ended'}",
+        "id": f"{event.episode.id}.{'started' if event.reason is None else 'ended'}",
         "source": f"/detectors/{event.holder}",
         "type": f"dev.wayside.event.{'started' if event.reason is None else 'ended'}",
-        "subject": event.subject,
-        "time": reference_time(event.start_time if event.end_time is None else event.end_time),
+        "subject": event.episode.subject,
+        "time": reference_time(event.episode.start_time if event.end_time is None else event.end_time),
         "datacontenttype": "application/json",
         **({} if event.traceparent is None else {"traceparent": event.traceparent}),
         **({} if event.recording is None else {"recording": event.recording}),
@@ -171,7 +176,8 @@ def test_a_value_that_json_does_not_have_is_the_same_error(event: Event) -> None
 
 @given(events(TIMES, VALUES))
 def test_actions_get_the_cloud_event_of_the_text(event: Event) -> None:
-    event = msgspec.structs.replace(event, classification={"timeSensitivity": ["Immediate"]})
+    episode = msgspec.structs.replace(event.episode, classification={"timeSensitivity": ["Immediate"]})
+    event = msgspec.structs.replace(event, episode=episode)
     document = event.cloud_event()
     assert compact(document) == reference_text(event)
     assert document == json.loads(reference_text(event))
@@ -196,9 +202,12 @@ def test_an_episode_keeps_its_id_from_version_to_version() -> None:
 
 def test_events_with_the_same_fields_are_equal_and_none_can_be_changed() -> None:
     one, other = (
-        Event("h", "r", "car", ("car",), "e", START, START, None, None, {"v": math.nan}, None) for _ in range(2)
+        Event("h", EpisodeRecord("e", "r", "car", ("car",), None, START, START, {}, None), {"v": math.nan})
+        for _ in range(2)
     )
     assert one == other
     assert one != msgspec.structs.replace(other, dry_run=True)
     with pytest.raises(AttributeError, match="immutable"):
-        one.rule = "another"  # type: ignore[misc]
+        one.dry_run = True  # type: ignore[misc]
+    with pytest.raises(AttributeError, match="immutable"):
+        one.episode.rule = "another"  # type: ignore[misc]

@@ -56,15 +56,17 @@ def events(tracer: Tracer) -> list[Event]:
 def found(events: list[Event]) -> dict[str, list[Span]]:
     """The episodes of each rule."""
     spans: dict[str, list[Span]] = {rule: [] for rule in TRUTHS}
-    ends = {event.episode: event for event in events if event.end_time is not None}
+    ends = {event.episode.id: event for event in events if event.end_time is not None}
     for event in events:
         if event.end_time is None:
-            last = ends.get(event.episode)
+            last = ends.get(event.episode.id)
             known = last is not None and last.reason is not None and last.reason.value == "Until"
             end = (
                 (last.end_time - START_NS) // TICK if known and last is not None and last.end_time is not None else None
             )
-            spans[event.rule].append(Span(event.subject, (event.start_time - START_NS) // TICK, end))
+            spans[event.episode.rule].append(
+                Span(event.episode.subject, (event.episode.start_time - START_NS) // TICK, end)
+            )
     return {rule: sorted(each) for rule, each in spans.items()}
 
 
@@ -79,12 +81,12 @@ def test_a_rule_finds_what_numpy_finds(rule: str, found: dict[str, list[Span]]) 
 
 
 def test_the_least_time_to_collision_of_an_episode_is_that_of_numpy(events: list[Event]) -> None:
-    ended = [each for each in events if each.rule == "least-time-to-collision" and each.end_time is not None]
+    ended = [each for each in events if each.episode.rule == "least-time-to-collision" and each.end_time is not None]
     assert ended
     for event in ended:
-        a, b = (USERS[name] for name in event.subject.split("+"))
+        a, b = (USERS[name] for name in event.episode.subject.split("+"))
         assert event.end_time is not None
-        first, last = (event.start_time - START_NS) // TICK, (event.end_time - START_NS) // TICK
+        first, last = (event.episode.start_time - START_NS) // TICK, (event.end_time - START_NS) // TICK
         times = time_to_collision(Pair(a, b))[first : last + 1]
         assert event.values["least"] == pytest.approx(np.nanmin(times), abs=1e-9)
         assert event.values["leastAt"] == pytest.approx((START_NS + (first + np.nanargmin(times)) * TICK) / 1e9)
@@ -94,7 +96,7 @@ def test_the_nearest_that_did_not_happen_are_those_of_numpy(events: list[Event],
     trace = tracer.trace()
     rules = {name: run.rule for name, run in tracer.engine.rules.items()} if tracer.engine is not None else {}
     moments = nearest_moments("", rules, trace.subjects, episodes_of("", events, trace))
-    braked = {event.subject for event in events if event.rule == "hard-braking"}
+    braked = {event.episode.subject for event in events if event.episode.rule == "hard-braking"}
     expected = {name: -5 - np.nanmin(acceleration(user)) for name, user in USERS.items() if name not in braked}
     found: dict[str, float] = {}
     for moment in moments:

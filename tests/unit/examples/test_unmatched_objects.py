@@ -85,7 +85,7 @@ def test_what_the_other_does_not_see_for_long_enough_is_reported() -> None:
         driven.take(a_list(seconds, "a", "camera", (0.2, 0), (10, 0), *ghost), until=seconds + 0.05)
         driven.take(a_list(seconds + 0.03, "a", "lidar", (0, 0), (10, 1)), until=seconds + 0.1)
     assert driven.take(until=3) == []
-    assert [event.start_time for event in driven.events] == [at(2)]
+    assert [event.episode.start_time for event in driven.events] == [at(2)]
     assert driven.events[0].values["unmatched"] == [{"x": 30.0, "y": 3.0, "seconds": 1.0}]
 
 

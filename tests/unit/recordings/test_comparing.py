@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from detector.commands import cli
 from detector.engine.episodes.episodes import Ending
 from detector.engine.episodes.events import Event
+from detector.engine.episodes.record import EpisodeRecord
 from detector.replay.comparing import compare
 from tests import onnx_models
 from tests.driving import START, a_detector, a_rule, at
@@ -24,22 +25,13 @@ def episodes(rule: str, *spans: tuple[float, float | None], subject: str = "car"
     """Events of episodes from and to seconds after the start; None: still open."""
     events = []
     for first, last in spans:
+        episode = EpisodeRecord(
+            f"{rule}{subject}{first}", rule, subject, (subject,), None, at(first), at(first), {}, None
+        )
         for end in (None, last):
             if end is None or last is not None:
-                fields = {
-                    "holder": "h",
-                    "rule": rule,
-                    "subject": subject,
-                    "subjects": (subject,),
-                    "episode": f"{rule}{subject}{first}",
-                    "onset_time": at(first),
-                    "start_time": at(first),
-                    "end_time": None if end is None else at(end),
-                    "reason": None if end is None else Ending.UNTIL,
-                    "values": {},
-                    "classification": None,
-                }
-                events.append(Event(**fields))  # type: ignore[arg-type]
+                ended = () if end is None else (at(end), Ending.UNTIL)
+                events.append(Event("h", episode, {}, *ended))
     return events
 
 

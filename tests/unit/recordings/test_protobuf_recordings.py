@@ -114,7 +114,7 @@ def test_a_recording_with_protobuf_replays(recording: Path, tmp_path: Path, enco
     (tmp_path / "detector.yaml").write_text(json.dumps(a_detector(stream, clock=clock).to_json()))
     (tmp_path / "rules.yaml").write_text(json.dumps(rule.to_json()))
     events = run(tmp_path / "rules.yaml", tmp_path / "detector.yaml", recording)
-    assert [(event.started, event.start_time - at(0)) for event in events] == [(True, 10**9), (False, 10**9)]
+    assert [(event.started, event.episode.start_time - at(0)) for event in events] == [(True, 10**9), (False, 10**9)]
 
 
 def test_each_item_of_a_list_of_protobuf_is_a_client(recording: Path, tmp_path: Path) -> None:
@@ -124,7 +124,7 @@ def test_each_item_of_a_list_of_protobuf_is_a_client(recording: Path, tmp_path: 
     (tmp_path / "detector.yaml").write_text(json.dumps(a_detector({**stream, **items}).to_json()))
     (tmp_path / "rules.yaml").write_text(json.dumps(rule.to_json()))
     events = run(tmp_path / "rules.yaml", tmp_path / "detector.yaml", recording)
-    assert [(event.subject, event.started) for event in events] == [("car-3", True), ("car-3", False)]
+    assert [(event.episode.subject, event.started) for event in events] == [("car-3", True), ("car-3", False)]
 
 
 def test_a_cut_recording_with_protobuf_is_read_up_to_there(recording: Path) -> None:

@@ -64,8 +64,8 @@ def test_a_replay_of_a_recording_gives_the_event_again(tmp_path: Path) -> None:
     bench = Bench(tmp_path / "recordings", *STREAMS[:3])
     folder = bench.record(an_episode(), [speed(1 + k / 10, 20 if 10 <= k < 20 else 5) for k in range(40)])
     events = run(tmp_path / "r.yaml", tmp_path / "d.yaml", folder)
-    assert [(event.subject, event.started) for event in events] == [("car1", True), ("car1", False)]
-    assert events[0].start_time == at(2.0)
+    assert [(event.episode.subject, event.started) for event in events] == [("car1", True), ("car1", False)]
+    assert events[0].episode.start_time == at(2.0)
 
 
 def test_a_file_that_is_gone_is_reported(tmp_path: Path) -> None:

@@ -51,23 +51,23 @@ def subject(trace: Trace, rule: str, name: str) -> SubjectTrace:
 def test_the_values_at_the_start_of_an_episode_are_those_of_its_event(seen: tuple[Replayed, Trace]) -> None:
     outcome, trace = seen
     started = [event for event in outcome.events if event.started]
-    assert {event.rule for event in started} == {"too-fast", "harsh", "close", "slow-one"}
+    assert {event.episode.rule for event in started} == {"too-fast", "harsh", "close", "slow-one"}
     for event in started:
-        found = subject(trace, event.rule, event.subject)
-        time = np.array([event.start_time])
+        found = subject(trace, event.episode.rule, event.episode.subject)
+        time = np.array([event.episode.start_time])
         for name, value in event.values.items():
             if name in found.signals:
                 series = found.signals[name]
                 assert series.plain(float(series.at(time)[0])) == value
-        assert found.conditions["when"].at(np.array([event.onset_time])).tolist() == [TRUE]
+        assert found.conditions["when"].at(np.array([event.episode.onset_time])).tolist() == [TRUE]
 
 
 def test_a_condition_changes_at_the_tick_at_which_an_episode_starts_or_ends(seen: tuple[Replayed, Trace]) -> None:
     outcome, trace = seen
     for event in outcome.events:
-        conditions = subject(trace, event.rule, event.subject).conditions
+        conditions = subject(trace, event.episode.rule, event.episode.subject).conditions
         if event.started:
-            assert event.onset_time in conditions["when"].times
+            assert event.episode.onset_time in conditions["when"].times
         elif "until" in conditions:
             assert event.end_time in conditions["until"].times
         else:

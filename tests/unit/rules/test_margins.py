@@ -77,7 +77,10 @@ def test_the_margin_is_a_value_of_events_and_a_signal_for_others() -> None:
     for second, x in enumerate([40.0, 30, 15, 12, 11.5, 11.5, 60], start=1):
         drive.take(place(second, "a", 0), place(second, "b", x), until=second)
     start, end = drive.events
-    assert (start.start_time, start.values["margin"]) == (at(3), 0.5)  # 5 m of 10 below 20 m, 14 m/s of 2 above 1 m/s
+    assert (start.episode.start_time, start.values["margin"]) == (
+        at(3),
+        0.5,
+    )  # 5 m of 10 below 20 m, 14 m/s of 2 above 1 m/s
     assert (end.values["margin"], end.values["clearest"]) == (-24.75, 0.8)
 
 

@@ -61,7 +61,7 @@ def test_signals_scopes_and_actions_see_them_too() -> None:
     ]
     started = drive.take(*sorted(arrivals, key=lambda each: each.received), until=1)
     assert started == ["too-fast car started 1", "too-fast far started 1"]
-    demanded = {demand.subject: demand.parameters for demand in drive.engine.demands().values()}
+    demanded = {demand.episode.subject: demand.parameters for demand in drive.engine.demands().values()}
     assert demanded["car"] == {"limit": 10, "area": SQUARE}
     assert demanded["far"] == {"limit": 10, "area": moved}
 

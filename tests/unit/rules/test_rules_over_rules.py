@@ -116,7 +116,7 @@ def test_a_dependency_that_is_disabled_is_unknown_and_one_that_comes_later_bring
     assert drive.take(until=2) == ["braking car started 2"]
     drive.note(drive.engine.set_rules(compiled(detector, braking(), top)))
     assert drive.take(until=3) == ["top car started 3"]
-    assert drive.events[-1].onset_time == at(3)
+    assert drive.events[-1].episode.onset_time == at(3)
 
 
 def test_a_dependency_that_changes_its_meaning_begins_with_no_starts() -> None:

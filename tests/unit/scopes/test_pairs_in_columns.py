@@ -63,7 +63,7 @@ def test_all_pairs_at_once_give_the_events_of_each_by_itself(seed: int, clients:
     for drive in (together, one_by_one):
         drive.take(*walk(seed, clients, side, steps), until=steps / 10 + 3)
     assert [event.to_json() for event in together.events] == [event.to_json() for event in one_by_one.events]
-    assert {event.rule for event in together.events} == {rule.name for rule in rules()}
+    assert {event.episode.rule for event in together.events} == {rule.name for rule in rules()}
     for name, counters in together.engine.counters.rules.items():
         other = one_by_one.engine.counters.rules[name]
         counted = (counters.evaluations, counters.crowded_pairs, counters.misplaced, counters.started, counters.ended)

@@ -35,7 +35,7 @@ def test_with_roles_each_ordered_pair_that_fits_is_a_subject() -> None:
         "p car2+bus1 started 1",
         "p car2+bus2 started 1",
     ]
-    assert drive.events[0].subjects == ("car1", "bus1")
+    assert drive.events[0].episode.clients == ("car1", "bus1")
     assert drive.events[0].values["a"]["client"] == "car1"
 
 
@@ -176,7 +176,7 @@ def test_the_fleet_is_one_subject_and_its_members_are_those_that_are_known_to_be
     assert drive.take(speed(0.5, 1, "a"), speed(0.5, None, "b"), place(0.5, "c", 0), until=1) == []
     assert drive.take(speed(1.5, 3, "b"), until=2) == ["f ~fleet started 2"]
     (event,) = drive.events
-    assert event.subjects == ()
+    assert event.episode.clients == ()
     assert event.values == {"count": 2, "members": [{"client": "a", "speed": 1}, {"client": "b", "speed": 3}]}
     assert event.key == "wayside/events/h/f/~fleet"
     assert drive.take(speed(2.5, 0, "a"), until=3) == []
@@ -229,7 +229,7 @@ def test_a_rule_with_elements_is_evaluated_once_for_each() -> None:
     drive = Drive(a_detector(), rule)
     assert drive.take(place(0.5, "car", 130), until=1) == ["r car~north started 1"]
     assert drive.take(place(1.5, "car", 510), until=2) == ["r car~south started 2"]
-    assert {demand.subject: demand.parameters for demand in drive.engine.demands().values()} == {
+    assert {demand.episode.subject: demand.parameters for demand in drive.engine.demands().values()} == {
         "car~north": {"node": "rsu-1", "at": 10},
         "car~south": {"node": "rsu-2", "at": 10},
     }
@@ -288,7 +288,7 @@ def test_elements_in_every_scope_and_its_conditions() -> None:
         when = "size(members) == 1" if "fleet" in scope else "true"
         drive = Drive(a_detector(clients=clients), a_rule(scope=scope, each=each, when=when))
         drive.take(*here, until=1)
-        reported[str(scope)] = [event.subject for event in drive.events]
+        reported[str(scope)] = [event.episode.subject for event in drive.events]
     assert list(reported.values()) == [
         ["n1~n", "n2~n", "s1~s"],
         ["n1+n2~n", "n1+s1~n", "n2+s1~n"],
@@ -302,7 +302,7 @@ def test_an_episode_of_an_element_is_restored_and_one_of_an_element_that_is_gone
     drive = Drive(a_detector(), rule)
     drive.take(place(0.5, "car", 0), until=1)
     held = drive.engine.demands()
-    assert sorted(demand.subject for demand in held.values()) == ["car~north", "car~south"]
+    assert sorted(demand.episode.subject for demand in held.values()) == ["car~north", "car~south"]
     again = Drive(a_detector(), rule)
     assert again.note(again.engine.restore(list(held.values()), at(0))) == []
     assert again.engine.demands() == held

@@ -130,7 +130,7 @@ def test_a_rule_on_pairs_finds_no_ghosts_of_road_users_that_left(
 ) -> None:
     """With the README's kind of Detector: a stream with no settings about age."""
     users = traffic(seed)
-    started = {event.subject for event in replayed(users, rule).events if event.started}
+    started = {event.episode.subject for event in replayed(users, rule).events if event.started}
     expected = true_pairs(users, 60)
     assert expected
     assert started == expected

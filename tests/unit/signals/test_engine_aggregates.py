@@ -247,4 +247,4 @@ def probe(tick: int) -> bytes:
 
 
 def event_time(event: Event) -> float:
-    return ((event.start_time if event.end_time is None else event.end_time) - at(0)) / SECOND
+    return (event.time - at(0)) / SECOND

@@ -161,7 +161,7 @@ def test_one_that_throws_is_unknown_counted_and_reported_and_continues_afterward
     other = plugin_rule("other")
     driven = drive(plugin_rule(parameters={"raiseAt": 2}), other)
     driven.take(arrival(0.5, "a", {"v": 1}), arrival(1.5, "a", {"v": 2}), arrival(2.5, "a", {"v": 1}), until=3)
-    assert [event.rule for event in driven.events] == ["other", "r"]
+    assert [event.episode.rule for event in driven.events] == ["other", "r"]
     counters = driven.engine.counters.rule("r")
     assert counters.errors == 1
     assert counters.last_error.startswith("signal p: plugin counting: ValueError: 2 is not acceptable (signals.py:")

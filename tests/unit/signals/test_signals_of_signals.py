@@ -120,7 +120,9 @@ def test_the_replay_of_lags_and_statistics_gives_the_same_events() -> None:
         live.put([(f"vehicles/{client}/speed", b'{"v": %d}' % value) for client in ("a", "b")])
         live.evaluator.call(lambda: None).result(10)
     recording = live.stop()
-    assert {(event.rule, event.started) for event in recording.logged} == set(itertools.product("rs", (True, False)))
+    assert {(event.episode.rule, event.started) for event in recording.logged} == set(
+        itertools.product("rs", (True, False))
+    )
     assert lines(replay_intake(recording.records, None, None).events) == lines(recording.logged)
 
 

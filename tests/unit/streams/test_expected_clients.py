@@ -59,5 +59,5 @@ def test_with_clock_data_it_is_known_since_the_time_of_the_data_began() -> None:
     stamps = (1_000.5, 1_001, 1_002, 1_003, 1_004, 1_005)
     drive.take(*(arrival(n, "car", {"t": stamp}) for n, stamp in enumerate(stamps)), until=9)
     (event,) = drive.events
-    assert event.start_time == 1_004 * 10**9
-    assert event.start_time < at(0)
+    assert event.episode.start_time == 1_004 * 10**9
+    assert event.episode.start_time < at(0)

@@ -171,7 +171,7 @@ def test_live_and_replay_give_the_same_events() -> None:
         if n % 7 == 0:
             live.evaluator.ask("ask").result(10)
     recording = live.stop()
-    assert {event.subject for event in recording.logged} >= {"1", "2", "3", "1+2"}
+    assert {event.episode.subject for event in recording.logged} >= {"1", "2", "3", "1+2"}
     assert {str(event.reason) for event in recording.logged} >= {"ClientLost", "Until"}
     assert lines(replay_intake(recording.records, None, None).events) == lines(recording.logged)
 
