@@ -133,15 +133,15 @@ def run(
         str | None,
         typer.Option(
             metavar="QUANTITY",
-            help="Memory of this manager and its worker processes, e.g. 1Gi: near it, no new tasks are accepted. "
-            "Default: the container's limit.",
+            help="The memory limit of this manager and its worker processes, e.g. 1Gi. Near the limit, no new tasks "
+            "are accepted. Default: the container's limit.",
         ),
     ] = None,
     lease: Annotated[
         str | None,
         typer.Option(
             metavar="[NAMESPACE/]NAME",
-            help="The Lease that elects the active one of several managers of the same namespaces. Default: "
+            help="The Lease by which one of several managers of the same namespaces becomes active. Default: "
             "application-manager, in the pod's namespace, else in the first managed one.",
         ),
     ] = None,

@@ -27,9 +27,11 @@ class Measures:
         self.registry = CollectorRegistry(auto_describe=False)
         self.looked = time.monotonic()
         self._applied = self._histogram(
-            "event_to_applied_seconds", "From an event's start to its task's Applied", _SERVICE
+            "event_to_applied_seconds", "Time from the start of an event until its task is Applied", _SERVICE
         )
-        self._ready = self._histogram("event_to_ready_seconds", "From an event's start to its task's Ready", _SERVICE)
+        self._ready = self._histogram(
+            "event_to_ready_seconds", "Time from the start of an event until its task is Ready", _SERVICE
+        )
         self._reconciled = self._histogram("reconcile_seconds", "Time that reconciling one object took", _WORK, "queue")
         self._failures = self._counter("reconcile_failures", "Reconciliations that failed and are retried", "queue")
         self._refusals = self._counter("refusals", "Refusals of tasks; each new reason counts again", "reason")

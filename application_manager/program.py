@@ -1,4 +1,4 @@
-"""The console script: able to end before the rest is imported, which takes a while."""
+"""The console script: it can end before the slow imports."""
 
 from __future__ import annotations
 

@@ -57,7 +57,7 @@ def main() -> int:
                 attached.append(cost(pid, options.seconds).cpu)
                 messages += came[0] - before
             time.sleep(2)
-        left_out = log.read_text().count("thinning of low-priority rules is now at level")
+        left_out = log.read_text().count("low-priority rules are now thinned at level")
     ratio = statistics.median(attached) / statistics.median(without)
     shown = messages / (options.rounds * options.seconds)
     print(f"{options.vehicles} vehicles at {HZ} Hz, 10 rules; medians of {options.rounds}, CPU as a part of one core")

@@ -54,18 +54,18 @@ async def fill(manager: subprocess.Popen[bytes], namespace: str, count: int, siz
     try:
         await client.create(TEMPLATES, {**TEMPLATE, "metadata": {"name": "app", "namespace": namespace}})
         await client.create(TASKS, task(namespace, "first"))
-        await _all_told(client, namespace)
+        await _all_reported(client, namespace)
         before = resident(manager.pid, "VmRSS")
         for number in range(count):
             await client.create(TASKS, large(namespace, number, size))
-        await _all_told(client, namespace)
+        await _all_reported(client, namespace)
         await asyncio.sleep(SETTLED)
         return before, resident(manager.pid, "VmHWM"), resident(manager.pid, "VmRSS")
     finally:
         await client.close()
 
 
-async def _all_told(client: Client, namespace: str) -> None:
+async def _all_reported(client: Client, namespace: str) -> None:
     async with asyncio.timeout(PATIENCE):
         while True:
             reported = [

@@ -120,7 +120,7 @@ class Seen:
 
     def __init__(self) -> None:
         self.at: dict[str, float] = {}
-        self._news = asyncio.Condition()
+        self._changed = asyncio.Condition()
 
     @asynccontextmanager
     async def watching(self, client: Client, namespace: str) -> AsyncIterator[None]:
@@ -146,13 +146,13 @@ class Seen:
             event = json.loads(line)
             if event["type"] == "ADDED":
                 self.at[event["object"]["metadata"]["name"]] = time.perf_counter()
-                async with self._news:
-                    self._news.notify_all()
+                async with self._changed:
+                    self._changed.notify_all()
 
     async def wait(self, count: int) -> None:
         """Wait until this number was seen."""
-        async with self._news, asyncio.timeout(PATIENCE):
-            await self._news.wait_for(lambda: len(self.at) >= count)
+        async with self._changed, asyncio.timeout(PATIENCE):
+            await self._changed.wait_for(lambda: len(self.at) >= count)
 
 
 async def at_once(series: list[Any]) -> None:

@@ -109,7 +109,7 @@ def _nonempty(text: str, offset: int, part: str) -> str:
         elif text[offset - 1] == ":":
             problem = "the pattern begins with a slash: remove it"
         else:
-            problem = "two slashes stand in a row: remove one"
+            problem = "the pattern has two slashes in a row: remove one"
         raise KeyPatternError(text, offset, problem)
     return part
 

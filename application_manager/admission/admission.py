@@ -1,4 +1,4 @@
-"""Reviews of what the API server is about to store: a template, rule or detector, answered from what the manager knows.
+"""Reviews a template, rule or Detector before the API server stores it, against the manager's cache.
 
 The answers are the findings that also make the conditions. What a rule has only with others (its Detectors, the rules
 and templates that it names) is looked up again at the API server before it is reported: a Detector that was applied a
@@ -56,8 +56,8 @@ class Admission:
     Attributes:
         resources: where EventRules and Detectors live.
         observe: takes an object that was read.
-        pool: where objects are judged.
-        namespaces: those that the manager looks after; empty: all.
+        pool: where objects are checked.
+        namespaces: those that are managed; empty: all.
         defaults: what holds for all detectors; None where the manager runs none.
     """
 

@@ -1,4 +1,4 @@
-"""Certificates of our own making, for the webhook where there is no cert-manager.
+"""Creates certificates for the webhook, where there is no cert-manager.
 
 A new authority signs one certificate and is forgotten: its key is kept nowhere, so nothing else can be signed with it.
 """

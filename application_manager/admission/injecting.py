@@ -1,4 +1,4 @@
-"""Pods that are to be made and ask for a detector: what they get, from what the manager knows.
+"""Pods that request a detector: what they get when they are created, from what the manager knows.
 
 Before a pod goes without, its Detector is looked up at the API server: it may have been applied a moment before.
 Whatever else goes wrong is no answer, and the pod is made without its detector (failurePolicy Ignore).

@@ -1,4 +1,4 @@
-"""The webhook's certificate where nobody else makes one: made here, kept in a Secret, and renewed in time.
+"""The webhook's certificate, if the manager issues it: created, stored in a Secret, and renewed in time.
 
 All managers of a release share the Secret. A manager that finds its certificate missing or due writes a new one; the
 resourceVersion decides between two. The previous authority stays in `ca.crt` beside the new one, and the API server

@@ -56,23 +56,23 @@ class Serving:
         return certificate_secret(self.service)
 
 
-class Desk:
-    """Takes the questions of one kind."""
+class ReviewHandler:
+    """Answers the AdmissionReviews of one webhook."""
 
     def __init__(self, review: Review, ready: Callable[[], bool], measures: Measures) -> None:
         """`ready`: whether enough is known to answer."""
         self._review = review
         self._ready = ready
         self._measures = measures
-        self._asked = 0
+        self._in_progress = 0
 
     async def answer(self, request: web.Request) -> web.Response:
-        """The answer to one question; an HTTP error where there is none."""
+        """The answer to one AdmissionReview; an HTTP error if there is none."""
         if not self._ready():
             return self._none(503, "the caches are not synced yet")
-        if self._asked >= AT_ONCE:
+        if self._in_progress >= AT_ONCE:
             return self._none(503, f"{AT_ONCE} reviews are in progress: try again")
-        self._asked += 1
+        self._in_progress += 1
         try:
             question = msgspec.json.decode(await request.read())
             return web.json_response(body=msgspec.json.encode(await self._review(question)))
@@ -85,7 +85,7 @@ class Desk:
             log.exception("a review failed")
             return self._none(500, f"{type(error).__name__}: {error}")
         finally:
-            self._asked -= 1
+            self._in_progress -= 1
 
     def _none(self, status: int, why: str) -> web.Response:
         self._measures.reviewed("", "failed")
@@ -93,8 +93,8 @@ class Desk:
 
 
 @asynccontextmanager
-async def webhook(serving: Serving | None, desks: Mapping[str, Desk]) -> AsyncIterator[None]:
-    """Serve the desks, by their paths, on all addresses while the block runs; nothing where `serving` is None.
+async def webhook(serving: Serving | None, handlers: Mapping[str, ReviewHandler]) -> AsyncIterator[None]:
+    """Serve the handlers, by their paths, on all addresses while the block runs; nothing where `serving` is None.
 
     Raises ConfigurationError where the port is taken, CertificateError where there is no valid certificate.
     """
@@ -103,9 +103,9 @@ async def webhook(serving: Serving | None, desks: Mapping[str, Desk]) -> AsyncIt
         return
     certificate = ServingCertificate(serving.certificates, FOLDER_OPTION)
     application = web.Application(client_max_size=LARGEST)
-    for path, desk in desks.items():
-        application.router.add_post(path, desk.answer)
-    # A question that the API server has given up is given up here too.
+    for path, handler in handlers.items():
+        application.router.add_post(path, handler.answer)
+    # A request that the API server has cancelled is cancelled here too.
     runner = web.AppRunner(
         application, access_log=None, handle_signals=False, shutdown_timeout=1, handler_cancellation=True
     )

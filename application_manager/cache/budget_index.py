@@ -94,8 +94,8 @@ class BudgetIndex:
         else:
             return None
         message = (
-            f"{whose} may have {limit} unfinished tasks and already has that number of older ones: this task waits "
-            "until one of them ends; end some, or have the administrator raise the limit"
+            f"{whose} has reached the limit of {limit} unfinished tasks: this task waits until an older task ends; "
+            "end some tasks, or have the administrator raise the limit"
         )
         return Verdict(Standing.WAITING, LIMIT_REACHED, message)
 

@@ -19,7 +19,7 @@ from application_manager.core.objects.policy import Name
 from wayside.api import ApplicationTask, ApplicationTemplate
 
 Claims = Callable[[ApplicationTemplate | InvalidTemplate | None, ApplicationTask], Claim | Verdict | None]
-"""What a task claims of a template, or its verdict; None while that is being worked out."""
+"""What a task claims of a template, or its verdict; None while that is being computed."""
 
 
 _ANY = TaskPolicy()
@@ -28,7 +28,7 @@ _ANY = TaskPolicy()
 class ClaimIndex:
     """Claims of all tasks, and the verdicts of those that claim nothing.
 
-    A task whose claim is being worked out keeps the one that it had, if any. Those that were there before this process
+    A task whose claim is being computed keeps the one that it had, if any. Those that were there before this process
     began to act may well have instances: until their claims are known, their templates are unsettled, and what runs of
     them stays as it is.
 
@@ -53,7 +53,7 @@ class ClaimIndex:
         self._templates: dict[Name, Name] = {}  # task → template
 
     def note(self, name: Name, entry: Entry, template: ApplicationTemplate | InvalidTemplate | None) -> set[Name]:
-        """Note a task as it is now; returns the instances that it claimed or claims, none while that is worked out."""
+        """Note a task as it is now; returns the instances that it claimed or claims, none while that is computed."""
         task = entry.model
         if isinstance(task, ApplicationTask) and finished(task) is None and self._policy.refusal(task) is None:
             moved = self._budgets.enter(task)
@@ -87,7 +87,7 @@ class ClaimIndex:
                 claimed = replace(claimed, instance=before.instance)
             self._verdicts[name] = claimed
             return touched
-        assert claimed is not None  # noqa: S101  what is being worked out has returned above
+        assert claimed is not None  # noqa: S101  what is being computed has returned above
         instance = (name[0], claimed.instance)
         self._claims[name] = claimed
         self._by_instance.setdefault(instance, {})[name] = claimed
@@ -103,7 +103,7 @@ class ClaimIndex:
         return self._policy.refusal(task) or self._budgets.verdict((task.namespace, task.name))
 
     def _wait(self, name: Name, task: ApplicationTask, before: Claim | None) -> set[Name]:
-        """Note that a task's claim is being worked out: until then, a task that had one keeps it."""
+        """Note that a task's claim is being computed: until then, a task that had one keeps it."""
         touched = set() if before is not None and before.task.metadata.uid == task.metadata.uid else self._drop(name)
         self._file(name, task)
         self._pending.setdefault((name[0], task.spec.template_name), set()).add(name)
@@ -126,11 +126,11 @@ class ClaimIndex:
                         self.settled(template)
 
     def pending(self, template: Name) -> bool:
-        """Whether claims of the template's tasks are being worked out."""
+        """Whether claims of the template's tasks are being computed."""
         return template in self._pending
 
     def begin(self) -> None:
-        """Everything is listed: what is being worked out now was there before."""
+        """Everything is listed: what is being computed now was there before."""
         self._unsettled = {template: set(names) for template, names in self._pending.items()}
 
     def unsettled(self, template: Name) -> bool:
@@ -173,7 +173,7 @@ class ClaimIndex:
         return claimed
 
     def claimed_of(self, template: Name) -> set[Name]:
-        """The instances of a template that tasks claim; what stands for all of them is none."""
+        """The instances of a template that tasks claim; a name that means all of them is left out."""
         found = {claimed.instance for name in self.tasks_of(template) if (claimed := self._claims.get(name))}
         return {(template[0], each) for each in found if template_of_all(each) is None}
 

@@ -207,7 +207,7 @@ class ClusterCache:
     def touch(self, instances: Iterable[Name]) -> set[Name]:
         """Note that something about the instances changed; returns those to decide again.
 
-        A name that stands for all instances of a template means each of these.
+        A name that means all instances of a template means each of these.
         """
         found = {each for name in instances for each in self.meant(name)}
         for each in found:
@@ -242,7 +242,7 @@ class ClusterCache:
         return Limits(self._limits.get(namespace, {}), self.limit)
 
     def meant(self, name: Name) -> set[Name]:
-        """The instances that a name means, which may stand for all of a template; that name is among them."""
+        """The instances that a name means, which may mean all of a template; that name is among them."""
         of = template_of_all(name[1])
         if of is None:
             return {name}

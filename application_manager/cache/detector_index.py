@@ -1,4 +1,4 @@
-"""What is known of the detectors that the manager runs: their objects, and whether they run."""
+"""An index of the detectors that the manager runs: their objects, and whether they run."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class DetectorIndex:
     _troubles: dict[Name, list[Trouble]] = field(default_factory=dict)
 
     def take(self, objects: Iterable[Object], pods: Iterable[Object], requesting: Iterable[Object] = ()) -> None:
-        """Take all objects, their pods, and the pods that ask for detectors, as they were listed just now."""
+        """Replace all objects, their pods, and the pods that request detectors, by those just listed."""
         self.objects = {}
         deployments: set[tuple[str, str]] = set()
         for raw in objects:

@@ -1,4 +1,4 @@
-"""Which templates fall back to which, and which tasks turned to them: an index, kept up to date one by one."""
+"""An index of fallbacks: which template falls back to which, and which tasks use the fallback."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Other managers that look after the same namespaces, by what they write into the statuses of templates.
+"""Other managers of the same namespaces, by what they write into the statuses of templates.
 
 Managers with one Lease take turns by that. Two releases have a Lease each, and none may read the other's. So each
 writes its Lease, and when that was created, into the status of every template. Of two, the one with the older Lease
@@ -46,7 +46,7 @@ class _Yielded:
 
 
 class OverlapIndex:
-    """Namespaces that others look after as well.
+    """Namespaces that others manage as well.
 
     Attributes:
         own: what this manager writes; None while its Lease is not known.
@@ -106,7 +106,7 @@ class OverlapIndex:
         return state.rival.lease if state is not None else ""
 
     def forget(self, template: Name) -> None:
-        """Note that a template is gone."""
+        """Note that a template was deleted."""
         self._written.pop(template, None)
         state = self._yielded.get(template[0])
         if state is not None and state.template == template:

@@ -1,4 +1,4 @@
-"""Who has a place in namespaces with limits: an index, kept up to date instance by instance.
+"""An index of places: which instances may run in namespaces with limits.
 
 A place depends on what each instance requests, and on the order of all requests. So only the instances that changed
 since are decided again, and the order is determined again when any request differs. Namespaces without limits cost

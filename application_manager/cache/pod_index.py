@@ -1,4 +1,4 @@
-"""Pods that are in trouble, by the instance that they belong to: an index, kept up to date pod by pod.
+"""An index of the pods with problems, by instance.
 
 Pods are recognised by the instance's label, which the rendering puts into pod templates. Of those that run well, which
 are nearly all, nothing is kept here.
@@ -33,7 +33,7 @@ class PodIndex:
         return before != self.troubles(instance)
 
     def forget(self, pod: Object) -> bool:
-        """Forget a pod that is gone; whether that changes the `troubles` of its instance."""
+        """Forget a pod that is deleted; whether that changes the `troubles` of its instance."""
         instance = _instance_of(pod)
         if instance is None:
             return False

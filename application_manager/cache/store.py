@@ -1,4 +1,4 @@
-"""What the manager knows of the cluster: the newest version of each object that it has seen.
+"""The store of the cache: the newest version of each object that the manager has received.
 
 Fed by watch events, by the answers to our own writes and by lists, in any order. An older version never replaces a
 newer one, and what was seen deleted does not come back from a list that is older than its deletion.
@@ -92,7 +92,7 @@ class Store:
         return entry
 
     def remove(self, raw: Object) -> Entry | None:
-        """Note that an object is gone; what was known of it, or None where that is known."""
+        """Note that an object was deleted; what was known of it, or None where that is known."""
         uid = raw["metadata"]["uid"]
         self._deleted[uid] = None
         if len(self._deleted) > _TOMBSTONES:
@@ -105,7 +105,7 @@ class Store:
         return self._objects[kind_of(raw)].pop(name_of(raw))
 
     def missing(self, kind: KindKey, present: Set[Name], version: str, scope: str | None) -> list[Entry]:
-        """The entries that are gone, since a list (of the namespace `scope`, None for all) has only those `present`."""
+        """The deleted entries: a list (of the namespace `scope`, None for all) has only those `present`."""
         return [
             entry
             for name, entry in self.all(kind)

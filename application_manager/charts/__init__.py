@@ -1,1 +1,1 @@
-"""Helm charts: fetched, kept and rendered in the background."""
+"""Helm charts: fetched, cached and rendered in the background."""

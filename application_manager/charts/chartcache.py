@@ -1,4 +1,4 @@
-"""Charts on disk: each archive once, under the digest of its content; and which source has which.
+"""The cache of charts on disk: each archive once, by its digest, and the digest of each source.
 
     <folder>/charts/<sha256>.tgz        an archive
     <folder>/sources/<sha256>           a source, by its hash → the digest of its archive

@@ -1,4 +1,4 @@
-"""The helm program, run where it can neither reach the cluster nor keep the manager waiting.
+"""Runs the helm program, without access to the cluster, and without blocking the manager.
 
 Each run has a folder of its own as its home, an environment with nothing in it that leads to a cluster or to somebody's
 settings, and limits: time, memory, size of files, size of what it writes. `helm template` queries no cluster. Only a

@@ -1,4 +1,4 @@
-"""One chart rendered once, and the message where that fails."""
+"""Renders one chart once, and explains a failure."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Asking the API server, at the start, whether the manager's account has each right that it needs."""
+"""Checks at the start whether the manager's account has each right that it needs."""
 
 from __future__ import annotations
 

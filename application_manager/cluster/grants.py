@@ -1,4 +1,4 @@
-"""In which namespaces the account may write, where the manager looks after all of them.
+"""In which namespaces the account may write, for a manager of all namespaces.
 
 By its ClusterRole it may read everywhere. It writes where an administrator binds it to the role that allows writing
 (`application-manager rbac --grant`). What happens in other namespaces is seen and left alone: a request for each object
@@ -40,7 +40,7 @@ class Grants:
     async def may_write(self, namespace: str) -> bool:
         """Whether the account may write in the namespace. Raises ApiError or Unreachable where nobody answers."""
         async with self._asking:
-            if namespace not in self._granted | self._refused and not await self._ask(namespace):
+            if namespace not in self._granted | self._refused and not await self._is_granted(namespace):
                 self._refused.add(namespace)
                 log.warning(
                     "namespace %s is not granted to this manager, which ignores it: apply the output of "
@@ -51,17 +51,17 @@ class Grants:
         return namespace in self._granted
 
     async def run(self) -> None:
-        """Ask again about the namespaces that are not granted, until cancelled."""
+        """Check the namespaces that are not granted again and again, until cancelled."""
         await repeatedly(self._look, LOOK_EVERY, "")  # the look at its health reports that the API server is away
 
     async def _look(self) -> None:
-        granted = [each for each in sorted(self._refused) if await self._ask(each)]
+        granted = [each for each in sorted(self._refused) if await self._is_granted(each)]
         if granted:
             log.info("namespace %s is granted to this manager", ", ".join(granted))
             self._refused.difference_update(granted)
             self._changed()
 
-    async def _ask(self, namespace: str) -> bool:
+    async def _is_granted(self, namespace: str) -> bool:
         right = granting()
         if await may(self._client, right, right.verbs[0], namespace):
             self._granted.add(namespace)

@@ -1,7 +1,7 @@
-"""Being the one active manager: the Lease is renewed, or looked at until it can be taken.
+"""Leader election: renews the Lease, or watches it until it can be acquired.
 
 It has a client of its own, so that no other request holds up a renewal. A time limits what may be done, never a
-flag: a process that stood still finds its time over before anything had a chance to report it.
+flag: a process that was stopped finds its time over before anything had a chance to report it.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class LeaseKey:
 def lease_key(given: str | None, namespaces: tuple[str, ...]) -> LeaseKey:
     """The Lease of the option `--lease`, `NAME` or `NAMESPACE/NAME`.
 
-    The namespace is that of the pod, else the first that is looked after, else `default`. Raises ValueError where the
+    The namespace is that of the pod, else the first that is managed, else `default`. Raises ValueError where the
     name is that of a holder's Lease, or none.
     """
     namespace, _, name = (given or LEASE_NAME).rpartition("/")

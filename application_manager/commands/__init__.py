@@ -1,1 +1,1 @@
-"""Commands that look or print, and end by themselves."""
+"""Commands that read or print, and end by themselves."""

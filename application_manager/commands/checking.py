@@ -1,4 +1,4 @@
-"""`application-manager check`: what admission would find in files, with file, line and column. Without a cluster."""
+"""`application-manager check`: the findings of admission for files, with line and column. Needs no cluster."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ def _lines(explanation: Explanation) -> Iterator[str]:
     if instance is None:
         task = explanation.task
         of_all = task is not None and task.operation != "Deploy" and task.standing in ("Counts", "Waiting")
-        yield "instances: all of the template" if of_all else "instance: none"
+        yield "instances: all instances of the template" if of_all else "instance: none"
         return
     yield from _instance(instance, template.name)
     yield from _tasks(explanation, instance)
@@ -39,7 +39,7 @@ def _lines(explanation: Explanation) -> Iterator[str]:
         yield f"  {each.name} = {shown} (merge {each.merge}{origin})" + (f": {each.note}" if each.note else "")
         for part in each.contributions:
             why = f": {part.why}" if part.why else ""
-            effect = {"decides": "is it", "part": "is part of it", "outbid": "is outbid", "none": "is nothing"}[
+            effect = {"decides": "is used", "part": "is merged", "outbid": "is overridden", "none": "has no effect"}[
                 part.effect
             ]
             yield f"    {values.shown(part.value)} of {part.task}{about.get(part.task, '')} {effect}{why}"
@@ -68,7 +68,7 @@ def _task(task: ExplainedTask) -> Iterator[str]:
         lost = ", counted as lost" if task.holder_is_lost else ""
         yield f"  requested by detector {task.detector or '(unnamed)'}, holder {task.holder or 'none'}{age}{lost}"
     else:
-        yield "  created by a person: it never lapses"
+        yield "  created by a person: it never expires"
     yield f"  {task.operation}, priority {task.priority}, created {task.created or 'just now'}"
     yield f"  {task.standing}, {task.reason}: {task.message}"
     shown = ("Accepted", "Finished") if task.standing == "Finished" else ("Accepted",)  # by the line above
@@ -100,7 +100,7 @@ def _conditions(conditions: list[dict[str, object]], but: tuple[str, ...] = ()) 
 
 def _tasks(explanation: Explanation, instance: ExplainedInstance) -> Iterator[str]:
     yield f"tasks of instance {instance.name}" + ("" if explanation.tasks else ": none")
-    # What is over stays for an hour, and must not push what counts out of sight.
+    # A finished task stays for an hour, and must not displace one that counts.
     for task in sorted(explanation.tasks, key=lambda each: each.standing == "Finished")[:_TASKS_SHOWN]:
         about = f"{task.rule} of {task.subject}" if task.rule else "by a person" if not task.holder else task.holder
         why = "" if task.standing == "Counts" else f", {task.reason}: {task.message}"

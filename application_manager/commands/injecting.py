@@ -1,4 +1,4 @@
-"""`application-manager inject`: manifests with their detectors in them, as the webhook would make their pods."""
+"""`application-manager inject`: injects detectors into manifests, as the webhook does into pods."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Asking the cluster what an explanation needs: `application-manager explain`. It only reads."""
+"""Reads from the cluster what `application-manager explain` needs. Never writes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Options, read and checked: each names its option where it is wrong (typer.BadParameter).
+"""Parses and checks options; an error names its option (typer.BadParameter).
 
 What is read into is imported when it is read, as all that a command runs.
 """
@@ -42,7 +42,7 @@ def option_bytes(option: str, written: str) -> int:
 
 
 def policy_of(kinds: list[str] | None, accounts: list[str] | None, *, everywhere: bool = False) -> Policy:
-    """The policy; `everywhere`: of a manager that looks after all namespaces."""
+    """The policy; `everywhere`: of a manager of all namespaces."""
     from application_manager.core.objects.policy import Policy
 
     try:

@@ -27,8 +27,8 @@ def webhooks(
     ca_bundle: Annotated[
         Path | None,
         typer.Option(
-            help="The certificate (PEM) of the CA that signed the manager's certificate. Without it, another "
-            "program must add it, such as cert-manager."
+            help="The certificate (PEM) of the CA that signed the manager's certificate. Default: another "
+            "program, such as cert-manager, adds the certificate."
         ),
     ] = None,
     make_certificates: Annotated[
@@ -69,7 +69,7 @@ def rbac(
         list[str] | None,
         typer.Option(
             help="As for `run`: a namespace to manage, which gets a Role; repeatable. Default: a ClusterRole that "
-            "reads in all of them."
+            "reads in all namespaces."
         ),
     ] = None,
     grant: Annotated[

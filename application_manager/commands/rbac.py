@@ -102,10 +102,10 @@ def plurals(policy: Policy) -> dict[KindKey, str]:
     """What roles call the kinds of the policy. Raises ConfigurationError for one that nobody knows."""
     known = {kind: PLURALS[kind] for kind in policy.kinds if kind in PLURALS}
     others = sorted(policy.kinds - known.keys())
-    return known | (asyncio.run(_asked(others)) if others else {})
+    return known | (asyncio.run(_looked_up(others)) if others else {})
 
 
-async def _asked(kinds: list[KindKey]) -> dict[KindKey, str]:
+async def _looked_up(kinds: list[KindKey]) -> dict[KindKey, str]:
     listed = ", ".join(map(kind_text, kinds))
     remedy = "use the kubeconfig of a cluster that has this kind"
     try:

@@ -1,4 +1,4 @@
-"""`application-manager webhooks`: what makes the API server ask the manager, as YAML to be applied."""
+"""`application-manager webhooks`: the webhook configurations that make the API server call the manager, as YAML."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def print_webhooks(
         url: of a manager elsewhere.
         ca_bundle: the certificate of the authority, a PEM file.
         folder: where an authority and a certificate are made in place of `ca_bundle`.
-        namespaces: that the manager looks after; empty: all.
+        namespaces: those that are managed; empty: all.
         name: of the objects.
         detectors: whether detectors are put into pods.
 

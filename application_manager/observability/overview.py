@@ -1,4 +1,4 @@
-"""What there is, as Prometheus metrics, looked at when somebody scrapes: tasks, instances, queues, Leases."""
+"""Prometheus metrics of the current state, computed at each scrape: tasks, instances, queues, Leases."""
 
 from __future__ import annotations
 

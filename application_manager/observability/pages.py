@@ -1,4 +1,4 @@
-"""/metrics, /healthz and /readyz over HTTP(S), in the manager's own event loop: one that hangs does not answer."""
+"""Serves /metrics, /healthz and /readyz over HTTP(S), in the event loop: if that hangs, they do not respond."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class _Queue(Protocol):
 def stalled(measures: Measures, every: float, queues: Sequence[_Queue] = (), least: float = STALLED_AFTER) -> Lack:
     """Whether work has stalled: no resync has ended, or a worker was at one key, for too long.
 
-    A resync that fails, the API server being away, ends as well. Any thread may ask.
+    A resync that fails, the API server being away, ends as well. Any thread may call it.
 
     Args:
         measures: knows when the last resync ended.

@@ -1,4 +1,4 @@
-"""The spans of what is done for tasks, where traces are on (see `wayside.process.tracing`), and the task has a trace.
+"""The spans of the work for tasks that have a trace, if tracing is on (see `wayside.process.tracing`).
 
 A task that an instance serves for the first time gets `reconcile`, with `apply` in it, and `ready` once its workloads
 are. Each is in the task's own trace; where an instance serves several tasks, `reconcile` is linked to the others.
@@ -51,7 +51,7 @@ class TaskTraces:
         self.tracing = tracing
         self._cache = cache
         self._known: OrderedDict[str, _Known] = OrderedDict()
-        self._said = False
+        self._reported = False
 
     async def reconciling(self, name: Name, work: Callable[[Name], Awaitable[None]]) -> None:
         """Do the work on an instance, and emit what it did for tasks."""
@@ -168,8 +168,8 @@ class TaskTraces:
         self._emit(Span("ready", min(start, now), now, parent=parent, attributes=about, error=failure))
 
     def _emit(self, span: Span) -> TraceContext:
-        if self.tracing.failed and not self._said:
-            self._said = True
+        if self.tracing.failed and not self._reported:
+            self._reported = True
             log.warning("%s does not accept spans; lost spans are counted in the metrics", self.tracing.endpoint)
         return self.tracing.emit(span)
 

@@ -1,1 +1,1 @@
-"""A manager that runs: its options, start, wiring of queues to work, and end."""
+"""The running manager: its options, start, wiring of queues to work, and stop."""

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable
 from application_manager.cache.cluster_cache import DETECTOR, INSTANCE, TASK, TEMPLATE, ClusterCache
 from application_manager.cache.detector_index import DetectorIndex
 from application_manager.charts.chartcache import ChartCache
-from application_manager.charts.chartdesk import ChartDesk
+from application_manager.charts.chartrenderer import ChartRenderer
 from application_manager.cluster.looks import FailedPodsLook, NodeLook
 from application_manager.core.demand.decisions import Decision
 from application_manager.core.objects.policy import KindKey, Name
@@ -160,7 +160,7 @@ class Assembly:
             again=self._statuses.add_at,
         )
         cache = ChartCache(options.helm, options.chart_cache, options.chart_folder)
-        self.charts = ChartDesk(options.helm, cache, self._instances.add_at)
+        self.charts = ChartRenderer(options.helm, cache, self._instances.add_at)
         self._renderings = Renderings(
             self.cache,
             self._answers,
@@ -225,8 +225,11 @@ class Assembly:
     def _claimed(self, name: Name) -> None:
         self.router.claimed(name)
 
-    def begin_anew(self, children: Iterable[Resource]) -> None:
-        """Forget what we did: others may have acted since. `children` are the kinds of what templates create."""
+    def begin_term(self, children: Iterable[Resource]) -> None:
+        """Begin a term as the active manager: forget what this one did, since others may have acted meanwhile.
+
+        `children` are the kinds of what templates create.
+        """
         self.cache.forget_work()
         self.publisher.forget()
         self.applier.begin(
@@ -234,7 +237,7 @@ class Assembly:
         )
 
     def publish_all(self) -> None:
-        """Ask for the configurations of all instances to be published."""
+        """Enqueue the publication of the configurations of all instances."""
         for name, _ in self.cache.store.all(INSTANCE):
             self._configurations.add(name)
 
@@ -272,7 +275,7 @@ class Assembly:
             await self._rule_work.reconcile(key)
 
     def _judge(self, key: RuleKey) -> None:
-        """Ask for a rule or Detector to be judged, soon; a Detector's objects are looked after before."""
+        """Enqueue the check of a rule or Detector; a Detector's objects are reconciled before."""
         self._rules.add_at(key, time.time() + _JUDGING_PAUSE)
         if key[0] == DETECTOR:
             self.detectors.add(key[1])

@@ -1,4 +1,4 @@
-"""How near the manager is to its memory limit, and whether it may take in more.
+"""The manager's distance to its memory limit, and whether it may accept more tasks.
 
 Beyond a limit the kernel ends the process, and with it the work for all namespaces. So beyond 85 % of it, tasks that
 were never served are not taken in: their statuses give the reason, and a resync takes them in once there is room again.

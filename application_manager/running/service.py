@@ -1,4 +1,4 @@
-"""The running manager: what watches, what works and what answers, started in order and stopped at once.
+"""The running manager: starts watches, queues and servers in order, and stops them together.
 
 The order matters: all objects are listed before anything is decided, so that nothing is stopped for want of knowing
 what demands it. Then the watches and the periodic looks run side by side, and while this manager is the active one the
@@ -20,7 +20,7 @@ import kopf
 from application_manager.admission.admission import Admission
 from application_manager.admission.injecting import Injecting
 from application_manager.admission.issuing import issuing
-from application_manager.admission.reviewing import Desk, webhook
+from application_manager.admission.reviewing import ReviewHandler, webhook
 from application_manager.cache.cluster_cache import DETECTOR, OWN_KINDS, POD
 from application_manager.cluster.client import manager_client
 from application_manager.cluster.grants import Grants
@@ -136,8 +136,8 @@ class Manager:
         """Run until SIGTERM or SIGINT."""
         stop = asyncio.Event()
         watching = asyncio.Event()
-        desks = {
-            path: Desk(review, watching.is_set, self._work.measures)
+        review_handlers = {
+            path: ReviewHandler(review, watching.is_set, self._work.measures)
             for path, review in ((PATH, self._admission.review), (INJECTION_PATH, self._injecting.review))
         }
         _on_signals(stop)
@@ -158,7 +158,7 @@ class Manager:
                 lambda: self._leadership.role,
                 self._work.options.metrics_certificates,
             ),
-            webhook(self._work.options.admission, desks),
+            webhook(self._work.options.admission, review_handlers),
         ):
             try:
                 if await _until(stop, self._first()):
@@ -211,7 +211,7 @@ class Manager:
     async def _begin(self, *, again: bool) -> None:
         """Get ready to act. Where others may have acted since we looked, what we know comes from the cluster alone."""
         if again:  # else it is listed since the Lease is ours
-            self._work.begin_anew(self._listing.children)
+            self._work.begin_term(self._listing.children)
             await self._listing.first()
             self._work.publish_all()
         self._work.cache.claims.begin()

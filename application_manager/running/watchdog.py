@@ -1,7 +1,7 @@
 """Ends a manager that has stalled, so that Kubernetes starts it again and a standby takes over meanwhile.
 
 A thread of its own looks, since an event loop that hangs cannot look at itself. It counts its own steps and not the
-clock: a process that stood still as a whole (a stopped container, a sleeping machine) has not stalled.
+clock: a process that was stopped as a whole (a stopped container, a sleeping machine) has not stalled.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ SILENT = 30.0
 """Seconds without a sign of life of the event loop after which it hangs, at the most."""
 
 PERSISTENT = 10.0
-"""Seconds for which a stall must be seen, so that one who stood still has time to continue."""
+"""Seconds for which a stall must be seen, so that a process that was stopped has time to continue."""
 
 STALLED = 70
 """The exit code of a manager that was ended: EX_SOFTWARE."""

@@ -1,4 +1,4 @@
-"""Looking at the objects of the detectors that the manager runs, and at the pods with them, every few seconds.
+"""Lists the objects of the detectors that the manager runs, and the pods with sidecars, every few seconds.
 
 There are few of them, and a look shows all that a watch could have missed.
 """

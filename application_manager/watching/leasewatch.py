@@ -1,4 +1,4 @@
-"""Looking at the API server's health, and at Leases that seem to have lapsed."""
+"""Checks the API server's health, and Leases that seem to have expired."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class LeaseWatch:
-    """Measures the time in which we reach the API server, on which Leases lapse.
+    """Measures the time in which we reach the API server, on which Leases expire.
 
     Attributes:
         probe: what is listed to see whether the API server and its storage answer.
@@ -39,7 +39,7 @@ class LeaseWatch:
     instance: Callable[[Name], None]
 
     async def run(self) -> None:
-        """Look until cancelled. Reading never holds up the look at the health, by which all Leases are judged."""
+        """Look until cancelled. Reading never holds up the look at the health, by which all Leases are checked."""
         async with asyncio.TaskGroup() as group:
             group.create_task(self._measure(), name="health")
             group.create_task(self._read(), name="overdue leases")

@@ -1,4 +1,4 @@
-"""Listing everything: once before anything is decided, and periodically, in case a watch missed something."""
+"""Lists everything: once before the first decision, then periodically, in case a watch missed something."""
 
 from __future__ import annotations
 

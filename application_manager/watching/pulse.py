@@ -1,4 +1,4 @@
-"""Signs of life of each watch: an event, a bookmark or a new beginning. One without any is restarted, or ends us.
+"""Supervises watches: one without an event or a bookmark is restarted, or the manager is ended.
 
 kopf has a timeout of its own for inactive watches, and it can kill them: its `asyncio.timeout` stays armed while kopf's
 consumer, and not the stream, is waiting. Expired there, as after a stall of the process, it cancels the consumer, and

@@ -205,7 +205,7 @@ class Router:
             self._enqueue_all(self.cache.claims.holders().get(key, ()))
 
     def _rules(self, namespace: str) -> None:
-        """Rules and detectors of a namespace are judged together: either may be what is wrong with the other.
+        """Rules and detectors of a namespace are checked together: either may be what is wrong with the other.
 
         Findings of rules about templates may have changed too.
         """
@@ -215,7 +215,7 @@ class Router:
                     self.rule((kind, name))
 
     def look_at(self, name: Name) -> None:
-        """Enqueue an instance, or all of a template where the name stands for these."""
+        """Enqueue an instance, or all of a template where the name means these."""
         self._enqueue_all([name])
 
     def _enqueue_all(self, instances: Iterable[Name]) -> None:

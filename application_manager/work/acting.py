@@ -1,4 +1,4 @@
-"""What only the active manager does: the queues work, Events are posted, configurations published.
+"""The work of the active manager only: reconciling, posting Events, publishing configurations.
 
 Several times over, if need be: a manager that cannot renew its Lease stops at once and becomes a standby, and may
 become active again. At the end of the process what is under way is finished, within a bound, and then the Lease is
@@ -125,7 +125,7 @@ async def _first(wanted: Coroutine[None, None, None], stopping: asyncio.Task[boo
 
 
 async def _release(leadership: Leadership, client: Client) -> None:
-    """Release the Lease, unless a request that was given up may yet be done: then it lapses by itself."""
+    """Release the Lease, unless a request that was given up may yet be done: then it expires by itself."""
     if not leadership.active:
         return
     if client.open_until > time.monotonic():

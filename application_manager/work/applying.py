@@ -1,4 +1,4 @@
-"""Making an instance's objects as rendered, without ever touching what is not ours.
+"""Applies an instance's rendered objects, and never touches objects of others.
 
 Before an object is applied for the first time it is looked for: one that exists and whose controller is not this
 instance is left alone. Every later apply carries the uid, so an object that was replaced meanwhile is a conflict and
@@ -81,7 +81,7 @@ class Applier:
             self.note(raw)
 
     def forget(self, raw: Object) -> None:
-        """Note that an object is gone."""
+        """Note that an object was deleted."""
         uid = raw["metadata"]["uid"]
         self._fields.pop(uid, None)
         self._drifted.discard(uid)

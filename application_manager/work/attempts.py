@@ -1,4 +1,4 @@
-"""When what was refused is tried again: after a growing pause, and at once when it is something else that is tried."""
+"""When a refused apply is retried: with backoff, and at once when the objects change."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Bringing an instance's configuration to those that follow it: its pods, by way of the kubelet, and Zenoh.
+"""Announces an instance's configuration: to its pods, through the kubelet, and on Zenoh.
 
-Level-triggered: what the ConfigMap holds now is compared with what was announced to each pod last, so the work can be
-done again at any time. It only makes things fast: without it the kubelet brings the same content a minute later.
+Level-triggered: the current content of the ConfigMap is compared with the last announcement to each pod, so the work
+can be repeated at any time. It only saves time: without it, the kubelet writes the same content a minute later.
 """
 
 from __future__ import annotations

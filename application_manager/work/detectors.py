@@ -1,4 +1,4 @@
-"""Reconciling the detectors that the manager runs: their objects are as their Detectors want them, or are gone.
+"""Reconciles the detectors that the manager runs: applies their objects, or deletes them.
 
 What is not the Detector's own is left alone: an object of the same name that it does not control. What it owns goes
 with it, by Kubernetes' garbage collection, and without its mode by us.

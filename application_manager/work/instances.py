@@ -1,4 +1,4 @@
-"""Reconciling one instance: decide, apply the instance, apply its objects. All the way in one go.
+"""Reconciles one instance: decides, applies the instance, applies its objects, in one pass.
 
 Nothing here waits for our own watch events: each answer of the API server enters the store, and the next step starts
 from it. What fails is tried again as a whole, from what is known then. How it went is noted in the cache's record of
@@ -59,7 +59,7 @@ class _Start:
         return self.record if self.record is not None and self.record.uid == instance.metadata.uid else None
 
     def known(self, instance: ApplicationInstance) -> Known:
-        """What was applied so far: the record where there is one, since it is newer than the status."""
+        """What was applied until now: the record where there is one, since it is newer than the status."""
         if (record := self.record_of(instance)) is not None:
             return Known.read(record.digest, record.applied.objects)
         status = instance.status
@@ -86,7 +86,7 @@ class InstanceWork:
         absent: called with the decision about an instance that neither exists nor should.
         observe: takes an object that was read.
         configured: called when an instance's configuration was applied.
-        objects: the objects of an instance, or why it has none; None: they are being worked out, and the instance is
+        objects: the objects of an instance, or why it has none; None: they are being computed, and the instance is
             enqueued once they are.
         attempts: knows what was refused, and when it is tried again.
         not_made: called with the reason why an instance cannot be made.
@@ -124,7 +124,7 @@ class InstanceWork:
 
     async def _reconcile(self, name: Name) -> None:
         if self.cache.is_unsettled(name):
-            return  # what runs stays: the claims of its tasks are being worked out, and that enqueues it again
+            return  # what runs stays: the claims of its tasks are being computed, and that enqueues it again
         if name in self.cache.places.being_made:
             await self._look_whether_it_was_made(name)
         decision = self._decide(name)
@@ -302,7 +302,7 @@ class InstanceWork:
                 self.observe(raw)
 
     async def _released(self, name: Name, over: Decision) -> bool:
-        """Delete the instance, unless claims of tasks are still being worked out; whether it was deleted."""
+        """Delete the instance, unless claims of tasks are still being computed; whether it was deleted."""
         instance = self.cache.instance(name)
         if instance is None:
             return False

@@ -1,7 +1,7 @@
-"""Reporting on an instance after the work: its status, its Events, and what its tasks need to know.
+"""Writes the status and the Events of an instance after the work, and enqueues its tasks.
 
-Apart from the work itself, so that statuses never hold up what runs. Until a status is written, the cache's record of
-the instance stands for it; should we die before, the work is done again, and finds that nothing is left to do.
+A queue of its own, so that statuses never delay the work. Until a status is written, the cache's record of the instance
+replaces it; if the manager dies before, the next one repeats the work and finds nothing to do.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class InstanceStatusWork:
         elif not await self.statuses.write(self.instances, instance, instance.status, new, now):
             return
         elif old.release_time is None and new.release_time is not None:
-            note = f"no demand is left; it is released at {new.release_time} unless a demand arrives"
+            note = f"no demand is left; the instance is released at {new.release_time} unless a demand arrives"
             self.statuses.recorder.event(instance, EventReason.LINGERING, note, now)
         # How many pods are ready stays with the instance: it changes often, and the tasks may be many.
         why_not = "" if applied.aspect.holds else applied.aspect.message

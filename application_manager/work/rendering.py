@@ -1,4 +1,4 @@
-"""The objects of instances, worked out in the worker processes; those of small templates that only read, here.
+"""Renders the objects of instances in worker processes; those of small templates that only read, in this one.
 
 What is not there yet is requested, and the instance enqueued once it is. A rendering that takes too much is a
 problem of its template, whose status gives it; what runs of the instance stays as it is.
@@ -28,7 +28,7 @@ _JUDGED = 1024  # templates of which is known whether they are plain
 
 
 class Renderings:
-    """Takes requests. Only the event loop's thread uses it."""
+    """Renders charts in the background. Only the event loop's thread uses it."""
 
     def __init__(
         self,
@@ -42,7 +42,7 @@ class Renderings:
 
         Args:
             cache: the policy, and what exceeded.
-            answers: has the renderings worked out.
+            answers: computes the renderings.
             charts: knows what became of a chart.
             again: enqueues an instance at a time, in seconds since 1970.
             template_changed: enqueues a template whose renderings exceed the limit, or do so no more.
@@ -80,7 +80,7 @@ class Renderings:
         return None
 
     def forget(self, name: Name) -> None:
-        """Drop what is known of an instance that is gone."""
+        """Drop what is known of an instance that is deleted."""
         for kind in ("rendering", "chart"):
             self._answers.forget((kind, *name))
         for template in [each for each, instances in self._cache.exceeded.items() if name in instances]:
@@ -129,7 +129,7 @@ class Renderings:
         return known
 
     def _note(self, name: Name, template: Name, found: object | None) -> None:
-        """Note whether the instance's rendering exceeds the limit; nothing while it is being worked out."""
+        """Note whether the instance's rendering exceeds the limit; nothing while it is being computed."""
         if found is None:
             return
         known = self._cache.exceeded.get(template, {})

@@ -1,4 +1,4 @@
-"""Reconciling EventRules and Detectors: their statuses. They run in detectors; here they are only judged."""
+"""Reconciles EventRules and Detectors: checks them and writes their statuses."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class RuleWork:
 
     Attributes:
         resources: where EventRules and Detectors live.
-        pool: where they are judged.
+        pool: where they are checked.
         detectors: what is known of those that the manager runs.
     """
 

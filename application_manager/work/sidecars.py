@@ -1,4 +1,4 @@
-"""Posting an Event about each pod that was to have a detector as a sidecar and was made without.
+"""Posts an Event about each pod that requested a sidecar and was created without it.
 
 The API server's review comes before there is a pod, or not at all since no manager is there. So the pods are looked at
 afterwards, and have their Event within an hour after they were made.

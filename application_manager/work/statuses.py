@@ -1,4 +1,4 @@
-"""Writing the statuses of all kinds: only what differs, and Events about the conditions that changed."""
+"""Writes the statuses of all kinds, only what differs, and Events about changed conditions."""
 
 from __future__ import annotations
 

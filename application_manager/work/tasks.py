@@ -1,4 +1,4 @@
-"""Reconciling one task: its status, and its deletion some time after it has finished."""
+"""Reconciles one task: writes its status, and deletes it some time after it has finished."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from wayside.times import parse_seconds
 _SHED = Verdict(
     Standing.WAITING,
     "ManagerOverloaded",
-    "the application manager is near its memory limit and accepts no new tasks: it accepts this one once memory is "
+    "the application manager is near its memory limit and accepts no new tasks: this task is accepted once memory is "
     "free; end tasks, or raise the limit",
 )
 _OWN_CONDITIONS = ("Accepted", "Finished")  # the others are the instance's, which has Events about them

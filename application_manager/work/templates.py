@@ -1,4 +1,4 @@
-"""Reconciling one template: whether it can be rendered, and how many instances it has."""
+"""Reconciles one template: whether it can be rendered, and the number of its instances."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class TemplateWork:
 
     Attributes:
         templates: where ApplicationTemplates live.
-        pool: where templates are judged.
+        pool: where templates are checked.
         again: enqueues a template at a time, in seconds since 1970.
     """
 
@@ -61,7 +61,7 @@ class TemplateWork:
         await self.statuses.write(self.templates, regarding, old if entry.raw.get("status") else None, new, now)
 
     async def _challenge(self, regarding: Kind, own: TemplateManager, now: float) -> None:
-        """Find out by the template's status whether the manager is alive that looks after the namespace as well."""
+        """Find out by the template's status whether the other manager of the namespace is alive."""
         other = self.cache.overlap.waits_for(regarding.namespace)
         note = (
             f"this namespace is managed by the managers of the Leases {other} and {own.lease}: the second one stands by"

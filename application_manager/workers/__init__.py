@@ -1,1 +1,1 @@
-"""Where users' expressions run: in at most two processes beside the manager's, with a limit of CPU time."""
+"""Evaluates users' expressions in at most two worker processes, with a limit of CPU time."""

@@ -77,7 +77,7 @@ class AnswerCache:
         return None
 
     def forget(self, key: Hashable) -> None:
-        """Drop the answer of an object that is gone."""
+        """Drop the answer of an object that is deleted."""
         known = self._kept.pop(key, None)
         if known is not None:
             self._size -= known.size

@@ -1,4 +1,4 @@
-"""One worker process, as the manager sees it: started, given a job, ended."""
+"""The manager's side of one worker process: starts it, sends it a job, ends it."""
 
 from __future__ import annotations
 

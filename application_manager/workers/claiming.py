@@ -1,6 +1,6 @@
-"""What tasks ask for, worked out in a worker process where that runs an expression or a pattern of the template.
+"""What tasks request, computed in a worker process if that evaluates an expression or a pattern of the template.
 
-A key that only puts parameters together (`${parameters.region}-${parameters.lane}`) is worked out at once: it costs no
+A key that only puts parameters together (`${parameters.region}-${parameters.lane}`) is computed at once: it costs no
 more than to write it down.
 """
 
@@ -32,7 +32,7 @@ class Claiming:
     def __call__(
         self, template: ApplicationTemplate | InvalidTemplate | None, task: ApplicationTask
     ) -> Claim | Verdict | None:
-        """What the task claims, or its verdict where it claims nothing; None while that is being worked out."""
+        """What the task claims, or its verdict where it claims nothing; None while that is being computed."""
         if not isinstance(template, ApplicationTemplate) or claims_are_plain(template):
             return claim_or_verdict(template, task)
         over = finished(task)
@@ -58,7 +58,7 @@ class Claiming:
         return None
 
     def forget(self, name: Name) -> None:
-        """Drop what is known of a task that is gone."""
+        """Drop what is known of a task that is deleted."""
         self._answers.forget(("claim", *name))
 
 

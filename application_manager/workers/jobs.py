@@ -1,4 +1,4 @@
-"""What the worker processes work out: all that runs, or compiles, what a user wrote as an expression.
+"""The jobs of the worker processes: everything that compiles or evaluates expressions of users.
 
 Each job is data, and its result follows from it alone. A template travels as bytes, since a process that has compiled
 it before need not read it again.
@@ -122,7 +122,7 @@ class TemplateJob:
 
 @dataclass(frozen=True, slots=True)
 class RuleContext:
-    """What a rule is judged with: the valid objects of its namespace, and the names of the others."""
+    """What a rule is checked with: the valid objects of its namespace, and the names of the others."""
 
     detectors: Sequence[Detector] = ()
     invalid_detectors: Sequence[str] = ()

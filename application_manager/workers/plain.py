@@ -1,4 +1,4 @@
-"""Which templates are worked out in the manager itself: those whose expressions only read, and that are small.
+"""Which templates are computed in the manager itself: those whose expressions only read, and that are small.
 
 `${parameters.region}` costs no more than to write it down. A worker process would cost more than the work: two switches
 between processes, while other work waits for the same processors.

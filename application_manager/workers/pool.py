@@ -1,4 +1,4 @@
-"""At most two worker processes, shared by all namespaces: who used the least CPU time goes first.
+"""At most two worker processes, shared by all namespaces: the namespace that used the least CPU time is first.
 
 No namespace has more than one of the two, so a template whose expressions take long delays others of its namespace and
 leaves the second process to all else. A process starts when there is work for it, and one that was ended for its CPU

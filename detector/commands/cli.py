@@ -71,7 +71,9 @@ def run(
     ] = False,
     output: Annotated[
         Path | None,
-        typer.Option(help="A folder for events.jsonl and, without a cluster, the tasks. Default there: out."),
+        typer.Option(
+            help="A folder for events.jsonl and, without a cluster, the tasks. Default without a cluster: out."
+        ),
     ] = None,
     record_intake: Annotated[
         Path | None,
@@ -165,13 +167,13 @@ def replay(
     detector: DetectorFile = None,
     rules: RuleFiles = None,
     as_one: Annotated[
-        bool, typer.Option("--as-one", help=("Play all recordings as one, merged by time: they belong to one drive."))
+        bool, typer.Option("--as-one", help="Play all recordings as one, merged by time, for recordings of one drive.")
     ] = False,
     results: Annotated[
         list[ResultKind] | None,
         typer.Option(
-            help="Also write results to look at: report.html; results.mcap for Foxglove; the table of episodes as "
-            "Parquet and CSV; or all. May be repeated."
+            help="Also write report.html, results.mcap for Foxglove, or the table of episodes as Parquet and CSV; "
+            "or all of them. May be repeated."
         ),
     ] = None,
     sets: Annotated[
@@ -180,7 +182,7 @@ def replay(
             "--set",
             metavar="RULE.FIELD=VALUE",
             help="Also play the rule with another value of a field, e.g. close.when='distance < 120', and compare the "
-            "two; or RULE=OTHER: compare it with another rule; may be repeated.",
+            "two; or RULE=OTHER: compare the rule with another one; may be repeated.",
         ),
     ] = None,
     sweeps: Annotated[
@@ -274,7 +276,7 @@ def new(
     stream: Annotated[str, typer.Option(help="The stream that the rule reads.")] = "odom",
     name: Annotated[str | None, typer.Option(help="The rule's name. Default: the name of the use case.")] = None,
 ) -> None:
-    """Print a rule to begin with, made from a use case."""
+    """Print an example rule for a use case, to start from."""
     with importing():
         from detector.commands.drafts import drafts, rule_draft
 

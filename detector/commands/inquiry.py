@@ -48,7 +48,8 @@ def status(
     everything: Annotated[
         bool,
         typer.Option(
-            "--all", help="Add up all detectors: those in the file, which may contain several, else every detector."
+            "--all",
+            help="Print totals over all detectors: those in the file, which may contain several, else every detector.",
         ),
     ] = False,
     as_json: Annotated[
@@ -59,7 +60,7 @@ def status(
     """Show what running detectors receive, evaluate and lose; for a rule also its values, and which are unknown."""
     if everything:
         if name is not None or subject is not None:
-            refuse(f"--all adds up every detector: remove {'--name' if name is not None else '--subject'}")
+            refuse(f"--all prints totals over all detectors: remove {'--name' if name is not None else '--subject'}")
         _show_total(detector, connect, rule, timeout, as_json)
         return
     if subject is not None and rule is None:
@@ -101,7 +102,7 @@ def _show_total(
     else:
         _print_view(total_view(added))
     for holder, why in missing.items():
-        typer.echo(f"detector: the sums lack {holder}: {why}", err=True)
+        typer.echo(f"detector: {holder} is not in the totals: {why}", err=True)
     if missing:
         raise typer.Exit(1)
 

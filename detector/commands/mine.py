@@ -90,7 +90,7 @@ def mine_recordings(
     finally:
         workers.close()
     if not run.complete:
-        typer.echo(f"{_did(run)}; others have not done their share yet: {output}", err=True)
+        typer.echo(f"{_did(run)}; other shares are not finished yet: {output}", err=True)
         return
     summary = summary_of(output)
     if run.changed or not (output / REPORT).exists():
@@ -103,13 +103,13 @@ def _finish(run: MiningRun, summary: Summary, output: Path, *, shared: bool) -> 
     """Print the errors and the last line. A share fails only if another attempt may help."""
     for cut in run.cut:
         whole = ", ".join(f"{rule} ({why})" for rule, why in sorted(cut.whole.items()))
-        typer.echo(f"{cut.name}: cut into {cut.pieces} pieces" + (f", uncut for {whole}" if whole else ""), err=True)
+        typer.echo(f"{cut.name}: cut into {cut.pieces} pieces" + (f", whole for {whole}" if whole else ""), err=True)
     for error in summary.errors[:_ERRORS]:
         what = "" if error["kind"] == "unreadable" else f"{error['kind']}: "
         typer.echo(f"{error['recording']}: {what}{error['message']}", err=True)
     kinds = Counter(error["kind"] for error in summary.errors)
     if len(summary.errors) > _ERRORS:
-        typer.echo(f"and {len(summary.errors) - _ERRORS} more: errors.parquet has all", err=True)
+        typer.echo(f"and {len(summary.errors) - _ERRORS} more: see errors.parquet", err=True)
     episodes = sum(rule.episodes for rule in summary.rules)
     parts = [f"{run.recordings} recordings", f"{summary.seconds / 3600:.1f} hours", f"{summary.samples} samples"]
     parts += [f"{episodes} episodes", *(f"{count} {kind}" for kind, count in sorted(kinds.items()))]
@@ -120,7 +120,7 @@ def _finish(run: MiningRun, summary: Summary, output: Path, *, shared: bool) -> 
 
 def _did(run: MiningRun) -> str:
     if not run.mined:
-        return "nothing was left to do"
+        return "nothing left to mine"
     rules = f"{len(run.rules_run)} rules" if len(run.rules_run) > _NAMES else ", ".join(sorted(run.rules_run))
     return f"{run.mined} mined now, with {rules}"
 

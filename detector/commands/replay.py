@@ -135,7 +135,7 @@ def _lines(outcome: Replayed, where: str) -> Iterator[str]:
     if outcome.cut:
         yield "the intake file ends in the middle: its detector was killed"
     if outcome.lost:
-        yield f"the intake file lacks {outcome.lost} samples, since the disk was too slow: events may differ"
+        yield f"{outcome.lost} samples are missing in the intake file, since the disk was too slow: events may differ"
 
 
 def _counted(outcomes: Sequence[Replayed], tried: Set[str]) -> str:

@@ -138,7 +138,7 @@ class Engine:
             yield self._executor.run((step,))
 
     def gap(self, time: int) -> list[Event]:
-        """The wall clock stood still or jumped: continue at `time`; windows reset, open episodes are kept."""
+        """The wall clock was stopped or jumped: continue at `time`; windows reset, open episodes are kept."""
         return self._executor.run(self._timeline.gap(time))
 
     def set_rules(self, rules: Sequence[CompiledRule]) -> list[Event]:

@@ -187,7 +187,7 @@ class Evaluator:
     def ask(self, rule: str) -> Future[list[OnDemandResult]]:
         """Evaluate a rule with onDemand now; thread-safe. The future has its result for each subject, or
         NoAnswerError."""
-        return self.call(lambda: self._ask(rule))
+        return self.call(lambda: self._evaluate_on_demand(rule))
 
     def pause_rule(self, rule: str, paused: bool) -> Future[None]:
         """Pause the rule, or (not `paused`) resume it; thread-safe.
@@ -277,7 +277,7 @@ class Evaluator:
             events += self._configure(wanted)
         self._hand_over(events)
 
-    def _ask(self, rule: str) -> list[OnDemandResult]:
+    def _evaluate_on_demand(self, rule: str) -> list[OnDemandResult]:
         events, answers = self._engine.evaluate_now(rule)
         self._record(self._engine.now, {"kind": "ask", "rule": rule})
         self._hand_over(events)
@@ -298,7 +298,7 @@ class Evaluator:
         if self._overload.observe(self._now(), spent, self._engine.schedule.highest):
             level, highest = self._overload.level, self._engine.schedule.highest
             text = "the evaluation is overloaded" if spent > LONG else "the evaluation keeps up with the load"
-            _log.warning("%s: thinning of low-priority rules is now at level %d of %d", text, level, highest)
+            _log.warning("%s: low-priority rules are now thinned at level %d of %d", text, level, highest)
             self._record(self._engine.now, {"kind": "level", "level": level})
             self._engine.set_level(level)
 

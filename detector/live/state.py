@@ -72,7 +72,7 @@ class StateFile:
         except FileNotFoundError:
             return []
         except OSError as error:
-            _log.error("cannot read %s; restoring no episode from it: %s", self.path, error)
+            _log.error("cannot read %s; restoring no episodes: %s", self.path, error)
             return []
         try:
             return self._read(text)
@@ -99,9 +99,9 @@ class StateFile:
         try:
             self.path.rename(aside)
         except OSError as refused:
-            _log.error("cannot read %s: %s; cannot set it aside either: %s", self.path, error, refused)
+            _log.error("cannot read %s: %s; cannot rename the file either: %s", self.path, error, refused)
         else:
-            _log.error("cannot read the state; set it aside as %s and restored nothing from it: %s", aside, error)
+            _log.error("cannot read the state; renamed the file to %s and restored no episodes: %s", aside, error)
 
     def save(self, episodes: Sequence[OpenEpisode]) -> None:
         """Save the open episodes. Never waits; only the latest set counts."""

@@ -82,7 +82,8 @@ def _sections(folder: Path, summary: Summary) -> Iterator[str]:
     if summary.nearest:
         yield _section(
             "Nearest without an episode",
-            "Of rules with a margin: at most 0 if the condition did not hold; more if it held for too short a time.",
+            "Only rules with a margin. Up to 0: the condition did not hold. Above 0: the condition did not hold long "
+            "enough.",
             ["rule", "recording", "subject", "time", "#margin"],
             [
                 [each.rule, each.recording, each.subject, format_time(each.time), f"{each.margin:.3g}"]

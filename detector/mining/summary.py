@@ -136,7 +136,7 @@ def show(console: Console, summary: Summary) -> None:
         console.print()
         console.print(table)
         if (more := len(summary.recordings) - _RECORDINGS) > 0:
-            console.print(f"and {more} more recordings with episodes: rules.parquet has all")
+            console.print(f"and {more} more recordings with episodes: see rules.parquet")
     if summary.rarest:
         console.print()
         console.print("the rarest:")

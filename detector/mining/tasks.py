@@ -100,7 +100,7 @@ def _with(job: MiningJob, wanted: frozenset[str]) -> MiningJob:
 
 
 class _Pieces:
-    """The pieces of a recording, and their results so far."""
+    """The pieces of a recording, and their results until now."""
 
     def __init__(self, job: MiningJob, cutting: Cutting) -> None:
         self.job = job._replace(clips=None)

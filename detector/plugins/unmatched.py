@@ -60,7 +60,8 @@ class ObjectList(PluginParameters):
     def _one_way(self) -> ObjectList:
         if self.frame is not None and self.pose is not None:
             raise ValueError(
-                "give either frame (by tf) or pose (by a stream), not both; give neither if the frame is already common"
+                "give frame (with tf) or pose (with a stream of poses), not both; give neither if the objects are "
+                "already in a common frame"
             )
         return self
 

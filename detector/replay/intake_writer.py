@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 _FLUSH_SECONDS = 0.8
 """Maximum seconds until data is passed to the kernel: about the loss caused by a kill -9."""
 _OVERHEAD = 100
-"""Bytes that an arrival takes in the queue beside its payload."""
+"""Bytes that an arrival takes in the queue in addition to its payload."""
 _MAX_CHANNELS = 60_000
 """MCAP numbers channels with 16 bits; messages on further keys are left out."""
 
@@ -181,7 +181,7 @@ class _Mcap:
                 self._writer.finish()  # type: ignore[no-untyped-call]
 
     def flush(self) -> None:
-        """Everything written so far can be read after this call, whatever happens to the process."""
+        """Everything written until now can be read after this call, whatever happens to the process."""
         self._writer.flush()  # type: ignore[no-untyped-call]
 
     def follow(self, streams: Iterable[Stream], types: RosTypes) -> None:

@@ -113,7 +113,7 @@ def _first_wrong(lines: Sequence[_Line], last: int) -> _Wrong | None:
         return None
     for position, (line, previous) in enumerate(zip(lines, times[:-1], strict=True)):
         if line.t < previous:
-            back = f"t goes back from {previous} to {line.t}: sort the lines by t"
+            back = f"t decreases from {previous} to {line.t}: sort the lines by t"
             return _Wrong(position, "t is negative" if line.t < 0 else back)
         if not topic_key(line.key):
             return _Wrong(position, f"key is empty: write each line as {EXAMPLE}")

@@ -200,20 +200,26 @@ class Chunks:
         for number in dict.fromkeys(channels[~self._has_come[channels]].tolist()):
             self._channels[number] = self._described(self._summary.channels[number])
             self._has_come[number] = True
-        begins, ends = rows["begin"].tolist(), rows["end"].tolist()
-        if len(data) == 1:
-            (whole,) = data
-            payloads = [whole[begin:end] for begin, end in zip(begins, ends, strict=True)]
-        else:
-            places = zip(rows["chunk"].tolist(), begins, ends, strict=True)
-            payloads = [data[chunk][begin:end] for chunk, begin, end in places]
-        return Batch(rows["time"].tolist(), self._channels[channels].tolist(), payloads)
+        return Batch(rows["time"].tolist(), self._channels[channels].tolist(), _payloads(rows, data))
 
     def _kept(self, rows: _Rows) -> NDArray[np.bool_]:
         """Which messages are not left out."""
         pairs = zip(rows["channel"].tolist(), rows["sequence"].tolist(), strict=True)
         filters = self._filters
         return np.array([number not in filters or not filters[number](sequence) for number, sequence in pairs], bool)
+
+
+def _payloads(rows: _Rows, data: Sequence[bytes]) -> list[bytes]:
+    """The payloads of the rows."""
+    begins, sizes = rows["begin"], rows["end"] - rows["begin"]
+    if len(data) == 1 and len(rows) and sizes[0] and (sizes == sizes[0]).all():
+        size = int(sizes[0])
+        # A view of the payload at every byte: indexing it copies only the payloads.
+        windows = np.ndarray((len(data[0]) - size + 1,), (np.void, size), data[0], strides=(1,))
+        payloads: list[bytes] = windows[begins].tolist()
+        return payloads
+    places = zip(rows["chunk"].tolist(), begins.tolist(), rows["end"].tolist(), strict=True)
+    return [data[chunk][begin:end] for chunk, begin, end in places]
 
 
 def _split(waiting: Sequence[_Waiting], index: ChunkIndex) -> tuple[list[_Waiting], list[_Waiting]]:

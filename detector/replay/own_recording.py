@@ -1,4 +1,4 @@
-"""Recordings of the record action: a rosbag2 that may contain JSON and other streams beside its ROS topics.
+"""Recordings of the record action: a rosbag2 that may contain JSON and other streams in addition to its ROS topics.
 
 Other readers skip those, so its MCAP files are read here. In a split recording each file begins with the last samples
 of latched streams; such a message has its original number, and is used only once.

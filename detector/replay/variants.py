@@ -115,7 +115,7 @@ def _known(option: str, text: str, rule: str, rules: Mapping[str, EventRule]) ->
     """The name, if that rule exists."""
     if rule not in rules:
         close = difflib.get_close_matches(rule, rules, n=1)
-        hint = f"did you mean {close[0]}?" if close else f"there is {', '.join(sorted(rules)) or 'none'}"
+        hint = f"did you mean {close[0]}?" if close else f"the rules are {', '.join(sorted(rules)) or 'none'}"
         raise VariantError(f"{option} {text}: there is no rule {rule}; {hint}")
     return rule
 
@@ -139,7 +139,7 @@ def _values(option: str, text: str) -> Iterator[Any]:
     except ValueError:
         raise VariantError(f"--sweep {option}: {text} is not a range of numbers: write first:last:step") from None
     if step <= 0 or last < first:
-        raise VariantError(f"--sweep {option}: write first:last:step, with a step above 0 and the last not below first")
+        raise VariantError(f"--sweep {option}: write first:last:step, with step above 0 and last not below first")
     for number in range(int((last - first) / step + 1e-9) + 1):
         value = round(first + number * step, 9)
         yield int(value) if value == int(value) else value
@@ -194,4 +194,4 @@ def _index(items: Sequence[Any], step: str, change: Change) -> int:
     if step.isdigit() and int(step) < len(items):
         return int(step)
     names = ", ".join(str(item.get("name")) for item in items if isinstance(item, Mapping))
-    raise VariantError(f"{change.rule}: {'.'.join(change.path)}: there is no {step}; there is {names or 'none'}")
+    raise VariantError(f"{change.rule}: {'.'.join(change.path)}: there is no {step}; the names are {names or 'none'}")

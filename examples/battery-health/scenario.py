@@ -65,7 +65,7 @@ def messages(seed: int) -> Iterator[Message]:
         voltages = 3.62 + 0.004 * rng.standard_normal(CELLS)
         for second in range(DURATION_S):
             after, t = phase + second * SECOND, second + phase / SECOND
-            capacity = _said(bus, t, health(t) * (1 + 0.004 * rng.standard_normal()))
+            capacity = _reported_capacity(bus, t, health(t) * (1 + 0.004 * rng.standard_normal()))
             current = -60.0 + 25.0 * math.sin(t / 9.0) + rng.standard_normal()
             sag = 0.06 * (1.0 - health(t))
             cells = voltages + 0.0004 * current
@@ -84,7 +84,7 @@ def messages(seed: int) -> Iterator[Message]:
                 yield Message(after + SECOND // 20, f"vehicles/{bus}/service", as_json(content))
 
 
-def _said(bus: str, t: float, health: float) -> float:
+def _reported_capacity(bus: str, t: float, health: float) -> float:
     """The capacity in Ah that the battery management system reports."""
     if bus == "bus-3" and 60 <= t < 63:
         return 0.0  # it restarts
@@ -150,7 +150,7 @@ def picture(seed: int, due: list[Episode]) -> str:
     for number, (bus, health) in enumerate(TRUTH.items()):
         rng = np.random.default_rng([seed, number])
         noise = 0.004 * rng.standard_normal(DURATION_S)
-        values = [_said(bus, t, health(t) * (1 + noise[t])) / DESIGN_AH for t in range(DURATION_S)]
+        values = [_reported_capacity(bus, t, health(t) * (1 + noise[t])) / DESIGN_AH for t in range(DURATION_S)]
         logged.append((bus, [(t, value) for t, value in enumerate(values) if not math.isnan(value)]))
     chart.curves("state of health as reported by the batteries", logged, 0.6, 1.0, ("threshold", THRESHOLD))
     for rule in ("battery-health", "battery-report"):

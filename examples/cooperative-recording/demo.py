@@ -54,7 +54,8 @@ def main() -> int:
         file.unlink(missing_ok=True)
     console = Console(highlight=False, soft_wrap=True)
     console.print(
-        "[bold]Fifteen vehicles drive; six carry a lidar. Two of those closer than 150 m: record the scene.[/]"
+        "[bold]Fifteen vehicles drive, and six of them carry a lidar. "
+        "If two of the six are closer than 150 m, record the scene.[/]"
     )
     with _detector(output) as detector, _vehicles() as drive:
         expected = _expected()  # while both are starting
@@ -219,8 +220,8 @@ def _verdict(console: Console, output: Path, expected: list[str], running: list[
     lines = (output / "events.jsonl").read_text(encoding="utf-8").splitlines()
     found = sorted(event["subject"] for event in map(json.loads, lines) if event["type"].endswith("started"))
     console.print(
-        f"[bold]{len(found)} episodes; the vehicles' positions alone give {len(expected)}."
-        f" {len(running) or 'No'} application{'s' if len(running) > 1 else ''} would still run.[/]"
+        f"[bold]{len(found)} episodes detected; {len(expected)} expected from the vehicles' positions."
+        f" Applications still running: {len(running)}.[/]"
     )
     console.print(f"See {output}/events.jsonl, {output}/tasks.yaml, {output}/manifests.yaml (and detector.log).")
     console.print(f"Open {output}/report.html in a browser to see what happened, and why.")

@@ -59,7 +59,7 @@ def main() -> int:
             [sys.executable, str(HERE / "drive.py"), "--wait", str(PATIENCE_S)], stdout=subprocess.DEVNULL
         )
         stack.callback(drive.terminate)
-        left = _tell(console, Api(kubeconfig, NAMESPACE), drive)
+        left = _report(console, Api(kubeconfig, NAMESPACE), drive)
     console.print(f"See {output}: events.jsonl, detector.log, manager.log.")
     return 1 if left or drive.returncode else 0
 
@@ -109,7 +109,7 @@ def _program(module: str, arguments: list[str], log: Path, environment: dict[str
             process.wait(PATIENCE_S)
 
 
-def _tell(console: Console, api: Api, drive: subprocess.Popen[bytes]) -> list[str]:
+def _report(console: Console, api: Api, drive: subprocess.Popen[bytes]) -> list[str]:
     """Print what changes until the drive is over and the last application is gone; what is left then."""
     begin, until = time.monotonic(), None
     seen: dict[str, str] = {}

@@ -61,9 +61,9 @@ class Foresight:
         elif before.spec.parameters != after.spec.parameters:
             yield Change("is reconfigured", name, _text(after.spec.parameters))
         elif lingering and not lingered:
-            yield Change("lingers", name, f"no demand is left; it goes in {template.spec.lifecycle.linger}")
+            yield Change("lingers", name, f"no demand is left; removed in {template.spec.lifecycle.linger}")
         elif lingered and not lingering:
-            yield Change("stays", name, "demanded again while it lingered: it never stopped")
+            yield Change("stays", name, "demanded again during its linger; it did not stop")
 
     def _objects(self, name: str) -> str:
         return ", ".join(sorted(each["kind"] for each in self.ever[name].manifests))

@@ -209,7 +209,7 @@ def picture(due: list[Episode]) -> str:
         rows = [
             (each.thing, [(max(start, each.start_s), min(end, each.end_s), each.taken_for)])
             for each in TRUTH
-            for start, end in [_in_sight(each.thing)]
+            for start, end in [_visible(each.thing)]
             if bool(each.taken_for) == mistaken
         ]
         chart.bars(title, rows, "#8e5ea2")
@@ -221,7 +221,7 @@ def picture(due: list[Episode]) -> str:
     return chart.svg()
 
 
-def _in_sight(name: str) -> tuple[float, float]:
+def _visible(name: str) -> tuple[float, float]:
     (thing,) = (each for each in THINGS if each.name == name)
     times = [t / 10 for t in range(DURATION_S * 10) if thing.ahead(t / 10) is not None]
     return times[0], times[-1]

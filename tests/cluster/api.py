@@ -261,13 +261,13 @@ class Api:
         deadline = time.monotonic() + PATIENCE
         while True:
             try:
-                return self._ask(method, path, body, content_type, accept)
+                return self._send(method, path, body, content_type, accept)
             except ApiError as error:
                 if error.code not in COME_BACK or time.monotonic() >= deadline:
                     raise
             time.sleep(INTERVAL)
 
-    def _ask(self, method: str, path: str, body: Object | Objects | None, content_type: str, accept: str) -> str:
+    def _send(self, method: str, path: str, body: Object | Objects | None, content_type: str, accept: str) -> str:
         headers = {"Accept": accept, "Content-Type": content_type, "Authorization": self._authorization}
         sent = json.dumps(body) if body is not None and content_type == APPLY_PATCH else body
         url = self._client.configuration.host + path

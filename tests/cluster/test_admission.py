@@ -182,7 +182,7 @@ def test_kubectl_prints_what_is_refused_and_what_is_warned_of_as_the_guide_shows
         assert f"Warning: no valid Detector in namespace {namespace} selects the rule: create a Detector" in logged
         code, logged = kubectl_apply(control_plane, doubtful, namespace)
         assert code == 0
-        for part in ("Warning: spec.manifests[0].data.lane", "`parameters.lane` is null", "where tasks give no param"):
+        for part in ("Warning: spec.manifests[0].data.lane", "`parameters.lane` is null", "when tasks give no param"):
             assert part in logged
         code, logged = kubectl_apply(control_plane, detector(), namespace)
         assert (code, logged) == (0, "")

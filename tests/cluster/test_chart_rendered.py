@@ -80,9 +80,9 @@ def test_the_linter_finds_nothing(helm: Helm) -> None:
         ),
         (
             {"detectors": [DETECTOR], "manager": {"namespaces": ["north", "south"]}},
-            r"Detector town is in namespace town, which .* does not look after: .*\(north, south\)",
+            r"Detector town is in namespace town, which .* does not manage: .*\(north, south\)",
         ),
-        ({"detectors": [DETECTOR], "manager": {"grant": ["north"]}}, r"does not look after: add it to manager\.grant"),
+        ({"detectors": [DETECTOR], "manager": {"grant": ["north"]}}, r"does not manage: add it to manager\.grant"),
         ({"manager": {"namespaces": ["a"], "grant": ["b"]}}, r"manager\.grant and manager\.namespaces: remove one"),
         ({"manager": {"allowedKinds": ["v1/Secret"]}}, r"v1/Secret needs manager\.namespaces"),
     ],

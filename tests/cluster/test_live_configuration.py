@@ -72,7 +72,7 @@ def wait_for_pod(api: Api) -> Object:
     return pod
 
 
-def wait_until_told(api: Api, *sources: str) -> Object:
+def wait_until_announced(api: Api, *sources: str) -> Object:
     """Wait until the pod's annotation stands for the configuration with these sources; return the pod."""
     wait_for_sources(api, *sources)
     content = fingerprint(api.get("ConfigMap", CONFIG_MAP)["data"])
@@ -118,14 +118,14 @@ def test_a_change_touches_the_pods_and_not_their_template(api: Api, manager: Pro
     pod = wait_for_pod(api)
     deployment = api.get("Deployment", "fusion")
     api.create(vehicle("car2"))
-    reported = wait_until_told(api, "car1", "car2")
+    reported = wait_until_announced(api, "car1", "car2")
     assert reported["metadata"]["uid"] == pod["metadata"]["uid"]
     now = api.get("Deployment", "fusion")
     assert now["spec"] == deployment["spec"]
     assert now["metadata"]["generation"] == deployment["metadata"]["generation"]
     wait_settled(api)
     end(api, "car2")
-    wait_until_told(api, "car1")
+    wait_until_announced(api, "car1")
     wait_settled(api)
 
 
@@ -145,13 +145,13 @@ def test_pods_of_others_are_left_alone(api: Api, manager: Process) -> None:
     api.create(vehicle("car2"))
     api.wait_list(
         "Pod",
-        lambda pods: [_was_told(each) for each in pods if each["metadata"]["name"] != "stranger"] == [True],
+        lambda pods: [_was_announced(each) for each in pods if each["metadata"]["name"] != "stranger"] == [True],
         what="the application's pod is annotated",
     )
-    assert not _was_told(api.get("Pod", "stranger"))
+    assert not _was_announced(api.get("Pod", "stranger"))
 
 
-def _was_told(pod: Object) -> bool:
+def _was_announced(pod: Object) -> bool:
     return ANNOTATION in pod["metadata"].get("annotations", {})
 
 
@@ -187,7 +187,7 @@ def test_a_killed_manager_comes_back_and_answers_again(
     wait_until(
         lambda: requested(network, key), lambda found: found == [["car1", "car2"]], what="there is an answer again"
     )
-    wait_until_told(api, "car1", "car2")
+    wait_until_announced(api, "car1", "car2")
 
 
 def test_zenoh_may_come_late_and_go(api: Api, namespace: str, endpoint: str, manager: Process) -> None:

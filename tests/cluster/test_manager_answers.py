@@ -96,8 +96,8 @@ def test_explain_goes_from_the_event_over_merged_values_to_the_pods(
         "distance = 7",
         "requested by detector town, holder town",
         "rate = 9 (merge Max)",
-        "5 of one (car1) is outbid: a larger value counts",
-        "9 of two is it",
+        "5 of one (car1) is overridden: a larger value counts",
+        "9 of two is used",
         f"{pods[0]['metadata']['name']} Pending: not ready yet",
     ):
         assert line in reported
@@ -137,7 +137,7 @@ def test_explain_knows_what_has_no_place_and_what_replaces_what(
     assert f"FallenBack: instance {NORTH} is not ready; until it is, instance {instead} of template lite" in north
     assert "\ntemplate app\n" in north
     assert f"\ninstance {instead} of template lite (" in north
-    assert '"north" of north is it' in north
+    assert '"north" of north is used' in north
     south = explain(control_plane, api, "task/south").stdout
     assert "Waiting, LimitReached: " in south
     assert "the namespace is at its limit of 2 instances" in south

@@ -42,7 +42,7 @@ def unharmed(api: Api, manager: Process) -> Iterator[None]:
     assert manager.alive
 
 
-def wait_told(api: Api, kind: str, name: str, type_: str, parts: list[str]) -> Object:
+def wait_for_false(api: Api, kind: str, name: str, type_: str, parts: list[str]) -> Object:
     """Wait until the object's condition is False and its message has all these parts; return the condition.
 
     The first message may be a different one, e.g. for a task that arrives before its template.
@@ -83,7 +83,7 @@ def changed(container: Object) -> Object:
 @pytest.mark.usefixtures("unharmed")
 def test_a_task_that_cannot_be_served_reports_why(api: Api, spec: Object, reason: str, parts: list[str]) -> None:
     api.create({**task("wrong"), "spec": spec})
-    accepted = wait_told(api, "ApplicationTask", "wrong", "Accepted", parts)
+    accepted = wait_for_false(api, "ApplicationTask", "wrong", "Accepted", parts)
     assert accepted["reason"] == reason
     assert api.get("ApplicationTask", "wrong")["status"]["phase"] == "Refused"
 
@@ -109,9 +109,9 @@ def test_a_task_that_cannot_be_served_reports_why(api: Api, spec: Object, reason
 def test_a_template_that_cannot_be_rendered_reports_why(api: Api, manifest: Object, parts: list[str]) -> None:
     api.create(template("bad", manifests=[manifest]))
     api.create(task("north", of="bad"))
-    wait_told(api, "ApplicationTemplate", "bad", "Accepted", parts)
-    wait_told(api, "ApplicationInstance", BAD, "Applied", parts)
-    wait_told(api, "ApplicationTask", "north", "Applied", parts)
+    wait_for_false(api, "ApplicationTemplate", "bad", "Accepted", parts)
+    wait_for_false(api, "ApplicationInstance", BAD, "Applied", parts)
+    wait_for_false(api, "ApplicationTask", "north", "Applied", parts)
 
 
 @pytest.mark.parametrize(
@@ -132,7 +132,7 @@ def test_a_template_that_cannot_be_rendered_reports_why(api: Api, manifest: Obje
 def test_an_instance_that_cannot_be_applied_reports_why(api: Api, manifest: Object, parts: list[str]) -> None:
     api.create(template("bad", manifests=[manifest]))
     api.create(task("north", of="bad"))
-    wait_told(api, "ApplicationInstance", BAD, "Applied", parts)
+    wait_for_false(api, "ApplicationInstance", BAD, "Applied", parts)
     assert not api.find("ConfigMap", BAD, namespace="kube-system")
 
 
@@ -154,7 +154,7 @@ def test_a_template_that_makes_no_sense_keeps_what_runs_until_it_does(api: Api) 
     # To the API server any default is fine, the manager knows better.
     wrong = {"parameters": {"region": {"type": "string", "required": True}, "rate": {"type": "number", "default": "x"}}}
     api.patch("ApplicationTemplate", "bad", {"spec": wrong})
-    refused = wait_told(api, "ApplicationTask", "north", "Accepted", ["'x' is not of type number"])
+    refused = wait_for_false(api, "ApplicationTask", "north", "Accepted", ["'x' is not of type number"])
     assert refused["reason"] == "TemplateInvalid"
     api.wait_for(
         "ApplicationTemplate",

@@ -69,7 +69,7 @@ def test_a_lost_holder_releases_and_a_returning_one_counts_again(
     assert lost["status"]["phase"] == "Lapsed"
     api.wait_gone("Deployment", NORTH)
     wait_settled(api, lost=LOST)
-    assert len(api.list("Deployment")) == 1, "a person's task never lapses"
+    assert len(api.list("Deployment")) == 1, "a person's task never expires"
 
     manager.kill9()  # the loss is remembered: a new manager has not observed anything, and yet starts nothing
     manager.start()

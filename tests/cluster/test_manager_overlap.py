@@ -1,4 +1,4 @@
-"""Two releases with a Lease each look after one namespace: one of them acts, and the other one waits."""
+"""Two releases with a Lease each manage one namespace: one of them acts, and the other one waits."""
 
 from __future__ import annotations
 

@@ -74,7 +74,7 @@ def wait_bound(api: Api, region: str, node_name: str) -> None:
     )
 
 
-def wait_told(api: Api, name: str, *parts: str) -> Object:
+def wait_for_message(api: Api, name: str, *parts: str) -> Object:
     return api.wait_for(
         "ApplicationTask",
         name,
@@ -96,7 +96,7 @@ def test_the_node_that_a_task_names_gets_the_application_and_one_that_is_not_the
     wait_bound(api, "north", nodes[0])
     api.create(task("west", node="rsu-9"))
     named = "fits no node: nodeSelector: no node has the label kubernetes.io/hostname=rsu-9"
-    reported = wait_told(api, "west", named, "no node fits the pod")
+    reported = wait_for_message(api, "west", named, "no node fits the pod")
     assert nodes[0] in reported["status"]["message"]  # what there is instead
     api.wait_for(
         "ApplicationInstance",
@@ -119,11 +119,11 @@ def test_affinity_and_tolerations_come_from_parameters_too(
     affinity = {"nodeAffinity": {"requiredDuringSchedulingIgnoredDuringExecution": required}}
     api.create(placed(affinity=affinity, tolerations=[{"key": "${parameters.tolerate}", "operator": "Exists"}]))
     api.create(task("south"))
-    wait_told(api, "south", "no node fits the pod", "untolerated taint")  # of what fits, the scheduler speaks
+    wait_for_message(api, "south", "no node fits the pod", "untolerated taint")  # of what fits, the scheduler speaks
     api.create(task("more", region="south", tolerate="edge"))
     wait_bound(api, "south", nodes[1])
     api.create(task("west"))
-    wait_told(api, "west", f"no node has the label site-{namespace}=west (there are north, south)")
+    wait_for_message(api, "west", f"no node has the label site-{namespace}=west (there are north, south)")
     node(api, f"rsu-3-{namespace}"[:63], "west", taints=[])
     try:
         wait_bound(api, "west", f"rsu-3-{namespace}"[:63])
@@ -137,4 +137,4 @@ def test_a_node_name_that_is_not_there_is_reported_though_no_scheduler_looks(
     start_manager(processes, namespace)
     api.create(placed(nodeName="${parameters.node}"))
     api.create(task("north", node="rsu-9"))
-    wait_told(api, "north", "nodeName: there is no node rsu-9")
+    wait_for_message(api, "north", "nodeName: there is no node rsu-9")

@@ -23,7 +23,7 @@ def its_pod(api: Api) -> str:
     return str(found["metadata"]["name"])
 
 
-def kubelet_says(api: Api, pod: str, **status: Any) -> None:
+def set_pod_status(api: Api, pod: str, **status: Any) -> None:
     api.patch("Pod", pod, {"status": status}, subresource="status")
 
 
@@ -36,7 +36,7 @@ def waiting(reason: str, message: str) -> list[Object]:
     return container({"waiting": {"reason": reason, "message": message}})
 
 
-def wait_ready_says(api: Api, kind: str, name: str, *, status: str = "False", reason: str, text: str) -> None:
+def wait_for_ready(api: Api, kind: str, name: str, *, status: str = "False", reason: str, text: str) -> None:
     def holds(raw: Object) -> bool:
         found = condition(raw, "Ready")
         return (found.get("status"), found.get("reason")) == (status, reason) and text in found["message"]
@@ -50,8 +50,8 @@ def test_why_its_pods_do_not_run_is_reported_by_task_and_instance_until_they_do(
     pod = its_pod(api)
 
     def logged(reason: str, text: str) -> None:
-        wait_ready_says(api, "ApplicationTask", "north", reason=reason, text=text)
-        wait_ready_says(api, "ApplicationInstance", NORTH, reason=reason, text=text)
+        wait_for_ready(api, "ApplicationTask", "north", reason=reason, text=text)
+        wait_for_ready(api, "ApplicationInstance", NORTH, reason=reason, text=text)
 
     unscheduled = {
         "type": "PodScheduled",
@@ -59,28 +59,28 @@ def test_why_its_pods_do_not_run_is_reported_by_task_and_instance_until_they_do(
         "reason": "Unschedulable",
         "message": "0/3 nodes are free",
     }
-    kubelet_says(api, pod, conditions=[unscheduled])
+    set_pod_status(api, pod, conditions=[unscheduled])
     logged("Unschedulable", "no node fits the pod: 0/3 nodes are free")
-    kubelet_says(
+    set_pod_status(
         api, pod, conditions=[unscheduled | {"status": "True"}], containerStatuses=waiting("ErrImagePull", "not found")
     )
     logged("ImagePullFailed", "cannot pull image registry.example/app:9: not found")
     ended = {"exitCode": 137, "reason": "OOMKilled"}
     crashed = container({"waiting": {"reason": "CrashLoopBackOff"}}, lastState={"terminated": ended}, restartCount=2)
-    kubelet_says(api, pod, containerStatuses=crashed)
+    set_pod_status(api, pod, containerStatuses=crashed)
     logged("CrashLoop", "container main crashes: it ended with exit code 137, killed for exceeding its memory limit")
 
     api.patch("Pod", pod, {"status": running(api.get("Pod", pod))}, subresource="status")
-    wait_ready_says(api, "ApplicationTask", "north", status="True", reason="Ready", text="is ready")
-    wait_ready_says(api, "ApplicationInstance", NORTH, status="True", reason="Ready", text="ready")
+    wait_for_ready(api, "ApplicationTask", "north", status="True", reason="Ready", text="is ready")
+    wait_for_ready(api, "ApplicationInstance", NORTH, status="True", reason="Ready", text="ready")
     ready = [
         each | {"status": "False"}
         for each in api.get("Pod", pod)["status"]["conditions"]
         if each["type"] != "PodScheduled"
     ]
-    kubelet_says(api, pod, containerStatuses=crashed, conditions=ready)
-    wait_ready_says(api, "ApplicationTask", "north", reason="CrashLoop", text="container main crashes")
-    wait_ready_says(api, "ApplicationInstance", NORTH, reason="CrashLoop", text="has 0 of 1 pods available")
+    set_pod_status(api, pod, containerStatuses=crashed, conditions=ready)
+    wait_for_ready(api, "ApplicationTask", "north", reason="CrashLoop", text="container main crashes")
+    wait_for_ready(api, "ApplicationInstance", NORTH, reason="CrashLoop", text="has 0 of 1 pods available")
     wait_until(
         lambda: {each["reason"] for each in api.list("Event.events.k8s.io") if each["type"] == "Warning"},
         lambda warned: warned - {"FailedScheduling"} == {"CrashLoop", "ImagePullFailed", "Unschedulable"},
@@ -94,12 +94,12 @@ def test_a_new_version_that_does_not_run_is_not_ready_though_the_old_one_still_d
 ) -> None:
     api.create(template())
     api.create(task("north"))
-    wait_ready_says(api, "ApplicationInstance", NORTH, status="True", reason="Ready", text="ready")
+    wait_for_ready(api, "ApplicationInstance", NORTH, status="True", reason="Ready", text="ready")
     changed = deployment(image="app:2")
     # Its pod becomes ready here, but not available.
     changed["spec"]["minReadySeconds"] = 500
     api.patch("ApplicationTemplate", "app", {"spec": {"manifests": [changed]}})
-    wait_ready_says(api, "ApplicationInstance", NORTH, reason="NotReady", text=f"Deployment {NORTH} ")
+    wait_for_ready(api, "ApplicationInstance", NORTH, reason="NotReady", text=f"Deployment {NORTH} ")
 
 
 def test_other_kinds_are_judged_by_their_conditions(api: Api, manager: Process) -> None:
@@ -146,5 +146,5 @@ def test_other_kinds_are_judged_by_their_conditions(api: Api, manager: Process) 
     api.patch("Service", f"{NORTH}-out", {"status": balancer}, subresource="status")
     wait_instance(status="True")
     failed = container({"terminated": {"exitCode": 2, "reason": "Error"}}, ready=False)
-    kubelet_says(api, pod, phase="Failed", containerStatuses=failed)
+    set_pod_status(api, pod, phase="Failed", containerStatuses=failed)
     wait_instance(f"Job {NORTH} has failed", "container main failed: it ended with exit code 2")

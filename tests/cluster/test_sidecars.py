@@ -122,19 +122,19 @@ def test_a_second_webhook_that_is_called_for_the_same_pod_adds_nothing(
         api.apply(other)
         try:
 
-            def asked_how_often() -> int:
-                before = asked_about_pods(metrics)
+            def number_of_reviews() -> int:
+                before = reviews_of_pods(metrics)
                 made = api.apply(pod("probe"), dry_run=True)
                 names = [each["name"] for each in made["spec"].get("volumes", [])]
                 assert (len(set(names)), len(sidecars(made))) == (len(names), min(len(sidecars(made)), 1))
-                return asked_about_pods(metrics) - before if sidecars(made) else 0
+                return reviews_of_pods(metrics) - before if sidecars(made) else 0
 
-            wait_until(asked_how_often, lambda found: found == 2, what="it is called twice, and the pod has it once")
+            wait_until(number_of_reviews, lambda found: found == 2, what="it is called twice, and the pod has it once")
         finally:
             api.delete("MutatingWebhookConfiguration", other["metadata"]["name"])
 
 
-def asked_about_pods(port: int) -> int:
+def reviews_of_pods(port: int) -> int:
     """How many questions about pods the manager has answered."""
     with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=30) as response:
         lines = response.read().decode().splitlines()
@@ -219,7 +219,7 @@ def test_an_event_is_not_reported_again_by_the_next_manager(
     event_of(api, "car", "has no valid Detector")
 
 
-def test_what_the_command_cannot_do_is_said_and_the_rest_is_printed(
+def test_what_the_command_cannot_do_is_reported_and_the_rest_is_printed(
     api: Api, control_plane: ControlPlane, namespace: str, tmp_path: Path
 ) -> None:
     (file := tmp_path / "detector.yaml").write_text(yaml.safe_dump(sidecar_detector("vehicle")))

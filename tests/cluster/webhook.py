@@ -78,7 +78,7 @@ class Webhook:
 
     @contextmanager
     def requested(self) -> Iterator[None]:
-        """Have the API server ask the manager during the block."""
+        """Have the API server call the manager during the block."""
         applied = [self.configuration, *([self.injection] if self._sidecars else [])]
         for each in applied:
             self._api.apply(each)

@@ -46,12 +46,12 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
     failed = isinstance(report, pytest.TestReport) and report.failed and call.when != "teardown"
     if failed and isinstance(running, Node):
         if namespace := getattr(item, "funcargs", {}).get("namespace"):
-            report.sections.append(("pods of the test", pods_told(running, namespace)))
+            report.sections.append(("pods of the test", pods_text(running, namespace)))
         report.sections.append(("logs of the node", running.tails(25)))
     return report
 
 
-def pods_told(node: Node, namespace: str) -> str:
+def pods_text(node: Node, namespace: str) -> str:
     """What there is to know about the pods of a namespace, for a message."""
     kubectl = partial(node.plane.kubectl, "--namespace", namespace)
     reported = [kubectl("get", "pods,deployments", "-o", "wide"), kubectl("get", "events")]

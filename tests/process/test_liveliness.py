@@ -112,10 +112,10 @@ def test_with_clock_data_a_token_counts_after_the_samples_up_to_the_newest_stamp
         fast(1.5, "car2"), fast(2.5, "car1"), alive(102.6, "car1", TokenState.DROPPED), fast(3.5, "car2"), until=200
     )
     assert drive.take(fast(4.5, "car2"), until=200) == []
-    assert [line for line in _told(drive) if "car1" in line] == ["fast car1 started 1", "fast car1 ClientLost 3"]
+    assert [line for line in _reported(drive) if "car1" in line] == ["fast car1 started 1", "fast car1 ClientLost 3"]
 
 
-def _told(drive: Drive) -> list[str]:
+def _reported(drive: Drive) -> list[str]:
     return Drive.note(drive, []) or [
         f"{e.episode.rule} {e.episode.subject} {e.reason or 'started'} {(e.time - START) / 1e9:g}" for e in drive.events
     ]

@@ -152,7 +152,7 @@ def test_one_process_and_shares_give_the_same_bytes(fleet: Path) -> None:
     mine(fleet, "one", "--processes", "1")
     assert files(fleet / "one") == files(fleet / "out")
     first = mine(fleet, "shared", "--processes", "1", "--share", "0/2")
-    assert "others have not done their share yet" in first
+    assert "other shares are not finished yet" in first
     assert not files(fleet / "shared")
     mine(fleet, "shared", "--processes", "1", "--share", "1/2")
     assert files(fleet / "shared") == files(fleet / "out")
@@ -163,7 +163,7 @@ def test_a_second_run_does_nothing_and_a_changed_rule_runs_alone(fleet: Path) ->
         return {path: path.stat().st_mtime_ns for path in (fleet / "out").rglob("*")}
 
     before = times()
-    assert "nothing was left to do" in mine(fleet, "out")
+    assert "nothing left to mine" in mine(fleet, "out")
     assert times() == before
     changed = (fleet / "rules.yaml").read_text().replace("cooldown: 2s", "cooldown: 3s")
     assert changed.count("cooldown: 3s") == 1
@@ -176,7 +176,7 @@ def test_a_second_run_does_nothing_and_a_changed_rule_runs_alone(fleet: Path) ->
     different = [name for name, data in files(fleet / "again").items() if data != files(fleet / "out")[name]]
     assert different == ["episodes/rule=harsh/part-0.parquet", "rules.parquet"]
     (fleet / "harsh.yaml").write_text(HARSH)
-    assert "nothing was left to do" in mine(fleet, "again", rules="harsh.yaml")
+    assert "nothing left to mine" in mine(fleet, "again", rules="harsh.yaml")
     assert [name for name in files(fleet / "again") if "rule=" in name] == ["episodes/rule=harsh/part-0.parquet"]
 
 
@@ -184,7 +184,7 @@ def test_a_long_recording_is_cut_for_the_rules_for_which_that_is_exact(fleet: Pa
     (fleet / "long").mkdir()
     write_mcap(fleet / "long" / "drive.mcap", 7, 600.0, cars=2)
     logged = mine(fleet, "cut", "--processes", "2", drives="long")
-    assert "long/drive.mcap: cut into 3 pieces, uncut for close (pairs)" in logged
+    assert "long/drive.mcap: cut into 3 pieces, whole for close (pairs)" in logged
     assert "pieces" not in mine(fleet, "uncut", "--processes", "1", drives="long")
     assert files(fleet / "cut") == files(fleet / "uncut")
     ((episodes,),) = requested(fleet, "SELECT count(*) FROM 'cut/episodes/*/*.parquet'")
@@ -258,14 +258,14 @@ def test_recordings_behind_urls_are_mined_as_those_on_disk(fleet: Path, monkeypa
         assert requested(fleet, f"SELECT {columns} FROM 's3/episodes/*/*.parquet' ORDER BY ALL") == expected
         names = [row[0] for row in requested(fleet, "SELECT recording FROM 's3/recordings.parquet'")]
         assert names == [f"{url}/{path.name}" for path in drives]
-        assert "nothing was left to do" in mine(fleet, "s3", drives=url)
+        assert "nothing left to mine" in mine(fleet, "s3", drives=url)
         s3.put(environment, f"2026/{drives[0].name}", drives[-1].read_bytes())
         assert "1 mined now" in mine(fleet, "s3", drives=url)
     with serving(fleet) as address:
         (fleet / "list.txt").write_text("".join(f"{address}/drives/{path.name}\n" for path in drives))
         (fleet / "list.txt").open("a").write(f"{address}/drives/none.mcap\n")
         assert "none.mcap: there is no such file" in mine(fleet, "http", drives="@list.txt")
-        assert "nothing was left to do" in mine(fleet, "http", drives=f"{address}/drives/")
+        assert "nothing left to mine" in mine(fleet, "http", drives=f"{address}/drives/")
     assert requested(fleet, f"SELECT {columns} FROM 'http/episodes/*/*.parquet' ORDER BY ALL") == expected
 
 

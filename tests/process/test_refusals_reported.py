@@ -27,7 +27,7 @@ print("up", flush=True)
 threading.Event().wait()
 """
 
-SAY_ALL = "info,zenoh::net::routing::interceptor::access_control=trace"
+LOG_ALL = "info,zenoh::net::routing::interceptor::access_control=trace"
 """As docs/security.md gives it."""
 
 
@@ -109,7 +109,7 @@ def test_who_is_not_let_in_and_who_has_no_rights_is_in_the_routers_log(guarded: 
         wait_for(lambda: "did not match any configured ACL subject" in guarded.log)
 
 
-@pytest.mark.parametrize("guarded", [SAY_ALL], indirect=True)
+@pytest.mark.parametrize("guarded", [LOG_ALL], indirect=True)
 def test_a_foreign_key_is_reported_with_the_name_of_the_certificate(guarded: GuardedRouter) -> None:
     with guarded.connect(guarded.authority.sign("car1")) as car:
         car.put("vehicles/car1/pose", "own")
@@ -127,4 +127,4 @@ def test_a_foreign_key_is_reported_with_the_name_of_the_certificate(guarded: Gua
 
 def test_the_guide_gives_the_filter_that_is_tested() -> None:
     guide = Path(__file__).parents[2] / "docs" / "security.md"
-    assert SAY_ALL in guide.read_text()
+    assert LOG_ALL in guide.read_text()

@@ -286,6 +286,6 @@ def test_what_does_not_go_together_is_reported_with_its_place(tmp_path: Path) ->
         findings(load_documents([tmp_path / "detector.yaml"]))
     first, second = caught.value.problems
     assert (first.line, first.field) == (6, "spec.streams[0]")
-    assert "encoding must be cdr or raw, but is json" in first.message
+    assert "encoding must be cdr or raw; got json" in first.message
     assert (second.line, second.field) == (10, "spec.streams[1]")
     assert "domain is valid only with layout RmwZenoh" in second.message

@@ -235,7 +235,7 @@ def test_a_running_detector_follows_changes_of_its_sources_and_reports_their_sta
         ),
         (
             {"plugin": "once", "parameters": {"text": 1}},
-            "spec.sources[0].parameters.text: must be a string, but is 1: put it in quotes",
+            "spec.sources[0].parameters.text: must be a string; got 1: put it in quotes",
         ),
         ({"plugin": "once", "parameters": {"txt": "a"}}, "spec.sources[0].parameters.txt: unknown field"),
     ],

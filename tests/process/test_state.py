@@ -179,7 +179,7 @@ def test_a_broken_file_is_reported_and_set_aside(
     state = StateFile(tmp_path, "default", "h")
     with caplog.at_level(logging.ERROR):
         assert state.load() == []
-    assert "set it aside as" in caplog.text
+    assert "renamed the file to" in caplog.text
     assert state.set_aside == 1
     (aside,) = tmp_path.glob("*.unreadable-*")
     assert aside.read_bytes() == broken

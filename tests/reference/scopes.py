@@ -36,7 +36,7 @@ def text(subject: Subject) -> str:
     return ("+".join(clients) or "~fleet") + ("" if element is None else f"~{element}")
 
 
-def _says(spec: dict[str, Any], word: str) -> bool:
+def _uses(spec: dict[str, Any], word: str) -> bool:
     """Whether a condition of the rule has the word."""
     return any(word in str(spec.get(field, "")) for field in ("when", "until", "scope", "signals"))
 
@@ -53,7 +53,7 @@ def looks(spec: dict[str, Any], world: World, now: int, view: Callable[[str], di
         if "client" in scope:
             yield from _clients(scope["client"], views, signals, extra, name)
         elif "pairs" in scope:
-            pairs = {**scope["pairs"], "closing": _says(spec, "closingSpeed")}
+            pairs = {**scope["pairs"], "closing": _uses(spec, "closingSpeed")}
             yield from _pairs(pairs, views, signals, extra, name, world, now)
         else:
             yield _fleet(scope["fleet"], views, signals, extra, name)

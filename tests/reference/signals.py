@@ -32,7 +32,7 @@ def truth(source: str | None, variables: dict[str, Any], names: Iterable[str]) -
 _WHERE = Where({}, {})
 
 
-def tell_places(places: Iterable[dict[str, Any]], position: dict[str, str]) -> None:
+def set_places(places: Iterable[dict[str, Any]], position: dict[str, str]) -> None:
     """The places that expressions name, and the position of a sample."""
     _WHERE.places.update({place["name"]: place for place in places})
     _WHERE.position.update(position)

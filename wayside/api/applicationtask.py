@@ -1,4 +1,4 @@
-"""ApplicationTask: one demand on an application, and why."""
+"""ApplicationTask: one demand for an application, and its cause."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ class Requester(Model):
     )
     holder: Holder | None = Field(
         default=None,
-        description="The holder that emitted the task. It keeps the task alive by renewing the Lease "
-        "wayside-<holder>. A task without a holder never lapses.",
+        description="The holder that emitted the task. The holder keeps the task alive by renewing the Lease "
+        "wayside-<holder>. A task without a holder never expires.",
     )
     subjects: list[Annotated[str, Field(max_length=256)]] = Field(
         default_factory=list,
@@ -76,7 +76,7 @@ class TaskEvent(Model):
 
 
 class ApplicationTaskSpec(Model):
-    """One demand on an application, and its cause."""
+    """One demand for an application, and its cause."""
 
     template_name: TemplateName = Field(
         description="The name of the ApplicationTemplate, in the same namespace. Immutable.",
@@ -104,7 +104,7 @@ class ApplicationTaskSpec(Model):
     )
     event: TaskEvent | None = Field(default=None, description="The event that caused the task. Immutable.")
     end_time: Time | None = Field(
-        default=None, description="The end of the demand. Absent while the demand holds; immutable once set."
+        default=None, description="The end of the demand. Absent while the demand is live; immutable once set."
     )
 
 
@@ -149,7 +149,7 @@ class ApplicationTaskStatus(Model):
 
 
 class ApplicationTask(Kind):
-    """A demand on an application. It holds from its creation until its end."""
+    """A demand for an application. It is live from its creation until its end."""
 
     plural: ClassVar[str] = "applicationtasks"
     short_name: ClassVar[str] = "apptask"

@@ -69,8 +69,8 @@ class Lifecycle(Model):
     )
     minimum_uptime: Duration = Field(
         default=Duration("0s"),
-        description="The minimum lifetime of an instance, from its creation. Before that, the instance is neither "
-        "released nor preempted.",
+        description="The minimum lifetime of an instance, from its creation. During this time, the instance is "
+        "neither released nor preempted.",
     )
     ready_timeout: PositiveDuration | None = Field(
         default=None,
@@ -80,7 +80,7 @@ class Lifecycle(Model):
     fallback: FallbackTemplate | None = Field(
         default=None,
         description="The template that serves the tasks of an instance that exceeded its readyTimeout, until that "
-        "instance is ready again. It receives those task parameters that it defines. Needs readyTimeout.",
+        "instance is ready again. It receives only the task parameters that it defines. Needs readyTimeout.",
     )
     on_detector_loss: OnDetectorLoss = Field(
         default=OnDetectorLoss(), description="The policy for demands whose holder's Lease has expired."
@@ -224,7 +224,7 @@ class ApplicationTemplateStatus(Model):
 
 
 class ApplicationTemplate(Kind):
-    """The definition of an application: how it is deployed, and how the demands on it merge."""
+    """The definition of an application: how to deploy it, and how to merge the demands for it."""
 
     plural: ClassVar[str] = "applicationtemplates"
     short_name: ClassVar[str] = "apptpl"

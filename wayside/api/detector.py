@@ -51,7 +51,7 @@ class KnownClient(Model):
         default_factory=dict,
         max_length=64,
         description="Values for this client that replace a rule's parameters, by rule and parameter name. In a pairs "
-        "scope they apply to a or b.",
+        "scope, expressions read them as a.parameters or b.parameters.",
     )
     expected: bool = Field(
         default=False,
@@ -64,7 +64,7 @@ class BufferLimits(Model):
     """The limits of the buffer of all streams."""
 
     duration: PositiveDuration = Field(
-        default=PositiveDuration("10s"), description="How long samples are kept. A stream can set its own."
+        default=PositiveDuration("10s"), description="How long samples are kept. A stream can set its own duration."
     )
     bytes: PositiveQuantity = Field(
         default=PositiveQuantity("512Mi"),
@@ -157,8 +157,8 @@ class DetectorSpec(Model):
     asn1: list[Asn1Module] = Field(
         default_factory=list,
         max_length=32,
-        description="ASN.1 modules for uper streams: for messages that no package defines, such as etsi/cpm, or to "
-        "replace the versions of the packages. All modules that they import must be included.",
+        description="ASN.1 modules for uper streams. They define messages that no package defines, such as etsi/cpm, "
+        "or replace the definitions of the packages. Include all modules that they import.",
         json_schema_extra=ATOMIC_LIST,
     )
     messages: list[MessageDefinition] = Field(
@@ -305,8 +305,9 @@ class DetectorStatus(Model):
     )
     rules: int = Field(default=0, description="The number of EventRules that the detector selects.")
     conditions: list[Condition] = conditions_field(
-        "Accepted: the specification can run. Running (only with a mode): the detector runs; otherwise the reason "
-        "explains why not. Ready: all of these are True. Stalled: the specification is invalid and must be corrected."
+        "Accepted: the specification is valid. Running (only with a mode): the detector runs; otherwise the reason "
+        "explains why not. Ready: Accepted and, with a mode, Running are True. Stalled: the specification is invalid "
+        "and must be corrected."
     )
 
 

@@ -132,8 +132,8 @@ def parse_object(raw: dict[str, Any]) -> Kind:
             raise ValueError("spec: is nested too deeply: flatten it") from None
         if size > MAXIMUM_BYTES:
             raise ValueError(
-                f"spec: takes {size} bytes as JSON, more than the {MAXIMUM_BYTES} that an object of kind "
-                f"{kind.__name__} may: move data into files, ConfigMaps or charts of your own"
+                f"spec: has {size} bytes as JSON; an object of kind {kind.__name__} may have at most {MAXIMUM_BYTES}: "
+                "move data into files, ConfigMaps or charts"
             )
     try:
         return kind.model_validate(raw)
@@ -204,9 +204,7 @@ def _document(node: yaml.Node, file: str, problems: list[Problem]) -> Document |
         return None
     try:
         if not isinstance(raw, dict):
-            raise ValueError(
-                f"must be an object, but is {raw!r}: each document needs apiVersion, kind, metadata and spec"
-            )
+            raise ValueError(f"must be an object; got {raw!r}: each document needs apiVersion, kind, metadata and spec")
         kind = _kind_of(raw)
     except ValueError as error:
         problems.append(Problem(file, *_mark(marks, ()), "", str(error)))

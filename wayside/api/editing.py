@@ -1,4 +1,4 @@
-"""One JSON Schema of all kinds, for editors: it completes fields, shows what they mean, and marks misspelt ones."""
+"""One JSON Schema of all kinds, with which editors complete fields, show descriptions and mark misspelt fields."""
 
 from __future__ import annotations
 

@@ -141,8 +141,8 @@ class Signal(Model):
     rule_name: ObjectName | None = Field(
         default=None,
         description="Instead of a stream: another rule that the Detector selects. Its samples are the starts "
-        "(or ends, see samples) of that rule's episodes with the client as a subject. msg contains episode, subject, "
-        "subjects, onsetTime and startTime (seconds since the epoch), and the values at the start.",
+        "(or ends, see samples) of those episodes of that rule in which the client is a subject. msg contains "
+        "episode, subject, subjects, onsetTime and startTime (seconds since the epoch), and the values at the start.",
     )
     samples: Samples = Field(
         default=Samples.STARTS,
@@ -155,15 +155,15 @@ class Signal(Model):
     plugin: SignalPlugin | None = Field(
         default=None,
         description="Instead of a stream: Python code that computes the value for the rule's subject at each "
-        "evaluation. In a pairs scope, the value belongs to the pair: expressions use the bare name, without a or b.",
+        "evaluation. In a pairs scope, the value belongs to the pair: expressions use its name without a or b.",
     )
     of: Expression | None = Field(
         default=None,
         description="Instead of a stream: CEL over the variables of `when`, such as another signal or the distance "
-        "of a pair. The samples are the values of the expression at the evaluations of the subject. "
+        "of a pair. Each evaluation of the subject adds one sample, the value of the expression. "
         "Without over and lag, the signal is the value itself. In a pairs scope, the value belongs to "
-        "the pair: expressions use the bare name. The values are kept for over and lag: at most 25 "
-        "bytes for each evaluation of each subject.",
+        "the pair: expressions use its name without a or b. Samples that over and lag need are kept, with at most "
+        "25 bytes each.",
     )
     client: ClientName | None = Field(
         default=None,
@@ -174,7 +174,7 @@ class Signal(Model):
     value: Expression | None = Field(
         default=None,
         description="CEL over msg (the decoded sample), item (its item, if the stream has items), before (the "
-        "client's previous message or item, unless it was stale by then), key (the captured chunks), "
+        "client's previous message or item, unless that was stale already), key (the captured chunks), "
         "sample (stamp, received, latency, size) and parameters. Required, except with the aggregates "
         "Count, Age and Active.",
     )
@@ -183,14 +183,15 @@ class Signal(Model):
     )
     over: WindowLength | None = Field(
         default=None,
-        description="The length of the window: at tick t it is (t - over, t]. Required, except with the aggregates "
-        "Last, First, Previous, Age and Active. Episode, for a signal with of: the evaluations of the "
-        "open episode, from its start to its end. Such a signal is known only while an episode is "
+        description="The length of the window: at tick t the window is (t - over, t]. Required, except with the "
+        "aggregates Last, First, Previous, Age and Active. Episode (only with of): the window is the open "
+        "episode, from its start to its end. Such a signal is known only while an episode is "
         "open. Events and actions can use it; conditions and other signals cannot.",
     )
     lag: PositiveDuration | None = Field(
         default=None,
-        description="For a signal with of: the window ends in the past. At tick t it is (t - lag - over, t - lag].",
+        description="Only with of: how far in the past the window ends. At tick t the window is "
+        "(t - lag - over, t - lag].",
     )
     aggregate: Aggregate = Field(
         default=Aggregate.LAST,
@@ -283,10 +284,10 @@ class EventRuleSpec(Model):
     margin: dict[Identifier, Annotated[float, Field(gt=0)]] | None = Field(
         default=None,
         max_length=64,
-        description="Adds the signal margin to the rule: how far `when` is from changing, positive while it holds "
-        "and negative while it does not. The margin of a comparison is the distance to its threshold. "
-        "&& has the smaller margin of its two sides, || the larger; ! negates the margin. If `when` compares "
-        "several quantities, each needs a scale here: the signal (or distance, closingSpeed) and the "
+        description="Adds a signal named margin to the rule: how far `when` is from changing. It is positive while "
+        "`when` is true, and negative while `when` is false. The margin of a comparison is the distance to its "
+        "threshold; && takes the smaller margin of its two sides, || the larger; ! negates. If `when` compares "
+        "several quantities, give a scale for each: the signal (or distance, closingSpeed) and the "
         "difference that counts as 1. The results of a replay list the ten largest margins without an episode.",
     )
     until: Expression | None = Field(
@@ -341,7 +342,9 @@ class EventRuleStatus(Model):
         json_schema_extra=ATOMIC_LIST,
     )
     selected_by: str = Field(
-        default="", max_length=1024, description="The names of these Detectors as one text, for tables."
+        default="",
+        max_length=1024,
+        description="The names of the Detectors that select the rule, as one text for tables.",
     )
     conditions: list[Condition] = conditions_field(
         "Accepted, Ready: the rule can be evaluated. Stalled: the rule is invalid and must be corrected."

@@ -19,8 +19,8 @@ class ModelWindow(Model):
     signals: list[Identifier] = Field(
         min_length=1,
         max_length=64,
-        description="Signals of this rule over a stream. The input is made of the values of their samples; their "
-        "aggregates are ignored.",
+        description="Signals of this rule that read a stream. The input consists of the values of their samples; "
+        "their aggregates are ignored.",
         json_schema_extra=ATOMIC_LIST,
     )
     last: int | None = Field(
@@ -158,7 +158,8 @@ class ModelInput(Model):
         json_schema_extra=ATOMIC_LIST,
     )
     window: ModelWindow | None = Field(
-        default=None, description="The latest values of signals: a vector, or a matrix of rows with several signals."
+        default=None,
+        description="The latest values of signals: a vector of one signal, or a matrix with one column per signal.",
     )
     image: ModelImage | None = Field(default=None, description="The newest image of a camera.")
     points: ModelPoints | None = Field(

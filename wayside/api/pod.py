@@ -323,8 +323,8 @@ class DetectorPod(Model):
     )
     security_context: Embedded | None = Field(
         default=None,
-        description="Fields of the pod's security context, as in a PodSpec, e.g. fsGroup. They take precedence over "
-        "the defaults, with which the pod meets the restricted Pod Security Standard. Not with mode Sidecar.",
+        description="Fields of the pod's security context, as in a PodSpec, e.g. fsGroup. They override the "
+        "defaults. The defaults meet the restricted Pod Security Standard. Not with mode Sidecar.",
     )
     env: list[DetectorVariable] = Field(
         default_factory=list,

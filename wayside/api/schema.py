@@ -1,4 +1,4 @@
-"""Models to CRDs: pydantic's JSON schema made structural, plus what Kubernetes wants beside it."""
+"""Generates CRDs from the models: pydantic's JSON schema made structural, with Kubernetes' extensions."""
 
 from __future__ import annotations
 

@@ -120,7 +120,7 @@ class PairsScope(Model):
         default=10_000,
         ge=1,
         le=1_000_000,
-        description="The maximum number of near pairs per evaluation. At the limit, the nearest pairs are "
+        description="The maximum number of pairs per evaluation. At the limit, the nearest pairs are "
         "evaluated; the others are skipped and counted. Pairs with an open episode, or whose condition already holds, "
         "are always evaluated.",
     )

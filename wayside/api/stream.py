@@ -1,4 +1,4 @@
-"""Streams: one kind of data of every client, where it comes from, how it is read and how much of it is kept."""
+"""Streams: one kind of data of every client, with its source, encoding and buffer."""
 
 from __future__ import annotations
 
@@ -47,8 +47,9 @@ class MessageDefinition(Model):
     name: MessageType = Field(description="The type, e.g. my_package/msg/Track.")
     definition: str = Field(
         max_length=65_536,
-        description="The definition in the format of .msg files. Each type that it refers to needs its own entry in "
-        "messages, or its definition here, after a line of = and a line `MSG: <type>`, as `ros2 bag` records it.",
+        description="The definition in the format of .msg files. Each type that it refers to needs a "
+        "definition as well: an entry of its own in messages, or a part of this text, after a line of = and a "
+        "line `MSG: <type>`, as `ros2 bag` writes it.",
     )
 
 
@@ -298,8 +299,8 @@ class Stream(Model):
             raise ValueError(f"a {self.encoding} stream has no type: remove it")
         if self.layout is Layout.RMW_ZENOH and self.encoding not in (Encoding.CDR, Encoding.RAW):
             raise ValueError(
-                f"layout RmwZenoh needs ROS 2 messages: encoding must be cdr or raw, but is {self.encoding}; "
-                "correct it, or remove layout"
+                f"layout RmwZenoh needs ROS 2 messages: encoding must be cdr or raw; got {self.encoding}: "
+                "correct encoding, or remove layout"
             )
         if self.layout is Layout.RMW_ZENOH and self.source != ZENOH:
             raise ValueError(f"layout RmwZenoh needs source zenoh, not {self.source}: remove one of them")

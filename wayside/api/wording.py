@@ -79,19 +79,19 @@ def _message(item: ErrorDetails) -> str:
             return "is empty: give it a value, or remove it"
         case "string_type" if isinstance(given, bool | int | float):
             written = str(given).lower() if isinstance(given, bool) else str(given)
-            return f"must be a string, but is {written}: put it in quotes, e.g. '{written}'"
+            return f"must be a string; got {written}: put it in quotes, e.g. '{written}'"
         case "string_type":
-            return f"must be a string; given: {_short(given)}: quote it as a whole"
+            return f"must be a string; got {_short(given)}: quote it as a whole"
         case "bool_type" | "bool_parsing":
-            return f"must be true or false; given: {_short(given)}"
+            return f"must be true or false; got {_short(given)}"
         case "model_type" | "model_attributes_type" | "dict_type":
-            return f"must be an object; given: {_short(given)}"
+            return f"must be an object; got {_short(given)}"
         case "string_pattern_mismatch":
             pattern = item["ctx"]["pattern"]
-            return f"must be {_PATTERNS.get(pattern, f'text like {pattern}')}; given: {_short(given)}"
+            return f"must be {_PATTERNS.get(pattern, f'text like {pattern}')}; got {_short(given)}"
         case _:
             wanted = re.sub(r"^(Input|String|List|Dictionary|Value) should ", "must ", item["msg"])
-            return f"{wanted}; given: {_short(given)}"
+            return f"{wanted}; got {_short(given)}"
 
 
 def _written(location: tuple[int | str, ...], raw: Any) -> FieldPath:

@@ -14,6 +14,7 @@ import enum
 import math
 import re
 from collections.abc import Callable, Mapping
+from functools import lru_cache
 from types import MappingProxyType
 from typing import Final
 
@@ -22,7 +23,7 @@ from cel_expr_python import cel
 from wayside.expressions.diagnostics import EMPTY, diagnose
 from wayside.expressions.errors import EvaluationError, ExpressionError, position
 from wayside.expressions.expanding import NamedPlaces, expanded
-from wayside.expressions.failures import NO_MEMBERS, clean, says_absent
+from wayside.expressions.failures import NO_MEMBERS, clean, reports_absent
 from wayside.expressions.functions import DECLARATIONS, TAKING_HANDLES
 from wayside.expressions.functions.calls import drop_lost_references
 from wayside.expressions.growth import MOST, growth
@@ -51,6 +52,8 @@ Value = None | bool | int | float | str | bytes | list["Value"] | dict[str | int
 
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _CACHE_SIZE = 1024
+_SHARED = 256
+"""Maximum number of environments and programs that are shared; the oldest are forgotten."""
 _ORDERING = frozenset({"_<_", "_<=_", "_>_", "_>=_"})
 
 
@@ -120,8 +123,9 @@ class Environment:
                 raise ValueError(f"variable {name!r}: CEL reserves this word; choose another name")
         self.variables: Mapping[str, CelType] = MappingProxyType(dict(variables))
         self._members: Mapping[str, CelType] = MappingProxyType(dict(members or {}))
-        self._env = _cel_environment(self.variables)
-        self._typed = _cel_environment({**self.variables, **self._members}) if self._members else None
+        self._env = _cel_environment(tuple(self.variables.items()))
+        typed = tuple({**self.variables, **self._members}.items())
+        self._typed = _cel_environment(typed) if self._members else None
         self._cache: dict[tuple[str, CelType], Expression] = {}
 
     def knowing(self, members: Mapping[str, CelType]) -> Environment:
@@ -148,11 +152,12 @@ class Environment:
         whole = expanded(source, self._places)
         rewritten = doubled(whole.text, whole.origin)
         try:
-            program = self._env.compile(rewritten.text)
+            program = _program(self._env, rewritten.text)
             parsed = parse(program.serialize())
             read, leaves = self._reads(parsed)
             # `has(a.b)` tests for a member of a map; it would not if `a.b` were a variable.
-            typed = program if self._typed is None or "has(" in rewritten.text else self._typed.compile(rewritten.text)
+            untyped = self._typed is None or "has(" in rewritten.text
+            typed = program if untyped else _program(self._typed, rewritten.text)
         except Exception as error:  # noqa: BLE001 (the binding raises RuntimeError, ValueError and others alike)
             raise diagnose(str(error), source, rewritten, self.variables) from None
         _check_patterns(parsed, source)
@@ -177,8 +182,16 @@ class Environment:
         return paths(node, names), leaves
 
 
-def _cel_environment(variables: Mapping[str, CelType]) -> cel.Env:
-    return cel.NewEnv(variables={name: _TYPES[kind] for name, kind in variables.items()}, functions=list(DECLARATIONS))
+@lru_cache(maxsize=_SHARED)
+def _cel_environment(variables: tuple[tuple[str, CelType], ...]) -> cel.Env:
+    """Rules with equal variables share one: making it costs as much as compiling an expression."""
+    return cel.NewEnv(variables={name: _TYPES[kind] for name, kind in variables}, functions=list(DECLARATIONS))
+
+
+@lru_cache(maxsize=_SHARED)
+def _program(environment: cel.Env, text: str) -> cel.Expression:
+    """Rules mostly read the same fields of a stream. Raises what the binding raises."""
+    return environment.compile(text)
 
 
 class Expression:
@@ -290,7 +303,7 @@ class Expression:
             raise EvaluationError(clean(str(error))) from None
         if failed:
             message = clean(value)
-            raise EvaluationError(message, absent=says_absent(message) or (known and "null" in message))
+            raise EvaluationError(message, absent=reports_absent(message) or (known and "null" in message))
         result = _plain(value)
         if self.result is not CelType.DYN:
             self._check(result)
@@ -300,7 +313,7 @@ class Expression:
         wanted = _PYTHON[self.result]
         if isinstance(value, wanted) and not (isinstance(value, bool) and self.result is CelType.DOUBLE):
             return
-        raise EvaluationError(f"must be {self.result.value}, is {_describe(value)}", absent=value is None)
+        raise EvaluationError(f"must be {self.result.value}; got {_describe(value)}", absent=value is None)
 
 
 def _check_static(actual: cel.Type, wanted: CelType, source: str) -> None:
@@ -311,7 +324,7 @@ def _check_static(actual: cel.Type, wanted: CelType, source: str) -> None:
     start = len(source) - len(source.lstrip())
     line, column = position(source, start)
     is_text = kind.value if kind else name.lower()
-    raise ExpressionError(f"must be {wanted.value}, is {is_text}", source=source, line=line, column=column)
+    raise ExpressionError(f"must be {wanted.value}; got {is_text}", source=source, line=line, column=column)
 
 
 def _check_patterns(node: Node, source: str) -> None:
@@ -338,7 +351,7 @@ def _not_text(source: object) -> ExpressionError:
         return ExpressionError("the expression is empty", source="", hint=EMPTY)
     written = str(source).lower() if isinstance(source, bool) else str(source)
     return ExpressionError(
-        f"an expression must be a text, is {type(source).__name__} {written}",
+        f"an expression must be a text; got {type(source).__name__} {written}",
         source=written,
         hint=f'put it in quotes: "{written}"',
     )

@@ -29,18 +29,18 @@ _OF_A_SAMPLE: Final = frozenset({"msg", "item", "sample"})
 AXES: Final = {False: ("x", "y", "yaw"), True: ("latitude", "longitude", "heading")}
 """What a position has in metres, and on the Earth: two coordinates and a direction."""
 FIELDS_AT: Final = {
-    "inside": "whether it is inside the area or lane, or on its edge",
-    "distance": "metres to it; 0 inside",
+    "inside": "whether the position is inside the area or lane, or on its edge",
+    "distance": "metres to the place; 0 inside",
     "along": "metres along the line or lane; negative before its start, greater than its length beyond its end",
     "across": "metres to the left of the line or of the middle of the lane; negative to the right",
-    "heading": "the direction of the position against that of the line, degrees in (-180, 180]; positive to the left",
+    "heading": "the direction of the position relative to the line, degrees in (-180, 180]; positive to the left",
 }
 FIELDS_SEEN: Final = {
     "ahead": "metres to b along the direction of a; negative behind",
     "left": "metres to b across the direction of a, to the left; negative to the right",
     "speedAhead": "the velocity of b minus that of a, along the direction of a, m/s; negative if b falls back",
-    "speedLeft": "the same to the left of a, m/s",
-    "heading": "the direction of b against that of a, degrees in (-180, 180]; positive to the left",
+    "speedLeft": "the velocity of b minus that of a, to the left of a, m/s",
+    "heading": "the direction of b relative to that of a, degrees in (-180, 180]; positive to the left",
 }
 
 

@@ -49,7 +49,7 @@ def clean(message: str) -> str:
     return message
 
 
-def says_absent(message: str) -> bool:
+def reports_absent(message: str) -> bool:
     """Whether a clean message reports an absent value."""
     return message.startswith(_ABSENT)
 
@@ -61,7 +61,7 @@ def _no_overload(operation: str) -> str:
     call = _CALL.search(operation)
     if call is not None and (function := FUNCTIONS.get(call[1])) is not None:
         given = ", ".join(_TYPES.get(kind, kind) for kind in call[2].split(", "))
-        return f"{function.usage()} takes {function.types()}, but got {given}"
+        return f"{function.usage()} takes {function.types()}; got {given}"
     if call is None:
         return f"the operation does not take these types: {operation}"
     name = call[1].replace("_", "").lstrip("@") if not call[1].isalpha() else call[1]

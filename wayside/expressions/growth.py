@@ -1,4 +1,4 @@
-"""How much an expression can make of what it is given: a short one could otherwise fill the memory.
+"""Bounds the size of an expression's result: a short expression could otherwise fill the memory.
 
 CEL bounds how often a loop runs, and how deep an expression is nested, but not how large a value becomes:
 `[text].map(a, a + a)[0]`, within itself and again, doubles it each time. So each literal and each variable counts as

@@ -1,4 +1,4 @@
-"""Values that pass CEL by unread: bytes always, lists and maps where a function of ours takes them as they are.
+"""Handles for values that CEL passes on unread: bytes always, lists and maps if a function takes them as they are.
 
 CEL cuts bytes at NUL and converts lists item by item, which an image or a thousand objects do not survive in time. So
 they enter an expression as a handle: a uint that no field can be taken of, that has no size, and that only the

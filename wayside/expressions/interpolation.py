@@ -90,7 +90,7 @@ class CompiledTemplate:
         """The fields with the values filled in; None where the whole was dropped.
 
         With `integers`, integral doubles become integers throughout, as manifests need them. Raises
-        InterpolationError where an expression fails, is null inside a text, or yields what JSON cannot hold.
+        InterpolationError where an expression fails, is null inside a text, or yields what JSON cannot represent.
         """
         result = _render(self.root, values, integers)
         return None if isinstance(result, _Dropped) else result
@@ -265,17 +265,17 @@ def _failure(embedded: Embedded, message: str, hint: str | None) -> Interpolatio
 
 
 def _checked(value: object) -> Json:
-    """The value as JSON. Raises EvaluationError for NaN, infinities and bytes, which JSON cannot hold."""
+    """The value as JSON. Raises EvaluationError for NaN, infinities and bytes, which JSON cannot represent."""
     match value:
         case float() if not math.isfinite(value):
-            raise EvaluationError(f"yields {value}, which JSON cannot hold")
+            raise EvaluationError(f"yields {value}, which JSON cannot represent")
         case None | bool() | int() | float() | str():
             return value
         case list():
             return [_checked(item) for item in value]
         case dict():
             return {_key_text(key): _checked(item) for key, item in value.items()}
-    raise EvaluationError(f"yields {type(value).__name__}, which JSON cannot hold")
+    raise EvaluationError(f"yields {type(value).__name__}, which JSON cannot represent")
 
 
 def _key_text(key: object) -> str:

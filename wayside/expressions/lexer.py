@@ -1,4 +1,4 @@
-"""CEL's tokens, with their places in the text: what the number pass and the `${…}` scanner stand on.
+"""CEL's tokens with their positions in the text, for the number pass and the `${…}` scanner.
 
 The lexer never fails: what is no token of CEL becomes `OTHER`, and CEL's own parser then reports it.
 """

@@ -1,4 +1,4 @@
-"""Hands an expression just what it reads, as values that CEL takes.
+"""Projects a message to the values that an expression reads, in the types of CEL.
 
 CEL converts a message as a whole, at a cost that grows with it, and one member that it does not know spoils the rest.
 So the paths that an expression reads form a tree, and only what lies on it is copied out of the values, and converted:

@@ -1,4 +1,4 @@
-"""How large a regular expression becomes once RE2 has compiled it, and how long a text `matches` takes.
+"""Bounds the size of a regular expression compiled by RE2, and the length of the text that it matches.
 
 RE2's time is linear in the text, but also in its program, and the program grows with counted repetitions:
 `([ab]{50}){3}` is 150 classes. So the pattern of `matches` must be a literal, whose size is estimated here from its

@@ -1,4 +1,4 @@
-"""Areas, lines and lanes; and exact decisions about single points. `positions` has what is calculated over many."""
+"""Areas, lines and lanes, and exact tests of single points. `positions` computes over many points."""
 
 from __future__ import annotations
 

@@ -287,7 +287,7 @@ class Client:
         return await self._request("PUT", resource.path(metadata["namespace"], metadata["name"]), self._ours, manifest)
 
     async def review(self, resource: Resource, question: Object) -> Object:
-        """Ask something by posting it, which changes nothing: a standby may as well."""
+        """Send a query by POST, which changes nothing: a standby may as well."""
         return await self._request("POST", resource.path(None), body=question, writes=False)
 
     async def server_version(self) -> str:

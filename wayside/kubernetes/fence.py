@@ -1,4 +1,4 @@
-"""The last look before a write goes out: whether this manager may still act.
+"""The last check before a write is sent: whether this manager is still active.
 
 Between the first check and the sending a connection is opened, and a process may be stopped for any time. So the check
 is repeated where the bytes are handed to the socket, in one go with that.

@@ -4,7 +4,7 @@ Each process judges a Lease on its own monotonic clock. The holder renews the Le
 it *sent* its last renewal that was taken. Another process takes the Lease once it has itself *observed it unchanged*
 for its duration, or at once where it was released. Since a renewal is sent before anyone can observe it and the
 deadline is shorter than the duration, the old one has stopped before a new one begins, whatever their clocks show and
-however long either stood still: every write of the Lease carries the resourceVersion that was read, so only one of two
+however long either was stopped: every write of the Lease carries the resourceVersion that was read, so only one of two
 can succeed. No time written by others is believed.
 """
 

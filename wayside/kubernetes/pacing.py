@@ -3,8 +3,8 @@
 Namespaces take turns, and one has as many writes under way as the API server answers without a queue: a flood in one
 leaves the others both the places here and the API server's time. docs/decisions/0029 has the measurements.
 
-A request that waits here has not begun, so its own time limit does not count yet. What waits is bounded by those who
-ask: the workers of the queues, each with the objects of one instance.
+A request that waits here has not begun, so its own time limit does not count yet. The workers of the queues bound the
+number of waiting requests: each worker sends those of one instance.
 """
 
 from __future__ import annotations

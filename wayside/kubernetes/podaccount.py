@@ -62,7 +62,7 @@ class _Token:
         self._file = file
         self._token = ""
         self._read_at = 0.0
-        self._said = False
+        self._reported = False
 
     def read(self) -> str:
         """The token. Raises AccountError where there is none."""
@@ -75,7 +75,7 @@ class _Token:
             raise AccountError(f"{self._file} is empty")
         if self._token and found != self._token:
             log.info("read the renewed token of the pod's service account")
-        self._token, self._said = found, False
+        self._token, self._reported = found, False
         return found
 
     def newest(self) -> str:
@@ -85,7 +85,7 @@ class _Token:
         try:
             return self.read()
         except AccountError as error:
-            if not self._said:
+            if not self._reported:
                 log.warning("cannot read the token of the pod's service account: %s; using the previous token", error)
-            self._said = True
+            self._reported = True
             return self._token

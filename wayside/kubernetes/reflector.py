@@ -86,7 +86,7 @@ class Reflector:
         self._resync = resync
         self._backoff = Backoff(0.1, 5.0)
         self.lists = 0
-        """Number of lists so far."""
+        """Number of lists until now."""
         self.outages = 0
         """How often the server stopped responding or refused."""
 

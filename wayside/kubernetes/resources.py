@@ -1,4 +1,4 @@
-"""Where the API server has the objects of a kind."""
+"""The resources of the API server: group, version and plural of each kind."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""What every process of ours needs: its start, command line, certificate, traces and retries."""
+"""The shared parts of both programs' processes: start, command line, certificate, traces and backoff."""

@@ -73,7 +73,7 @@ def run_cli(app: typer.Typer, program: str, expected: tuple[type[Exception], ...
         if not all(isinstance(each, (_UsageError, *(() if debug else expected))) for each in causes):
             raise
         for each in causes:
-            _tell(program, each)
+            _report(program, each)
         return BAD_INPUT
 
 
@@ -121,7 +121,7 @@ def refuse(message: str) -> NoReturn:
     raise typer.BadParameter(message)
 
 
-def _tell(program: str, error: BaseException) -> None:
+def _report(program: str, error: BaseException) -> None:
     if not isinstance(error, _UsageError):
         print(f"{program}: {error}", file=sys.stderr)  # noqa: T201  the one place
     elif message := error.format_message():  # else the help is the answer, and is printed already

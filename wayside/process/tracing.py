@@ -1,4 +1,4 @@
-"""Spans for OpenTelemetry, as an option: on where the environment names an OTLP endpoint, else nothing is imported.
+"""OpenTelemetry spans, if the environment names an OTLP endpoint; otherwise nothing is imported.
 
     OTEL_EXPORTER_OTLP_ENDPOINT=http://collector:4318   (or OTEL_EXPORTER_OTLP_TRACES_ENDPOINT)
 

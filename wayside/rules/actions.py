@@ -122,10 +122,10 @@ def _window(compiler: Compiler, at: FieldPath, action: ActionSpec, window: Windo
     for stream in streams:
         kept = compiler.kept_ns(stream)
         if window.before.ns and back > kept and not stream.latched:
-            with_for = f" and the rule's for ({compiler.spec.for_})" if compiler.spec.for_.ns else ""
+            with_for = f" plus the rule's for ({compiler.spec.for_})" if compiler.spec.for_.ns else ""
             compiler.problem(
                 (*at, "before"),
-                f"{window.before}{with_for}, more than the {kept / 1e9:g} s that Detector "
+                f"{window.before}{with_for} exceeds the {kept / 1e9:g} s that Detector "
                 f"{compiler.detector.name} keeps of stream {stream.name}: shorten it, or raise the stream's "
                 "buffer.duration",
             )

@@ -268,7 +268,7 @@ class CompiledRule:
 
     @property
     def has_actions(self) -> bool:
-        """Whether an episode has any consequence beside its events, so that its variables may be rendered."""
+        """Whether an episode has any consequence in addition to its events, so that its variables may be rendered."""
         return bool(self.deploys or self.actions)
 
     @property

@@ -64,7 +64,7 @@ def _named(rule: EventRule) -> Iterator[tuple[int, str]]:
 
 def _unknown(name: str, others: Sequence[str]) -> str:
     close = difflib.get_close_matches(name, others, n=1)
-    hint = f"did you mean {close[0]}?" if close else f"there is {', '.join(sorted(others)) or 'no other rule'}"
+    hint = f"did you mean {close[0]}?" if close else f"the others are {', '.join(sorted(others)) or 'none'}"
     return f"there is no rule {name} that the same Detector selects; {hint}"
 
 

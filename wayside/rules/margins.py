@@ -1,4 +1,4 @@
-"""The margin of a condition: how nearly it holds, or by how much.
+"""The margin of a condition: how far it is from changing.
 
 It is the robustness of signal temporal logic: the signed distance of each comparison to its threshold in units of a
 scale, the smaller of both for `&&`, the larger for `||`, and the negative for `!`. It is written as an expression of
@@ -102,8 +102,8 @@ class _Margin:
         if len(scales) > 1:
             raise MarginError(
                 ("spec", MARGIN),
-                f"`{self._text(text)}` reads {' and '.join(sorted(names))}, which have different scales: make it a "
-                "signal with of, and give that a scale",
+                f"`{self._text(text)}` reads {' and '.join(sorted(names))}, which have different scales: define "
+                "this part as a signal with of, and give that signal a scale",
             )
         self._comparisons.append(_Comparison(self._text(text), names, bool(scales)))
         left, right = (f"({self._text(side)})" for side in sides)

@@ -1,4 +1,4 @@
-"""The places of a Detector and the positions of its streams: what rules get of them, and what is wrong with them."""
+"""The places of a Detector and the positions of its streams: compiled for rules, and checked."""
 
 from __future__ import annotations
 

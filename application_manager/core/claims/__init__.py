@@ -1,1 +1,1 @@
-"""What each task requests, and what the tasks of one instance come to: Deploy merges, Reconfigure lies over it."""
+"""What each task requests, and the merged result of the tasks of one instance."""

@@ -1,4 +1,4 @@
-"""What one task requests by itself: an instance and values for it, or why it cannot be had.
+"""What one task requests: an instance and values for it, or the reason for its refusal.
 
 Pure, and independent of all other tasks: it depends on the task's spec and on the template's parameters and key only.
 """
@@ -126,8 +126,8 @@ def _on_what_runs(template: ApplicationTemplate, task: ApplicationTask, given: M
         name, value = next(iter(rest.items()))
         return Refusal(
             Refused.INVALID_PARAMETERS,
-            f"spec.parameters.{name}: {values.shown(value)}: a Suspend task cannot change parameters: remove "
-            f"it{_which(of_key)}",
+            f"spec.parameters.{name}: {values.shown(value)} is given, but a Suspend task cannot change parameters: "
+            f"remove it{_which(of_key)}",
         )
     if operation is Operation.RECONFIGURE and not rest:
         return Refusal(
@@ -143,9 +143,8 @@ def _on_what_runs(template: ApplicationTemplate, task: ApplicationTask, given: M
     if missing:
         return Refusal(
             Refused.INVALID_KEY,
-            f"spec.parameters.{missing[0]}: is missing, and the key of template {template.name}, "
-            f"{template.spec.key}, needs it to identify the instance: give it, or omit all parameters of the key "
-            "to select all instances",
+            f"spec.parameters.{missing[0]}: is missing, but the key of template {template.name} ({template.spec.key}) "
+            "needs it to identify the instance: give it, or omit all parameters of the key to select all instances",
         )
     key = _key_or_refusal(template, given)
     return key if isinstance(key, Refusal) else Claim(task, instance_name(template.name, key), key, rest)
@@ -163,19 +162,19 @@ def _key_or_refusal(template: ApplicationTemplate, given: Mapping[str, Any]) -> 
     if len(key) > MAXIMUM_KEY_LENGTH:
         return Refusal(
             Refused.INVALID_KEY,
-            f"the key of template {template.name}, {template.spec.key}, has {len(key)} characters for this task, "
-            f"more than {MAXIMUM_KEY_LENGTH}: make it from shorter parameters",
+            f"the key of template {template.name} ({template.spec.key}) has {len(key)} characters for this task; at "
+            f"most {MAXIMUM_KEY_LENGTH} are allowed: use shorter parameters",
         )
     return key
 
 
 def all_instances(template: str) -> str:
-    """What stands for all instances of the template where an instance's name stands else; no instance has this name."""
+    """What means all instances of the template where an instance's name stands else; no instance has this name."""
     return f"{template}/*"
 
 
 def template_of_all(instance: str) -> str | None:
-    """The template, where the name stands for all its instances; else None."""
+    """The template, where the name means all its instances; else None."""
     return instance.removesuffix("/*") if instance.endswith("/*") else None
 
 

@@ -1,4 +1,4 @@
-"""Several demands made one: the values of tasks, merged parameter by parameter by the template's strategies.
+"""Merges the values of several tasks, parameter by parameter, by the template's strategies.
 
 Pure. The contributions come in their order of precedence, and nothing else about them matters: which of them arrived
 first, or how often, has no influence. A default counts only where nobody gives the parameter, so it is not added here.
@@ -45,7 +45,7 @@ class Conflict:
         whose, until = (f"task {self.other_task}", "wait until that task ends, ") if self.other_task else (BASELINE, "")
         return (
             f"spec.parameters.{self.parameter}: {values.shown(self.value)} differs from {values.shown(self.other)} of "
-            f"{whose}, and its merge strategy is Same: give the same value, {until}"
+            f"{whose}, but the parameter has merge strategy Same: give the same value, {until}"
             "or let the template's key distinguish the two"
         )
 
@@ -57,7 +57,7 @@ class Merged:
     Attributes:
         parameters: without defaults.
         conflicts: the tasks that could not take part, by name.
-        capped: a word about each sum that went beyond its parameter's bounds.
+        capped: a message about each sum that went beyond its parameter's bounds.
     """
 
     parameters: dict[str, Any]
@@ -144,7 +144,7 @@ def _shown(total: Fraction) -> str:
     try:
         return f"{float(total):g}"
     except OverflowError:
-        return "more than any number can hold"
+        return "more than a number can represent"
 
 
 def _within(parameter: Parameter, total: Fraction) -> int | float:

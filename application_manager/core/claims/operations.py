@@ -1,4 +1,4 @@
-"""What the live tasks of one instance come to: Deploy merges, Reconfigure lies over it, Suspend stops it.
+"""The result of the live tasks of one instance: Deploy tasks merge, Reconfigure overrides, Suspend stops.
 
 Pure. `settle` looks at one instance; a task that means all instances of a template gets a verdict from each, and
 `gathered` makes one of them.
@@ -62,7 +62,7 @@ class Settled:
         parameters: the merged values with the defaults; None where nobody demands the instance.
         suspender: the first task that suspends it and is not outbid.
         verdicts: of all tasks, by name.
-        capped: a word about each sum that is held at a bound.
+        capped: a message about each sum that is held at a bound.
         too_large: why the parameters are beyond their bounds; empty where they are not.
     """
 

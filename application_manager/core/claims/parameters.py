@@ -1,4 +1,4 @@
-"""The parameters of tasks, checked against those that the template declares.
+"""Checks the parameters of tasks against those that the template declares.
 
 Pure. A task whose values do not fit is refused as a whole, and then contributes nothing to any parameter.
 Patterns are matched by CEL's regular expressions (RE2), whose time is linear in the text: Python's own would let a

@@ -1,4 +1,4 @@
-"""JSON values compared and ordered by what they mean: 1 and 1.0 are one value, true and 1 are two."""
+"""Compares and orders JSON values by meaning: 1 and 1.0 are one value, true and 1 are two."""
 
 from __future__ import annotations
 

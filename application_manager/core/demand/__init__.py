@@ -1,1 +1,1 @@
-"""What should run, and where not all can, who does."""
+"""Which instances should run, and which of them do if limits do not permit all."""

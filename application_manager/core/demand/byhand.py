@@ -1,4 +1,4 @@
-"""What people request of an instance by annotations: leave it as it is (pause), or keep it running (hold). Pure.
+"""The annotations of people on an instance: pause (change nothing) and hold (keep it running). Pure.
 
 An annotation counts by being there, whatever its value, which may name who wants it and why; only `false` is as if it
 were absent. Both are conditions of the instance's status while they hold, and are False once it is gone.

@@ -1,4 +1,4 @@
-"""What should become of one instance, from indexes of its namespace and the time. Pure.
+"""Decides what should become of one instance, from indexes of its namespace and the time. Pure.
 
 `decide` is the one way to a decision: the operator calls it over the indexes of its cache, and `demand` over those of a
 snapshot. It changes nothing. Without limits, a decision follows from the tasks that claim the instance, its status and
@@ -73,7 +73,7 @@ class Decided:
 
 
 def decide(name: str, indexes: Indexes, now: float) -> Decided:
-    """What should become of an instance, or of tasks for all instances of a template by the name that stands for these.
+    """What should become of an instance, or of tasks for all instances of a template by the name that means these.
 
     `now` is in seconds since 1970.
     """

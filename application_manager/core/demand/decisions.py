@@ -1,4 +1,4 @@
-"""What is decided of one instance."""
+"""The decision about one instance."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Decision:
         next_change: when this decision changes by itself, in seconds since 1970; None: not at all.
         paused: whether a person wants the instance and its objects left as they are.
         withheld: whether the pause keeps merged values from the instance.
-        capped: a word about each merged sum that is held at its parameter's bound.
+        capped: a message about each merged sum that is held at its parameter's bound.
         too_large: why the merged values are too large and it keeps those that it has; empty where they are not.
         baseline: whether the template demands it by itself.
         suspended: whether it is to be at zero; None where that stays as it is.

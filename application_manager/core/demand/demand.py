@@ -193,7 +193,7 @@ def verdict_of(claimed: Claim, decided: Mapping[str, VerdictSource], meant: Iter
 
     Args:
         claimed: the claim.
-        decided: by instance, and by the names that stand for all instances of a template.
+        decided: by instance, and by the names that mean all instances of a template.
         meant: the instances of the template, where the task means them all.
     """
     task, own = claimed.task.name, decided.get(claimed.instance)

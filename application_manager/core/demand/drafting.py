@@ -1,4 +1,4 @@
-"""An instance as a decision wants it, before the cluster has it: its spec, its manifest and its objects. Pure."""
+"""Drafts an instance from a decision: its spec, its manifest and its objects. Pure."""
 
 from __future__ import annotations
 

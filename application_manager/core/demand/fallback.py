@@ -1,4 +1,4 @@
-"""What a demand turns to when its application does not become ready: `lifecycle.readyTimeout` and `fallback`. Pure.
+"""Fallbacks of instances that do not become ready: `lifecycle.readyTimeout` and `fallback`. Pure.
 
 An instance is overdue once it has not been ready for `readyTimeout` in one go, and no longer so once it has been ready
 for as long in one go: both are shown by conditions of its status with their times of transition, so a restart of the

@@ -1,4 +1,4 @@
-"""Who runs where there is a limit: of all instances that are demanded or there, those that have a place. Pure.
+"""Which instances run within a limit, of all that are demanded or exist. Pure.
 
 Two limits may hold at once: a template's `maxInstances`, and one for the namespace. The order is: what may not be
 stopped (held or paused by a person, or younger than its `minimumUptime`); then what is demanded, by the priority of its

@@ -1,4 +1,4 @@
-"""Limits: what a decision by itself requests, and what becomes of it once places are given. Pure."""
+"""Applies limits: what a decision requests, and its result once places are assigned. Pure."""
 
 from __future__ import annotations
 
@@ -95,8 +95,8 @@ def _why(decision: Decision, place: GrantedPlace) -> tuple[str, str]:
         instead = f", and preempts {place.preempts}" if place.preempts else ""
         return LIMIT_REACHED, f"instance {decision.name} starts once {place.awaits} is deleted{instead}"
     if decision.rank is None:
-        return LIMIT_REACHED, f"{place.limit}, and no task demands instance {decision.name}"
-    remedy = "raise the limit, or wait until another ends"
+        return LIMIT_REACHED, f"{place.limit}, and no task demands the instance {decision.name}"
+    remedy = "raise the limit, or wait until another instance ends"
     if place.yields_to:
         message = f"instance {decision.name} was preempted by {place.yields_to}, since {place.limit}: {remedy}"
         return PREEMPTED, message

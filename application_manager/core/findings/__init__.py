@@ -1,1 +1,1 @@
-"""What is wrong with templates, rules and detectors, before anything depends on them."""
+"""Finds errors in templates, rules and Detectors before anything depends on them."""

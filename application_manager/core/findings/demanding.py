@@ -1,4 +1,4 @@
-"""What a rule's deploy actions ask of templates, looked at before any task is emitted. Pure.
+"""What a rule's deploy actions require of templates, checked before any task is emitted. Pure.
 
 The rule is in order all the same, and a template may yet come or change: so these are remarks, and nothing is refused.
 What `${…}` will be nobody knows before the episode, so of these parameters only the names are looked at.

@@ -1,4 +1,4 @@
-"""Values that a template is tried with before any task gives some. Pure.
+"""Example values to render a template with before any task exists. Pure.
 
 A default, a member of an enum and both booleans are values that will come; all others are made up. So what goes wrong
 on these is only a remark, and on those a fault of the template.
@@ -45,12 +45,12 @@ def _of_tasks(declared: Mapping[str, Parameter]) -> tuple[Example, ...]:
     required = {name: example_of(each) for name, each in declared.items() if each.required}
     made_up = frozenset(name for name in required if not _is_real(declared[name]))
     given = f"only {', '.join(sorted(required))}" if required else "no parameters"
-    least = Example(required, made_up | optional, f"where tasks give {given}")
+    least = Example(required, made_up | optional, f"when tasks give {given}")
     if not optional:
         return (least,)
     every = {name: example_of(each) for name, each in declared.items() if each.default is None}
     made_up = frozenset(name for name in every if not _is_real(declared[name]))
-    return (least, Example(every, made_up, "where tasks give all parameters"))
+    return (least, Example(every, made_up, "when tasks give all parameters"))
 
 
 def example_of(parameter: Parameter) -> Any:

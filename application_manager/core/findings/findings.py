@@ -1,4 +1,4 @@
-"""What a look at a template, a rule or a detector finds: what must be corrected, what may come right, what is odd.
+"""The findings about a template, rule or Detector: errors, errors that may resolve by themselves, and remarks.
 
 The same findings make the condition Accepted, the answer of admission, and what `application-manager check` prints.
 """

@@ -1,4 +1,4 @@
-"""Whether a pod gets the detector that its label names, and the answer to the API server's request. Pure.
+"""Decides whether a pod gets the detector that its label names, and builds the AdmissionReview. Pure.
 
 A pod is never refused. Where it cannot have its detector it is made without, a warning gives the reason to who made it,
 and later an Event of the pod gives it to everybody.

@@ -1,4 +1,4 @@
-"""AdmissionReviews: the API server's requests before it stores an object of ours, and the answers. Pure.
+"""AdmissionReviews: the requests of the API server before it stores an object, and the responses. Pure.
 
 Only a new spec can be refused. Whatever leaves the spec as it is passes, also of an object that was wrong all along:
 else nobody could label it, and a finalizer could never be removed. Deleting passes, and so does what is going anyway.
@@ -19,7 +19,7 @@ REVIEWED = {"ApplicationTemplate": "applicationtemplates", "Detector": "detector
 """The kinds that are looked at, and their resources. Never tasks and instances: an outage of ours, or a fault, must not
 keep a demand from ending."""
 
-MOST_TOLD = 16  # problems, and warnings, of one answer; an HTTP header holds each warning
+MOST_REPORTED = 16  # problems, and warnings, of one answer; an HTTP header holds each warning
 LONGEST = 1024  # characters of each
 
 Json = dict[str, Any]
@@ -32,7 +32,7 @@ class ReviewError(ValueError):
 class Weight(Enum):
     """What findings come to."""
 
-    NONE = "not looked at"
+    NONE = "not checked"
     WARNED = "warned of"
     REFUSED = "refused"
 
@@ -124,7 +124,7 @@ def _cause(problem: str) -> Json:
 
 def shortened(texts: tuple[str, ...]) -> list[str]:
     """The texts as headers can hold them, the first of them where there are many."""
-    lines = [_line(each) for each in texts[:MOST_TOLD]]
+    lines = [_line(each) for each in texts[:MOST_REPORTED]]
     left = len(texts) - len(lines)
     return [*lines, f"and {left} more: correct these first"] if left else lines
 

@@ -1,6 +1,6 @@
-"""What is wrong with EventRules and Detectors, as far as can be known without the message types. Pure.
+"""Finds errors in EventRules and Detectors, as far as possible without the message types. Pure.
 
-The same compiler that the detector runs judges here. A rule is judged with all Detectors that select it. What the rule
+The same compiler that the detector runs checks here. A rule is checked with all Detectors that select it. What the rule
 alone has, or has with every one of them, is its own fault; what only some have, what stands in a field of theirs, and
 what is merely not there yet is a doubt.
 """

@@ -1,4 +1,4 @@
-"""What is wrong with an ApplicationTemplate, found before any task names it. Pure.
+"""Finds errors in an ApplicationTemplate before any task names it. Pure.
 
 It is compiled, its expressions are checked for the types of the parameters they read, and it is rendered on examples.
 What fails on an example counts against the template only if no value of a task could change it; else it is a remark,

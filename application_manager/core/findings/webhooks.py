@@ -1,9 +1,9 @@
-"""The configurations by which the API server requests the manager's review of objects before it stores them. Pure.
+"""The webhook configurations, by which the API server calls the manager before it stores objects. Pure.
 
 A ValidatingWebhookConfiguration for templates, rules and detectors, and a MutatingWebhookConfiguration for pods that
-ask for a detector. What makes them safe to have is here: failurePolicy Ignore and a short timeout, so that a manager
-that is away or hangs delays a change and never prevents it; new specs only, of three kinds, and new pods only that have
-the label; and no side effects, so that a dry run is reviewed as well.
+request a detector. This module makes them safe: failurePolicy Ignore and a short timeout, so that a manager that is
+unavailable or hangs delays a change and never prevents it; only new specs of three kinds, and only new pods with the
+label; and no side effects, so that a dry run is reviewed as well.
 """
 
 from __future__ import annotations
@@ -79,13 +79,13 @@ def certificate_secret(service: str) -> tuple[str, str]:
 def webhook_configuration(
     place: WebhookClientConfig, authority: bytes | None, namespaces: Sequence[str] = (), name: str = "wayside"
 ) -> dict[str, Any]:
-    """What makes the API server ask about templates, rules and detectors.
+    """The webhook configuration for templates, rules and detectors.
 
     Args:
         place: where the manager is.
         authority: the certificate (PEM) of the authority that signed the manager's; None where somebody else writes it
             in, as cert-manager does.
-        namespaces: those that the manager looks after; empty: all.
+        namespaces: those that are managed; empty: all.
         name: the object's.
     """
     webhook: dict[str, Any] = {
@@ -111,7 +111,7 @@ def webhook_configuration(
 def injection_configuration(
     place: WebhookClientConfig, authority: bytes | None, namespaces: Sequence[str] = (), name: str = "wayside"
 ) -> dict[str, Any]:
-    """What makes the API server ask about pods that are to have a detector; the arguments are as above."""
+    """The webhook configuration for pods that request a detector; the arguments are as above."""
     webhook: dict[str, Any] = {
         "name": f"injection.{GROUP}",
         "clientConfig": place.at(INJECTION_PATH, authority),

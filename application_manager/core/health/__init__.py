@@ -1,1 +1,1 @@
-"""Whether what was applied does its work, and in words what keeps it from that."""
+"""Whether the applied objects are ready, and the reason if they are not."""

@@ -1,4 +1,4 @@
-"""Whether any node is as an object's pods require it, in words that name the field and the value. Pure.
+"""Whether any node fits the pods of an object; the message names the field and the value. Pure.
 
 What is looked at is what a template renders from parameters: `nodeName`, `nodeSelector`, and the node affinity that is
 required. Taints, room and all else are the scheduler's to report, on the pod.

@@ -1,4 +1,4 @@
-"""What keeps a pod from running, in words for people who do not read pod statuses. Pure.
+"""Why a pod does not run, from its status, in plain words. Pure.
 
 The same trouble gives the same words, whatever the kubelet is at just now: an image is being pulled once more, a
 container that crashes runs for a moment. So a status that repeats them is not rewritten with each attempt.

@@ -1,4 +1,4 @@
-"""Whether an object that exists also does its work, judged by its status. Pure.
+"""Whether an object is ready, by its status. Pure.
 
 The rules are those of `kubectl rollout status` for workloads and of the conditions Ready and Available for all else. A
 kind without either is ready by being there.

@@ -1,1 +1,1 @@
-"""Whether those who demand, and those who manage, are still there: Leases, judged by our own clock."""
+"""Whether holders of demands are alive, by their Leases and the manager's own clock."""

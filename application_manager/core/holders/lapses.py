@@ -1,4 +1,4 @@
-"""Demands that lapse: those of holders whose Lease is no longer renewed. Pure."""
+"""Demands that expire: those of holders whose Lease is no longer renewed. Pure."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def _lapse(
         return Verdict(Standing.FINISHED, "DetectorLost", message), None
     message = (
         f"holder {holder} is lost: its Lease {lease_name(holder)} was not renewed for {limit:g} s; the demand "
-        "counts again once it is renewed"
+        "counts again once the Lease is renewed"
     )
     return Verdict(Standing.LAPSED, HOLDER_LOST, message), since + FINISH_LOST_AFTER
 

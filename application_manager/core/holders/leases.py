@@ -1,4 +1,4 @@
-"""Whether the holders of demands are still there, judged by their Leases and by our own clock alone.
+"""Whether the holders of demands are alive, by their Leases and the manager's own clock alone.
 
 A Lease lapses when it has been *observed unchanged* for long enough, on a clock of ours that runs only while we reach
 the API server: the holder's clock may be wrong, and an outage stops its renewals as well as our looking. Pure: fed with
@@ -40,7 +40,7 @@ class HealthyTime:
     """Seconds during which we reached the API server.
 
     The time between two looks counts when both succeeded and were at most `longest` seconds apart; a longer gap means
-    that we ourselves stood still, and then nothing is known about others.
+    that this process itself was stopped, and then nothing is known about others.
     """
 
     def __init__(self, longest: float = 5.0) -> None:

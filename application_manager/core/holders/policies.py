@@ -1,6 +1,6 @@
-"""What tasks may ask for: the administrator's word on how many there may be, and on what holders may do. Pure.
+"""What tasks may request: the administrator's limits on their number, and on what holders may do. Pure.
 
-Who a holder is, the chart's admission policy makes sure of; what it may ask for is decided here. People's tasks have no
+Who a holder is, the chart's admission policy makes sure of; what it may request is decided here. People's tasks have no
 holder, and are limited by their roles.
 """
 
@@ -85,7 +85,7 @@ class TaskPolicy:
         return next((each for each in self.holders if each.matches(namespace, holder)), None)
 
     def refusal(self, task: ApplicationTask) -> Verdict | None:
-        """Why the task's holder may not ask for that, whatever others do; None if it may."""
+        """Why the task's holder may not request that, whatever others do; None if it may."""
         holder = task.spec.requester.holder
         policy = self.of(task.namespace, holder)
         if policy is None:

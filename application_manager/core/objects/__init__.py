@@ -1,1 +1,1 @@
-"""From a template and an instance to manifests: rendered, labelled, allowed."""
+"""Turns a template and an instance into manifests: rendered, labelled, checked against the policy."""

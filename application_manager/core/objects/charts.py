@@ -115,7 +115,7 @@ def parse_chart(source: ChartSource, text: str) -> ChartOutcome:
         if not found_problems:
             objects.append(ChartObject(file, manifest))
     if len(objects) > MAXIMUM_OBJECTS:
-        problems.append(f"it has {len(objects)} objects, more than {MAXIMUM_OBJECTS}: use a smaller chart")
+        problems.append(f"it has {len(objects)} objects; at most {MAXIMUM_OBJECTS} are allowed: use a smaller chart")
     if not objects and not problems:
         problems.append("it renders no objects with these values: correct the values")
     if problems:

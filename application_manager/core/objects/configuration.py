@@ -79,8 +79,8 @@ class Configuration:
         size = sum(len(name.encode()) + len(text.encode()) for name, text in files.items())
         if size > MAXIMUM_BYTES:
             problems.append(
-                f"spec.configuration: the files have {size} bytes together, more than the {MAXIMUM_BYTES} that a "
-                "ConfigMap can hold: pass a reference to the data instead"
+                f"spec.configuration: the files have {size} bytes together; a ConfigMap can contain at most "
+                f"{MAXIMUM_BYTES}: pass a reference to the data instead"
             )
         return files, problems
 

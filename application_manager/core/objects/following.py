@@ -1,8 +1,8 @@
-"""Which pods follow an instance's configuration, and how each shows what it received last. Pure.
+"""Which pods mount an instance's configuration, and the annotation that announces a change to them. Pure.
 
-The kubelet brings a changed ConfigMap into a pod at its next look at that pod, which may be more than a minute away.
-It looks at once when the pod itself changes, and an annotation is enough. It names the content that it stands for, so
-the same content is never announced twice.
+The kubelet writes a changed ConfigMap into a pod at its next sync of that pod, which may be more than a minute away. It
+syncs at once when the pod itself changes, and an annotation is enough. The annotation is a hash of the content, so the
+same content is never announced twice.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _OVER = ("Succeeded", "Failed")
 
 
 def fingerprint(files: Mapping[str, str]) -> str:
-    """A short text that stands for the content of the files."""
+    """A short hash of the content of the files."""
     return hashlib.sha256(values.canonical(dict(files)).encode()).hexdigest()[:16]
 
 

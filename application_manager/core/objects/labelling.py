@@ -1,4 +1,4 @@
-"""The labels by which an instance's objects, and the pods of its workloads, are found again. Pure.
+"""The labels that identify an instance's objects and the pods of its workloads. Pure.
 
 Pods have the instance's label alone: it never changes while the instance lives, so it never makes a workload roll out.
 """

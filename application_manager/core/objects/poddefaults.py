@@ -1,4 +1,4 @@
-"""What holds for the pods of all detectors that a manager runs, beside what each Detector has. Pure."""
+"""The defaults for the pods of all detectors that a manager runs; a Detector overrides them. Pure."""
 
 from __future__ import annotations
 

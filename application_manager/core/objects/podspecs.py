@@ -1,4 +1,4 @@
-"""The pod specs in a manifest, and the accounts that it names elsewhere, found by their shape: whatever its kind. Pure.
+"""Finds the pod specs and the service accounts in a manifest of any kind, by their shape. Pure.
 
 Kinds that an administrator allows may make pods in ways that nobody foresaw here (ReplicaSet, Rollout, Knative
 Service), so what has `containers` is a pod's spec wherever it stands.

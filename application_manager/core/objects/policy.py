@@ -1,4 +1,4 @@
-"""What a template may create: the administrator's word on kinds, namespaces and service accounts.
+"""What a template may create: the administrator's limits on kinds, namespaces and service accounts.
 
 The namespace is the wall: a template's objects stay in its own namespace, are of the allowed kinds and run with the
 listed service accounts. The account `default` is there for everyone, so its token is never mounted.

@@ -84,8 +84,8 @@ class Renderer:
         if (count := _expressions(template)) > MOST_EXPRESSIONS:
             raise RenderError(
                 [
-                    f"spec: has {count} expressions in ${{…}}, more than the {MOST_EXPRESSIONS} that a template may "
-                    "have: give longer texts with fewer of them, or make several templates of it"
+                    f"spec: has {count} expressions in ${{…}}; a template may have at most {MOST_EXPRESSIONS}: use "
+                    "fewer expressions, or split the template"
                 ]
             )
         self._keyed = template.spec.key is not None

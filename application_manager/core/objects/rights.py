@@ -1,4 +1,4 @@
-"""What the manager's account must be allowed to do, from the kinds that templates may create. Pure.
+"""The rights that the manager's account needs, from the kinds that templates may create. Pure.
 
 One table, read three times: `application-manager rbac` prints it as roles, a manager that starts queries the API server
 for each of its entries, and the tests hold it against what a manager does. A verb that nothing needs is not in it.
@@ -20,7 +20,7 @@ _LEASES = "coordination.k8s.io"
 _RBAC = "rbac.authorization.k8s.io"
 _LOOKING = ("list", "watch")
 _READING = frozenset({"get", *_LOOKING})
-_TOLD_BY_EVENTS = frozenset({("apps/v1", "StatefulSet"), ("apps/v1", "DaemonSet"), ("batch/v1", "Job")})
+_REPORTED_BY_EVENTS = frozenset({("apps/v1", "StatefulSet"), ("apps/v1", "DaemonSet"), ("batch/v1", "Job")})
 """The kinds whose status does not show that their pods are refused (core/health/refusals.py)."""
 
 
@@ -60,7 +60,7 @@ REMEDY = "apply the output of `application-manager rbac`"
 
 
 def rights(plurals: Mapping[KindKey, str], *, detectors: bool = False) -> list[Right]:
-    """What is needed in each namespace that is looked after.
+    """The rights that are needed in each managed namespace.
 
     Args:
         plurals: of the kinds that are allowed.
@@ -186,7 +186,7 @@ def _children(plurals: Mapping[KindKey, str]) -> Iterator[Right]:
         yield Right(group, plural, others, f"no {kind} of a template is created, changed or deleted")
         if (api_version, kind) in SCALED:
             yield Right(group, f"{plural}/scale", ("patch",), f"no {kind} is suspended or resumed")
-    if _TOLD_BY_EVENTS & plurals.keys():
+    if _REPORTED_BY_EVENTS & plurals.keys():
         yield Right(
             "events.k8s.io",
             "events",
@@ -216,7 +216,7 @@ def roles(
 
     Args:
         plurals: of the kinds that are allowed.
-        namespaces: those that are looked after; empty: all.
+        namespaces: those that are managed; empty: all.
         lease: namespace and name of the managers' Lease.
         account: namespace and name of the manager's service account.
         name: of all roles and bindings; those of the Lease end with `-lease`, of the webhook's certificate

@@ -1,4 +1,4 @@
-"""The detector as a sidecar: what a pod gets that names a Detector in its label. Pure.
+"""The detector as a sidecar: the patch for a pod whose label names a Detector. Pure.
 
 The webhook adds it to pods, and `application-manager inject` to manifests. It is a native sidecar, an init container
 that is always restarted: it starts before the pod's own containers, ends after them, and keeps no Job from completing.
@@ -28,7 +28,7 @@ from application_manager.core.objects.poddefaults import PodDefaults
 from wayside.api import Detector
 
 SIDECAR_LABEL = "wayside.dev/detector"
-"""On pods: the Detector that they ask for."""
+"""On pods: the Detector that they request."""
 CONTAINER = "wayside-detector"
 """The name of the container. A pod that has one of this name has its detector."""
 

@@ -1,10 +1,9 @@
-"""What of an instance is at zero while it is suspended, and what determines its replicas otherwise. Pure.
+"""Which workloads of an instance are scaled to zero while it is suspended, and their replicas afterwards. Pure.
 
-- What has the `scale` subresource goes to zero replicas. What a HorizontalPodAutoscaler scales is thereby paused, as
-  Kubernetes has it: an autoscaler leaves alone what has been set to zero, and continues once it has replicas again. So
-  the autoscaler itself stays as it is, and nothing is fought over.
+- A workload with the `scale` subresource is scaled to zero. This also pauses a HorizontalPodAutoscaler: it ignores a
+  workload with zero replicas, and continues once there are replicas again. So the autoscaler itself is not changed.
 - Jobs and CronJobs have a field for it, `spec.suspend`.
-- A DaemonSet and a bare Pod can only be there or not: they are removed, and made again afterwards.
+- A DaemonSet and a bare Pod cannot be scaled: they are deleted, and created again afterwards.
 """
 
 from __future__ import annotations

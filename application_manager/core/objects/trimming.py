@@ -1,4 +1,4 @@
-"""What of an object the cache keeps: the fields that decisions read, and none that people may fill at will. Pure.
+"""Trims objects for the cache to the fields that decisions read. Pure.
 
 An object may have 1.5 MB, and Python needs several times that. So neither the texts of ConfigMaps and Secrets are kept
 nor containers, managed fields of others, foreign annotations and the values of a task's event.
@@ -18,7 +18,7 @@ Object = dict[str, Any]
 _CONTAINERS = frozenset({"containers", "initContainers", "ephemeralContainers", "volumes"})
 _SPEC_IS_READ = frozenset({"Deployment", "StatefulSet", "DaemonSet", "Job", "CronJob", "Pod", "Service"})
 _CONTENT = frozenset({"data", "binaryData", "stringData"})
-_OF_TASKS = ("templateName",)  # fields of a task's spec that are read beside its model
+_OF_TASKS = ("templateName",)  # fields of a task's spec that are read in addition to its model
 
 
 def own(raw: Object) -> Object:

@@ -28,7 +28,7 @@ NOT_ACCEPTED = Aspect(RUNNING, False, "NotAccepted", "no objects are created for
 
 
 def carried(detector: Detector, pods: Sequence[Mapping[str, Any]]) -> Aspect:
-    """The condition Running of one in others' pods, by the pods that ask for it; those that are over do not count."""
+    """The condition Running of a sidecar, by the pods that request it; pods that have ended do not count."""
     if not detector.spec.service_account_names:
         return Aspect(
             RUNNING, False, "NoAccounts", "spec.serviceAccountNames: is empty: list the service accounts of its pods"

@@ -36,7 +36,7 @@ TEMPLATE_INVALID = "TemplateInvalid"
 
 @dataclass(frozen=True, slots=True)
 class Service:
-    """What an instance has given to its tasks so far.
+    """What an instance has given to its tasks until now.
 
     Attributes:
         applied: whether all objects are as they should be.

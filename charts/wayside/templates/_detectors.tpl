@@ -33,7 +33,7 @@ Of a list: the root, and the Detector. */}}
 {{- toYaml $spec -}}
 {{- end -}}
 
-{{/* The namespace of an object of the values; it must be one that the manager looks after. Of a list: the root, the kind,
+{{/* The namespace of an object of the values; it must be one that the manager manages. Of a list: the root, the kind,
 and the object. */}}
 {{- define "wayside.lookedAfter" -}}
 {{- $root := index . 0 -}}{{- $object := index . 2 -}}
@@ -41,7 +41,7 @@ and the object. */}}
 {{- $list := ternary "namespaces" "grant" (not (empty $root.Values.manager.namespaces)) -}}
 {{- $namespaces := default (list $root.Release.Namespace) (index $root.Values.manager $list) -}}
 {{- if not (has $namespace $namespaces) -}}
-{{- fail (printf "%s %s is in namespace %s, which the manager does not look after: add it to manager.%s, or give it the namespace of one of them (%s)" (index $ 1) $object.name $namespace $list (join ", " $namespaces)) -}}
+{{- fail (printf "%s %s is in namespace %s, which the manager does not manage: add it to manager.%s, or give it the namespace of one of them (%s)" (index $ 1) $object.name $namespace $list (join ", " $namespaces)) -}}
 {{- end -}}
 {{- $namespace -}}
 {{- end -}}

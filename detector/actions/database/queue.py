@@ -56,7 +56,7 @@ class Queue:
         """The key of the request that `first` returned."""
         if self._spool is not None and self._spool.count:
             self._inherited = self._spool.count
-            _log.info("database: the spool holds %d requests of an earlier run", self._inherited)
+            _log.info("database: the spool contains %d requests of an earlier run", self._inherited)
 
     @property
     def inherited(self) -> bool:

@@ -172,8 +172,8 @@ class HolderLease:
             self.held.clear()
             _log.error(
                 (
-                    "process %s took over the Lease %s, because this process (%s) did not renew it; it creates "
-                    "no more tasks until it holds the Lease again"
+                    "process %s took over the Lease %s, because this process (%s) did not renew the Lease; this "
+                    "process creates no tasks until it holds the Lease again"
                 ),
                 holder,
                 self.name,
@@ -183,8 +183,8 @@ class HolderLease:
             _log.warning(
                 (
                     "the Lease %s is held by %s: either another detector with the same name is running (stop "
-                    "or rename one of them), or that process has just been killed; this process (%s) creates "
-                    "no tasks until the Lease has not been renewed for %g s"
+                    "or rename one of them), or the process has just been killed. This process (%s) creates "
+                    "no tasks until the Lease expires, %g s after its last renewal"
                 ),
                 self.name,
                 holder,
@@ -199,7 +199,7 @@ class HolderLease:
         if not self.held.is_set():
             return
         self.held.clear()
-        with suppress(RequestError, TimeoutError):  # then it lapses
+        with suppress(RequestError, TimeoutError):  # then it expires
             async with asyncio.timeout(_RELEASE_DEADLINE):
                 self._candidate.observe(await self._client.get(LEASES, self._namespace, self.name), self._monotonic())
                 draft = self._candidate.released(self._now())

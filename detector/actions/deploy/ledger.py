@@ -88,7 +88,7 @@ class Ledger:
             self.held.add(name)
         elif name not in self.surrendered:
             self.surrendered.add(name)
-            _log.warning("another client ended the task %s, which is still demanded; it stays ended", name)
+            _log.warning("another client ended the task %s, although its episode is open; the task stays ended", name)
 
     def end_of(self, name: str) -> int | None:
         """When the demand ended, in nanoseconds since the epoch; None if it is unknown."""

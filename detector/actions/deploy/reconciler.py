@@ -208,7 +208,7 @@ class DemandReconciler:
         try:
             task = to_task(demand) if self._traces is None else self._traces.task(demand, to_task(demand))
         except ValueError as error:
-            raise TaskRefusedError("Invalid", f"cannot make an ApplicationTask of the demand: {error}") from error
+            raise TaskRefusedError("Invalid", f"cannot create an ApplicationTask from the demand: {error}") from error
         deleted = name in self._ledger.held
         try:
             self._ledger.put(name, await self._store.create(task))

@@ -129,7 +129,7 @@ class Recording:
 
     @property
     def bytes(self) -> int:
-        """Bytes written so far."""
+        """Bytes written until now."""
         return self._closed_bytes + (0 if self._file is None else self._file.end)
 
     @property

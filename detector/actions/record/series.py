@@ -95,7 +95,7 @@ class RecordedSeries:
             self.lost += missing
 
     def outcome(self, state: OutcomeState) -> Outcome:
-        """The outcome so far; the files are those of the last recording."""
+        """The outcome until now; the files are those of the last recording."""
         open_one = self._recording
         return Outcome(
             state,

@@ -21,7 +21,7 @@ def message(store: Typestore, name: str, values: object, where: str) -> object:
     Raises ServiceError if a value belongs to no field, or does not fit its field.
     """
     if not isinstance(values, Mapping):
-        raise ServiceError(f"{where} is {values!r:.80}, but {name} is a map of fields")
+        raise ServiceError(f"{where} must be a map with the fields of {name}; got {values!r:.80}")
     fields = dict(store.fielddefs[name][1])
     unknown = sorted(str(key) for key in values if key not in fields)
     if unknown:
@@ -41,7 +41,7 @@ def _value(store: Typestore, desc: FieldDesc, value: Any, where: str) -> Any:
     count = int(detail[1]) if kind is Nodetype.ARRAY else 0
     items: Sequence[Any] = [None] * count if value is None else value
     if not isinstance(items, list | tuple) or (kind is Nodetype.ARRAY and len(items) != count):
-        raise ServiceError(f"{where} is {value!r:.80}, but must be a list{f' of {count}' if count else ''}")
+        raise ServiceError(f"{where} must be a list{f' of {count}' if count else ''}; got {value!r:.80}")
     made = [_value(store, element, item, f"{where}[{index}]") for index, item in enumerate(items)]
     primitive = str(element[1][0]) if element[0] is Nodetype.BASE else "string"
     return made if primitive == "string" else np.array(made, dtype=_DTYPES.get(primitive, primitive))
@@ -62,7 +62,7 @@ def _scalar(kind: str, value: Any, where: str) -> Any:
             return float(value)
         if float(value).is_integer():
             return _in_range(kind, int(value), where)
-    raise ServiceError(f"{where} is {value!r:.80}, but must be of type {kind}")
+    raise ServiceError(f"{where} must be of type {kind}; got {value!r:.80}")
 
 
 def _in_range(kind: str, value: int, where: str) -> int:
@@ -70,5 +70,5 @@ def _in_range(kind: str, value: int, where: str) -> int:
     signed = kind.startswith("int")
     low, high = (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if signed else (0, 2**bits - 1)
     if not low <= value <= high:
-        raise ServiceError(f"{where} is {value}, but {kind} goes from {low} to {high}")
+        raise ServiceError(f"{where} must be between {low} and {high} ({kind}); got {value}")
     return value

@@ -1,4 +1,4 @@
-"""Rules to begin with, each a use case made small. They read JSON of a stream `odom`; comments name what to change."""
+"""Rules to start from, each a short version of a use case. They read JSON of a stream `odom`; comments guide you."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ class Ingest:
         self._counters = counters
         self._number = 0
         self._newest = NEVER
-        """The greatest time of all samples so far: a sample that is not before it is late in no lane."""
+        """The greatest time of all samples until now: a sample that is not before it is late in no lane."""
         self.came: list[Sample] = []
         """Samples inserted since the last time they were taken, while `noting`."""
         self.lanes: list[Lane] = []

@@ -104,13 +104,13 @@ class Conditions:
             for row, condition in chosen if strange or len(ours) < len(chosen) else ():
                 foreign: Truths | None = None
                 if condition.node is None:
-                    self._ask_cel(block, row, condition, true[row], false[row])
+                    self._evaluate_by_cel(block, row, condition, true[row], false[row])
                     continue
                 if strange and (foreign := results.foreign(condition.node)) is not None and foreign.any():
                     own = block.points(row)
                     foreign = foreign if own is None else foreign & own
                     for point in np.flatnonzero(foreign).tolist():
-                        self._ask_point(block, row, condition, point, true[row], false[row])
+                        self._evaluate_point_by_cel(block, row, condition, point, true[row], false[row])
             unknown = ~(true | false)
             if unknown.any():
                 for row, condition in chosen:
@@ -121,7 +121,7 @@ class Conditions:
 
     # CEL
 
-    def _ask_cel(self, block: Block, row: int, condition: ClientCondition, true: Truths, false: Truths) -> None:
+    def _evaluate_by_cel(self, block: Block, row: int, condition: ClientCondition, true: Truths, false: Truths) -> None:
         """Evaluate a condition by CEL, at the points where any of its inputs changes."""
         count = len(block.ticks)
         changed = np.zeros(block.shape, bool)
@@ -146,9 +146,9 @@ class Conditions:
             return
         for point, following in zip(points, [*points[1:], block.shape[0] * count], strict=True):
             end = min(following, (point // count + 1) * count)
-            self._ask_point(block, row, condition, point, true, false, end - point)
+            self._evaluate_point_by_cel(block, row, condition, point, true, false, end - point)
 
-    def _ask_point(
+    def _evaluate_point_by_cel(
         self,
         block: Block,
         row: int,

@@ -86,7 +86,7 @@ class SampleFields:
         columns: list[list[Any]] = []
         for values in fields.columns:
             column: list[Any] = [MISSING] * len(before)
-            for at, value in zip(there, values, strict=True):
+            for at, value in zip(there, values.tolist() if isinstance(values, np.ndarray) else values, strict=True):
                 column[at] = value
             columns.append(column)
         return columns

@@ -215,7 +215,7 @@ class FleetGroup:
             unknown = ~(verdict.true | verdict.false) & ~strange
             if unknown.any():
                 kinds = np.where(unknown, int(kinds.max()) + 1 + self._kinds(fleet, row, exact=False), kinds)
-        self._ask(fleet, row, field, kinds, verdict)
+        self._evaluate_by_cel(fleet, row, field, kinds, verdict)
         return verdict
 
     def _strange(
@@ -254,7 +254,7 @@ class FleetGroup:
         found: Integers = kinds.reshape(count)
         return found
 
-    def _ask(self, fleet: FleetBlock, row: int, field: str, kinds: Integers, verdict: Ternary) -> None:
+    def _evaluate_by_cel(self, fleet: FleetBlock, row: int, field: str, kinds: Integers, verdict: Ternary) -> None:
         """Evaluate a condition by CEL, once for the ticks of each kind; ticks of a negative kind are already
         decided."""
         track, expression = self.tracks[row], self._of[row][field].expression
@@ -268,8 +268,8 @@ class FleetGroup:
                 track.counters.note(*note, place, int(alike.sum()))
 
 
-_PLACE = "members,"
-"""For errors such as "members, of car1"."""
+_PLACE = "members"
+"""For errors such as "members of car1"."""
 
 
 def _members(rule: CompiledRule) -> Mapping[str, Expression]:

@@ -65,18 +65,18 @@ class Formulas:
         for field, node in self._nodes.items():
             if node is None:
                 verdict = Ternary(np.zeros(count, bool), np.zeros(count, bool))
-                self._ask(field, rows, np.arange(count), verdict)
+                self._evaluate_by_cel(field, rows, np.arange(count), verdict)
             else:
                 true, false = results.truths([node])
                 verdict = Ternary(true[0].copy(), false[0].copy())
                 foreign = results.foreign(node)
                 self._note_unknown(field, rows, verdict, foreign, tags)
                 if foreign is not None:
-                    self._ask(field, rows, np.flatnonzero(foreign), verdict)
+                    self._evaluate_by_cel(field, rows, np.flatnonzero(foreign), verdict)
             found[field] = verdict
         return found
 
-    def _ask(self, field: str, rows: Rows, at: NDArray[np.intp], verdict: Ternary) -> None:
+    def _evaluate_by_cel(self, field: str, rows: Rows, at: NDArray[np.intp], verdict: Ternary) -> None:
         """Evaluate a condition by CEL at some rows."""
         for row in at.tolist():
             value, why = self._conditions[field].explained(rows.variables(row))
@@ -109,7 +109,7 @@ class Formula:
         """The value of each row. Counts unknown values."""
         if self._node is None or not rows.size:
             empty = Column(np.zeros(rows.size), np.zeros(rows.size, np.uint8), None)
-            return self._asked(rows, np.arange(rows.size), empty) if rows.size else empty
+            return self._with_values_by_cel(rows, np.arange(rows.size), empty) if rows.size else empty
         columns = [rows.column(leaf) for leaf in self._program.leaves]
         if self._is_leaf:
             column, tags, foreign = columns[0], columns[0].tags, None
@@ -123,9 +123,9 @@ class Formula:
             at = np.flatnonzero(unknown if foreign is None else unknown & ~foreign)
             kinds = [each.tags if each.tags is not None else np.ones(rows.size, np.uint8) for each in columns]
             _note_unknown(self._name, self._expression, rows, at, np.stack(kinds) if kinds else None)
-        return column if foreign is None else self._asked(rows, np.flatnonzero(foreign), column)
+        return column if foreign is None else self._with_values_by_cel(rows, np.flatnonzero(foreign), column)
 
-    def _asked(self, rows: Rows, at: NDArray[np.intp], column: Column) -> Column:
+    def _with_values_by_cel(self, rows: Rows, at: NDArray[np.intp], column: Column) -> Column:
         """The column, with the values from CEL for some rows."""
         found: list[object] = []
         for row in at.tolist():

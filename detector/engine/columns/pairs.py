@@ -235,7 +235,7 @@ class PairColumns:
             client = block.clients[row]
             condition = getattr(self._subject, role)
             if reason is Reason.ERROR or not self._never(client) & {str(path[0]) for path in condition.paths}:
-                self._track.counters.note(reason, message, f"where of a role, of {client}", times)
+                self._track.counters.note(reason, message, f"where of a or b for {client}", times)
 
         rows = Rows(
             len(block.clients),

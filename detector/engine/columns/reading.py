@@ -118,7 +118,7 @@ class Reader:
             if len(missing):
                 batch = _Batch(table.samples[missing].tolist(), table.clients_of(missing), _Leaves([], None, {}, ()))
                 for row in range(len(missing)):
-                    why: tuple[Reason | None, str] = self._ask(at, batch, row)[1] or (None, "")
+                    why: tuple[Reason | None, str] = self._value_by_cel(at, batch, row)[1] or (None, "")
                     yield Failure(int(batch.clients[row]), *why, 1)
             if at == used.where:
                 rows = rows[(tags == Tag.BOOLEAN) & (values == 1)]
@@ -196,13 +196,13 @@ class Reader:
     def _by_cel(self, at: int, batch: _Batch, rows: Sequence[int], failed: dict[int, tuple[Reason, str]]) -> Column:
         values = []
         for row in rows:
-            value, why = self._ask(at, batch, row)
+            value, why = self._value_by_cel(at, batch, row)
             values.append(value)
             if why is not None:
                 failed[row] = why
         return column_of(values, self._texts)
 
-    def _ask(self, at: int, batch: _Batch, row: int) -> tuple[Value | Unknown, tuple[Reason, str] | None]:
+    def _value_by_cel(self, at: int, batch: _Batch, row: int) -> tuple[Value | Unknown, tuple[Reason, str] | None]:
         """The value of a row by CEL, and the reason if it has none; None if the sample cannot be read."""
         reading, sample = self._readings[at], batch.samples[row]
         parameters = reading.parameters.of(self._names[batch.clients[row]])
@@ -255,7 +255,7 @@ class Reader:
             else:
                 alike = tuple([Tag.NUMBER if each is None else int(each[row]) for each in kinds])
                 if alike not in known:
-                    known[alike] = self._ask(at, batch, row)[1] or (None, "")
+                    known[alike] = self._value_by_cel(at, batch, row)[1] or (None, "")
                 why = known[alike]
             which = (int(batch.clients[row]), *why)
             counts[which] = counts.get(which, 0) + 1

@@ -317,7 +317,7 @@ class SignalColumns:
             own, counters = block.points(row), self._tracks[row].counters
             counters.errors += int(counts.sum() if own is None else counts[own].sum())
             place = f"signal {signal.name} of {block.clients[point // len(block.ticks)]}, stream {key.stream}"
-            counters.last_error = f"{place}: {key.aggregate} needs {wanted}, is {value!r:.80}"
+            counters.last_error = f"{place}: {key.aggregate} needs {wanted}; got {value!r:.80}"
 
     def _note_unknown_signal(self, block: Block, at: int, key: Key, column: Column, fresh: Truths) -> None:
         if column.tags is None:

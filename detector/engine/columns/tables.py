@@ -42,7 +42,7 @@ class Tables:
         self._durations: dict[str, int] = {}
         self._evictions = buffer.evictions
         self._stale = True
-        self._asked: set[tuple[str, Hashable]] = set()
+        self._used: set[tuple[str, Hashable]] = set()
         """The marks requested since the rules were set, by stream and owner."""
         self._marks: dict[tuple[str, Hashable], int] = {}
         self.users: dict[tuple[str, Used], list[tuple[RuleCounters, CompiledSignal]]] = {}
@@ -66,9 +66,9 @@ class Tables:
     def forget_users(self) -> None:
         """Release all columns and marks, except the marks whose owners requested them since the last call."""
         self.users.clear()
-        kept = {name: self._tables[name[0]].marks[at] for name, at in self._marks.items() if name in self._asked}
+        kept = {name: self._tables[name[0]].marks[at] for name, at in self._marks.items() if name in self._used}
         self._marks.clear()
-        self._asked.clear()
+        self._used.clear()
         for table in self._tables.values():
             table.marks.clear()
         for (stream, owner), mark in kept.items():
@@ -95,7 +95,7 @@ class Tables:
 
     def mark(self, stream: str, owner: Hashable) -> int:
         """The owner's mark in the stream's table: the same one at each call, until tables are rebuilt."""
-        self._asked.add((stream, owner))
+        self._used.add((stream, owner))
         if (stream, owner) not in self._marks:
             self._marks[stream, owner] = self._tables[stream].mark()
         return self._marks[stream, owner]

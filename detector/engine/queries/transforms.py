@@ -204,9 +204,9 @@ class _Tree:
             beyond = links[0].stamp - stamp if after == 0 else stamp - links[-1].stamp
             side = "before the first" if after == 0 else "after the last"
             raise TransformError(
-                f"frame {frame!r} of client {self._client} in {links[-1].parent!r} is not known at {_text(stamp)}: "
-                f"that is {beyond / 1e9:.3f} s {side} of its transforms, "
-                f"which are from {_text(links[0].stamp)} to {_text(links[-1].stamp)}"
+                f"client {self._client} has no transform from frame {links[-1].parent!r} to {frame!r} at "
+                f"{_text(stamp)}, which is {beyond / 1e9:.3f} s {side} transform: these frames have transforms from "
+                f"{_text(links[0].stamp)} to {_text(links[-1].stamp)}"
             )
         before = links[after - 1]
         if before.stamp == stamp or after == len(links) or links[after].parent != before.parent:

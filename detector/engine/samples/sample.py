@@ -6,13 +6,15 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 from wayside.expressions.columns.values import MISSING
 
 __all__ = ["MISSING"]
 
 SAMPLE_OVERHEAD = 160
-"""The memory that a sample takes beside its payload, in bytes: its object, its numbers and its entries in queues."""
+"""The memory of a sample without its payload, in bytes: its object, its numbers and its entries in queues."""
 
 
 class Arrival(msgspec.Struct, frozen=True, gc=False, order=True):
@@ -134,11 +136,15 @@ class NearDecoder(Decoder, Protocol):
         """The sender's time nearest to the receive time; nanoseconds since the epoch. Used instead of `stamp`."""
 
 
+FieldColumn = Sequence[Any] | NDArray[np.float64]
+"""A value for each payload: plain as from `decode`, or MISSING. An array: all are doubles."""
+
+
 class Fields(NamedTuple):
     """Some fields of several messages."""
 
-    columns: Sequence[Sequence[Any]]
-    """By path, a value for each payload: plain as from `decode`, or MISSING."""
+    columns: Sequence[FieldColumn]
+    """By path."""
     errors: Mapping[int, DecodeError]
     """The payloads that cannot be read, by their indices; they are MISSING in all columns."""
     odd: Sequence[int]

@@ -233,7 +233,7 @@ def candidates(
                 members = [
                     views.of(client, element)
                     for client, view in seen
-                    if views.truth(fleet.members, view, f"members, of {client}") is True
+                    if views.truth(fleet.members, view, f"members of {client}") is True
                 ]
                 yield Candidate(
                     Subject((), element.name),
@@ -301,7 +301,7 @@ def _role(where: Expression | None, element: CompiledElement, views: Views, clie
     if where is None:
         return dict.fromkeys(clients, True)
     return {
-        client: views.truth(where, _with(views, client, element), f"where of a role, of {client}") for client in clients
+        client: views.truth(where, _with(views, client, element), f"where of a or b for {client}") for client in clients
     }
 
 

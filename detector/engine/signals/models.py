@@ -80,7 +80,7 @@ def _numbers(
         if value is None or isinstance(value, Unknown):
             return None
         if not isinstance(value, int | float):
-            counters.note(Reason.ERROR, f"signal {model.name}: {name} must be a number, is {value!r:.80}")
+            counters.note(Reason.ERROR, f"signal {model.name}: {name} must be a number; got {value!r:.80}")
             return None
         numbers.append(float(value))
     return numbers

@@ -255,7 +255,7 @@ def _fitting(
             fitting.append((time, value))
         else:
             counters.errors += 1
-            needs = f"{signal.aggregate} needs {wanted}, is {value!r:.80}"
+            needs = f"{signal.aggregate} needs {wanted}; got {value!r:.80}"
             counters.last_error = f"{_place(signal, client)}: {needs}"
     return fitting
 

@@ -181,7 +181,7 @@ class DataTimeline:
         yield from self._release(None)
 
     def _token(self, arrival: Arrival) -> Iterator[Step]:
-        """A change of a token has no stamp: it follows all samples with the newest stamp so far."""
+        """A change of a token has no stamp: it follows all samples with the newest stamp until now."""
         newest = self.now if self._newest is None else self._newest
         if newest <= self.now or self._waiting_bytes >= self.maximum_bytes:
             yield Insert((arrival,), (self.now,))

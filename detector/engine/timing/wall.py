@@ -60,7 +60,7 @@ class WallTimeline:
         return deque(each for each in arrivals if each.stream in triggers and each.received > past)
 
     def gap(self, time: int) -> Iterator[Step]:
-        """The clock stood still or jumped: continue at `time` without the ticks between."""
+        """The clock was stopped or jumped: continue at `time` without the ticks between."""
         backwards, self.now = time < self.now, time
         yield Gap(time, backwards)
 

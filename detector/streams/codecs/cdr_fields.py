@@ -1,7 +1,8 @@
 """CDR: reads a few fields, by a function whose source is generated for the type and the paths (see `cdr_walk`).
 
-It finds what rosbags finds, and makes all its checks, including those of skipped fields. A payload that fails a check
-is decoded as a whole, so that the decoder reports the error.
+It finds what rosbags finds, and makes all its checks, including those of skipped fields. Many payloads alike are read
+together (see `cdr_columns`), the others one after another. A payload that fails a check is decoded as a whole, so that
+the decoder reports the error.
 """
 
 from __future__ import annotations
@@ -10,15 +11,16 @@ import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from rosbags.interfaces import Nodetype
 
-from detector.engine.samples.sample import MISSING, FieldReader, Fields
+from detector.engine.samples.sample import MISSING, FieldColumn, FieldReader, Fields
+from detector.streams.codecs.cdr_columns import LEAST, CdrColumns, Places
 from detector.streams.codecs.cdr_source import CdrSource, UnwalkableError
 from detector.streams.codecs.cdr_values import PADDING
-from detector.streams.codecs.cdr_walk import Tree, Walk
+from detector.streams.codecs.cdr_walk import Tree, Value, Walk
 from detector.streams.codecs.paths import Path, complete, shortest, spread
 from detector.streams.codecs.ros import RosTypes
 
@@ -54,32 +56,60 @@ def cdr_fields(
     """
     whole = tuple(shortest(_readable(types, type_name, path) for path in paths))
     try:
-        little, big = _walkers(types, type_name, whole)
+        little, big = _readers(types, type_name, whole)
     except UnwalkableError:
         return None
 
     def read_fields(payloads: Sequence[bytes]) -> Fields:
-        columns, left = _read(little, payloads)
+        columns, left = little.read(payloads)
         # A stream rarely has both byte orders: payloads with the most common one are read, the others are decoded as a
         # whole.
         if 2 * sum(payloads[place][:2] == _BIG.representation for place in left) > len(payloads):
-            columns, left = _read(big, payloads)
+            columns, left = big.read(payloads)
         return spread(complete(payloads, columns, whole, left, decode), whole, paths)
 
     return read_fields
 
 
-def _read(walk: _Walker, payloads: Sequence[bytes]) -> tuple[list[list[Any]], list[int]]:
-    """The columns of the readable payloads, and the indices of the others."""
-    left: list[int] = []
-    columns = walk(payloads, left.append)
-    present = len(payloads) - len(left)
-    return [[MISSING] * present if column is None else column for column in columns], left
+class _Reader(NamedTuple):
+    """Reads paths in payloads of one byte order."""
+
+    walk: _Walker
+    together: CdrColumns | None
+    """Reads the paths that exist in many payloads at once; None: some are neither numbers nor texts."""
+    existing: Sequence[int]
+    """The indices of the paths that exist."""
+
+    def read(self, payloads: Sequence[bytes]) -> tuple[list[FieldColumn], list[int]]:
+        """The columns of the readable payloads, and the indices of the others."""
+        if self.together is None or len(payloads) < LEAST:
+            return self._walked(payloads)
+        rows, values = self.together.read(payloads)
+        others = np.delete(np.arange(len(payloads)), rows)
+        columns, refused = self._walked([payloads[place] for place in others.tolist()])
+        order = np.argsort(np.concatenate([rows, np.delete(others, refused)])) if len(others) else rows
+        read = dict(zip(self.existing, values, strict=True))
+        for at, column in enumerate(columns):
+            if at not in read:
+                columns[at] = [MISSING] * len(order)
+            elif len(others):
+                walked = np.fromiter(column, object, len(column))
+                columns[at] = np.concatenate([read[at].astype(object), walked])[order].tolist()
+            else:
+                columns[at] = read[at] if read[at].dtype == np.float64 else read[at].tolist()
+        return columns, others[refused].tolist()
+
+    def _walked(self, payloads: Sequence[bytes]) -> tuple[list[FieldColumn], list[int]]:
+        """The same, one payload after another."""
+        left: list[int] = []
+        columns = self.walk(payloads, left.append)
+        present = len(payloads) - len(left)
+        return [[MISSING] * present if column is None else column for column in columns], left
 
 
 @lru_cache(maxsize=256)
-def _walkers(types: RosTypes, type_name: str, paths: tuple[Path, ...]) -> tuple[_Walker, _Walker]:
-    return _walker(types, type_name, paths, _LITTLE), _walker(types, type_name, paths, _BIG)
+def _readers(types: RosTypes, type_name: str, paths: tuple[Path, ...]) -> tuple[_Reader, _Reader]:
+    return _reader(types, type_name, paths, _LITTLE), _reader(types, type_name, paths, _BIG)
 
 
 def _readable(types: RosTypes, type_name: str, path: Path) -> Path:
@@ -95,37 +125,74 @@ def _readable(types: RosTypes, type_name: str, path: Path) -> Path:
     return path
 
 
-def _walker(types: RosTypes, type_name: str, paths: Sequence[Path], order: _Order) -> _Walker:
-    """A function that reads the paths, none of which lies below another one. Raises UnwalkableError."""
-    code = CdrSource(order.sign)
-    walk = Walk(types, code)
-    mark = code.encapsulation()
-    walk.message(type_name, _tree(paths))
-    code.flush()
-    refuse = ["refuse(place)", "continue"]
-    found = [walk.found.get(path) for path in paths]
+def _reader(types: RosTypes, type_name: str, paths: Sequence[Path], order: _Order) -> _Reader:
+    """Reads the paths, none of which lies below another one. Raises UnwalkableError."""
+    source, found = _walk(types, type_name, paths, order, noting=False)
     appended = [(at, value) for at, value in enumerate(found) if value is not None]
-    source = [
+    refuse = ["refuse(place)", "continue"]
+    lines = [
         "def read(payloads, refuse):",
         *(f" column{at} = []; append{at} = column{at}.append" for at, _ in appended),
         " for place, p in enumerate(payloads):",
         "  try:",
-        *(f"   {line}" for line in code.lines),
+        *(f"   {line}" for line in source.lines),
         "  except refused:",
         *(f"   {line}" for line in refuse),
-        f"  if {mark} != {order.mark} or not {code.at()} <= len(p) <= {code.at(3)}:",
+        f"  if {source.wrong(order.mark)}:",
         *(f"   {line}" for line in refuse),
         *(f"  append{at}({value.expression})" for at, value in appended),
         f" return [{', '.join('None' if value is None else f'column{at}' for at, value in enumerate(found))}]",
     ]
-    space = {**code.bound, "refused": _REFUSED, "texts": _Texts(), "frombuffer": np.frombuffer}
+    texts = _Texts()
+    walk = _compiled(type_name, lines, source, texts)
+    conversions = [(at, value.convert) for at, value in appended if value.convert is not None]
+    together = _together(types, type_name, paths, order, texts)
+    return _Reader(
+        partial(_converted, walk, conversions) if conversions else walk, together, [at for at, _ in appended]
+    )
+
+
+def _together(
+    types: RosTypes, type_name: str, paths: Sequence[Path], order: _Order, texts: _Texts
+) -> CdrColumns | None:
+    """Reads the paths that exist in many payloads at once; None if some are neither numbers nor texts."""
+    source, found = _walk(types, type_name, paths, order, noting=True)
+    existing = [value for value in found if value is not None]
+    places = [value.place for value in existing if value.place is not None]
+    if len(places) < len(existing):
+        return None
+    lines = [
+        "def read(p):",
+        " lengths, spans = [], []",
+        *(f" {line}" for line in source.lines),
+        f" if {source.wrong(order.mark)}: raise IndexError",
+        f" return Places(lengths, spans, [{', '.join(f'({begin}, {end})' for begin, end in places)}])",
+    ]
+    kinds = [np.dtype(order.sign + value.form) if value.form else None for value in existing]
+    return CdrColumns(_compiled(type_name, lines, source, texts), _REFUSED, kinds, texts)
+
+
+def _walk(
+    types: RosTypes, type_name: str, paths: Sequence[Path], order: _Order, *, noting: bool
+) -> tuple[CdrSource, list[Value | None]]:
+    """The source that walks through a payload, and by path the value that it reads."""
+    source = CdrSource(order.sign, noting)
+    walk = Walk(types, source)
+    source.encapsulation()
+    walk.message(type_name, _tree(paths))
+    source.flush()
+    return source, [walk.found.get(path) for path in paths]
+
+
+def _compiled(type_name: str, lines: Sequence[str], source: CdrSource, texts: _Texts) -> Any:
+    """The function `read` that these lines define."""
+    space = {**source.bound, "refused": _REFUSED, "texts": texts, "frombuffer": np.frombuffer, "Places": Places}
     try:
         # The only external text in the source are quoted names of fields.
-        exec(compile("\n".join(source), f"<fields of {type_name}>", "exec"), space)  # noqa: S102
+        exec(compile("\n".join(lines), f"<fields of {type_name}>", "exec"), space)  # noqa: S102
     except (SyntaxError, RecursionError, MemoryError) as error:
         raise UnwalkableError(f"{type_name} is too large") from error
-    conversions = [(at, value.convert) for at, value in appended if value.convert is not None]
-    return partial(_converted, space["read"], conversions) if conversions else space["read"]
+    return space["read"]
 
 
 def _converted(

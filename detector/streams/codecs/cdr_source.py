@@ -26,12 +26,16 @@ class CdrSource:
 
     sign: str
     """The sign of the byte order in struct and numpy."""
+    noting: bool = False
+    """Whether the lines also add the places of all lengths and texts to the lists `lengths` and `spans`."""
     modulus: int = 8
     remainder: int = 0
     """Of the distance to the end of the encapsulation, divided by the modulus."""
     base: str = ""
     constant: int = 0
 
+    mark: str = ""
+    """The name of the byte order's number."""
     lines: list[str] = field(default_factory=list)
     bound: dict[str, Any] = field(default_factory=dict)
     """The objects that the lines refer to."""
@@ -45,11 +49,14 @@ class CdrSource:
         constant = self.constant + further
         return str(constant) if not self.base else f"{self.base} + {constant}" if constant else self.base
 
-    def encapsulation(self) -> str:
-        """Reads the byte order; returns the name of the number."""
-        mark = self.read("H", 2)
+    def encapsulation(self) -> None:
+        """Reads the byte order."""
+        self.mark = self.read("H", 2)
         self.constant, self.remainder = 4, 0
-        return mark
+
+    def wrong(self, mark: int) -> str:
+        """After the last field: whether the payload has another byte order than `mark`, or does not end here."""
+        return f"{self.mark} != {mark} or not {self.at()} <= len(p) <= {self.at(3)}"
 
     def name(self) -> str:
         """A new variable."""
@@ -73,6 +80,12 @@ class CdrSource:
         self.pending.append((self.constant, form, name))
         self.advance(size)
         return name
+
+    def length(self) -> str:
+        """Reads the length of a text or sequence; returns the name of its value."""
+        if self.noting:
+            self.lines.append(f"{self.indent}lengths.append({self.at()})")
+        return self.read("I", 4)
 
     def flush(self) -> None:
         """Adds the line that reads the pending numbers."""

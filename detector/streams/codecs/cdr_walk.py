@@ -48,11 +48,15 @@ _MOST_FIELDS = 20_000
 
 
 @dataclass(frozen=True, slots=True)
-class _Value:
+class Value:
     """A value that the source has read, and its conversion to a plain value."""
 
     expression: str
     convert: Callable[[Any], Any] | None = None
+    place: tuple[str, str] | None = None
+    """The source of its first byte and of the byte behind it; None: it is no number or text."""
+    form: str = ""
+    """The format of a number; empty: it is none."""
 
 
 @dataclass
@@ -61,7 +65,7 @@ class Walk:
 
     types: RosTypes
     source: CdrSource
-    found: dict[Path, _Value] = field(default_factory=dict)
+    found: dict[Path, Value] = field(default_factory=dict)
     """The requested values, by path."""
     fields: int = 0
 
@@ -72,7 +76,7 @@ class Walk:
         for place, (name, desc) in enumerate(fields):
             self.fields += 1
             if self.fields > _MOST_FIELDS:
-                raise UnwalkableError(f"{type_name} holds too much")
+                raise UnwalkableError(f"{type_name} has too many fields")
             if isinstance(wanted, bool):
                 value = self._field(desc, wanted)
                 if name != PADDING:
@@ -88,18 +92,18 @@ class Walk:
                     self.source.align(following)
         return f"{{{', '.join(parts)}}}"
 
-    def _plain(self, value: _Value) -> str:
+    def _plain(self, value: Value) -> str:
         """The source of the plain value."""
         convert = value.convert
         if convert is None:
             return value.expression
         return f"{self.source.bind(convert)}({value.expression})"
 
-    def _field(self, desc: FieldDesc, wanted: Tree | bool, path: Path = ()) -> _Value:
+    def _field(self, desc: FieldDesc, wanted: Tree | bool, path: Path = ()) -> Value:
         """Walks through a field; its value is kept if the whole field is requested."""
         kind, detail = desc
         if kind is Nodetype.NAME:
-            return _Value(self.message(str(detail), wanted, path))
+            return Value(self.message(str(detail), wanted, path))
         whole = wanted is True
         if kind is Nodetype.BASE:
             return self._scalar(str(detail[0]), whole)
@@ -118,50 +122,52 @@ class Walk:
             return self._sequence_of_messages(str(element[1]), whole)
         return self._sequence(str(element[1][0]), whole)
 
-    def _scalar(self, kind: str, wanted: bool) -> _Value:
+    def _scalar(self, kind: str, wanted: bool) -> Value:
         """A number or a text."""
         if kind == "string":
-            return _Value(self._text(wanted))
+            return self._text(wanted)
         size = _size(kind)
         if wanted:
+            form, place = _FORMATS[kind], (self.source.at(), self.source.at(size))
             # A byte is read as an octet directly.
-            return _Value(self.source.read(_FORMATS[kind], size), float if kind == "byte" else scalar(kind))
+            return Value(self.source.read(form, size), float if kind == "byte" else scalar(kind), place, form)
         self.source.advance(size)
-        return _Value("")
+        return Value("")
 
-    def _text(self, wanted: bool) -> str:
-        """A text; returns the name of its value."""
-        length = self.source.read("I", 4)
+    def _text(self, wanted: bool) -> Value:
+        length = self.source.length()
         self.source.flush()
         begin = self.source.at()
         self.source.rebase(f"{begin} + {length}", 1)
         text = f"texts[p[{begin}:{self.source.base}]]"
+        if self.source.noting:
+            self.source.line(f"spans.append(({begin}, {self.source.base}))")
         if not wanted:
             self.source.line(text)
-            return ""
+            return Value("")
         name = self.source.name()
         self.source.line(f"{name} = {text}")
-        return name
+        return Value(name, place=(begin, self.source.base))
 
-    def _array(self, kind: str, count: int, wanted: bool) -> _Value:
+    def _array(self, kind: str, count: int, wanted: bool) -> Value:
         if kind == "string":
             values = self._collected(wanted)
-            self._append(values, self._text(wanted))
+            self._append(values, self._text(wanted).expression)
             if count > 1:
                 with_values = partial(self._next_text, values)
                 self.source.loop(str(count - 1), with_values)
-            return _Value(values or "")
+            return Value(values or "")
         value = self._numbers(kind, str(count), self.source.at()) if wanted else ""
         self.source.advance(count * _size(kind))
-        return _Value(value)
+        return Value(value)
 
-    def _sequence(self, kind: str, wanted: bool) -> _Value:
-        count = self.source.read("I", 4)
+    def _sequence(self, kind: str, wanted: bool) -> Value:
+        count = self.source.length()
         if kind == "string":
             values = self._collected(wanted)
             self.source.line(f"if {self.source.at()} + 5 * {count} > len(p): raise IndexError")
             self.source.loop(count, partial(self._next_text, values))
-            return _Value(values or "")
+            return Value(values or "")
         size = _size(kind)
         begin = self.source.at()
         divisor = self.source.divisor()
@@ -171,7 +177,7 @@ class Walk:
         self.source.flush()
         value = self._numbers(kind, count, begin) if wanted else ""
         self.source.rebase(f"{begin} + {count} * {size}", math.gcd(divisor, size))
-        return _Value(value)
+        return Value(value)
 
     def _numbers(self, kind: str, count: str, begin: str) -> str:
         """Reads an array of numbers; returns the name of its value."""
@@ -186,9 +192,9 @@ class Walk:
 
     def _next_text(self, values: str | None) -> None:
         self.source.align(4)
-        self._append(values, self._text(values is not None))
+        self._append(values, self._text(values is not None).expression)
 
-    def _array_of_messages(self, type_name: str, count: int, wanted: bool) -> _Value:
+    def _array_of_messages(self, type_name: str, count: int, wanted: bool) -> Value:
         element: FieldDesc = (Nodetype.NAME, type_name)
         before = self._alignment(element)
         aligned = before > self._alignment_behind(element)
@@ -204,10 +210,10 @@ class Walk:
                 one(values)
         else:
             self.source.loop(str(count), partial(one, values))
-        return _Value(values or "")
+        return Value(values or "")
 
-    def _sequence_of_messages(self, type_name: str, wanted: bool) -> _Value:
-        count = self.source.read("I", 4)
+    def _sequence_of_messages(self, type_name: str, wanted: bool) -> Value:
+        count = self.source.length()
         before = self._alignment((Nodetype.NAME, type_name))
         self.source.line(f"if {self.source.at()} + {count} > len(p): raise IndexError")
         size = None if wanted else self._fixed_size(type_name, before)
@@ -219,7 +225,7 @@ class Walk:
             )
             stride = size + -size % before
             self.source.rebase(f"{begin} + {size} + {stride} * ({count} - 1) if {count} else {here}", divisor)
-            return _Value("")
+            return Value("")
 
         def one(values: str | None) -> None:
             self.source.align(before)
@@ -227,7 +233,7 @@ class Walk:
 
         values = self._collected(wanted)
         self.source.loop(count, partial(one, values))
-        return _Value(values or "")
+        return Value(values or "")
 
     def _fixed_size(self, type_name: str, alignment: int) -> int | None:
         """The size of messages of the type if it is constant for this alignment; else None."""

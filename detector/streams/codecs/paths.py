@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Final
 
-from detector.engine.samples.sample import MISSING, DecodeError, Fields
+from detector.engine.samples.sample import MISSING, DecodeError, FieldColumn, Fields
 
 Path = tuple[str | int, ...]
 
@@ -24,7 +24,7 @@ def shortest(paths: Iterable[Path]) -> list[Path]:
 
 def complete(
     payloads: Sequence[bytes],
-    columns: Sequence[list[Any]],
+    columns: Sequence[FieldColumn],
     read: Sequence[Path],
     left: Sequence[int],
     decode: Callable[[bytes], Any],
@@ -53,7 +53,7 @@ def complete(
     return Fields([_merged(column, left, [row[at] for row in rows]) for at, column in enumerate(columns)], errors, odd)
 
 
-def _merged(column: list[Any], places: Sequence[int], values: Sequence[Any]) -> list[Any]:
+def _merged(column: FieldColumn, places: Sequence[int], values: Sequence[Any]) -> list[Any]:
     """The column with the values inserted at their indices."""
     merged: list[Any] = []
     taken = 0
@@ -69,7 +69,7 @@ def _merged(column: list[Any], places: Sequence[int], values: Sequence[Any]) -> 
 def spread(fields: Fields, read: Sequence[Path], paths: Sequence[Path]) -> Fields:
     """The columns of `paths`, each of which is one of the paths `read` or lies below one."""
     places = {path: at for at, path in enumerate(read)}
-    columns: list[Sequence[Any]] = []
+    columns: list[FieldColumn] = []
     odd = set(fields.odd)
     for path in paths:
         length = next(length for length in range(len(path) + 1) if path[:length] in places)

@@ -257,4 +257,4 @@ def test_a_window_that_reaches_back_further_than_the_buffer_is_refused() -> None
         compiled(detector, rule)
     text = str(refused.value)
     assert "spec.actions[0].plugin.window.before" in text
-    assert "4s and the rule's for (2s), more than the 5 s that Detector d keeps of stream speed" in text
+    assert "4s plus the rule's for (2s) exceeds the 5 s that Detector d keeps of stream speed" in text

@@ -69,7 +69,7 @@ def test_an_action_gets_its_parameters_as_its_model() -> None:
             "plugin.name: deploy is a built-in action, not a plugin: write deploy: {…} instead of plugin: {…}",
         ),
         ("lamp", {}, "plugin.parameters.colour: is missing: add it"),
-        ("lamp", {"colour": "red", "seconds": 0}, "plugin.parameters.seconds: must be greater than 0; given: 0"),
+        ("lamp", {"colour": "red", "seconds": 0}, "plugin.parameters.seconds: must be greater than 0; got 0"),
         ("lamp", {"colour": "red", "color": "red"}, "plugin.parameters.color: unknown field"),
     ],
 )
@@ -88,7 +88,7 @@ def test_check_reports_line_and_column(tmp_path: Path) -> None:
         "  actions:\n    - name: a\n      plugin: {name: lamp, parameters: {colour: 3}}\n"
     )
     (problem,) = findings(load_documents([tmp_path])).problems
-    assert "r.yaml:8:49: spec.actions[0].plugin.parameters.colour: must be a string, but is 3" in str(problem)
+    assert "r.yaml:8:49: spec.actions[0].plugin.parameters.colour: must be a string; got 3" in str(problem)
 
 
 def test_a_rule_whose_action_is_refused_continues_as_it_last_was() -> None:

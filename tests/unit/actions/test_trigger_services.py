@@ -49,12 +49,16 @@ def test_a_definition_may_use_messages_of_the_detector() -> None:
 @pytest.mark.parametrize(
     ("definition", "request_", "reported"),
     [
-        ("int8 x\n---\n", {"x": 300}, "request.x is 300, but int8 goes from -128 to 127"),
+        ("int8 x\n---\n", {"x": 300}, r"request.x must be between -128 and 127 \(int8\); got 300"),
         ("int8 x\n---\n", {"y": 3}, "request.y is not a field of a/srv/B_Request: its fields are x"),
-        ("int8 x\n---\n", {"x": 0.5}, "request.x is 0.5, but must be of type int8"),
-        ("string s\n---\n", {"s": 4}, "request.s is 4, but must be of type string"),
-        ("uint8[2] s\n---\n", {"s": [4]}, r"request.s is \[4\], but must be a list of 2"),
-        ("builtin_interfaces/Time t\n---\n", {"t": 4}, "request.t is 4, but builtin_interfaces/msg/Time is a map"),
+        ("int8 x\n---\n", {"x": 0.5}, "request.x must be of type int8; got 0.5"),
+        ("string s\n---\n", {"s": 4}, "request.s must be of type string; got 4"),
+        ("uint8[2] s\n---\n", {"s": [4]}, r"request.s must be a list of 2; got \[4\]"),
+        (
+            "builtin_interfaces/Time t\n---\n",
+            {"t": 4},
+            "request.t must be a map with the fields of builtin_interfaces/msg/Time; got 4",
+        ),
         ("int8 x\n", {}, "has 0 lines of ---: there must be exactly one, between request and response"),
         ("int8\n---\n", {}, "cannot read the request in the definition of a/srv/B: write a type and a name"),
         ("foo/Bar x\n---\n", {}, "x has the unknown type foo/msg/Bar: define it in spec.messages"),

@@ -13,7 +13,7 @@ from kubernetes.aio.client import Configuration
 from application_manager.admission.admission import Admission
 from application_manager.cache.cluster_cache import DETECTOR, EVENT_RULE, TEMPLATE, ClusterCache
 from application_manager.core.findings.findings import Findings
-from application_manager.core.findings.reviews import LONGEST, MOST_TOLD, ReviewError, answer, read
+from application_manager.core.findings.reviews import LONGEST, MOST_REPORTED, ReviewError, answer, read
 from application_manager.core.findings.webhooks import WebhookClientConfig, webhook_configuration
 from application_manager.core.objects.policy import Policy
 from application_manager.measures import Measures
@@ -106,7 +106,7 @@ def test_what_is_not_looked_at_passes_without_a_word(review: dict[str, Any]) -> 
 @given(st.lists(st.text(max_size=40).map(lambda text: text * 60), max_size=40))
 def test_warnings_are_few_short_lines_whatever_is_in_them(texts: list[str]) -> None:
     warnings = answered(question(new=OBJECT), Findings((), tuple(texts))).get("warnings", [])
-    assert len(warnings) <= MOST_TOLD + 1
+    assert len(warnings) <= MOST_REPORTED + 1
     assert all(len(each) <= LONGEST and each.isprintable() for each in warnings)
 
 

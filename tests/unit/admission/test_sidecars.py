@@ -179,10 +179,10 @@ def test_it_holds_for_its_pod_with_a_token_of_its_own_under_the_restricted_stand
 
 
 def test_its_folders_secrets_and_resources_are_as_of_a_standalone_detectors_pod() -> None:
-    pod_says = {"image": "own:2", "secretNames": ["pager"], "resources": {"limits": {"memory": "2Gi"}}}
+    pod_fields = {"image": "own:2", "secretNames": ["pager"], "resources": {"limits": {"memory": "2Gi"}}}
     given_one = {
         "state": {"path": "/state"},
-        "pod": pod_says,
+        "pod": pod_fields,
         "zenoh": {"connect": ["tls/z:7447"], "tlsSecretName": "z"},
     }
     mine = sidecar(injected(pod(), detector(**given_one)))

@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 from application_manager.admission.authority import make_certificates
-from application_manager.admission.reviewing import AT_ONCE, LARGEST, Desk, Serving, webhook
+from application_manager.admission.reviewing import AT_ONCE, LARGEST, ReviewHandler, Serving, webhook
 from application_manager.cli import EXPECTED, app
 from application_manager.core.findings.reviews import ReviewError
 from application_manager.core.findings.webhooks import PATH
@@ -27,7 +27,9 @@ from wayside.process.servingcertificate import CertificateError, ServingCertific
 Ask = Callable[..., Awaitable[tuple[int, str]]]
 
 
-def served(folder: Path, desk: Desk, scenario: Callable[[Ask], Awaitable[None]], authority: Path | None = None) -> None:
+def served(
+    folder: Path, handler: ReviewHandler, scenario: Callable[[Ask], Awaitable[None]], authority: Path | None = None
+) -> None:
     """Run the scenario with a function that posts to the webhook."""
     port = free_port()
 
@@ -42,7 +44,7 @@ def served(folder: Path, desk: Desk, scenario: Callable[[Ask], Awaitable[None]],
             ):
                 return response.status, await response.text()
 
-        async with asyncio.timeout(120), webhook(Serving(port, folder), {PATH: desk}):
+        async with asyncio.timeout(120), webhook(Serving(port, folder), {PATH: handler}):
             await scenario(ask)
 
     asyncio.run(run())
@@ -82,7 +84,7 @@ def test_a_question_is_answered_and_what_is_none_is_not(folder: Path) -> None:
         assert (await ask(method="GET"))[0] == 405
         assert await ask(b'{"a": 2}') == (200, '{"response":{"a":2}}')
 
-    served(folder, Desk(review, lambda: True, measures), scenario)
+    served(folder, ReviewHandler(review, lambda: True, measures), scenario)
     assert failures(measures).endswith(" 5.0")
 
 
@@ -97,7 +99,7 @@ def test_nothing_is_answered_before_everything_is_known(folder: Path) -> None:
         known.append(True)
         assert (await ask())[0] == 200
 
-    served(folder, Desk(review, lambda: bool(known), Measures()), scenario)
+    served(folder, ReviewHandler(review, lambda: bool(known), Measures()), scenario)
 
 
 def test_those_beyond_the_limit_are_sent_away_at_once(folder: Path) -> None:
@@ -119,7 +121,7 @@ def test_those_beyond_the_limit_are_sent_away_at_once(folder: Path) -> None:
         assert {status for status, _ in await asyncio.gather(*requested)} == {200}
         assert (await ask())[0] == 200
 
-    served(folder, Desk(review, lambda: True, Measures()), scenario)
+    served(folder, ReviewHandler(review, lambda: True, Measures()), scenario)
 
 
 def test_a_certificate_is_for_the_hosts_given_and_its_key_for_its_owner_alone(folder: Path) -> None:
@@ -166,19 +168,19 @@ def test_a_port_that_is_taken_is_reported(folder: Path) -> None:
     async def review(requested: Any) -> dict[str, Any]:
         return {}
 
-    desk = Desk(review, lambda: True, Measures())
+    handler = ReviewHandler(review, lambda: True, Measures())
 
     async def run() -> None:
         serving = Serving(free_port(), folder)
-        async with webhook(serving, {PATH: desk}):
+        async with webhook(serving, {PATH: handler}):
             with pytest.raises(ConfigurationError, match=f"--admission-port {serving.port}: .*give another port"):
-                async with webhook(serving, {PATH: desk}):
+                async with webhook(serving, {PATH: handler}):
                     pass
 
     asyncio.run(run())
 
 
-# --- At the desk
+# --- At the handler
 
 
 @pytest.fixture

@@ -56,9 +56,9 @@ def problems(tmp_path: Path, text: str | bytes) -> list[str]:
             "f.yaml:5:9: spec.when[0]: is nested more than 100 levels deep",
             ["an alias may refer to itself"],
         ),
-        ("  when: {a: 1}", "f.yaml:5:9: spec.when: must be a string; given: {'a': 1}", ["quote it as a whole"]),
-        ("  when: true", "f.yaml:5:9: spec.when: must be a string, but is true", ["in quotes, e.g. 'true'"]),
-        ("  when: 5", "f.yaml:5:9: spec.when: must be a string, but is 5", ["in quotes"]),
+        ("  when: {a: 1}", "f.yaml:5:9: spec.when: must be a string; got {'a': 1}", ["quote it as a whole"]),
+        ("  when: true", "f.yaml:5:9: spec.when: must be a string; got true", ["in quotes, e.g. 'true'"]),
+        ("  when: 5", "f.yaml:5:9: spec.when: must be a string; got 5", ["in quotes"]),
         ("  when:", "f.yaml:5:8: spec.when: is empty", ["give it a value"]),
         ("  until: x", "f.yaml:5:3: spec.when: is missing", ["add it"]),
         ("  when: a\n  when: b", "f.yaml:6:3: spec.when: is given twice", ["remove one"]),
@@ -69,19 +69,19 @@ def problems(tmp_path: Path, text: str | bytes) -> list[str]:
             "f.yaml:7:53: spec.actions[0].deploy.operations: unknown field",
             ["did you mean operation?"],
         ),
-        ("  when: a\n  for: 2", "f.yaml:6:8: spec.for: must be a string, but is 2", []),
+        ("  when: a\n  for: 2", "f.yaml:6:8: spec.for: must be a string; got 2", []),
         ("  when: a\n  for: 2 s", "f.yaml:6:8: spec.for: '2 s' is not a duration", ["such as 500ms, 10s"]),
         ("  when: a\n  evaluation: {every: 0s}", "f.yaml:6:15: spec.evaluation: every: 0s", ["give 10ms or more"]),
-        ("  when: a\n  enabled: maybe", "f.yaml:6:12: spec.enabled: must be true or false; given: 'maybe'", []),
+        ("  when: a\n  enabled: maybe", "f.yaml:6:12: spec.enabled: must be true or false; got 'maybe'", []),
         (
             "  when: a\n  classification: {incidence: [Rare, Never]}",
             "f.yaml:6:38: spec.classification.incidence[1]: must be 'Frequent', 'Common', 'Rare' or 'Unexpected'",
-            ["given: 'Never'"],
+            ["got 'Never'"],
         ),
         (
             "  when: a\n  signals:\n  - name: 9x\n    stream: s\n    value: v",
             "f.yaml:7:11: spec.signals[0].name: must be letters, digits and _, not beginning with a digit",
-            ["given: '9x'"],
+            ["got '9x'"],
         ),
         (
             "  when: a\n  signals:\n  - {name: x, stream: s, value: v, aggregate: Max}",
@@ -95,7 +95,7 @@ def problems(tmp_path: Path, text: str | bytes) -> list[str]:
         ),
         (
             "  when: a\n  scope:\n    pairs: {position: {stream: s, x: a, y: b}, within: -3}",
-            "f.yaml:7:56: spec.scope.pairs.within: must be greater than 0; given: -3",
+            "f.yaml:7:56: spec.scope.pairs.within: must be greater than 0; got -3",
             [],
         ),
         (
@@ -104,7 +104,7 @@ def problems(tmp_path: Path, text: str | bytes) -> list[str]:
             [],
         ),
         ("  when: a\n  evaluation: {every: 5ms}", "f.yaml:6:15: spec.evaluation: every: 5ms", ["give 10ms or more"]),
-        ("  - when", "f.yaml:5:3: spec: must be an object; given: ['when']", []),
+        ("  - when", "f.yaml:5:3: spec: must be an object; got ['when']", []),
     ],
 )
 def test_a_problem_names_its_place_the_value_and_the_remedy(
@@ -119,21 +119,21 @@ def test_a_problem_names_its_place_the_value_and_the_remedy(
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("foo", "f.yaml:1:1: must be an object, but is 'foo': each document needs apiVersion, kind, metadata and spec"),
+        ("foo", "f.yaml:1:1: must be an object; got 'foo': each document needs apiVersion, kind, metadata and spec"),
         (
             "apiVersion: v1\nkind: Pod",
             "f.yaml:1:1: apiVersion 'v1', kind 'Pod' is not a Wayside kind: write apiVersion: way",
         ),
         ("kind: EventRule", "f.yaml:1:1: apiVersion None, kind 'EventRule' is not a Wayside kind"),
         (b"\xff\xfe\x00", "f.yaml: cannot be read: is not UTF-8 text"),
-        (DETECTOR + "  streams: {}", "f.yaml:5:12: spec.streams: must be a valid list; given: {}"),
+        (DETECTOR + "  streams: {}", "f.yaml:5:12: spec.streams: must be a valid list; got {}"),
         (
             DETECTOR + "  streams:\n  - {name: s, key: 'a/${client:*}', encoding: cdr}",
             "f.yaml:6:5: spec.streams[0]: a cdr stream needs its message type: give type, e.g. geometry_msgs/msg/Pose",
         ),
         (
             DETECTOR + "  streams:\n  - {name: s, key: 'a/${client:*}', encoding: json, staleAfter: 3}",
-            "f.yaml:6:65: spec.streams[0].staleAfter: must be a string, but is 3",
+            "f.yaml:6:65: spec.streams[0].staleAfter: must be a string; got 3",
         ),
         (
             DETECTOR + "  streams:\n  - {name: s, key: 'a/${client:*}', encoding: json, staleAfter: 0s}",
@@ -153,7 +153,7 @@ def test_a_problem_names_its_place_the_value_and_the_remedy(
         ),
         (
             DETECTOR + "  zenoh: {connect: ['zenoh:7447']}\n  streams: [{name: s, key: a, client: c, encoding: json}]",
-            "f.yaml:5:21: spec.zenoh.connect[0]: must be protocol/address:port, e.g. tcp/zenoh:7447; given: 'zeno",
+            "f.yaml:5:21: spec.zenoh.connect[0]: must be protocol/address:port, e.g. tcp/zenoh:7447; got 'zeno",
         ),
     ],
 )

@@ -150,10 +150,11 @@ WAYS = [
     way("typeOfAction", "DataCollection", ": spec.actions[0].notify sends a notification: add Reconfiguration",
         "Reconfiguration", actions=act(REPORT)),
     way("typeOfAction", "DataCollection Deployment", "[1]: Deployment (the action starts software that was not running)"
-        " contradicts the rule: no action of the rule does that (spec.actions[0].record): remove it, or add the action",
+        " contradicts the rule: no action of the rule is of this type (spec.actions[0].record): remove it, or add the "
+        "action",
         "DataCollection", actions=act(RECORD)),
     way("typeOfAction", "Reconfiguration Deployment", "[1]: Deployment (the action starts software that was not run"
-        "ning) contradicts the rule: no action of the rule does that (spec.actions[0].deploy)", "Reconfiguration",
+        "ning) contradicts the rule: no action of the rule is of this type (spec.actions[0].deploy)", "Reconfiguration",
         actions=act(RECONFIGURE)),
 ]  # fmt: skip
 

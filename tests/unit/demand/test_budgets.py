@@ -69,7 +69,7 @@ def test_one_beyond_them_waits_and_reports_for_what() -> None:
     verdict = index.verdict((made("t0").namespace, "t0"))
     assert verdict is not None
     assert verdict.standing is Standing.WAITING
-    assert "a1 may have 2 unfinished tasks" in verdict.message
+    assert "a1 has reached the limit of 2 unfinished tasks" in verdict.message
 
 
 @pytest.mark.parametrize(

@@ -210,7 +210,7 @@ def tasks_of(drawn: Iterable[tuple[str, str, int, int]], prefix: str = "t") -> l
 
 
 class Site:
-    """A namespace that a manager looks after, one step after the other; all that it remembers is what is live."""
+    """A namespace that a manager manages, one step after the other; all that it remembers is what is live."""
 
     def __init__(self, bounds: tuple[int | None, int | None, int | None], uptime: int = 0) -> None:
         self.own = dict(zip(NAMES, bounds, strict=False))

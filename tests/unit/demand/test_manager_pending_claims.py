@@ -46,14 +46,14 @@ class Answers:
         return self.found
 
 
-def book_of(answers: Answers) -> ClaimIndex:
+def index_of(answers: Answers) -> ClaimIndex:
     return ClaimIndex(Claiming(answers, lambda _: None))  # type: ignore[arg-type]  it has what is used
 
 
 def test_a_key_that_only_reads_parameters_is_worked_out_at_once_and_all_else_elsewhere() -> None:
     for key in ("${parameters.region}", "lane-${ parameters.region }", "fixed"):
         answers = Answers()
-        book_of(answers).note(NAME, Entry({}, task()), template(key))
+        index_of(answers).note(NAME, Entry({}, task()), template(key))
         assert not answers.requested
     for made in (
         template("${parameters.region + 'x'}"),
@@ -61,13 +61,13 @@ def test_a_key_that_only_reads_parameters_is_worked_out_at_once_and_all_else_els
         template(pattern="^[a-z]+$"),
     ):
         answers = Answers()
-        book_of(answers).note(NAME, Entry({}, task()), made)
+        index_of(answers).note(NAME, Entry({}, task()), made)
         assert answers.requested
 
 
 def test_a_task_keeps_the_claim_that_it_had_until_the_new_one_is_known() -> None:
     answers = Answers()
-    index, made = book_of(answers), template(pattern="^[a-z]+$")
+    index, made = index_of(answers), template(pattern="^[a-z]+$")
     first = claim_or_verdict(made, task())
     assert isinstance(first, Claim)
     assert index.note(NAME, Entry({}, task()), made) == set()
@@ -88,7 +88,7 @@ def test_a_task_keeps_the_claim_that_it_had_until_the_new_one_is_known() -> None
 def test_a_template_is_unsettled_until_all_tasks_that_were_there_are_known() -> None:
     answers = Answers()
     settled: list[tuple[str, str]] = []
-    index, made = book_of(answers), template(pattern="^[a-z]+$")
+    index, made = index_of(answers), template(pattern="^[a-z]+$")
     index.settled = settled.append
     index.note(NAME, Entry({}, task()), made)
     index.note(("site", "b"), Entry({}, task("south")), made)
@@ -105,7 +105,7 @@ def test_a_template_is_unsettled_until_all_tasks_that_were_there_are_known() -> 
 
 def test_a_claim_that_takes_too_much_is_refused_and_settles_nothing() -> None:
     answers = Answers()
-    index, made = book_of(answers), template(pattern="^[a-z]+$")
+    index, made = index_of(answers), template(pattern="^[a-z]+$")
     index.note(NAME, Entry({}, task()), made)
     index.begin()
     answers.found = Exceeded("takes more than 2 s of CPU time and was ended")

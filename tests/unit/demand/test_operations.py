@@ -127,7 +127,7 @@ TWO = {
 @pytest.mark.parametrize(
     ("wrong", "spec", "reason", "message"),
     [
-        (change("c", {"a": "x", "n": 1}), TWO, "InvalidKey", "spec.parameters.b: is missing, and the key"),
+        (change("c", {"a": "x", "n": 1}), TWO, "InvalidKey", "spec.parameters.b: is missing, but the key"),
         (change("c", {"a": "x", "b": "y"}), TWO, "InvalidParameters", "changes nothing: give at least one"),
         (change("c", {}), TWO, "InvalidParameters", "changes nothing"),
         (change("c", {"rateHz": 99}), FUSION, "InvalidParameters", "99 is above the maximum of 50"),

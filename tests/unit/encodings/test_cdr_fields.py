@@ -1,18 +1,21 @@
 """Fields of ROS 2 messages are read as the decoder of whole messages reads them, whatever the payloads are."""
 
+import struct
+from collections.abc import Sequence
 from random import Random
 from typing import Any
 
 import pytest
 
 from detector.engine.samples.sample import MISSING, DecodeError, FieldDecoder
-from detector.streams.codecs import CdrDecoder
+from detector.streams.codecs import CdrDecoder, cdr_columns, cdr_fields
+from detector.streams.codecs.cdr_columns import LEAST
 from detector.streams.codecs.definitions import Definition
 from detector.streams.codecs.ros import RosTypes, standard, types_with
 from tests.ros_messages import cdr, make, odometry, point_cloud, pose_stamped
 from tests.unit.encodings import hostile
 from tests.unit.encodings.random_ros_messages import random_message, random_paths, serialized
-from tests.unit.encodings.whole_messages import Path, assert_reads_as_decoded
+from tests.unit.encodings.whole_messages import Path, assert_reads_as_decoded, plain
 
 POSITION: list[Path] = [("pose", "position", "x"), ("pose", "position", "y")]
 STANDARD = sorted(standard().store.fielddefs)
@@ -95,6 +98,28 @@ def check(types: RosTypes, type_name: str, random: Random, rounds: int = 1) -> N
         assert not reader(big).errors
         assert_reads_as_decoded(decoder, paths, [*little, *odd, *tampered, *big[:1]])
         assert_reads_as_decoded(decoder, paths, [*big, *little[:1], *odd[:1]])
+        many = [*little, *odd, *tampered, *big[:1]] * 2
+        random.shuffle(many)
+        assert_reads_as_one_by_one(decoder, paths, many)
+        assert_reads_as_one_by_one(decoder, paths, [*big, *big, *odd])
+
+
+def assert_reads_as_one_by_one(decoder: CdrDecoder, paths: Sequence[Path], payloads: Sequence[bytes]) -> None:
+    """All payloads of one layout are read together, and give what they give one by one."""
+    reader = decoder.field_reader(paths)
+    assert reader is not None
+    assert len(payloads) < LEAST
+    alone = reader(payloads)
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (cdr_columns, cdr_fields):
+            patch.setattr(module, "LEAST", 1)
+        together = reader(payloads)
+    columns = [repr(plain(column)) for column in together.columns]
+    assert columns == [repr(plain(column)) for column in alone.columns], payloads
+    assert {place: str(error) for place, error in together.errors.items()} == {
+        place: str(error) for place, error in alone.errors.items()
+    }
+    assert list(together.odd) == list(alone.odd)
 
 
 def test_values_are_plain_as_decoded_or_missing() -> None:
@@ -161,6 +186,35 @@ def test_a_broken_text_is_refused_where_it_is_skipped(raw: bytes) -> None:
     body = b"\0\1\0\0" + len(raw).to_bytes(4, "little") + raw
     types = with_type("string skipped\nuint8 x")
     assert assert_reads_as_decoded(CdrDecoder("test_msgs/msg/Own", types), [("x",)], [body + b"\1", body]) == 2
+
+
+def test_many_messages_of_several_layouts_with_some_broken_read_as_decoded() -> None:
+    random = Random(1)
+    frames = ["map", "odom", "car7/base", "\u00fc", "car8/base"]
+    payloads = [cdr(pose_stamped(n, -n, frame_id=random.choice(frames))) for n in range(8 * LEAST)]
+    payloads += [cdr(pose_stamped(n), little_endian=False) for n in range(LEAST)]
+    for place in random.sample(range(len(payloads)), 40):
+        broken = bytearray(payloads[place])
+        broken[random.randrange(24)] ^= 1 << random.randrange(8)
+        payloads[place] = bytes(broken)
+    random.shuffle(payloads)
+    paths: list[Path] = [*POSITION, ("header", "frame_id"), ("header", "stamp", "sec"), ("pose", "nowhere")]
+    assert 10 < assert_reads_as_decoded(CdrDecoder("geometry_msgs/msg/PoseStamped"), paths, payloads) < 40
+
+
+def test_many_integers_beyond_doubles_read_as_decoded() -> None:
+    random = Random(1)
+    types = with_type("bool flag\nint64 a\nuint64 b\nbyte c\nint8 d\nfloat32 e")
+    structs = struct.Struct("<4x?7xqQBbxxf")
+    payloads = [
+        bytearray(structs.pack(n % 2, random.choice((n, -(2**60))), 2**64 - 1 - n, n % 256, n % 256 - 128, n / 3))
+        for n in range(4 * LEAST)
+    ]
+    for payload in payloads:
+        payload[1] = 1
+    paths: list[Path] = [(name,) for name in ["flag", "a", "b", "c", "d", "e"]]
+    decoder = CdrDecoder("test_msgs/msg/Own", types)
+    assert assert_reads_as_decoded(decoder, paths, [bytes(payload) for payload in payloads]) == 0
 
 
 def test_texts_that_come_by_the_thousands_and_long_ones_read_as_decoded() -> None:

@@ -130,7 +130,7 @@ def test_infinite_and_undefined_values_do_not_enter_events_that_json_cannot_carr
     assert drive.take(arrival(0.5, "car", {"zero": 0}), until=1) == ["r car started 1"]
     assert json.loads(drive.events[0].to_json())["data"]["values"] == {"both": [None, 2.0]}
     assert [demand.action for demand in drive.engine.demands().values()] == ["y"]
-    assert "JSON cannot hold" in drive.engine.counters.rules["r"].last_error
+    assert "JSON cannot represent" in drive.engine.counters.rules["r"].last_error
 
 
 def test_what_cannot_be_read_is_counted_by_its_stream_with_the_last_reason() -> None:

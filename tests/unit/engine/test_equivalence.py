@@ -21,7 +21,7 @@ from detector.engine.samples.sample import Arrival, DecodeError
 from tests.driving import START, a_detector, a_rule, a_stream, compiled
 from tests.reference.detector import Reference, Reported
 from tests.reference.places import located
-from tests.reference.signals import tell_places
+from tests.reference.signals import set_places
 from tests.reference.world import SECOND, Sample, World, listed
 from tests.unit.engine.random_drives import BROKEN, HALF, PLACES, POSITION, Message, Scene, scenes
 from wayside.rules import dependency_problems
@@ -117,7 +117,7 @@ def payload_of(time: int, message: Message) -> bytes:
 
 
 def by_the_reference(scene: Scene) -> list[Reported]:
-    tell_places(PLACES, POSITION)
+    set_places(PLACES, POSITION)
     counts, sizes = _given({"speed": scene.count}), _given({"pose": scene.pose_bytes})
     world = World(TIMEOUT, dict.fromkeys(STREAMS, KEPT), STREAMS, counts, sizes, scene.all_bytes, items=LISTS)
     lateness = scene.lateness * HALF if scene.data else None

@@ -208,11 +208,11 @@ def test_a_variable_must_be_one_that_an_expression_can_name(name: str) -> None:
 @pytest.mark.parametrize(
     ("source", "result", "message"),
     [
-        ("distance", CelType.BOOL, "must be a boolean, is a number"),
-        ("  'a'", CelType.BOOL, "must be a boolean, is a text"),
-        ("[1]", CelType.MAP, r"must be a map, is list\(double\)"),
-        ("null", CelType.DOUBLE, "must be a number, is null"),
-        ("b", CelType.STRING, "must be a text, is a boolean"),
+        ("distance", CelType.BOOL, "must be a boolean; got a number"),
+        ("  'a'", CelType.BOOL, "must be a boolean; got a text"),
+        ("[1]", CelType.MAP, r"must be a map; got list\(double\)"),
+        ("null", CelType.DOUBLE, "must be a number; got null"),
+        ("b", CelType.STRING, "must be a text; got a boolean"),
     ],
 )
 def test_a_result_of_the_wrong_type_is_refused_when_compiled(source: str, result: CelType, message: str) -> None:

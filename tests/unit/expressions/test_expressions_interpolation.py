@@ -172,9 +172,9 @@ def test_names_and_paths_are_those_of_all_expressions() -> None:
         ("${parameters.regoin}", "spec", (1, 3), "there is no `parameters.regoin`; did you mean `region`?", None),
         ("a\n ${parameters.region - 1}", "spec", (2, 4), "`-` does not take a text and a number", None),
         ("is ${parameters.nothing}", "spec", (1, 6), "`parameters.nothing` is null inside a text", "x == null"),
-        ("${parameters.nan}", "spec", (1, 3), "yields nan, which JSON cannot hold", None),
-        ("${parameters.replicas / 0}", "spec", (1, 3), "yields inf, which JSON cannot hold", None),
-        ("${b'x'}", "spec", (1, 3), "yields bytes, which JSON cannot hold", None),
+        ("${parameters.nan}", "spec", (1, 3), "yields nan, which JSON cannot represent", None),
+        ("${parameters.replicas / 0}", "spec", (1, 3), "yields inf, which JSON cannot represent", None),
+        ("${b'x'}", "spec", (1, 3), "yields bytes, which JSON cannot represent", None),
     ],
 )
 def test_errors_name_the_field_the_place_and_the_remedy(

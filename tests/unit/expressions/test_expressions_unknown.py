@@ -168,7 +168,7 @@ def test_a_boolean_that_turns_out_to_be_none_is_a_fault() -> None:
     expression = ENVIRONMENT.compile("p", result=CelType.BOOL)
     reported: list[tuple[Reason, str]] = []
     assert expression.evaluate_or_unknown({"p": 3}, lambda *why: reported.append(why)) is UNKNOWN
-    assert reported == [(Reason.ERROR, "must be a boolean, is a number")]
+    assert reported == [(Reason.ERROR, "must be a boolean; got a number")]
     assert expression.evaluate_or_unknown({"p": True}) is True
 
 

@@ -97,10 +97,10 @@ def test_a_wrong_call_does_not_compile(source: str, column: int, message: str, h
 @pytest.mark.parametrize(
     ("source", "values", "reason", "text"),
     [
-        ("inside(1, 2, area)", {"area": [[0, 0], [1, 1]]}, Reason.ERROR, "three corners or more, but this one has 2"),
+        ("inside(1, 2, area)", {"area": [[0, 0], [1, 1]]}, Reason.ERROR, "three corners or more; got 2"),
         ("inside(1, 2, area)", {"area": [[0, 0], [1, None], [2, 2]]}, Reason.ABSENT, "no value for polygon[1][1]"),
-        ("inside(1, 2, area)", {"area": "here"}, Reason.ERROR, "number, list, but got number, number, text"),
-        ("inside(msg.o, 2, area)", {"area": SQUARE, "msg": {"o": [1]}}, Reason.ERROR, "but got list, map or bytes"),
+        ("inside(1, 2, area)", {"area": "here"}, Reason.ERROR, "number, list; got number, number, text"),
+        ("inside(msg.o, 2, area)", {"area": SQUARE, "msg": {"o": [1]}}, Reason.ERROR, "; got list, map or bytes"),
         ("inside(1, 2, area)", {"area": {"x": 1}}, Reason.ERROR, "polygon must be a list"),
         ("inside(msg.x, 2, area)", {"area": SQUARE, "msg": {}}, Reason.ABSENT, "no key"),
         ("inside(msg.x, 2, area)", {"area": SQUARE, "msg": {"x": float("nan")}}, Reason.ABSENT, "no key"),

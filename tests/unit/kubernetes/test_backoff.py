@@ -17,7 +17,7 @@ def test_delays_double_up_to_the_cap_and_start_over_after_a_success() -> None:
     assert backoff.fail() <= 1.0
 
 
-def test_a_wait_that_the_other_side_asks_for_is_heeded_up_to_the_cap() -> None:
+def test_a_wait_that_the_server_requests_is_kept_up_to_the_cap() -> None:
     assert Backoff(first=0.1, cap=5.0).fail(at_least=3.0) == 3.0
     assert Backoff(first=0.1, cap=5.0).fail(at_least=600.0) == 5.0
 

@@ -76,7 +76,7 @@ def test_an_answer_that_is_no_status_is_still_an_error(body: bytes) -> None:
     assert (error.code, error.permanent) == (502, False)
 
 
-def test_a_wait_that_the_server_asks_for_is_kept() -> None:
+def test_a_wait_that_the_server_requests_is_kept() -> None:
     assert error_of(web.json_response({}, status=429, headers={"Retry-After": "7"})).retry_after == 7.0
 
 
@@ -87,7 +87,7 @@ def test_paths_of_core_and_other_groups() -> None:
 
 
 @pytest.mark.parametrize("content", [None, "{}", "clusters: [", "just text"])
-def test_a_missing_or_broken_kubeconfig_is_said_with_the_remedy(tmp_path: Path, content: str | None) -> None:
+def test_a_missing_or_broken_kubeconfig_is_reported_with_the_remedy(tmp_path: Path, content: str | None) -> None:
     file = tmp_path / "kubeconfig"
     if content is not None:
         file.write_text(content)

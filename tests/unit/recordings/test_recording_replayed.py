@@ -99,7 +99,7 @@ def test_what_is_wrong_with_metadata_is_found_at_its_place(tmp_path: Path) -> No
 def test_a_window_that_reaches_further_back_than_the_buffer_is_refused(tmp_path: Path) -> None:
     rule = RULE.replace("5s", "50s")
     found = problems(tmp_path, f"{DETECTOR}  recordings: {{path: /var/lib/wayside}}\n", rule)
-    assert "record.before: 50s, more than the 10 s that Detector d keeps of stream speed" in found[0]
+    assert "record.before: 50s exceeds the 10 s that Detector d keeps of stream speed" in found[0]
     assert found[0].startswith("20:24: ")
 
 

@@ -147,7 +147,7 @@ GOOD = '{"t": 5, "key": "a", "value": {}}'
         ([GOOD, '{"t": 6, "key": "a", "value": NaN}'], 2, "malformed"),
         ([GOOD, '{"t": 6, "key": "a", "value": 1, "stamp": 2}'], 2, "stamp"),
         ([GOOD, '{"t": 6, "key": "", "value": 1}'], 2, "key is empty"),
-        ([GOOD, "", '{"t": 4, "key": "a", "value": 1}'], 3, "goes back from 5 to 4"),
+        ([GOOD, "", '{"t": 4, "key": "a", "value": 1}'], 3, "t decreases from 5 to 4"),
         (['{"t": -1, "key": "a", "value": 1}'], 1, "negative"),
     ],
 )

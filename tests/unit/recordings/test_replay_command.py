@@ -28,8 +28,11 @@ def test_a_key_may_begin_with_the_slash_of_its_ros_topic(desk: Desk) -> None:
     ("key", "words"),
     [
         ("odom/", ["spec.streams[0].key", "'odom/'", "column 6", "the key ends with a slash: remove it"]),
-        ("a//b", ["spec.streams[0].key", "'a//b'", "column 3", "two slashes stand in a row: remove one"]),
-        ("//${client:*}/odom", ["'//${client:*}/odom'", "column 2", "two slashes stand in a row: remove one"]),
+        ("a//b", ["spec.streams[0].key", "'a//b'", "column 3", "the pattern has two slashes in a row: remove one"]),
+        (
+            "//${client:*}/odom",
+            ["'//${client:*}/odom'", "column 2", "two slashes in a row: remove one"],
+        ),
         ("/", ["'/'", "it is empty: give a key such as"]),
         ("v/${client}/x", ["key", "write ${client:*}"]),
     ],

@@ -80,10 +80,10 @@ def test_parameters_of_single_clients_hold_for_variants_that_do_not_set_them(tmp
         (["close"], [], "--set close: write RULE.FIELD=VALUE"),
         (["clos.when=true"], [], "there is no rule clos; did you mean close?"),
         ([], ["too-fast.parameters.limits=1:2:1"], "rule too-fast has no parameter limits; it has area, limit"),
-        ([], ["too-fast.parameters.limit=3:1:1"], "the last not below first"),
-        ([], ["too-fast.parameters.limit=1:2:0"], "a step above 0"),
+        ([], ["too-fast.parameters.limit=3:1:1"], "last not below first"),
+        ([], ["too-fast.parameters.limit=1:2:0"], "with step above 0"),
         ([], ["too-fast.parameters.limit=0:1000:1"], "1001 variants are more than 100"),
-        (["harsh.signals.slowest.over=1s"], [], "there is no slowest; there is speed, fastest"),
+        (["harsh.signals.slowest.over=1s"], [], "there is no slowest; the names are speed, fastest"),
         (["harsh.signals.speed.over=x"], [], "harsh with signals.speed.over=x: spec.signals.0.over"),
     ],
 )

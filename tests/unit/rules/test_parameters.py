@@ -125,7 +125,7 @@ def test_a_change_of_parameters_is_a_change_of_the_rule_wherever_it_is_made() ->
             ["a.parameters has no field maxSped", "did you mean maxSpeed?"],
         ),
         ({"when": "v > 3 &&\n parameters.maxSpeed == 'x'"}, "spec.when", ["line 2, column 22", "(double, string)"]),
-        ({"when": "parameters.maxSpeed"}, "spec.when", ["must be a boolean, is a number"]),
+        ({"when": "parameters.maxSpeed"}, "spec.when", ["must be a boolean; got a number"]),
         ({"when": "allZero(parameters.maxSpeed)"}, "spec.when", ["`allZero` does not take (double)"]),
         (
             {"signals": [{**SPEED, "where": "sample.size > 'x'"}]},
@@ -149,8 +149,8 @@ def test_a_parameter_that_is_not_there_or_does_not_fit_is_reported_where_it_is_u
 ) -> None:
     with pytest.raises(RuleError) as caught:
         compile_rule(too_fast(**spec), a_detector())
-    told_at = {str(problem).split(": ")[0]: str(problem) for problem in caught.value.problems}
-    assert all(part in told_at[field] for part in parts), told_at
+    reported_at = {str(problem).split(": ")[0]: str(problem) for problem in caught.value.problems}
+    assert all(part in reported_at[field] for part in parts), reported_at
 
 
 @pytest.mark.parametrize(

@@ -103,9 +103,9 @@ def problems(fields: dict[str, Fields] | None = None, **spec: Any) -> dict[str, 
             "spec.signals[0].value",
             ["no field siz", "did you mean size?"],
         ),
-        ({"signals": [SPEED | {"where": "msg.v + 1"}]}, "spec.signals[0].where", ["must be a boolean, is a number"]),
+        ({"signals": [SPEED | {"where": "msg.v + 1"}]}, "spec.signals[0].where", ["must be a boolean; got a number"]),
         ({"when": "v >", "signals": [SPEED]}, "spec.when", ["line 1, column 4", "ends too early"]),
-        ({"when": "1 + 2"}, "spec.when", ["line 1, column 1", "must be a boolean, is a number"]),
+        ({"when": "1 + 2"}, "spec.when", ["line 1, column 1", "must be a boolean; got a number"]),
         ({"when": "v > 1 and v < 3", "signals": [SPEED]}, "spec.when", ["column 7", "CEL writes `&&`"]),
         ({"when": "true\n  && client > 2"}, "spec.when", ["line 2, column 13", "does not take (string, double)"]),
         (
@@ -148,7 +148,7 @@ def test_a_problem_names_the_field_and_the_remedy(spec: dict[str, Any], field: s
 @pytest.mark.parametrize(
     ("axis", "source", "parts"),
     [
-        ("x", "msg.x > 3", ["must be a number, is a boolean"]),
+        ("x", "msg.x > 3", ["must be a number; got a boolean"]),
         ("y", "pose.y", ["`pose` is not declared here"]),
         ("z", "msg.", ["column 5: unexpected"]),
         ("stream", "poes", ["no stream poes", "did you mean pose?"]),

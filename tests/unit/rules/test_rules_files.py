@@ -103,4 +103,4 @@ def test_a_client_that_is_no_name_is_reported_with_the_valid_form(write: Write) 
         DocumentError, match=r"must be a name of up to 63 letters, .* or a template such as its-"
     ) as reported:
         load_rules(write("d.yaml", detector(streams=[stream])), [])
-    assert "given: 'a b'" in str(reported.value)
+    assert "got 'a b'" in str(reported.value)

@@ -116,7 +116,7 @@ def test_values_of_the_wrong_kind_are_left_out_and_counted_as_errors_with_what_w
     assert drive.take(*arrivals, until=1) == ["r car started 1"]
     counters = drive.engine.counters.rules["r"]
     assert counters.errors == 3 + 3  # of Max: a text, a boolean, a list; of All: a number, a text, a list
-    assert counters.last_error == "signal all of car, stream speed: All needs booleans, is [1.0]"
+    assert counters.last_error == "signal all of car, stream speed: All needs booleans; got [1.0]"
 
 
 def test_first_decodes_only_the_sample_that_it_is() -> None:

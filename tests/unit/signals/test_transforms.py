@@ -99,8 +99,8 @@ def test_beyond_the_stamps_nothing_is_known_and_the_times_are_reported() -> None
     with pytest.raises(TransformError) as error:
         place(drive, "map", "lidar", 1.75)
     assert str(error.value) == (
-        f"frame 'base' of client car in 'map' is not known at {FIRST + 1}.750000000: that is 0.250 s after the last of "
-        f"its transforms, which are from {FIRST + 1}.000000000 to {FIRST + 1}.500000000"
+        f"client car has no transform from frame 'map' to 'base' at {FIRST + 1}.750000000, which is 0.250 s after the "
+        f"last transform: these frames have transforms from {FIRST + 1}.000000000 to {FIRST + 1}.500000000"
     )
     assert place(drive, "camera", "lidar", 1.75) == (1, 0, 0)  # what moves is not on the way
 

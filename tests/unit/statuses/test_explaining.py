@@ -162,11 +162,11 @@ def test_the_text_shows_what_each_task_does_and_whose_values_lost_and_why() -> N
     assert "scene-a (scene of car1+car2, Deploy, priority 3) Counts" in lines
     assert "thin (by a person, Reconfigure, priority 0) Counts" in lines
     assert "rest (by a person, Suspend, priority 5) Counts" in lines
-    assert "20 of scene-a (car1+car2) is outbid: a Reconfigure task overrides it" in lines
-    assert "2 of thin is it" in lines
+    assert "20 of scene-a (car1+car2) is overridden: a Reconfigure task overrides it" in lines
+    assert "2 of thin is used" in lines
     assert not [each for each in lines if " of rest " in each], "its parameters only select its instance"
     of_all = explanation_text(explained("thin", tasks)).splitlines()
-    assert "instances: all of the template" in of_all
+    assert "instances: all instances of the template" in of_all
 
 
 def test_who_has_no_place_under_a_limit_waits_though_nobody_has_written_it() -> None:

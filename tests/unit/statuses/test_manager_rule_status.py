@@ -103,7 +103,10 @@ def test_a_detector_counts_its_rules_and_reports_what_is_wrong_with_its_streams(
 def test_a_key_that_is_none_is_reported_with_its_place() -> None:
     condition = detector_status(detector(key="v//${client:*}/pose"), [], NOW).conditions[0]
     assert (condition.status, condition.reason) == ("False", "DetectorInvalid")
-    assert "spec.streams[0].key: key 'v//${client:*}/pose', column 3: two slashes stand in a row" in condition.message
+    assert (
+        "spec.streams[0].key: key 'v//${client:*}/pose', column 3: the pattern has two slashes in a row"
+        in condition.message
+    )
 
 
 def test_what_is_accepted_is_so_only_as_far_as_is_known_here() -> None:

@@ -143,7 +143,7 @@ def test_a_detector_that_does_not_answer_is_an_error_beside_the_sum_of_the_other
     answers.add("south", None)
     code, text, errors = requested("--detector", str(answers.file), "--json", "--timeout", "2")
     assert code == 1
-    assert "the sums lack south: zenoh: cannot open a session" in errors
+    assert "south is not in the totals: zenoh: cannot open a session" in errors
     added = msgspec.json.decode(text, type=Total)
     assert ([each.holder for each in added.detectors], added.missing_detectors) == (["center", "north"], ["south"])
 

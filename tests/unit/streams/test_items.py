@@ -110,7 +110,7 @@ def test_what_is_no_item_with_a_name_is_dropped_and_counted_with_the_reason() ->
     drive.take(sent(0.3, item(1), item(1, v=20)), until=0.4)
     assert counters.last_unnamed["list"].endswith("client: two items of one message have the name 1")
     drive.take(Arrival(at(0.5), "list", "stations/n/list", b'{"objects": 3}'), until=0.6)
-    assert counters.last_unnamed["list"] == "stations/n/list: items: must be a list, is a number"
+    assert counters.last_unnamed["list"] == "stations/n/list: items: must be a list; got a number"
     drive.take(Arrival(at(0.7), "list", "stations/n/list", b'{"others": []}'), until=0.8)
     assert counters.last_unnamed["list"] == "stations/n/list: items: there is no `msg.objects`"
     drive.take(Arrival(at(0.9), "list", "stations/n/list", b"no json"), until=1)
@@ -251,7 +251,7 @@ def test_items_need_a_client_of_each(stream: Mapping[str, Any], problem: str) ->
     ("stream", "problem"),
     [
         (a_list("msg.objects >"), r"items: line 1, column \d+: "),
-        (a_list("msg.count > 1"), r"items: line 1, column 1: must be a list, is a boolean"),
+        (a_list("msg.count > 1"), r"items: line 1, column 1: must be a list; got a boolean"),
         (a_list("item.objects"), r"items: line 1, column 1: `item` is not declared here"),
         (a_list(client="${msg.id}"), r"client: each item needs its own client: use item, e.g. \$\{item.id\}"),
         (of_type("msg.object"), r"items: msg has no field object; did you mean objects\?"),

@@ -47,8 +47,8 @@ def test_captures_are_as_in_zenohs_key_format(pattern: str, key: str, captures: 
     ("pattern", "column", "words"),
     [
         ("", 1, "empty"),
-        ("/a", 2, "two slashes stand in a row: remove one"),
-        ("a//b", 3, "two slashes stand in a row: remove one"),
+        ("/a", 2, "the pattern has two slashes in a row: remove one"),
+        ("a//b", 3, "the pattern has two slashes in a row: remove one"),
         ("a/", 3, "the key ends with a slash: remove it"),
         ("a/${client:*", 3, "not closed"),
         ("a/${client}/b", 3, "${client:*}"),

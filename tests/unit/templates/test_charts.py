@@ -96,7 +96,7 @@ def test_a_crd_is_refused_with_its_file_and_a_remedy() -> None:
             "templates/a.yaml contains a document without apiVersion",
         ),
         ("---\n# Source: app/templates/a.yaml\n{\n", "templates/a.yaml is not YAML"),
-        (SERVICE * 257, "has 257 objects, more than 256"),
+        (SERVICE * 257, "has 257 objects; at most 256"),
     ],
 )
 def test_what_is_no_application_is_refused(text: str, problem: str) -> None:

@@ -144,7 +144,7 @@ def test_what_depends_on_what_tasks_give_is_a_remark_that_reports_it() -> None:
     found = template_findings(made, Policy())
     assert not found.problems
     assert len(found.remarks) == 1
-    for part in ("args[0]", "`parameters.lane` is null", "where tasks give only region"):
+    for part in ("args[0]", "`parameters.lane` is null", "when tasks give only region"):
         assert part in str(found.remarks[0])
     metadata = made.metadata.model_copy(update={"annotations": {IGNORE_ANNOTATION: "failing-example"}})
     assert not template_findings(made.model_copy(update={"metadata": metadata}), Policy()).all

@@ -29,7 +29,7 @@ class ActionSpec(Model):
 
     name: ObjectName = Field(description="The name of the action, unique within the rule.")
     deploy: Deploy | None = Field(
-        default=None, description="Emits an ApplicationTask that holds while the episode lasts."
+        default=None, description="Emits an ApplicationTask that is live while the episode lasts."
     )
     record: RecordAction | None = Field(
         default=None, description="Records the samples around the episode as rosbag2 with MCAP files."

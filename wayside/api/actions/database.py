@@ -36,8 +36,8 @@ class DatabaseAction(Window):
     )
     renew_after: PositiveDuration | None = Field(
         default=None,
-        description="Complete the scenario after this time and continue the episode in a new one; no sample is "
-        "missing or in both. For rules whose episodes never end. Default: one scenario per episode.",
+        description="Complete the scenario after this time and continue the episode in a new one. Each sample is "
+        "in exactly one of them. For rules whose episodes never end. Default: one scenario per episode.",
     )
     files: Attachments | None = Field(
         default=None,

@@ -40,8 +40,8 @@ class RecordAction(Window):
     split: Split = Field(default=Split(), description="When to continue in a new file. Default: never.")
     renew_after: PositiveDuration | None = Field(
         default=None,
-        description="Complete the recording after this time and continue the episode in a new one; no sample is "
-        "missing or in both. For rules whose episodes never end. Default: one recording per episode.",
+        description="Complete the recording after this time and continue the episode in a new one. Each sample is "
+        "in exactly one of them. For rules whose episodes never end. Default: one recording per episode.",
     )
     metadata: FreeData = Field(
         default_factory=dict,

@@ -196,9 +196,9 @@ class TriggerAction(Model):
     http: TriggerHttp | None = Field(default=None, description="Requests to an HTTP endpoint.")
     maximum_duration: PositiveDuration = Field(
         default=PositiveDuration("10m"),
-        description="The maximum duration of the recording; it ends after this time even without a stop. Another "
-        "detector enforces the limit itself. For ROS 2 services and HTTP endpoints, this detector sends the stop, if "
-        "it still runs.",
+        description="The maximum duration of the recording. The recording ends after this time even without a stop. "
+        "Another detector enforces the limit itself. For ROS 2 services and HTTP endpoints, this detector sends the "
+        "stop, and must be running to do so.",
     )
     give_up_after: PositiveDuration = Field(
         default=PositiveDuration("5m"),

@@ -1,4 +1,4 @@
-"""From the syntax tree of an expression to nodes of the graph, or the refusal of what only CEL can evaluate."""
+"""Lowers the syntax tree of an expression to nodes of the graph, or refuses what only CEL can evaluate."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The nodes of a graph of expressions: what there is, and where a node needs CEL's help."""
+"""The nodes of a graph of expressions, and which of them need CEL."""
 
 from __future__ import annotations
 

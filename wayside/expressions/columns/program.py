@@ -1,4 +1,4 @@
-"""Puts the nodes of a graph into steps, runs them over rows, and gives what the roots yield.
+"""Orders the nodes of a graph into steps, runs them over rows, and returns the results of the roots.
 
 Nodes of the same depth with the same operation are one step, whatever rule they belong to, so a run costs a few numpy
 calls for each depth and operation, however many rules and rows there are.
@@ -208,7 +208,7 @@ class Results:
             return np.zeros((0, n), bool), np.zeros((0, n), bool)
         operand = self._program.operand(roots)
         if operand.source is not Array.TRUTHS:
-            raise ValueError("the roots are no truths: take the nodes that Graph.truth gives for them")
+            raise ValueError("the roots are not boolean: use the nodes that Graph.truth returns for them")
         true, false = self._frame.truth(operand)
         if operand.partial and not self._frame.tagged:  # nobody wrote where the others are false
             false = np.where(self._program.partial(roots), false, ~true)

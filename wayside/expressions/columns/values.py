@@ -93,11 +93,13 @@ class Column:
     """object[n]: the values whose tag is OTHER; None: there is none."""
 
 
-def column_of(values: Sequence[object], texts: Texts) -> Column:
+def column_of(values: Sequence[object] | Doubles, texts: Texts) -> Column:
     """The column of plain values, one a row, as decoders give them and `Expression.evaluate_or_unknown` takes them.
 
     None, NaN, UNKNOWN and MISSING are absent; NOWHERE is unreachable. Integers are doubles up to 2^53.
     """
+    if isinstance(values, np.ndarray):
+        return _column_of_doubles(values)
     column = _column_of_numbers(values)
     if column is not None:
         return column
@@ -125,13 +127,16 @@ def _column_of_numbers(values: Sequence[object]) -> Column | None:
         doubles = np.array(values, np.float64)  # None becomes NaN
     except OverflowError:
         return None
-    absent = np.isnan(doubles)
-    if int in kinds and not bool((np.abs(doubles) < MAX_EXACT).all(where=~absent)):
+    if int in kinds and not bool((np.abs(doubles) < MAX_EXACT).all(where=~np.isnan(doubles))):
         return None
+    return _column_of_doubles(doubles)
+
+
+def _column_of_doubles(doubles: Doubles) -> Column:
+    absent = np.isnan(doubles)
     if not absent.any():
         return Column(doubles, None)
-    doubles[absent] = 0.0
-    return Column(doubles, np.where(absent, np.uint8(Tag.ABSENT), np.uint8(Tag.NUMBER)))
+    return Column(np.where(absent, 0.0, doubles), np.where(absent, np.uint8(Tag.ABSENT), np.uint8(Tag.NUMBER)))
 
 
 _NUMERIC: Final = frozenset({float, int, type(None)})
@@ -183,6 +188,6 @@ def value_at(column: Column, row: int, texts: Texts) -> Value | Unknown:
             return texts.text(int(double))
         case Tag.OTHER:
             if column.others is None:
-                raise ValueError(f"row {row} holds a value that this column cannot represent: evaluate it with CEL")
+                raise ValueError(f"row {row} has a value that this column cannot represent: evaluate it with CEL")
             return cast("Value", column.others[row])
     return UNKNOWN

@@ -1,4 +1,4 @@
-"""The functions that expressions have beyond CEL's own: one table of what there is, with units.
+"""The functions that complement CEL's own: one table of all, with units.
 
 Each module of this package holds functions of one kind, as plain Python that raises ValueError for arguments that have
 no answer; the evaluation is unknown then. `docs/rules.md` lists them for users, and a test compares the two.

@@ -48,14 +48,14 @@ FUNCTIONS = (
     function(
         "unmatched",
         Yields.LIST,
-        "the indices of the items without any of the others within that distance in metres",
+        "the indices of those items that have none of the others within the distance in metres",
         (unmatched, "items:list others:list within"),
         (unmatched, "items:list others:list within path:text"),
     ),
     function(
         "countUnmatched",
         Yields.NUMBER,
-        "the number of these",
+        "the number of such items",
         (count_unmatched, "items:list others:list within"),
         (count_unmatched, "items:list others:list within path:text"),
     ),

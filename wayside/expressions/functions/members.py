@@ -46,7 +46,7 @@ def pair(point: object, names: tuple[str, str], what: str) -> tuple[float, float
     """Two coordinates: a list of two numbers, or a map with the names."""
     if isinstance(point, list | tuple):
         if len(point) < 2:
-            raise ValueError(f"{what} must have two numbers, has {len(point)}")
+            raise ValueError(f"{what} must have two numbers; got {len(point)}")
         return number(point[0], f"{what}[0]"), number(point[1], f"{what}[1]")
     first, second = (number(member(point, name), f"{what}.{name}") for name in names)
     return first, second

@@ -1,4 +1,4 @@
-"""Plain mathematics: what CEL lacks, of numbers and of lists of numbers."""
+"""Mathematical functions that CEL does not have, on numbers and lists of numbers."""
 
 from __future__ import annotations
 

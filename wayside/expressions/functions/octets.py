@@ -1,4 +1,4 @@
-"""Bytes: what expressions can know of a payload or an image, without its ever becoming a list."""
+"""Functions on bytes, such as a payload or an image, without converting them to a list."""
 
 from __future__ import annotations
 

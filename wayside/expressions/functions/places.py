@@ -64,7 +64,7 @@ def count_inside(items: object, polygon: object, path: str = "") -> float:
 def _corners(polygon: object, names: tuple[str, str]) -> list[Point]:
     corners = [pair(corner, names, f"polygon[{i}]") for i, corner in enumerate(sequence(polygon, "polygon"))]
     if len(corners) < 3:
-        raise ValueError(f"a polygon needs three corners or more, but this one has {len(corners)}")
+        raise ValueError(f"a polygon needs three corners or more; got {len(corners)}")
     if not all(map(math.isfinite, (number for corner in corners for number in corner))):
         raise ValueError("a corner of the polygon is infinite")
     return corners

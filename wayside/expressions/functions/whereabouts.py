@@ -1,4 +1,4 @@
-"""What `at(position, place)` and `seenFrom(a, b)` come to: a function of numbers for each of their fields.
+"""The fields of `at(position, place)` and `seenFrom(a, b)`, each as a function of plain numbers.
 
 Authors write the field (`at(position, "crossing").inside`), and `expanding` makes a call of it. Headings are degrees
 counter-clockwise here, yaws radians counter-clockwise; turns are degrees, positive to the left.

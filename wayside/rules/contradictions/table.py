@@ -198,7 +198,7 @@ def _unaccounted_type(case: Case) -> Iterator[RuleProblem]:
     for value in case.given(TypeOfAction) if actions else ():  # without actions, another system acts on the events
         if value not in possible:
             listed = ", ".join(f"spec.actions[{index}].{each.field}" for index, each in enumerate(actions))
-            yield case.against(value, f"no action of the rule does that ({listed}): remove it, or add the action")
+            yield case.against(value, f"no action of the rule is of this type ({listed}): remove it, or add the action")
 
 
 CONTRADICTIONS = (

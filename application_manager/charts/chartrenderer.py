@@ -1,8 +1,8 @@
-"""Renderings of charts: requested at once, done in the background, kept while they are of use.
+"""Renders charts in the background, and caches the results.
 
 An instance whose chart is not rendered yet reports it, and is enqueued once it is: no worker ever waits for Helm.
-Charts stand apart from each other: each source has few runs at a time, and one that cannot be had, or that takes too
-long, is left alone for a while that doubles. So a wrong chart costs its own template, and no other.
+Charts do not affect each other: each source has few runs at a time, and a chart that cannot be fetched, or takes too
+long, is retried with backoff. So a wrong chart costs its own template, and no other.
 """
 
 from __future__ import annotations
@@ -75,8 +75,8 @@ class _Rendering:
     work: asyncio.Task[None] | None = None
 
 
-class ChartDesk:
-    """Takes requests. Only the event loop's thread uses it."""
+class ChartRenderer:
+    """Renders charts in the background. Only the event loop's thread uses it."""
 
     def __init__(self, helm: HelmRunner, cache: ChartCache, again: Callable[[Name, float], None]) -> None:
         """`again` enqueues an instance at a time, in seconds since 1970."""
@@ -88,8 +88,8 @@ class ChartDesk:
         self._runs = asyncio.Semaphore(_RUNS)
 
     def outcome(self, request: ChartRequest) -> ChartOutcome | None:
-        """What came of the request; None at first, and then the instance is enqueued. A failure stays until a new
-        attempt, after a pause, goes better.
+        """The result of the request; None while it is rendered, after which the instance is enqueued. A failure stays
+        until a new attempt, after a pause, succeeds.
         """
         known = self._renderings.setdefault(request, _Rendering())
         self._renderings.move_to_end(request)
