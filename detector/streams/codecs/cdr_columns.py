@@ -34,7 +34,7 @@ Values = NDArray[Any]
 """Doubles, or objects: the values as decoded."""
 
 
-class Places(NamedTuple):
+class FieldPlaces(NamedTuple):
     """What is where in a payload: first byte, and the byte behind it."""
 
     lengths: Sequence[int]
@@ -48,7 +48,7 @@ class Places(NamedTuple):
 class CdrColumns(NamedTuple):
     """Reads fields, all of them numbers or texts, of payloads of one type and byte order."""
 
-    locate: Callable[[bytes], Places]
+    locate: Callable[[bytes], FieldPlaces]
     """Raises one of `refused` for a payload that cannot be read."""
     refused: tuple[type[Exception], ...]
     kinds: Sequence[np.dtype[Any] | None]
