@@ -65,16 +65,8 @@ MaxInstances = Annotated[
 
 
 @app.callback()
-def _main(
-    debug: Annotated[
-        bool, typer.Option(commandline.DEBUG, help="Show the stack trace of an error, and log more.")
-    ] = False,
-) -> None:
-    logging.basicConfig(
-        level=logging.DEBUG if debug else logging.INFO,
-        format="%(asctime)s %(levelname)-7s %(message)s",
-        stream=sys.stderr,
-    )
+def _main(debug: commandline.Debug = False) -> None:
+    commandline.log_to_stderr("%(asctime)s %(levelname)-7s %(message)s", debug=debug)
     for noisy in ("asyncio", "aiohttp", "kopf"):
         logging.getLogger(noisy).setLevel(logging.WARNING)
     if not debug:  # each watch logs each attempt to come back; we report once that the API server is away
@@ -306,7 +298,7 @@ def check(
     Exits with 1 if the webhook would refuse an object; warnings are only printed.
     """
     with importing():
-        from application_manager.commands.checking import check_files
+        from application_manager.commands.checking import review_files
         from application_manager.core.findings.checks import CHECKS
         from wayside.api.documents import DocumentError
         from wayside.findings import UNREADABLE_FILE, check_lines, ignorable
@@ -318,7 +310,7 @@ def check(
         commandline.refuse("give YAML files or folders, or --list")
     ignored = ignorable(ignore or (), CHECKS)
     try:
-        checked = check_files(files, policy_of(allowed_kinds, service_accounts), ignored)
+        checked = review_files(files, policy_of(allowed_kinds, service_accounts), ignored)
     except DocumentError as error:
         for problem in error.problems:
             typer.echo(f"{problem} [{UNREADABLE_FILE.name}]", err=True)
@@ -369,7 +361,7 @@ app.command("detector-rbac")(detector_rbac)
 
 def main() -> None:
     """The console script."""
-    sys.exit(commandline.run(app, "application-manager", EXPECTED, sys.argv[1:]))
+    sys.exit(commandline.run_cli(app, "application-manager", EXPECTED, sys.argv[1:]))
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from detector.assembly.memory import tune_garbage_collection
 from detector.replay.recordings import open_recordings
-from detector.replay.routing import Router
+from detector.replay.routing import MessageRouter
 from wayside.api.stream import Encoding, Stream
 
 TARGET = {"MCAP": 1_500_000, "JSON lines": 1_000_000}
@@ -68,7 +68,7 @@ def write_lines(path: Path, messages: int) -> Path:
 
 
 def arrivals_in(path: Path) -> int:
-    router = Router(
+    router = MessageRouter(
         [
             Stream(name="pose", key="vehicles/${client:*}/pose", encoding=Encoding.CDR, type=POSE),
             Stream(name="speed", key="vehicles/${client:*}/speed", encoding=Encoding.JSON),

@@ -9,7 +9,7 @@ from application_manager.core.conditions import Aspect
 from application_manager.core.demand import drafting
 from application_manager.core.objects.policy import Policy
 from application_manager.core.objects.rendering import Rendering
-from application_manager.workers.jobs import Problem, RenderJob
+from application_manager.workers.jobs import RenderJob, RenderProblem
 from application_manager.workers.process import Job
 from wayside.api import ApplicationInstance, ApplicationTemplate
 
@@ -32,7 +32,7 @@ def objects(wanted: ApplicationInstance, template: drafting.TemplateState) -> Re
     found = RenderJob(
         f"{metadata.uid} {template.to_json()}", metadata.generation, pickle.dumps(template), Policy(), wanted
     ).run()
-    if isinstance(found, Problem):
+    if isinstance(found, RenderProblem):
         return drafting.problem(template, found.reason, found.message)
     assert isinstance(found, Rendering)
     return found

@@ -12,7 +12,7 @@ from detector.engine.samples.sample import Arrival
 from detector.replay.batches import batched, messages_of
 from detector.replay.message import Cut, Message, ignore
 from detector.replay.recordings import open_recordings
-from detector.replay.routing import Router
+from detector.replay.routing import MessageRouter
 
 
 def messages_in(
@@ -24,7 +24,7 @@ def messages_in(
     return messages_of(open_recordings(paths, wanted, on_cut))
 
 
-def arrivals_of(router: Router, messages: Iterable[Message]) -> Iterator[Arrival]:
+def arrivals_of(router: MessageRouter, messages: Iterable[Message]) -> Iterator[Arrival]:
     """The arrivals that the router makes of the messages."""
     return chain.from_iterable(router.arrivals(batched(messages)))
 

@@ -15,8 +15,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from application_manager.cache.cluster_cache import DETECTOR, EVENT_RULE, TEMPLATE, ClusterCache
-from application_manager.cache.surroundings import surroundings
+from application_manager.cache.cluster_cache import DETECTOR, EVENT_RULE, TEMPLATE, ClusterCache, surroundings
 from application_manager.core.findings.checks import BROKEN_RULE, INVALID_RULE
 from application_manager.core.findings.findings import Findings
 from application_manager.core.findings.reviews import Request, ReviewError, Weight, answer, read

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import InitVar, dataclass, field, replace
-from typing import Final, TypeVar
+from typing import Any, Final, TypeVar
 
 from application_manager.cache.claim_index import ClaimIndex
 from application_manager.cache.fallback_index import FallbackIndex
@@ -33,8 +33,18 @@ from application_manager.core.holders.policies import TaskPolicy
 from application_manager.core.objects.ownership import Applied
 from application_manager.core.objects.policy import KindKey, Name, Policy
 from application_manager.core.statuses.status import Service
-from wayside.api import API_VERSION, ApplicationInstance, ApplicationTask, ApplicationTemplate, Kind
+from application_manager.workers.jobs import RuleContext
+from wayside.api import (
+    API_VERSION,
+    ApplicationInstance,
+    ApplicationTask,
+    ApplicationTemplate,
+    Detector,
+    EventRule,
+    Kind,
+)
 from wayside.findings import ignored_by
+from wayside.rules import depends
 
 Model = TypeVar("Model", bound=Kind)
 
@@ -62,7 +72,7 @@ class Served:
 
 
 @dataclass(frozen=True, slots=True)
-class Record:
+class WorkRecord:
     """How the last work on an instance went.
 
     Attributes:
@@ -105,7 +115,7 @@ class ClusterCache:
     leases: LeaseIndex = field(default_factory=LeaseIndex)
     healthy: HealthyTime = field(default_factory=HealthyTime)
     served: dict[Name, Served] = field(default_factory=dict)
-    records: dict[Name, Record] = field(default_factory=dict)
+    records: dict[Name, WorkRecord] = field(default_factory=dict)
     deadlines: dict[Name, tuple[str, float | None]] = field(default_factory=dict)
     turns: FallbackIndex = field(default_factory=FallbackIndex)
     overlap: OverlapIndex = field(default_factory=OverlapIndex)
@@ -323,3 +333,22 @@ def _fallback(decided: Decided) -> Fallback | None:
 def _version(template: ApplicationTemplate) -> _Version:
     metadata = template.metadata
     return metadata.uid, metadata.generation, ignored_by(metadata.annotations)
+
+
+def surroundings(cache: ClusterCache, rule: EventRule) -> RuleContext:
+    """As far as they matter to the rule: other rules where it names any, templates where it deploys."""
+    namespace = rule.namespace
+    deploys = any(each.deploy is not None for each in rule.spec.actions)
+    return RuleContext(
+        detectors=cache.models(DETECTOR, Detector, namespace),
+        invalid_detectors=cache.invalid(DETECTOR, namespace),
+        rules=cache.models(EVENT_RULE, EventRule, namespace) if depends(rule) else [],
+        templates=[_bare(each) for each in cache.models(TEMPLATE, ApplicationTemplate, namespace)] if deploys else [],
+        invalid_templates=cache.invalid(TEMPLATE, namespace) if deploys else [],
+    )
+
+
+def _bare(template: ApplicationTemplate) -> ApplicationTemplate:
+    """The template without its objects, which may be large: a rule gives parameters alone."""
+    less: dict[str, Any] = {"manifests": [], "configuration": {}, "helm": None}
+    return template.model_copy(update={"spec": template.spec.model_copy(update=less), "status": None})

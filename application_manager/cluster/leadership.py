@@ -20,6 +20,7 @@ from wayside.kubernetes.errors import ApiError, RequestError, Unreachable
 from wayside.kubernetes.leases import LeaseCandidate, holder_of
 from wayside.kubernetes.podaccount import pod_namespace
 from wayside.kubernetes.resources import LEASES
+from wayside.process.backoff import retry_async
 
 LEASE_NAME = "application-manager"
 DURATION = 12
@@ -150,16 +151,14 @@ class Leadership:
     async def run(self) -> None:
         """Look until cancelled."""
         while True:
-            try:
-                await self.look()
-            except RequestError as error:
-                left = self.remaining()
-                until = f"; active for {left:.0f} s more" if left > 0 else ""
-                self._log(logging.WARNING, f"cannot renew the Lease {self._key}{until}: {error}", str(type(error)))
-                pause = LOOK_EVERY
-            else:
-                pause = RENEW_EVERY if self.active else LOOK_EVERY
-            await asyncio.sleep(pause)
+            await retry_async(self.look, RequestError, self._failed)
+            await asyncio.sleep(RENEW_EVERY if self.active else LOOK_EVERY)
+
+    def _failed(self, error: RequestError) -> float:
+        left = self.remaining()
+        until = f"; active for {left:.0f} s more" if left > 0 else ""
+        self._log(logging.WARNING, f"cannot renew the Lease {self._key}{until}: {error}", str(type(error)))
+        return LOOK_EVERY
 
     async def wait_active(self) -> None:
         """Wait until this manager is the active one."""

@@ -39,7 +39,7 @@ class Checked:
     looked_at: int = 0
 
 
-def check_files(paths: Iterable[Path], policy: Policy, ignored: Set[str] = frozenset()) -> Checked:
+def review_files(paths: Iterable[Path], policy: Policy, ignored: Set[str] = frozenset()) -> Checked:
     """Look at the templates, rules and detectors in the files, each with all others of its namespace among them.
 
     Warnings whose names are in `ignored`, or in the annotation of their object, are left out.

@@ -12,7 +12,7 @@ from kubernetes.aio.config import ConfigException, list_kube_config_contexts
 from application_manager.cluster.client import manager_client
 from application_manager.core.claims.claims import InvalidTemplate
 from application_manager.core.objects.labelling import INSTANCE_LABEL
-from application_manager.core.statuses.explaining import Found, explain, serving
+from application_manager.core.statuses.explaining import Found, explanation_of, serving
 from application_manager.core.statuses.explanation import Explanation
 from wayside.api import API_VERSION, ApplicationInstance, ApplicationTask, ApplicationTemplate, Kind
 from wayside.api.documents import parse_object
@@ -100,7 +100,7 @@ async def _inquire(client: Client, subject: str, namespace: str) -> Explanation:
     leases = {each: await client.get(LEASES, namespace, lease_name(each)) for each in holders if each}
     there = {holder: lease for holder, lease in leases.items() if lease is not None}
     whole = replace(found, objects=objects, pods=pods, leases=there)
-    return explain(whole, task=task.name if task else None, instance=instance, now=now)
+    return explanation_of(whole, task=task.name if task else None, instance=instance, now=now)
 
 
 async def _read(

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from prometheus_client.core import CounterMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from application_manager.cache.cluster_cache import ClusterCache, Record
+from application_manager.cache.cluster_cache import ClusterCache, WorkRecord
 from application_manager.core.claims.operations import Standing
 from application_manager.core.conditions import changed, find, holds
 from application_manager.core.objects.policy import Name
@@ -104,7 +104,7 @@ class TaskTraces:
         else:
             self._remembered(task.metadata.uid).unserved = True
 
-    def _reconciled(self, name: Name, began: int, record: Record) -> None:
+    def _reconciled(self, name: Name, began: int, record: WorkRecord) -> None:
         ended = time.time_ns()
         served: dict[str, tuple[ApplicationTask, TraceContext]] = {}
         for task_name, verdict in record.decision.verdicts.items():
@@ -122,7 +122,7 @@ class TaskTraces:
         served: Mapping[str, tuple[ApplicationTask, TraceContext]],
         began: int,
         ended: int,
-        record: Record,
+        record: WorkRecord,
     ) -> None:
         """Emit `reconcile` and `apply` of a task, unless it was applied before, or this failure was emitted."""
         if task.status is not None and task.status.applied_time is not None:

@@ -13,8 +13,7 @@ from application_manager.cache.cluster_cache import DETECTOR, INSTANCE, TASK, TE
 from application_manager.cache.detector_index import DetectorIndex
 from application_manager.charts.chartcache import ChartCache
 from application_manager.charts.chartrenderer import ChartRenderer
-from application_manager.cluster.failedpods import FailedPodsLook
-from application_manager.cluster.nodes import NodeLook
+from application_manager.cluster.looks import FailedPodsLook, NodeLook
 from application_manager.core.demand.decisions import Decision
 from application_manager.core.objects.policy import KindKey, Name
 from application_manager.measures import Measures
@@ -60,6 +59,7 @@ class Assembly:
     """All queues of a manager.
 
     Attributes:
+        client, options, resources, measures: as given.
         cache: the objects of the cluster.
         detector_index: what is known of Detectors that are run.
         recorder: posts Events.
@@ -80,6 +80,7 @@ class Assembly:
         measures: Measures,
         traced: Tracing | None,
     ) -> None:
+        self.client, self.options, self.resources, self.measures = client, options, resources, measures
         headroom = Headroom(options.memory_limit)
         measures.registry.register(headroom)
         self.cache = ClusterCache(options.policy, options.max_instances, headroom.tight, options.tasks)

@@ -26,7 +26,6 @@ from application_manager.cluster.client import manager_client
 from application_manager.cluster.grants import Grants
 from application_manager.cluster.leadership import RENEWAL_TIMEOUT, Leadership
 from application_manager.core.findings.webhooks import INJECTION_PATH, PATH
-from application_manager.core.objects.policy import KindKey
 from application_manager.measures import Measures
 from application_manager.observability.pages import pages, stalled
 from application_manager.running.assembly import Assembly
@@ -40,13 +39,11 @@ from application_manager.watching.operator import watch
 from application_manager.watching.pulse import Pulse
 from application_manager.work.acting import acting, ended
 from wayside.api.applicationtemplate import TemplateManager
-from wayside.kubernetes.client import Client
 from wayside.kubernetes.connection import ConfigurationError, load_configuration
 from wayside.kubernetes.errors import ApiError
 from wayside.kubernetes.pacing import Pacing, Share
 from wayside.kubernetes.repeating import until_answered
-from wayside.kubernetes.resources import Resource
-from wayside.process.tracing import Tracing, tracing
+from wayside.process.tracing import tracing
 
 log = logging.getLogger(__name__)
 
@@ -72,7 +69,8 @@ async def serve(options: Options) -> None:
         await selectable(client, resources, options.namespaces)
         helm = replace(options.helm, kube_version=version)
         async with issuing(renewals, options.admission):
-            await Manager(client, replace(options, helm=helm), resources, measures, leadership, traced).run()
+            work = Assembly(client, replace(options, helm=helm), resources, measures, traced)
+            await Manager(work, leadership).run()
     except ApiError as error:
         raise ConfigurationError(
             f"the API server refuses a request that the manager needs: {error}; check its service account and "
@@ -88,20 +86,10 @@ async def serve(options: Options) -> None:
 class Manager:
     """All parts of one manager."""
 
-    def __init__(
-        self,
-        client: Client,
-        options: Options,
-        resources: dict[KindKey, Resource],
-        measures: Measures,
-        leadership: Leadership,
-        traced: Tracing | None = None,
-    ) -> None:
+    def __init__(self, work: Assembly, leadership: Leadership) -> None:
+        self._work = work
         self._leadership = leadership
-        self._client = client
-        self._measures = measures
-        self._options = options
-        work = self._work = Assembly(client, options, resources, measures, traced)
+        client, options, resources, measures = work.client, work.options, work.resources, work.measures
         own = [resources[kind] for kind in OWN_KINDS]
         # Pods always: those of workloads show why they do not run.
         children = [resources[kind] for kind in sorted({*options.policy.kinds, POD}) if kind in resources]
@@ -149,12 +137,12 @@ class Manager:
         stop = asyncio.Event()
         watching = asyncio.Event()
         review_handlers = {
-            path: ReviewHandler(review, watching.is_set, self._measures)
+            path: ReviewHandler(review, watching.is_set, self._work.measures)
             for path, review in ((PATH, self._admission.review), (INJECTION_PATH, self._injecting.review))
         }
         _on_signals(stop)
-        limit = self._options.stalled_after
-        stall = stalled(self._measures, self._options.resync, self._work.queues, limit)
+        limit = self._work.options.stalled_after
+        stall = stalled(self._work.measures, self._work.options.resync, self._work.queues, limit)
 
         def healthy() -> str | None:
             return stall() or self._pulse.dead()
@@ -163,14 +151,14 @@ class Manager:
         async with (
             watchdog(healthy, min(SILENT, limit)),
             pages(
-                self._options.metrics_port,
-                self._measures,
+                self._work.options.metrics_port,
+                self._work.measures,
                 healthy,
                 ready,
                 lambda: self._leadership.role,
-                self._options.metrics_certificates,
+                self._work.options.metrics_certificates,
             ),
-            webhook(self._options.admission, review_handlers),
+            webhook(self._work.options.admission, review_handlers),
         ):
             try:
                 if await _until(stop, self._first()):
@@ -213,7 +201,7 @@ class Manager:
         """Act while we are active, until `stop` is set."""
         await acting(
             self._leadership,
-            self._client,
+            self._work.client,
             self._work.queues,
             (self._work.publisher, self._work.recorder),
             self._begin,
@@ -231,7 +219,11 @@ class Manager:
     async def _announce(self, watching: asyncio.Event, stop: asyncio.Event) -> None:
         await watching.wait()
         _on_signals(stop)  # kopf has put its own handlers in their place, which wait for tasks of ours
-        where = f"namespaces {', '.join(self._options.namespaces)}" if self._options.namespaces else "all namespaces"
+        where = (
+            f"namespaces {', '.join(self._work.options.namespaces)}"
+            if self._work.options.namespaces
+            else "all namespaces"
+        )
         log.info("watching %s", where)
         await asyncio.Event().wait()  # `_act` is who ends all, once nothing is written any more
 
@@ -242,9 +234,9 @@ class Manager:
             observe=self._work.router.observe,
             vanished=self._work.router.vanished,
             relist=self._relist,
-            failed=self._measures.unhandled,
+            failed=self._work.measures.unhandled,
             connect=self._connection,
-            namespaces=self._options.namespaces,
+            namespaces=self._work.options.namespaces,
             ready=watching,
             pulse=self._pulse,
         )
@@ -257,7 +249,7 @@ class Manager:
         await self._listing.again(resource.group, resource.plural, namespace, labels)
 
     async def _connection(self) -> kopf.ConnectionInfo:
-        configuration = self._client.configuration
+        configuration = self._work.client.configuration
         token = await configuration.get_api_key_with_prefix("BearerToken", alias="authorization")
         scheme, _, credentials = (token or "").partition(" ")
         return kopf.ConnectionInfo(

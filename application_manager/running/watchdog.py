@@ -29,7 +29,7 @@ Stall = Callable[[], str | None]
 """What has stalled, in words; None where nothing has. Another thread calls it, so it must only read."""
 
 
-def end(reason: str) -> None:
+def end_process(reason: str) -> None:
     """End the process at once, and log the reason and where every thread is. It takes no lock: its holder may hang."""
     when = time.strftime("%Y-%m-%d %H:%M:%S")
     line = f"{when},000 CRITICAL watchdog: {reason}; ending this manager, to be restarted\n"
@@ -40,7 +40,7 @@ def end(reason: str) -> None:
 
 @asynccontextmanager
 async def watchdog(
-    stalled: Stall, silent: float = SILENT, *, step: float = _STEP, end: Callable[[str], None] = end
+    stalled: Stall, silent: float = SILENT, *, step: float = _STEP, end: Callable[[str], None] = end_process
 ) -> AsyncIterator[None]:
     """Look after the event loop that this is entered in, and after what `stalled` reports, while the block runs.
 

@@ -1,24 +1,38 @@
-"""Registers the watches with kopf; `relay` passes every event on to the router.
+"""Registers the watches with kopf, and relays their events to the router directly, past kopf's queues.
 
 Only `on.event`, which neither adds finalizers nor writes to objects. kopf's own Events, peering and progress storage
 are off. The API server selects holders' Leases and instances' objects by their labels.
+
+kopf keeps a task, a queue and the object itself for each object with recent events. Handlers that only put objects into
+a cache need none of these, and they would take most of the time and memory. So kopf maintains the watches (connections,
+retries, expired versions) and sees only the version of each event. kopf's list provides the version to watch from; the
+manager then lists the objects itself. See docs/decisions/0027.
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Awaitable, Callable, Collection, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import kopf
+from kopf._cogs.clients import fetching, watching
 
 from application_manager.core.objects.labelling import INSTANCE_LABEL
 from application_manager.watching.pulse import NEVER, Pulse, pulsing
-from application_manager.watching.relay import Handler, Relist, relaying
+from wayside.kubernetes.errors import RequestError
 from wayside.kubernetes.leases import HOLDER_LEASE_LABEL
-from wayside.kubernetes.resources import LEASES, Resource
+from wayside.kubernetes.resources import LEASES, Object, Resource
 from wayside.process.backoff import Backoff
+
+Handler = Callable[[Object], None]
+Relist = Callable[[Any, str | None, str], Awaitable[None]]
+"""Lists a resource of kopf's again: in a namespace, or in all for None, by a label selector. May raise ApiError or
+Unreachable."""
+
+log = logging.getLogger(__name__)
 
 _FIRST_PAUSE, _LONGEST_PAUSE = 0.1, 1.0  # s between attempts to reach the API server
 
@@ -60,7 +74,7 @@ async def watch(
     settings.networking.request_timeout = 15
     settings.networking.connect_timeout = 5
     settings.watching.inactivity_timeout = NEVER  # see pulse
-    settings.watching.chunk_size = 1  # its list is for the version alone, see relay
+    settings.watching.chunk_size = 1  # its list is for the version alone, see relaying
     settings.process.ultimate_exiting_timeout = None
     settings.queueing.exit_timeout = 0.1  # s; what is lost by stopping at once is seen again at the next start
 
@@ -88,3 +102,54 @@ async def watch(
             namespaces=namespaces,
             ready_flag=ready,
         )
+
+
+@contextmanager
+def relaying(observe: Handler, vanished: Handler, relist: Relist, failed: Callable[[], None]) -> Iterator[None]:
+    """Relay the events of kopf's watches while the block runs.
+
+    Args:
+        observe: handles an object that was added or modified.
+        vanished: handles an object that was deleted.
+        relist: lists a kind and routes all of its objects.
+        failed: counts an object that could not be handled.
+    """
+    watch: Any = watching.watch_objs
+    fetch = fetching.fetch_objs
+    handlers = {"ADDED": observe, "MODIFIED": observe, "DELETED": vanished}
+
+    async def watch_objs(**about: Any) -> AsyncIterator[Any]:
+        async for event in watch(**about):
+            handle = handlers.get(event["type"])
+            if handle is None:
+                yield event
+                continue
+            raw: Object = event["object"]
+            try:
+                handle(raw)
+            except Exception:  # a defect in handling one object must not stop the watch
+                name = raw["metadata"].get("name")
+                log.exception("cannot handle %s %s; retrying at the next resync", raw.get("kind"), name)
+                failed()
+            version = raw["metadata"]["resourceVersion"]
+            del event, raw
+            yield {"type": "BOOKMARK", "object": {"metadata": {"resourceVersion": version}}}
+            await asyncio.sleep(0)  # many may have arrived: the work continues in between
+
+    async def fetch_objs(*, settings: Any, resource: Any, namespace: Any, **about: Any) -> AsyncIterator[Any]:
+        version, labels = None, ",".join(sorted(set(settings.watching.label_selectors.collect(resource))))
+        async for _, as_of in fetch(settings=settings, resource=resource, namespace=namespace, **about):
+            version = as_of
+            break
+        try:
+            await relist(resource, namespace, labels)
+        except RequestError as error:
+            log.warning("cannot list %s; retrying with backoff: %s", resource.plural, error)
+            raise TimeoutError from error  # on which kopf retries the list
+        yield [], version
+
+    watching.watch_objs, fetching.fetch_objs = watch_objs, fetch_objs
+    try:
+        yield
+    finally:
+        watching.watch_objs, fetching.fetch_objs = watch, fetch

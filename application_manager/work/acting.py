@@ -31,7 +31,7 @@ class Begin(Protocol):
         """Get ready."""
 
 
-class Worker(Protocol):
+class ActiveWork(Protocol):
     """What works until it is cancelled, or finished."""
 
     async def run(self) -> None:
@@ -44,8 +44,8 @@ class Worker(Protocol):
 async def acting(
     leadership: Leadership,
     client: Client,
-    queues: Sequence[Worker],
-    reporters: Sequence[Worker],
+    queues: Sequence[ActiveWork],
+    reporters: Sequence[ActiveWork],
     begin: Begin,
     stop: asyncio.Event,
 ) -> None:
@@ -81,7 +81,7 @@ async def acting(
     await _release(leadership, client)
 
 
-async def _work(queues: Sequence[Worker], reporters: Sequence[Worker], begin: Begin, again: bool) -> None:
+async def _work(queues: Sequence[ActiveWork], reporters: Sequence[ActiveWork], begin: Begin, again: bool) -> None:
     """Act; returns once all queues have finished, and then all reporters."""
     await begin(again=again)
     working = asyncio.create_task(_run(queues), name="queues")
@@ -99,7 +99,7 @@ async def _work(queues: Sequence[Worker], reporters: Sequence[Worker], begin: Be
             task.result()
 
 
-async def _run(workers: Sequence[Worker]) -> None:
+async def _run(workers: Sequence[ActiveWork]) -> None:
     async with asyncio.TaskGroup() as group:
         for worker in workers:
             group.create_task(worker.run())

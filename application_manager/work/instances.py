@@ -13,8 +13,8 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
-from application_manager.cache.cluster_cache import ClusterCache, Record
-from application_manager.core.claims.sizes import TOO_LARGE
+from application_manager.cache.cluster_cache import ClusterCache, WorkRecord
+from application_manager.core.claims.merging import TOO_LARGE
 from application_manager.core.conditions import Aspect, find
 from application_manager.core.demand import drafting
 from application_manager.core.demand.decisions import Decision
@@ -26,7 +26,7 @@ from application_manager.core.objects.policy import Name
 from application_manager.core.objects.rendering import Rendering, object_key
 from application_manager.work.applying import Applier
 from application_manager.work.attempts import Attempts
-from application_manager.work.recorder import Reason, Recorder
+from application_manager.work.recorder import EventReason, Recorder
 from application_manager.work.suspending import Suspending
 from wayside.api import ApplicationInstance
 from wayside.api.documents import parse_object
@@ -52,9 +52,9 @@ class _Start:
     decision: Decision
     existing: ApplicationInstance | None
     template: drafting.TemplateState
-    record: Record | None
+    record: WorkRecord | None
 
-    def record_of(self, instance: ApplicationInstance) -> Record | None:
+    def record_of(self, instance: ApplicationInstance) -> WorkRecord | None:
         """The record, unless it is of a namesake."""
         return self.record if self.record is not None and self.record.uid == instance.metadata.uid else None
 
@@ -276,7 +276,7 @@ class InstanceWork:
             applied = replace(applied, aspect=Aspect("Applied", False, TOO_LARGE, too_large))
         before = start.record_of(instance)
         since = before.since if before is not None else time.time()
-        self.cache.records[start.name] = Record(instance.metadata.uid, start.decision, applied, digest, since)
+        self.cache.records[start.name] = WorkRecord(instance.metadata.uid, start.decision, applied, digest, since)
         self.done(start.name)
 
     def _decide(self, name: Name) -> Decision | None:
@@ -311,6 +311,6 @@ class InstanceWork:
             return False
         await self.client.delete(self.instances, name[0], name[1], instance.metadata.uid)
         why = over.yields or "no demand arrived within its linger"
-        self.recorder.event(instance, Reason.PREEMPTED if over.yields else Reason.RELEASED, why, time.time())
+        self.recorder.event(instance, EventReason.PREEMPTED if over.yields else EventReason.RELEASED, why, time.time())
         log.info("instance %s/%s: released: %s", *name, why)
         return True

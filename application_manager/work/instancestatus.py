@@ -11,9 +11,8 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from application_manager.cache.cluster_cache import ClusterCache, Record, Served
-from application_manager.cluster.failedpods import FailedPodsLook
-from application_manager.cluster.nodes import NodeLook
+from application_manager.cache.cluster_cache import ClusterCache, Served, WorkRecord
+from application_manager.cluster.looks import FailedPodsLook, NodeLook
 from application_manager.core.conditions import Aspect
 from application_manager.core.demand.byhand import PAUSE_ANNOTATION
 from application_manager.core.demand.decisions import Decision
@@ -26,7 +25,7 @@ from application_manager.core.objects.ownership import Applied, ObjectKey
 from application_manager.core.objects.policy import Name
 from application_manager.core.statuses.status import Service, instance_status, suspension_aspect
 from application_manager.work.applying import Applier
-from application_manager.work.recorder import Reason
+from application_manager.work.recorder import EventReason
 from application_manager.work.statuses import StatusWriter
 from wayside.api import ApplicationInstance
 from wayside.api.applicationinstance import ApplicationInstanceStatus
@@ -89,7 +88,7 @@ class InstanceStatusWork:
             return
         elif old.release_time is None and new.release_time is not None:
             note = f"no demand is left; the instance is released at {new.release_time} unless a demand arrives"
-            self.statuses.recorder.event(instance, Reason.LINGERING, note, now)
+            self.statuses.recorder.event(instance, EventReason.LINGERING, note, now)
         # How many pods are ready stays with the instance: it changes often, and the tasks may be many.
         why_not = "" if applied.aspect.holds else applied.aspect.message
         reason = ""
@@ -197,7 +196,7 @@ class InstanceStatusWork:
         return Aspect("Ready", True, "Ready", "all workloads are ready")
 
 
-def _settles(instance: ApplicationInstance, record: Record, live: Iterable[Object | None]) -> float:
+def _settles(instance: ApplicationInstance, record: WorkRecord, live: Iterable[Object | None]) -> float:
     """Until when the first status of an instance waits, in seconds since 1970, since its objects are about to change.
 
     Their controllers look at new objects within a moment; without the wait, two statuses follow each other.

@@ -23,7 +23,7 @@ import zenoh
 
 from application_manager.core.objects.policy import Name
 from wayside.kubernetes.connection import ConfigurationError
-from wayside.process.backoff import Backoff
+from wayside.process.backoff import Backoff, retry
 
 _ALL = "wayside/instances/*/*/configuration"
 _FIRST_PAUSE, _LONGEST_PAUSE = 0.2, 2.0  # s between attempts to reach the network
@@ -164,15 +164,17 @@ class Publisher:
 
     def _opened(self, config: zenoh.Config) -> zenoh.Session | None:
         backoff = Backoff(_FIRST_PAUSE, _LONGEST_PAUSE)
-        while True:
-            try:
-                return zenoh.open(config)
-            except zenoh.ZError as error:
-                if backoff.failures == 0:
-                    log.warning("zenoh: cannot connect; not publishing configurations; retrying: %s", error)
+
+        def failed(error: zenoh.ZError) -> float:
+            if backoff.failures == 0:
+                log.warning("zenoh: cannot connect; not publishing configurations; retrying: %s", error)
+            return backoff.fail()
+
+        def pause(seconds: float) -> None:
             with self._lock:
-                if self._lock.wait_for(lambda: self._ended, backoff.fail()):
-                    return None
+                self._lock.wait_for(lambda: self._ended, seconds)
+
+        return retry(lambda: None if self._ended else zenoh.open(config), zenoh.ZError, failed, pause)
 
     def _next(self) -> list[tuple[str, bytes | None]] | None:
         """Wait for changes; None once we are to end."""

@@ -2,7 +2,8 @@
 
 The reasons are a fixed list. An Event follows from a change of a condition, which is stored in the cluster, so neither
 a restart nor a resync posts the same again. What is repeated is one Event with a series, as events.k8s.io has it.
-Namespaces take turns, and each has room for its own.
+Namespaces take turns, and each has room for its own. About one object a few Events may be posted at once, then only
+now and then.
 """
 
 from __future__ import annotations
@@ -15,16 +16,14 @@ import socket
 import time
 import uuid
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-from application_manager.core.conditions import changed
+from application_manager.core.conditions import READY, STALLED, changed
 from application_manager.core.health.pods import TroubleReason
-from application_manager.core.statuses.allowance import Allowance
-from application_manager.core.statuses.conclusions import READY, STALLED
 from application_manager.measures import Measures
 from wayside.api.base import Condition, Kind
 from wayside.kubernetes.client import Client
@@ -38,6 +37,14 @@ _WAITING = 1000  # Events of a namespace that may wait; further ones are dropped
 _SERIES = 360.0  # s after which a repetition is an Event of its own: as client-go has it
 _REFRESHED = 60.0  # s between two changes of a series
 _KEPT = 4096  # Events that are remembered, since they may be repeated
+
+BURST = 10
+"""Events of one object that may follow each other at once."""
+
+REFILL = 60.0
+"""Seconds after which one more may follow: an object that changes all the time has an Event a minute."""
+
+_KEPT_ALLOWANCES = 10_000  # objects that are remembered; the one with the oldest Event is forgotten, and starts over
 _REPORT_EVERY = 60.0  # s between two lines in the log about Events that were dropped
 _NAME_LENGTH = 236  # characters of the object's name, for a pod's may have as many as the Event's
 _NOTE_LENGTH = 1024  # characters, as events.k8s.io allows
@@ -45,7 +52,7 @@ _NOTE_LENGTH = 1024  # characters, as events.k8s.io allows
 log = logging.getLogger(__name__)
 
 
-class Reason(StrEnum):
+class EventReason(StrEnum):
     """All reasons that Events can have."""
 
     ACCEPTED = "Accepted"
@@ -82,46 +89,46 @@ class Reason(StrEnum):
 
 
 _OF_CONDITION = {
-    ("Accepted", "True"): Reason.ACCEPTED,
-    ("Accepted", "False"): Reason.REFUSED,
-    ("Applied", "True"): Reason.APPLIED,
-    ("Applied", "False"): Reason.NOT_APPLIED,
-    ("Ready", "True"): Reason.READY,
-    ("Ready", "False"): Reason.NOT_READY,
-    ("Running", "True"): Reason.READY,
-    ("Running", "False"): Reason.NOT_READY,
-    ("Finished", "True"): Reason.FINISHED,
-    ("Paused", "True"): Reason.PAUSED,
-    ("Paused", "False"): Reason.RESUMED,
-    ("Held", "True"): Reason.HELD,
-    ("Suspended", "True"): Reason.SUSPENDED,
-    ("Held", "False"): Reason.NOT_HELD,
+    ("Accepted", "True"): EventReason.ACCEPTED,
+    ("Accepted", "False"): EventReason.REFUSED,
+    ("Applied", "True"): EventReason.APPLIED,
+    ("Applied", "False"): EventReason.NOT_APPLIED,
+    ("Ready", "True"): EventReason.READY,
+    ("Ready", "False"): EventReason.NOT_READY,
+    ("Running", "True"): EventReason.READY,
+    ("Running", "False"): EventReason.NOT_READY,
+    ("Finished", "True"): EventReason.FINISHED,
+    ("Paused", "True"): EventReason.PAUSED,
+    ("Paused", "False"): EventReason.RESUMED,
+    ("Held", "True"): EventReason.HELD,
+    ("Suspended", "True"): EventReason.SUSPENDED,
+    ("Held", "False"): EventReason.NOT_HELD,
 }
-_TROUBLES = frozenset(Reason(each.value) for each in TroubleReason)
+_TROUBLES = frozenset(EventReason(each.value) for each in TroubleReason)
 _OWN_REASONS = frozenset(
     {
-        Reason.PREEMPTED,
-        Reason.LIMIT_REACHED,
-        Reason.READY_TIMEOUT,
-        Reason.FALLEN_BACK,
-        Reason.FALLBACK_FAILED,
-        Reason.HOLDER_LOST,
-        Reason.TEMPLATE_INVALID,
-        Reason.NOT_INJECTED,
-        Reason.MANAGERS_OVERLAP,
+        EventReason.PREEMPTED,
+        EventReason.LIMIT_REACHED,
+        EventReason.READY_TIMEOUT,
+        EventReason.FALLEN_BACK,
+        EventReason.FALLBACK_FAILED,
+        EventReason.HOLDER_LOST,
+        EventReason.TEMPLATE_INVALID,
+        EventReason.NOT_INJECTED,
+        EventReason.MANAGERS_OVERLAP,
     }
     | _TROUBLES
 )
 """Reasons of conditions that are those of their Events too."""
 
-_WARNINGS = frozenset({Reason.REFUSED, Reason.NOT_APPLIED}) | _OWN_REASONS
+_WARNINGS = frozenset({EventReason.REFUSED, EventReason.NOT_APPLIED}) | _OWN_REASONS
 _EXPECTED = frozenset({"Waiting", "ChartPending", "NotApplied", "NotReady"})  # reasons that come with every start
 
 
 @dataclass(frozen=True, slots=True)
 class _Event:
     regarding: Kind
-    reason: Reason
+    reason: EventReason
     note: str
     now: float
     once: bool = False
@@ -181,7 +188,7 @@ class Recorder:
         self._drops = _Drops()
         self._series: OrderedDict[tuple[str, str, str], _Series] = OrderedDict()
 
-    def event(self, regarding: Kind, reason: Reason, note: str, now: float, *, once: bool = False) -> None:
+    def event(self, regarding: Kind, reason: EventReason, note: str, now: float, *, once: bool = False) -> None:
         """Post an Event about the object, unless there were too many of it.
 
         Args:
@@ -229,13 +236,13 @@ class Recorder:
         for each in changes:
             if each.type == STALLED or (each.type == READY and concludes) or (each.type == "Applied" and at_once):
                 continue
-            if (regarding.kind, each.reason) == ("ApplicationTask", Reason.ACCEPTED) and not old:
+            if (regarding.kind, each.reason) == ("ApplicationTask", EventReason.ACCEPTED) and not old:
                 continue
             reason = _OF_CONDITION.get((each.type, each.status))
             if each.reason in _OWN_REASONS:
-                reason = Reason(each.reason)
-            if each.reason == Reason.NOT_SUSPENDED:
-                reason = Reason.NOT_SUSPENDED
+                reason = EventReason(each.reason)
+            if each.reason == EventReason.NOT_SUSPENDED:
+                reason = EventReason.NOT_SUSPENDED
             expected = each.status == "False" and each.type not in was_true and each.reason in _EXPECTED
             if reason is not None and not expected:
                 self.event(regarding, reason, each.message, now)
@@ -327,3 +334,20 @@ class Recorder:
 def _microseconds(seconds: float) -> str:
     """A time since 1970 as the API wants it, with microseconds."""
     return format_seconds(seconds).replace("Z", "000Z")
+
+
+class Allowance:
+    """Tokens for each object: `BURST` at first, one more each `REFILL` seconds."""
+
+    def __init__(self) -> None:
+        self._left: OrderedDict[Hashable, tuple[float, float]] = OrderedDict()  # tokens, as of when
+
+    def takes(self, key: Hashable, now: float) -> bool:
+        """Whether one more may be posted about the object at `now`, in seconds; if so, it is counted."""
+        tokens, since = self._left.pop(key, (float(BURST), now))
+        tokens = min(float(BURST), tokens + max(0.0, now - since) / REFILL)
+        allowed = tokens >= 1
+        self._left[key] = (tokens - 1 if allowed else tokens, now)
+        if len(self._left) > _KEPT_ALLOWANCES:
+            self._left.popitem(last=False)
+        return allowed

@@ -19,7 +19,7 @@ from application_manager.core.objects.charts import ChartFailure, ChartOutcome, 
 from application_manager.core.objects.policy import Name
 from application_manager.core.objects.rendering import Rendering
 from application_manager.workers.answers import AnswerCache, Exceeded
-from application_manager.workers.jobs import Problem, RenderJob
+from application_manager.workers.jobs import RenderJob, RenderProblem
 from application_manager.workers.plain import objects_are_plain, values_are_small
 from wayside.api import ApplicationInstance, ApplicationTemplate
 
@@ -73,7 +73,7 @@ class Renderings:
         match found:
             case Rendering():
                 return found
-            case Problem(reason, message):
+            case RenderProblem(reason, message):
                 return drafting.problem(template, reason, message)
             case Exceeded(message):
                 return drafting.problem(template, drafting.EXPRESSION_LIMIT, f"rendering this instance {message}")
@@ -84,7 +84,7 @@ class Renderings:
         for kind in ("rendering", "chart"):
             self._answers.forget((kind, *name))
         for template in [each for each, instances in self._cache.exceeded.items() if name in instances]:
-            self._note(name, template, Problem("", ""))
+            self._note(name, template, RenderProblem("", ""))
 
     def _answer(
         self, kind: str, wanted: ApplicationInstance, template: ApplicationTemplate, chart: ChartOutcome | None

@@ -5,10 +5,9 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, field
 
-from application_manager.cache.cluster_cache import EVENT_RULE, ClusterCache
+from application_manager.cache.cluster_cache import EVENT_RULE, ClusterCache, surroundings
 from application_manager.cache.detector_index import DetectorIndex
 from application_manager.cache.store import Entry
-from application_manager.cache.surroundings import surroundings
 from application_manager.core.objects.policy import KindKey, Name
 from application_manager.core.statuses.rulestatus import DETECTOR_INVALID, RULE_INVALID, unreadable_status
 from application_manager.work.statuses import StatusWriter

@@ -16,7 +16,7 @@ from application_manager.cache.detector_index import DetectorIndex
 from application_manager.core.findings.injections import injection
 from application_manager.core.objects.policy import Name
 from application_manager.core.objects.sidecars import has_sidecar
-from application_manager.work.recorder import Reason, Recorder
+from application_manager.work.recorder import EventReason, Recorder
 from wayside.api import Detector
 from wayside.api.base import Kind, Metadata
 from wayside.times import parse_seconds
@@ -62,7 +62,7 @@ class SidecarEvents:
                 about = Metadata(name=metadata["name"], namespace=name[0], uid=uid)
                 note = f"it runs without a detector: {why}. Recreate the pod once this is corrected"
                 regarding = Kind(api_version="v1", kind="Pod", metadata=about)
-                self.recorder.event(regarding, Reason.NOT_INJECTED, note, now, once=True)
+                self.recorder.event(regarding, EventReason.NOT_INJECTED, note, now, once=True)
         if posted:
             self._posted[name] = posted
 

@@ -14,7 +14,7 @@ from wayside.kubernetes.errors import ApiError
 from wayside.kubernetes.resources import Object, Resource
 
 
-class Status(Protocol):
+class KindStatus(Protocol):
     """The status of one of our kinds."""
 
     @property
@@ -41,8 +41,8 @@ class StatusWriter:
         self,
         resource: Resource,
         regarding: Kind,
-        old: Status | None,
-        new: Status,
+        old: KindStatus | None,
+        new: KindStatus,
         now: float,
         conditions: Collection[str] | None = None,
     ) -> bool:

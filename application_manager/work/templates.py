@@ -12,7 +12,7 @@ from application_manager.core.claims.claims import InvalidTemplate
 from application_manager.core.findings.findings import Findings
 from application_manager.core.objects.policy import Name
 from application_manager.core.statuses.status import template_status
-from application_manager.work.recorder import Reason
+from application_manager.work.recorder import EventReason
 from application_manager.work.statuses import StatusWriter
 from application_manager.workers.jobs import TemplateJob
 from application_manager.workers.pool import ExceededError, Runs
@@ -66,7 +66,7 @@ class TemplateWork:
         note = (
             f"this namespace is managed by the managers of the Leases {other} and {own.lease}: the second one stands by"
         )
-        self.statuses.recorder.event(regarding, Reason.MANAGERS_OVERLAP, note, now, once=True)
+        self.statuses.recorder.event(regarding, EventReason.MANAGERS_OVERLAP, note, now, once=True)
         await self.statuses.merge(self.templates, regarding, {"manager": own.to_json()})
 
     async def _findings(self, name: Name) -> Findings:

@@ -32,7 +32,7 @@ _renderers: OrderedDict[tuple[str, int], Renderer | RenderError] = OrderedDict()
 
 
 @dataclass(frozen=True, slots=True)
-class Problem:
+class RenderProblem:
     """Why an instance has no objects: as the condition Applied gives it."""
 
     reason: str
@@ -56,7 +56,7 @@ class RenderJob:
     instance: ApplicationInstance
     chart: ChartOutcome | None = None
 
-    def run(self) -> Rendering | Problem | ChartRequest:
+    def run(self) -> Rendering | RenderProblem | ChartRequest:
         """The objects, or why there are none, or the chart that is to be rendered first."""
         requested: list[ChartRequest] = []
 
@@ -71,7 +71,7 @@ class RenderJob:
         except _ChartWantedError:
             return requested[0]
         except RenderError as error:
-            return Problem(error.reason, str(error))
+            return RenderProblem(error.reason, str(error))
 
     def _renderer(self) -> Renderer:
         # The policy is the same for all jobs of a manager.

@@ -33,7 +33,7 @@ class _Assignment:
     """A worker, and the action that it runs."""
 
     rule: EventRule
-    action: api.Action
+    action: api.ActionSpec
     worker: Worker
 
 
@@ -123,7 +123,7 @@ class ActionHost:
                 worker.request_close()
         self._leaving = [worker for worker in self._leaving if not worker.ended]
 
-    def _maker(self, rule: EventRule, action: api.Action) -> Callable[[], Action[Any]]:
+    def _maker(self, rule: EventRule, action: api.ActionSpec) -> Callable[[], Action[Any]]:
         which = Which(rule.name, action.name)
         setting = Setting(
             rule=rule,
@@ -148,7 +148,7 @@ class ActionHost:
         return self._surroundings
 
 
-def _same(assignment: _Assignment, rule: EventRule, action: api.Action) -> bool:
+def _same(assignment: _Assignment, rule: EventRule, action: api.ActionSpec) -> bool:
     """Whether the action is unchanged. The labels and texts of its rule go into recordings, so they count."""
     before = assignment.rule
     return (

@@ -2,6 +2,9 @@
 
 Built-in actions are found in the same way as those of other packages. Their parameters are fields of the rule, so they
 are valid once the rule is read.
+
+An author of rules can have the value of a Secret sent anywhere. Therefore rules cannot use a Secret that the Detector
+names for its own use, unless `pod.secretNames` of the Detector lists it for rules as well.
 """
 
 from __future__ import annotations
@@ -12,7 +15,6 @@ from typing import Any
 from pydantic import BaseModel
 
 from detector.actions.base import Action
-from detector.actions.secrets import secret_problems
 from detector.plugins.entrypoints import Offers, PluginError
 from wayside.api import Detector, EventRule
 from wayside.api.actions import action as api
@@ -26,7 +28,7 @@ DEPLOY = "deploy"
 """The one action without a class here: its tasks are reconciled (detector/actions/deploy)."""
 
 
-def prepare_action(action: api.Action, streams: Sequence[str] | None = None) -> tuple[type[Action[Any]], BaseModel]:
+def prepare_action(action: api.ActionSpec, streams: Sequence[str] | None = None) -> tuple[type[Action[Any]], BaseModel]:
     """The class of an action other than deploy, and its parameters; `streams` are those that parameters may name.
 
     Raises PluginError; the paths begin at the action.
@@ -39,7 +41,7 @@ def prepare_action(action: api.Action, streams: Sequence[str] | None = None) -> 
             raise PluginError(((action.field,), f"the installed action {action.kind} takes the parameters {wanted}"))
         return offered, given
     name = action.plugin.name
-    if name in api.Action.model_fields:
+    if name in api.ActionSpec.model_fields:
         raise PluginError(
             (
                 ("plugin", "name"),
@@ -67,3 +69,47 @@ def action_problems(rule: EventRule, detector: Detector) -> Iterator[RuleProblem
                 below = (action.field,) if action.plugin is None else ("plugin", "parameters")
                 for path, text in offered.problems(parameters, detector):
                     yield RuleProblem((*at, *below, *path), text)
+
+
+_OWN = frozenset({"tlsSecretName", "credentialsSecretName", "uriSecretName"})
+"""Fields that name a Secret in a Detector and in the parameters of its sources."""
+
+_OF_RULES = _OWN | {"secretKeyRef", "urlSecretKeyRef"}
+"""Fields that name a Secret in an action, by name or as name and key."""
+
+Place = tuple[str | int, ...]
+
+
+def secret_problems(rule: EventRule, detector: Detector) -> Iterator[RuleProblem]:
+    """The places at which a rule names one of the detector's own Secrets."""
+    pod = detector.spec.pod
+    given = set() if pod is None else {*pod.secret_names}
+    own = {name for _, name in _named(detector.spec.to_json(), _OWN, ())} - given
+    if not own:
+        return
+    for index, action in enumerate(rule.to_json()["spec"].get("actions", [])):
+        for place, name in _named(action, _OF_RULES, ("spec", "actions", index)):
+            if name in own:
+                yield RuleProblem(
+                    place,
+                    (
+                        f"the Secret {name} contains the network credentials of the Detector itself: use another "
+                        "Secret, or share this one with rules in spec.pod.secretNames"
+                    ),
+                )
+
+
+def _named(value: Any, fields: frozenset[str], place: Place) -> Iterator[tuple[Place, str]]:
+    if isinstance(value, list):
+        for index, each in enumerate(value):
+            yield from _named(each, fields, (*place, index))
+    if not isinstance(value, dict):
+        return
+    for key, child in value.items():
+        at = (*place, key)
+        if key in fields and isinstance(child, str):
+            yield at, child
+        elif key in fields and isinstance(child, dict) and isinstance(child.get("name"), str):
+            yield (*at, "name"), child["name"]
+        else:
+            yield from _named(child, fields, at)

@@ -34,11 +34,6 @@ class CheckResult(NamedTuple):
     warnings: list[Problem]
 
 
-def check_documents(documents: Sequence[Document]) -> list[Problem]:
-    """Every problem of the Detectors, and of the rules with each Detector that selects them."""
-    return findings(documents).problems
-
-
 def findings(documents: Sequence[Document]) -> CheckResult:
     """The findings about the Detectors, and about the rules with each Detector that selects them."""
     problems: list[Problem] = []

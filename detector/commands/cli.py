@@ -42,16 +42,8 @@ RuleFiles = Annotated[
 
 
 @app.callback()
-def _main(
-    debug: Annotated[
-        bool, typer.Option(commandline.DEBUG, help="Show the stack trace of an error, and log more.")
-    ] = False,
-) -> None:
-    logging.basicConfig(
-        level=logging.DEBUG if debug else logging.INFO,
-        format="%(asctime)s %(levelname)s %(name)s: %(message)s",
-        stream=sys.stderr,
-    )
+def _main(debug: commandline.Debug = False) -> None:
+    commandline.log_to_stderr("%(asctime)s %(levelname)s %(name)s: %(message)s", debug=debug)
     if not debug:
         logging.getLogger("kubernetes").setLevel(logging.WARNING)
 
@@ -118,7 +110,7 @@ def run(
         import asyncio
 
         from detector.live.service import Files, Named, RunOptions
-        from detector.live.service import run as run_service
+        from detector.live.service import run_detector as run_service
         from detector.status.server import PagesAddress
 
     pages = None if metrics_port is None else PagesAddress(metrics_port, metrics_certificates)
@@ -139,7 +131,7 @@ def _view(address: str | None) -> View | None:
     if not port.isdecimal() or int(port) > 65535:
         refuse(f"--foxglove {address}: give a port, e.g. 8765, or host and port, e.g. 0.0.0.0:8765")
     with importing():
-        from detector.results.installed import check_package
+        from detector.results.kinds import check_package
 
         check_package("foxglove", "--foxglove")
         from detector.results.live import LiveView
@@ -286,10 +278,10 @@ def new(
 ) -> None:
     """Print an example rule for a use case, to start from."""
     with importing():
-        from detector.commands.drafts import draft, drafts
+        from detector.commands.drafts import drafts, rule_draft
 
     if case is not None:
-        typer.echo(draft(case, stream, name), nl=False)
+        typer.echo(rule_draft(case, stream, name), nl=False)
         return
     found = drafts()
     width = max(map(len, found))
@@ -355,7 +347,7 @@ for command in (inquiry.status, inquiry.evaluate, inquiry.pause, inquiry.resume,
 
 def main() -> None:
     """The entry point of the console script."""
-    sys.exit(commandline.run(app, "detector", _EXPECTED, sys.argv[1:]))
+    sys.exit(commandline.run_cli(app, "detector", _EXPECTED, sys.argv[1:]))
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from wayside.process.beginning import importing
-from wayside.process.commandline import refuse
+from wayside.process.commandline import refuse, table_console
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -35,9 +35,6 @@ Connect = Annotated[
 Timeout = Annotated[float, typer.Option(help="Seconds to wait for responses.", min=0.1)]
 
 RuleName = Annotated[str, typer.Argument(help="The rule's name.", show_default=False)]
-
-_WIDTH = 160
-"""Width in columns of a table that goes into a pipe or a file."""
 
 
 def status(
@@ -165,11 +162,7 @@ def _all_answer(holders: Iterable[str], replies: Sequence[Reply]) -> bool:
 
 def _print_view(view: RenderableType) -> None:
     with importing():
-        from rich.console import Console
-
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=_WIDTH)
+        console = table_console()
     console.print(view, highlight=False, markup=False)
 
 

@@ -19,11 +19,9 @@ from detector.mining.sources import sampled, sources_of
 from detector.mining.summary import Summary, show, summary_of
 from detector.mining.workers import LocalWorkers, Workers
 from detector.resources.files import load_rules
-from detector.results.installed import check_package
-from wayside.process.commandline import refuse
+from detector.results.kinds import check_package
+from wayside.process.commandline import refuse, table_console
 
-_WIDTH = 160
-"""Width in columns of a table that goes into a pipe or a file."""
 _ERRORS = 20
 """Maximum number of errors that are printed."""
 _NAMES = 8
@@ -97,7 +95,7 @@ def mine_recordings(
     summary = summary_of(output)
     if run.changed or not (output / REPORT).exists():
         write_mining_report(output, summary)
-    show(console if console.is_terminal else Console(stderr=True, width=_WIDTH), summary)
+    show(table_console(stderr=True), summary)
     _finish(run, summary, output, shared=part is not None)
 
 

@@ -10,7 +10,7 @@ import typer
 
 from detector.commands.inquiry import Connect, DetectorFile, Name, Timeout, query_selected
 from wayside.process.beginning import importing
-from wayside.process.commandline import refuse
+from wayside.process.commandline import refuse, table_console
 
 if TYPE_CHECKING:
     from detector.actions.trigger.requests import RecordingReport, RecordingRequest
@@ -19,9 +19,6 @@ app = typer.Typer(help="Request recordings of running detectors that permit it (
 
 Id = Annotated[str, typer.Argument(help="The id of the recording.", show_default=False)]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON, a line for each recording.")]
-
-_WIDTH = 160
-"""Width in columns of a table that goes into a pipe or a file."""
 
 
 @app.command()
@@ -69,8 +66,8 @@ def stop(
     _print(_request_reports(_request(do="stop", id=identity, after=after), detector, name, connect, timeout), as_json)
 
 
-@app.command()
-def status(
+@app.command("status")
+def recordings_status(
     identity: Annotated[str | None, typer.Argument(help="Only this recording.")] = None,
     detector: DetectorFile = None,
     name: Name = None,
@@ -121,12 +118,8 @@ def _print(reports: list[tuple[str, RecordingReport]], as_json: bool) -> None:
             answer = {"detector": holder, **{key: value for key, value in msgspec.to_builtins(report).items() if value}}
             typer.echo(json.dumps(answer))
     else:
-        from rich.console import Console
         from rich.table import Table
 
-        console = Console()
-        if not console.is_terminal:
-            console = Console(width=_WIDTH)
         table = Table(box=None, pad_edge=False, header_style="bold")
         for column in ("detector", "recording", "state", "until", "samples", "bytes", "files", "message"):
             table.add_column(column, overflow="fold")
@@ -134,6 +127,6 @@ def _print(reports: list[tuple[str, RecordingReport]], as_json: bool) -> None:
             counts = (report.samples, report.bytes)
             files = "\n".join(report.files)
             table.add_row(holder, report.id, report.state.value, report.until, *map(str, counts), files, report.message)
-        console.print(table, highlight=False, markup=False)
+        table_console().print(table, highlight=False, markup=False)
     if any(report.state in (Progress.REFUSED, Progress.FAILED) for _, report in reports):
         raise typer.Exit(1)

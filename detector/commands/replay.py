@@ -29,7 +29,7 @@ from detector.replay.intake_file import read_intake, recorded_outages
 from detector.replay.playing import Played, play
 from detector.replay.progress import ProgressLine
 from detector.replay.recordings import quick_span_of
-from detector.replay.replaying import Outcome, replay_intake
+from detector.replay.replaying import Replayed, replay_intake
 from detector.replay.variants import Variant, variants_of, with_variants
 from detector.resources.files import load_rules
 from detector.resources.selection import select
@@ -39,13 +39,10 @@ from detector.results.writing import Look, Looking, check_installed, show_summar
 from wayside.api import ApplicationTask, Detector, EventRule
 from wayside.api.documents import Document, Problem
 from wayside.findings import Finding, ignored_by
-from wayside.process.commandline import refuse
+from wayside.process.commandline import refuse, table_console
 
 CLIPS = "clips"
 """The folder for the output of record actions, below the output folder."""
-
-_WIDTH = 160
-"""Width in columns of a table that goes into a pipe or a file."""
 
 
 class PlayOptions(NamedTuple):
@@ -121,22 +118,16 @@ def replay_files(
     if variants:
         compared_variants = comparisons(outcomes, variants)
         write_variants(output / "variants.json", variants, compared_variants)
-        show_variants(_console(), variants, compared_variants)
+        show_variants(table_console(stderr=True), variants, compared_variants)
     if results:
-        show_summary(_console(), results)
+        show_summary(table_console(stderr=True), results)
     clipped = "" if clips is None else f", {_number(clips.count, 'clip')}"
     typer.echo(f"{_counted(outcomes, tried)}{clipped}: {output}", err=True)
     if refusals or played.errors:
         raise typer.Exit(1)
 
 
-def _console() -> Console:
-    """For tables; in a pipe they keep their full width."""
-    console = Console(stderr=True)
-    return console if console.is_terminal else Console(stderr=True, width=_WIDTH)
-
-
-def _lines(outcome: Outcome, where: str) -> Iterator[str]:
+def _lines(outcome: Replayed, where: str) -> Iterator[str]:
     """Messages about a recording for the user."""
     yield from (f"warning: {cut}" for cut in outcome.cuts)  # these name their files
     yield from (f"warning: {where}{doubt}" for doubt in outcome.doubts)
@@ -147,7 +138,7 @@ def _lines(outcome: Outcome, where: str) -> Iterator[str]:
         yield f"{outcome.lost} samples are missing in the intake file, since the disk was too slow: events may differ"
 
 
-def _counted(outcomes: Sequence[Outcome], tried: Set[str]) -> str:
+def _counted(outcomes: Sequence[Replayed], tried: Set[str]) -> str:
     events = [event for outcome in outcomes for event in outcome.events if event.episode.rule not in tried]
     started = sum(event.started for event in events)
     several = f"{len(outcomes)} recordings, " if len(outcomes) > 1 else ""
@@ -262,7 +253,7 @@ def _intake_replayed(
     progress: ProgressLine,
     look: Look | None,
     clips: Clips | None,
-) -> Outcome:
+) -> Replayed:
     if detector is None and rules:
         refuse("give --detector as well: rules are compiled against their Detector")
     given = None if detector is None else load_rules(detector, rules, lasting_problems).rule_set
@@ -278,7 +269,7 @@ def _intake_replayed(
         )
 
 
-def _traced(outcome: Outcome) -> tuple[Iterable[Event], Iterable[ApplicationTask]]:
+def _traced(outcome: Replayed) -> tuple[Iterable[Event], Iterable[ApplicationTask]]:
     """The events and tasks, with their trace context if the environment requests traces."""
     with episode_traces(export=False) as traces:
         if traces is None:

@@ -16,7 +16,7 @@ from detector.engine.consequences.consequences import Consequences
 from detector.engine.counters import Counters
 from detector.engine.episodes.current import Identity
 from detector.engine.episodes.demands import Demand
-from detector.engine.episodes.episodes import Reason
+from detector.engine.episodes.episodes import Ending
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.open_episodes import OpenEpisode
 from detector.engine.episodes.record import EpisodeRecord
@@ -40,7 +40,7 @@ from wayside.rules import CompiledRule, in_order
 __all__ = ["Engine", "KeyReader"]
 
 
-class NoAnswerError(ValueError):
+class NotEvaluableError(ValueError):
     """A rule cannot be evaluated on demand; the text names the reason and the remedy."""
 
 
@@ -151,7 +151,7 @@ class Engine:
         for name, run in sorted(self._runs.items()):
             rule = new.get(name)
             if rule is None or not same_semantics(run, rule):
-                events += self._executor.noted(run, run.end_all(now, Reason.RULE_CHANGED))
+                events += self._executor.noted(run, run.end_all(now, Ending.RULE_CHANGED))
                 self._starts.forget(name)
                 self.schedule.forget(name)
             else:
@@ -214,7 +214,7 @@ class Engine:
 
     def _ended_while_away(self, record: EpisodeRecord, now: int) -> Event:
         """The end of an episode whose rule changed or was removed while the detector was not running."""
-        return Event(self.identity.holder, record, {}, now, Reason.RULE_CHANGED)
+        return Event(self.identity.holder, record, {}, now, Ending.RULE_CHANGED)
 
     def open_episodes(self) -> list[OpenEpisode]:
         """All episodes that have not ended."""
@@ -237,7 +237,7 @@ class Engine:
         self._executor.wake_all(self.now)
 
     def set_level(self, level: int) -> None:
-        """Set the level of thinning (see load.py); 0: evaluate everything."""
+        """Set the level of thinning (see schedule.py); 0: evaluate everything."""
         self.schedule.set_level(level)
         self._executor.plan()
 
@@ -251,11 +251,13 @@ class Engine:
         """
         run = self._runs.get(name)
         if run is None:
-            raise NoAnswerError(f"there is no rule {name}; the detector has {', '.join(sorted(self._runs)) or 'none'}")
+            raise NotEvaluableError(
+                f"there is no rule {name}; the detector has {', '.join(sorted(self._runs)) or 'none'}"
+            )
         if not run.rule.on_demand:
-            raise NoAnswerError(f"rule {name} is not evaluated on demand: write evaluation: {{onDemand: true}}")
+            raise NotEvaluableError(f"rule {name} is not evaluated on demand: write evaluation: {{onDemand: true}}")
         if not run.rule.enabled or name in self.schedule.paused:
-            raise NoAnswerError(f"rule {name} is {'paused: resume it' if run.rule.enabled else 'not enabled'}")
+            raise NotEvaluableError(f"rule {name} is {'paused: resume it' if run.rule.enabled else 'not enabled'}")
         events, answers = run.answer(self.now, self._known.views(run, self.now), self.clients, self._plugins)
         self._executor.noted(run, events)
         self._known.looked(self.now)

@@ -17,7 +17,7 @@ from detector.actions.base import Surroundings
 from detector.assembly import RuleIndex, inlets
 from detector.assembly.memory import Sweeper
 from detector.engine.consequences.consequences import Consequence
-from detector.engine.engine import Engine, NoAnswerError
+from detector.engine.engine import Engine, NotEvaluableError
 from detector.engine.episodes.demands import Demand, to_task
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.open_episodes import OpenEpisode
@@ -285,7 +285,7 @@ class Evaluator:
 
     def _pause_rule(self, rule: str, paused: bool) -> None:
         if rule not in self._engine.rules:
-            raise NoAnswerError(
+            raise NotEvaluableError(
                 f"there is no rule {rule}; the detector has {', '.join(sorted(self._engine.rules)) or 'none'}"
             )
         names = self._engine.schedule.paused - {rule} | ({rule} if paused else set())

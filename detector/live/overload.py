@@ -1,7 +1,7 @@
 """Detects when the evaluation falls behind or has caught up: the level of thinning, from the duration of cycles. Pure.
 
 A slow cycle means that ticks are overdue: the level rises by one at once. It falls by one after each ten seconds
-without a slow cycle. `detector/engine/timing/load.py` defines the levels.
+without a slow cycle. `detector/engine/timing/schedule.py` defines the levels.
 """
 
 from __future__ import annotations

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import re
+import threading
 import time
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -30,13 +31,12 @@ from detector.plugins.processes import ProcessHost
 from detector.resources.selection import RuleSet
 from detector.sources.registry import source_plugin_problems
 from detector.sources.supervision import Sources
-from detector.status.pulse import LoopMonitor
 from detector.status.server import PagesAddress, StatusServer
 from detector.streams.answering import Answering
 from detector.streams.tally import Tally
 from detector.streams.zenoh import Network
 from wayside.api import Detector
-from wayside.api.source import ZENOH
+from wayside.api.plugin import ZENOH
 from wayside.api.stream import Stream
 
 if TYPE_CHECKING:
@@ -287,3 +287,27 @@ def _subscribed(streams: Iterable[Stream]) -> list[tuple[object, ...]]:
         for stream in streams
         if stream.source == ZENOH
     ]
+
+
+class LoopMonitor:
+    """Schedules a callback in the loop, and measures its delay."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._loop = loop
+        self._lock = threading.Lock()
+        self._sent: float | None = None
+
+    def silence(self) -> float:
+        """Seconds for which the callback has been overdue; 0.0 if it is not. From any thread."""
+        with self._lock:
+            if self._sent is None:
+                self._sent = time.monotonic()
+                try:
+                    self._loop.call_soon_threadsafe(self._answered)
+                except RuntimeError:  # closed: the process is ending
+                    self._sent = None
+            return 0.0 if self._sent is None else time.monotonic() - self._sent
+
+    def _answered(self) -> None:
+        with self._lock:
+            self._sent = None

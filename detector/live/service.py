@@ -59,7 +59,7 @@ class RunOptions:
     view: View | None = None
 
 
-async def run(options: RunOptions) -> None:
+async def run_detector(options: RunOptions) -> None:
     """Run until SIGTERM or SIGINT.
 
     Raises:

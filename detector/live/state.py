@@ -18,12 +18,13 @@ from typing import Any
 from detector.engine.episodes.open_episodes import OpenEpisode, from_document
 from wayside.api import Detector
 from wayside.names import encode
+from wayside.process.backoff import Backoff, retry
 
 _log = logging.getLogger(__name__)
 
 _VERSION = 1
 _RETRY = 5.0
-"""Seconds after which a failed write is retried, if nothing changes before."""
+"""Maximum seconds after which a failed write is retried, if nothing changes before."""
 
 
 def state_file(detector: Detector, holder: str) -> StateFile | None:
@@ -53,6 +54,7 @@ class StateFile:
         self._changed = threading.Condition()
         self._wanted: Sequence[OpenEpisode] | None = None
         self._closing = False
+        self._backoff = Backoff(_RETRY, _RETRY)
         self._thread: threading.Thread | None = None
         self.failures = 0
         """Number of failed writes; each was retried."""
@@ -120,30 +122,43 @@ class StateFile:
         self._draft.unlink(missing_ok=True)
 
     def _run(self) -> None:
-        failed, closing = False, False
+        closing = False
         while not closing:
             with self._changed:
-                if failed:
-                    self._changed.wait(_RETRY)
-                else:
-                    self._changed.wait_for(lambda: self._wanted is not None or self._closing)
-                wanted, self._wanted = self._wanted, None
-                closing = self._closing
-            if wanted is None:
-                continue
-            try:
+                self._changed.wait_for(lambda: self._wanted is not None or self._closing)
+            closing = retry(self._attempt, OSError, self._failed, self._pause)
+
+    def _attempt(self) -> bool:
+        """Write the newest set, if there is one; whether it was the last attempt."""
+        with self._changed:
+            wanted, self._wanted = self._wanted, None
+            closing = self._closing
+        try:
+            if wanted is not None:
                 self._write(wanted)
-            except OSError as error:
-                self.failures += 1
-                self.last_failure = str(error)
-                if not failed:
-                    _log.error("cannot write the state; retrying: %s", error)
-                failed = True
-                with self._changed:
-                    if self._wanted is None:
-                        self._wanted = wanted
-            else:
-                failed = False
+        except OSError as error:
+            with self._changed:
+                if self._wanted is None:
+                    self._wanted = wanted
+            if not closing:
+                raise
+            self._failed(error)
+        else:
+            self._backoff.succeed()
+        return closing
+
+    def _failed(self, error: OSError) -> float:
+        self.failures += 1
+        self.last_failure = str(error)
+        if not self._backoff.failures:
+            _log.error("cannot write the state; retrying: %s", error)
+        return self._backoff.fail()
+
+    def _pause(self, seconds: float) -> None:
+        """Wait, but not for more than a newer set or the end."""
+        with self._changed:
+            if not self._closing:
+                self._changed.wait(seconds)
 
     def _write(self, episodes: Sequence[OpenEpisode]) -> None:
         document = {

@@ -11,7 +11,7 @@ import numpy as np
 from detector.assembly import RuleIndex, inlets
 from detector.engine.counters import Counters, RuleCounters
 from detector.engine.episodes.current import Identity
-from detector.engine.episodes.episodes import Ended, Reason, Started, SubjectState
+from detector.engine.episodes.episodes import Ended, Ending, Started, SubjectState
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.subjects import Subject
 from detector.engine.evaluation.rule import RuleRun
@@ -97,7 +97,7 @@ def _stepped(
         if code == LOST:
             if state.is_open:
                 state.end(time, run.timing)
-                yield from _event(run, time, Ended(Reason.CLIENT_LOST), Candidate(subject, {}, True, True))
+                yield from _event(run, time, Ended(Ending.CLIENT_LOST), Candidate(subject, {}, True, True))
             else:
                 state.gap()
             continue

@@ -28,8 +28,8 @@ from detector.replay.mcap_file import read_mcap
 from detector.replay.message import Cut
 from detector.replay.parts import PAUSE, parts_of
 from detector.replay.recorded_types import with_recorded_types
-from detector.replay.replaying import Outcome, Replay
-from detector.replay.routing import Router
+from detector.replay.replaying import Replay, Replayed
+from detector.replay.routing import MessageRouter
 from detector.results.changes import Changes
 from detector.results.quality import Arrivals
 from detector.results.series import Bytes, Doubles, Integers
@@ -102,7 +102,7 @@ def observe(job: PieceJob) -> Observed:
 def _observed(job: PieceJob) -> Observed:
     recording = tuple(map(Path, job.files))
     detector = with_recorded_types(job.detector, recording)
-    router = Router(detector.spec.streams, str(recording[0]))
+    router = MessageRouter(detector.spec.streams, str(recording[0]))
     cuts: list[Cut] = []
     between = (job.span.reads, job.span.until)
     batches = merged_batches([read_mcap(path, router.wanted, cuts.append, between=between) for path in recording])
@@ -113,7 +113,7 @@ def _observed(job: PieceJob) -> Observed:
         first = part[0].received
         if replay is None:
             replay = Replay(
-                detector, job.rules, holder=detector.name, start=first - 1, outcome=Outcome(), onlooker=recorder
+                detector, job.rules, holder=detector.name, start=first - 1, outcome=Replayed(), onlooker=recorder
             )
         elif first - replay.engine.now > PAUSE:
             return Observed(flaw="it pauses for more than an hour")

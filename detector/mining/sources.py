@@ -16,7 +16,7 @@ from urllib.parse import urlsplit
 
 from detector.replay.errors import RecordingError
 from detector.replay.gathering import BINARY, TEXT, Recording, recording_name, recordings_of
-from detector.results.installed import check_package
+from detector.results.kinds import check_package
 
 _BLOCK = 1 << 20
 _BAG = "metadata.yaml"

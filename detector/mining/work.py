@@ -21,7 +21,7 @@ from detector.plugins.processes import REPLAY_PATIENCE, ProcessHost
 from detector.replay.clips import Clips
 from detector.replay.gathering import Recording
 from detector.replay.playing import play
-from detector.replay.replaying import Outcome
+from detector.replay.replaying import Replayed
 from detector.results.episodes import EpisodeRow
 from detector.results.nearest import NearMoment
 from detector.results.quality import Arrivals, StreamQuality
@@ -176,7 +176,7 @@ def in_their_order(episodes: Iterable[EpisodeRow]) -> list[EpisodeRow]:
     return sorted(episodes, key=lambda each: (each.rule, each.start_time, each.subject))
 
 
-def _flaws(outcome: Outcome, job: MiningJob, recording: Recording) -> list[Flaw]:
+def _flaws(outcome: Replayed, job: MiningJob, recording: Recording) -> list[Flaw]:
     cuts = [Flaw("cut", _plain(str(cut), recording)) for cut in outcome.cuts]
     refusals = [
         Flaw("refused", str(refusal), refusal.rule.name)

@@ -7,19 +7,19 @@ from detector.engine.queries.geometry import Pose
 from detector.engine.queries.poses import PoseError, pose_in
 from detector.engine.queries.queries import DecodedSample, Queries, QueryError
 from detector.engine.queries.transforms import TransformError
-from detector.plugins.base import Plugin, PluginParameters, Seconds, StreamName, Subject
+from detector.plugins.base import Plugin, PluginParameters, PluginSubject, Seconds, StreamName
 
 __all__ = [
     "DecodedSample",
     "Plugin",
     "PluginParameters",
+    "PluginSubject",
     "Pose",
     "PoseError",
     "Queries",
     "QueryError",
     "Seconds",
     "StreamName",
-    "Subject",
     "TransformError",
     "pose_in",
 ]

@@ -36,7 +36,7 @@ Seconds = Annotated[float, Field(ge=0, le=86_400)]
 """A parameter that is a duration in seconds."""
 
 
-class Subject(NamedTuple):
+class PluginSubject(NamedTuple):
     """The subject for which a plugin's object computes its signal."""
 
     text: str
@@ -56,7 +56,7 @@ class Plugin(ABC, Generic[P]):
     Parameters: ClassVar[type[PluginParameters]]
     """The model of `signals[].plugin.parameters`; `detector check` reports invalid ones with their place."""
 
-    def __init__(self, parameters: P, subject: Subject) -> None:
+    def __init__(self, parameters: P, subject: PluginSubject) -> None:
         self.parameters = parameters
         self.subject = subject
 

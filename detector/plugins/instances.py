@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from detector.engine.queries.queries import Queries
 from detector.engine.scoping.plugins import PluginCall, PluginFailedError
-from detector.plugins.base import Plugin, Subject
+from detector.plugins.base import Plugin, PluginSubject
 from detector.plugins.registry import prepare_plugin
-from detector.plugins.values import plain_value
 from wayside.expressions import Reason, Value
 from wayside.rules import CompiledPlugin, CompiledRule
 
@@ -23,7 +23,7 @@ class Instances:
         self._plugin.warm_up()
         self._objects: dict[str, Plugin[Any]] = {}
 
-    def value(self, subject: Subject, clients: tuple[str, ...], queries: Queries) -> Value:
+    def value(self, subject: PluginSubject, clients: tuple[str, ...], queries: Queries) -> Value:
         """The signal's value. Raises the plugin's exceptions, and TypeError if its value is not plain data."""
         found = self._objects.get(subject.text)
         if found is None:
@@ -73,7 +73,7 @@ class LocalHost:
         """See PluginHost."""
         try:
             return self._signals[call.rule, call.signal].value(
-                Subject(call.subject, call.element), call.clients, queries
+                PluginSubject(call.subject, call.element), call.clients, queries
             )
         except Exception as error:  # a plugin may raise any exception
             raise PluginFailedError(Reason.ERROR, failure_text(error)) from error
@@ -92,3 +92,34 @@ class LocalHost:
 
 def _instances(plugin: CompiledPlugin) -> Instances:
     return Instances(plugin.plugin, plugin.parameters)
+
+
+_DEEPEST = 32
+_EXACT = 2**53
+
+
+def plain_value(value: Any, depth: int = _DEEPEST) -> Value:
+    """The value with integers as doubles and tuples as lists; NaN becomes None, at any depth.
+
+    Raises TypeError for other data, and for data nested too deeply.
+    """
+    match value:
+        case None | bool() | str():
+            return value
+        case int():
+            return float(value) if -_EXACT <= value <= _EXACT else int(value)
+        case float():
+            return None if math.isnan(value) else float(value)
+        case list() | tuple() if depth:
+            return [plain_value(item, depth - 1) for item in value]
+        case dict() if depth and all(isinstance(key, str) for key in value):
+            return {key: plain_value(item, depth - 1) for key, item in value.items()}
+    if not depth:
+        raise TypeError(f"the value is nested more than {_DEEPEST} levels deep")
+    scalar = getattr(value, "item", None)  # numpy's numbers
+    if scalar is not None and getattr(value, "shape", None) == ():
+        return plain_value(scalar(), depth - 1)
+    raise TypeError(
+        f"the value is a {type(value).__name__}: return None, a boolean, a number, a text, or lists and "
+        "maps (with text keys) of these"
+    )

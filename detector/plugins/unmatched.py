@@ -18,10 +18,8 @@ from detector.engine.queries.geometry import NO_MOTION, Pose
 from detector.engine.queries.queries import DecodedSample, Queries, frame_of
 from detector.engine.queries.transforms import TransformError
 from detector.engine.queries.tuples import matched
-from detector.plugins import assignment
-from detector.plugins.assignment import Point, assigned
-from detector.plugins.base import Plugin, PluginParameters, Seconds, StreamName, Subject
-from detector.plugins.tracking import Tracks
+from detector.plugins.base import Plugin, PluginParameters, PluginSubject, Seconds, StreamName
+from detector.plugins.tracking import Point, Tracks, assigned, warm_up
 from wayside.expressions import Value
 
 _SAMPLES = 100
@@ -93,7 +91,7 @@ class UnmatchedObjects(Plugin[UnmatchedParameters]):
 
     Parameters = UnmatchedParameters
 
-    def __init__(self, parameters: UnmatchedParameters, subject: Subject) -> None:
+    def __init__(self, parameters: UnmatchedParameters, subject: PluginSubject) -> None:
         super().__init__(parameters, subject)
         self._tracks = Tracks(parameters.within, parameters.speed, round(parameters.gap * 1e9))
         self._last: int | None = None
@@ -102,7 +100,7 @@ class UnmatchedObjects(Plugin[UnmatchedParameters]):
     @classmethod
     def warm_up(cls) -> None:
         """Matching needs scipy."""
-        assignment.warm_up()
+        warm_up()
 
     def value(self, queries: Queries, clients: tuple[str, ...]) -> Value:
         """None until two samples could be compared, and if one of the streams is stale."""

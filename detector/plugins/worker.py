@@ -21,7 +21,7 @@ from detector.engine.queries.geometry import Pose
 from detector.engine.queries.poses import PoseError
 from detector.engine.queries.queries import DecodedSample, QueryError
 from detector.engine.queries.transforms import TransformError
-from detector.plugins.base import Subject
+from detector.plugins.base import PluginSubject
 from detector.plugins.entrypoints import PluginError
 from detector.plugins.instances import Instances, failure_text
 from detector.plugins.wire import ClosedError, Wire
@@ -128,7 +128,7 @@ def _value(
     instances: Instances, wire: Wire, subject: str, element: str | None, clients: list[str], now: int
 ) -> tuple[str, Any]:
     try:
-        return "result", instances.value(Subject(subject, element), tuple(clients), RemoteQueries(wire, now))
+        return "result", instances.value(PluginSubject(subject, element), tuple(clients), RemoteQueries(wire, now))
     except ClosedError:
         raise
     except Exception as error:  # noqa: BLE001  a plugin may raise any exception

@@ -12,7 +12,7 @@ from pydantic import BaseModel, Field
 from detector.replay.batches import messages_of
 from detector.replay.gathering import recording_name, recording_paths
 from detector.replay.recordings import open_recordings
-from detector.replay.routing import Router
+from detector.replay.routing import MessageRouter
 from detector.sources.base import Feed, Source
 from wayside.api.base import Model
 
@@ -51,7 +51,7 @@ class BagSource(Source[BagParameters]):
 
     def _play(self, feed: Feed) -> None:
         paths = recording_paths(Path(path) for path in self.parameters.paths)
-        router = Router([stream.spec for stream in feed.streams], recording_name(tuple(paths)))
+        router = MessageRouter([stream.spec for stream in feed.streams], recording_name(tuple(paths)))
         recordings = open_recordings(paths, router.wanted, lambda cut: _log.warning("%s", cut))
         first: int | None = None
         began = time.monotonic()

@@ -18,12 +18,12 @@ from detector.engine.buffering.latched import Topic
 from detector.engine.samples.sample import Arrival
 from detector.replay.message import OnCut, ignore
 from detector.replay.recordings import open_recordings
-from detector.replay.routing import Router
+from detector.replay.routing import MessageRouter
 from wayside.api import Detector
 
 
 def recorded_arrivals(
-    recordings: Sequence[Path], router: Router, detector: Detector, on_cut: OnCut = ignore
+    recordings: Sequence[Path], router: MessageRouter, detector: Detector, on_cut: OnCut = ignore
 ) -> Iterator[list[Arrival]]:
     """The recordings' messages for the Detector's streams, in lists; those of latched streams first.
 
@@ -36,7 +36,7 @@ def recorded_arrivals(
     if not topics:
         return arrivals
     # Read once for these only (a recording with an index skips the rest): it need not fit into memory as a whole.
-    latched = Router([stream for stream in detector.spec.streams if stream.latched])
+    latched = MessageRouter([stream for stream in detector.spec.streams if stream.latched])
     latched_arrivals = chain.from_iterable(latched.arrivals(open_recordings(recordings, latched.wanted)))
     return latched_first(arrivals, latched_arrivals, topics)
 

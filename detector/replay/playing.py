@@ -16,8 +16,8 @@ from detector.replay.gathering import Recording, recording_name
 from detector.replay.latched import recorded_arrivals
 from detector.replay.message import Cut
 from detector.replay.recorded_types import with_recorded_types
-from detector.replay.replaying import Outcome, ReplayObserver, replay_arrivals
-from detector.replay.routing import Router
+from detector.replay.replaying import Replayed, ReplayObserver, replay_arrivals
+from detector.replay.routing import MessageRouter
 from wayside.api import Detector, EventRule
 
 Plugins = Callable[[], AbstractContextManager[PluginHost | None]]
@@ -34,7 +34,7 @@ class ReplayWatch(Protocol):
 class Played(NamedTuple):
     """The result of playing several recordings."""
 
-    outcomes: dict[str, Outcome]
+    outcomes: dict[str, Replayed]
     """By the recording's name, in the order given; at least one."""
     errors: list[RecordingError]
     """Why the other recordings could not be replayed."""
@@ -61,7 +61,7 @@ def play(
         RecordingError: the one recording is damaged or does not fit the streams, or no message of any belongs to a
             stream; an ExceptionGroup of these where several recordings have several errors.
     """
-    outcomes: dict[str, Outcome] = {}
+    outcomes: dict[str, Replayed] = {}
     errors: list[RecordingError] = []
     unrouted: dict[str, list[str]] = {}
     for number, recording in enumerate(recordings, start=1):
@@ -90,11 +90,11 @@ def _played(
     holder: str,
     onlooker: ReplayObserver | None,
     clips: Clips | None,
-) -> tuple[Outcome, list[str]]:
+) -> tuple[Replayed, list[str]]:
     """The outcome of a recording, and its keys that belong to no stream."""
     cuts: list[Cut] = []
     completed = with_recorded_types(detector, recording)
-    router = Router(completed.spec.streams, recording_name(recording))
+    router = MessageRouter(completed.spec.streams, recording_name(recording))
     arrivals = recorded_arrivals(recording, router, completed, cuts.append)
     with plugins() as host:
         outcome = replay_arrivals(watch(arrivals), completed, rules, host, holder, onlooker, clips)
@@ -107,7 +107,7 @@ def _played(
 
 
 def _without_samples(
-    outcomes: dict[str, Outcome], unrouted: dict[str, list[str]], detector: Detector
+    outcomes: dict[str, Replayed], unrouted: dict[str, list[str]], detector: Detector
 ) -> Iterator[RecordingError]:
     """Why none of the recordings has anything to evaluate."""
     for name, outcome in outcomes.items():

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 from detector.actions.base import Surroundings
 from detector.assembly import Inlets, RefusedRule, RuleIndex, inlets, make_engine
-from detector.engine.engine import Engine, NoAnswerError
+from detector.engine.engine import Engine, NotEvaluableError
 from detector.engine.episodes.demands import Demand, from_task, to_task
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.open_episodes import OpenEpisode, from_document
@@ -44,7 +44,7 @@ class ReplayObserver(Observer, Protocol):
 
 
 @dataclass(slots=True)
-class Outcome:
+class Replayed:
     """The outcome of a replay."""
 
     events: list[Event] = field(default_factory=list)
@@ -77,7 +77,7 @@ class Replay:
         *,
         holder: str,
         start: int,
-        outcome: Outcome,
+        outcome: Replayed,
         plugins: PluginHost | None = None,
         version: int = ORDER,
         order: int = ORDER,
@@ -127,7 +127,7 @@ class Replay:
 
     def ask(self, rule: str) -> None:
         """A rule was evaluated on demand; if other rules were recorded, it may not exist here."""
-        with contextlib.suppress(NoAnswerError):
+        with contextlib.suppress(NotEvaluableError):
             self._note(self._engine.evaluate_now(rule)[0])
 
     def finish(self) -> None:
@@ -215,7 +215,7 @@ def replay_intake(
     plugins: PluginHost | None = None,
     onlooker: ReplayObserver | None = None,
     clips: Clips | None = None,
-) -> Outcome:
+) -> Replayed:
     """Replay an intake file with its own Detector and rules, or with others if given.
 
     `plugins` runs them; without it they run in this process. With `clips`, record actions run.
@@ -224,7 +224,7 @@ def replay_intake(
         RecordingError: it does not begin with a start.
         DetectorError: the Detector cannot run.
     """
-    outcome = Outcome()
+    outcome = Replayed()
     replay: Replay | None = None
     batch: list[Arrival] = []
     for record in records:
@@ -259,7 +259,7 @@ def _begin(
     record: Control,
     detector: Detector | None,
     rules: Sequence[EventRule] | None,
-    outcome: Outcome,
+    outcome: Replayed,
     plugins: PluginHost | None,
     onlooker: ReplayObserver | None,
     clips: Clips | None,
@@ -283,7 +283,7 @@ def _begin(
 
 
 def _control(
-    replay: Replay, record: Control, detector: Detector | None, rules: Sequence[EventRule] | None, outcome: Outcome
+    replay: Replay, record: Control, detector: Detector | None, rules: Sequence[EventRule] | None, outcome: Replayed
 ) -> None:
     document = record.document
     match record.kind:
@@ -327,7 +327,7 @@ def replay_arrivals(
     holder: str | None = None,
     onlooker: ReplayObserver | None = None,
     clips: Clips | None = None,
-) -> Outcome:
+) -> Replayed:
     """Replay any other recording in the way the live intake would have queued it; `plugins` as for an intake file.
 
     Args:
@@ -338,7 +338,7 @@ def replay_arrivals(
     Raises:
         DetectorError: the Detector cannot run.
     """
-    outcome = Outcome()
+    outcome = Replayed()
     replay: Replay | None = None
     last = 0
     begin = partial(

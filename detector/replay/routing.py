@@ -49,7 +49,7 @@ def _writer(channel: Channel, stream: Stream) -> Callable[[bytes], bytes] | None
     return written
 
 
-class Router:
+class MessageRouter:
     """Routes recorded messages to the Detector's streams."""
 
     def __init__(self, streams: Sequence[Stream], recording: str = "") -> None:

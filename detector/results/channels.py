@@ -17,8 +17,7 @@ from foxglove.messages import Log, LogLevel, Timestamp
 
 from detector.engine.episodes.events import Event
 from detector.results.result import Result
-from detector.results.series import WORDS, Integers, Series, SeriesKind, SubjectTrace
-from detector.results.thinning import thinned
+from detector.results.series import WORDS, Integers, Series, SeriesKind, SubjectTrace, thinned
 from wayside.times import format_time
 
 _TYPES = {SeriesKind.NUMBER: "number", SeriesKind.BOOLEAN: "boolean", SeriesKind.TEXT: "string"}

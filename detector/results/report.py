@@ -23,8 +23,7 @@ from detector.results.actions import Deed, deeds_of
 from detector.results.episodes import EpisodeRow
 from detector.results.places import polygons_of
 from detector.results.result import Result
-from detector.results.series import UNKNOWN, Integers, Series, SeriesKind, SubjectTrace
-from detector.results.thinning import thinned
+from detector.results.series import UNKNOWN, Integers, Series, SeriesKind, SubjectTrace, thinned
 from wayside.manifests import to_yaml
 from wayside.times import format_time
 

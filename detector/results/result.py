@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from detector.engine.episodes.events import Event
-from detector.replay.replaying import Outcome
+from detector.replay.replaying import Replayed
 from detector.results.episodes import EpisodeRow, episodes_of
 from detector.results.nearest import NearMoment, nearest_moments
 from detector.results.quality import Arrivals, StreamQuality
@@ -51,7 +51,7 @@ class Result:
         return nearest_moments(self.recording, self.rules, self.trace.subjects, self.episodes)
 
 
-def result_of(name: str, outcome: Outcome, tracer: Tracer, arrivals: Arrivals) -> Result:
+def result_of(name: str, outcome: Replayed, tracer: Tracer, arrivals: Arrivals) -> Result:
     """The result of a replay; `tracer` and `arrivals` observed it.
 
     Raises:

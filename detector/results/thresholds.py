@@ -10,7 +10,7 @@ import numpy as np
 
 from detector.results.series import Doubles, Series, SeriesKind, SubjectTrace
 from wayside.expressions import Expression, Path
-from wayside.expressions.syntax import Call, Constant, Node, Select, path_of
+from wayside.expressions.syntax import Call, Node, Scalar, Select, path_of
 from wayside.rules import CompiledRule
 
 _ORDER = {"_<_": "<", "_<=_": "<=", "_>_": ">", "_>=_": ">="}
@@ -101,7 +101,7 @@ def _constant(node: Node, names: frozenset[str], values: Mapping[str, Any]) -> f
             found = found.get(step) if isinstance(found, Mapping) else None
         return float(found) if isinstance(found, int | float) and not isinstance(found, bool) else None
     match node:
-        case Constant(int() | float() as value) if not isinstance(value, bool):
+        case Scalar(int() | float() as value) if not isinstance(value, bool):
             return float(value)
         case Call("-_", None, (operand,)):
             inner = _constant(operand, names, values)
@@ -126,7 +126,7 @@ def _written(node: Node, names: frozenset[str]) -> str | None:
     if path is not None:
         return None if path[0] == "parameters" or (isinstance(node, Select) and node.test_only) else _name(path)
     match node:
-        case Constant(int() | float() as value) if not isinstance(value, bool):
+        case Scalar(int() | float() as value) if not isinstance(value, bool):
             return f"{value:g}"
         case Call(function, None, (left, right)) if function in _ARITHMETIC:
             one, other = (_nested(each, _written(each, names)) for each in (left, right))
@@ -166,7 +166,7 @@ def _values(node: Node, names: frozenset[str], of: Callable[[str], Doubles]) -> 
     if path is not None:
         return of(_name(path))
     match node:
-        case Constant(int() | float() as value):
+        case Scalar(int() | float() as value):
             return float(value)
         case Call(function, None, (left, right)):
             return _ARITHMETIC[function][1](_values(left, names, of), _values(right, names, of))

@@ -12,11 +12,11 @@ from rich.markup import escape
 from rich.table import Table
 
 from detector.replay.comparing import Comparison, combined, compare
-from detector.replay.replaying import Outcome
+from detector.replay.replaying import Replayed
 from detector.replay.variants import Variant
 
 
-def comparisons(outcomes: Sequence[Outcome], variants: Sequence[Variant]) -> list[Comparison]:
+def comparisons(outcomes: Sequence[Replayed], variants: Sequence[Variant]) -> list[Comparison]:
     """Each variant with its rule as written, over all recordings."""
     return [
         combined([compare(outcome.events, each.of, each.rule.name, outcome.end) for outcome in outcomes])

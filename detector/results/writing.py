@@ -10,10 +10,9 @@ from rich.console import Console
 from rich.table import Table
 
 from detector.engine.samples.sample import Arrival
-from detector.replay.replaying import Outcome
+from detector.replay.replaying import Replayed
 from detector.results.episodes import EpisodeRow, write_csv, write_parquet
-from detector.results.installed import check_package
-from detector.results.kinds import ResultKind
+from detector.results.kinds import ResultKind, check_package
 from detector.results.nearest import NearMoment, nearest_by_rule, show_moments
 from detector.results.nearest import write_moments as write_nearest
 from detector.results.quality import Arrivals
@@ -51,7 +50,7 @@ class Looking:
         """The batches of the current recording, unchanged."""
         return [*self._looks.values()][-1].arrivals.watch_batches(batches)
 
-    def results(self, outcomes: Mapping[str, Outcome]) -> list[Result]:
+    def results(self, outcomes: Mapping[str, Replayed]) -> list[Result]:
         """The result of each recording."""
         return [result_of(name, outcome, *self._looks[name]) for name, outcome in outcomes.items()]
 

@@ -10,7 +10,7 @@ from pydantic import BaseModel
 from detector.plugins.entrypoints import Offers, PluginError
 from detector.sources.base import Source
 from wayside.api import Detector
-from wayside.api.source import DataSource
+from wayside.api.plugin import DataSource
 from wayside.rules import RuleProblem
 
 OFFERS = Offers[Source[Any]](

@@ -13,9 +13,9 @@ from detector.sources.base import Feed, Putter
 from detector.sources.registry import Make, prepare_source
 from detector.streams.tally import Cause, Tally
 from wayside.api import Detector
-from wayside.api.source import DataSource
+from wayside.api.plugin import DataSource
 from wayside.api.stream import Stream
-from wayside.process.backoff import Backoff
+from wayside.process.backoff import Backoff, retry
 
 log = logging.getLogger(__name__)
 
@@ -87,33 +87,35 @@ class SourceThread:
             )
 
     def _run(self) -> None:
-        while not self._feed.stopping:
-            self.state = SourceState.RUNNING
-            began = time.monotonic()
-            try:
-                self._make().run(self._feed)
-            except BaseException as error:  # noqa: BLE001  third-party code, which must not end the detector
-                if self._feed.stopping:
-                    break
-                if time.monotonic() - began >= _STEADY:
-                    self._backoff.succeed()
-                pause = self._backoff.fail()
-                self._failed(error, pause)
-                self._feed.wait(pause)
-            else:
-                break
+        retry(self._attempt, BaseException, self._failed, self._feed.wait)
         if self._feed.stopping:
             self.state = SourceState.STOPPED
         else:
             self.state = SourceState.FINISHED
             log.info("source %s has ended after %d messages", self.source.name, self.messages)
 
-    def _failed(self, error: BaseException, pause: float) -> None:
+    def _attempt(self) -> None:
+        """Run it; raises anything, since this is third-party code."""
+        if self._feed.stopping:
+            return
+        self.state = SourceState.RUNNING
+        began = time.monotonic()
+        try:
+            self._make().run(self._feed)
+        except BaseException:
+            if time.monotonic() - began >= _STEADY:
+                self._backoff.succeed()
+            if not self._feed.stopping:
+                raise
+
+    def _failed(self, error: BaseException) -> float:
+        pause = self._backoff.fail()
         self.state = SourceState.PAUSING
         self.last_error = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
         self._tally.add(Cause.FAILED, self.source.name, last=self.last_error)
         log.warning("source %s failed; restarting it in %.1f s: %s", self.source.name, pause, self.last_error)
         log.debug("source %s", self.source.name, exc_info=error)
+        return pause
 
 
 class Sources:

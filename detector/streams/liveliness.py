@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 
 import zenoh
 
-from detector.engine.samples.liveliness import Token
+from detector.engine.samples.liveliness import TokenState
 from detector.streams.session import Connections
 from wayside.keys import KeyPattern
 
@@ -96,7 +96,7 @@ class TokenWatch:
                         lambda: self._following is not None or self._stop.is_set() or not self._expecting
                     )
                     if self._following is None:
-                        self._put([(key, Token.UNSURE.value) for key in self._held])
+                        self._put([(key, TokenState.UNSURE.value) for key in self._held])
                         return
                     (self._subscriber, self._connections), self._following = self._following, None
                     self._expecting = False
@@ -121,11 +121,11 @@ class TokenWatch:
         for key, kind in newest.items():
             if kind == zenoh.SampleKind.PUT:
                 self._held[key] = self._connections.departures
-                self._put([(key, Token.DECLARED.value)])
+                self._put([(key, TokenState.DECLARED.value)])
             elif key in self._held:
                 departed = self._held.pop(key) != self._connections.departures
                 unsure = self._stop.is_set() or (departed and self._connections.router_left_within(_DOUBT))
-                self._put([(key, (Token.UNSURE if unsure else Token.DROPPED).value)])
+                self._put([(key, (TokenState.UNSURE if unsure else TokenState.DROPPED).value)])
 
 
 def _report(sample: zenoh.Sample) -> Report:

@@ -23,6 +23,7 @@ from detector.streams.liveliness import TokenWatch
 from detector.streams.membership import Membership
 from detector.streams.session import NetworkError, material_of, open_session
 from wayside.api.zenoh import Zenoh, ZenohMode
+from wayside.process.backoff import retry
 
 log = logging.getLogger(__name__)
 
@@ -34,6 +35,9 @@ _AT_LEAST, _AT_MOST = 1.0, 10.0
 have delivered the same samples."""
 
 _LOOK_AT_BOTH = 0.01
+
+_REOPEN_EVERY = 0.2
+"""Seconds between two attempts to open a closed session again, since samples are lost meanwhile."""
 
 _AGAIN = 60.0
 """Seconds after which material that failed is tried again: the other side may have been the cause."""
@@ -210,15 +214,18 @@ class Renewal:
         self.reopening.set()
         first.close()
         tried = material
-        while not self._stop.is_set():
-            try:
-                second = self._join(open_session(self._config, tried), tried)
-                break
-            except NetworkError as error:
-                refused = refused or error
-                tried = first.material
-                self._stop.wait(0.2)
-        else:
+
+        def attempt() -> Membership | None:
+            return None if self._stop.is_set() else self._join(open_session(self._config, tried), tried)
+
+        def failed(error: NetworkError) -> float:
+            nonlocal refused, tried
+            refused = refused or error
+            tried = first.material
+            return _REOPEN_EVERY
+
+        second = retry(attempt, NetworkError, failed, self._stop.wait)
+        if second is None:
             return
         if self._stop.is_set():
             second.close()

@@ -14,7 +14,7 @@ from detector.access.credentials import Material, read_material
 from detector.access.mounted import AccessError
 from wayside.api.zenoh import Zenoh, ZenohMode
 from wayside.inputerror import InputError
-from wayside.process.backoff import Backoff
+from wayside.process.backoff import Backoff, retry
 
 log = logging.getLogger(__name__)
 
@@ -53,16 +53,21 @@ def open_session(config: Zenoh, material: Material | None = None) -> zenoh.Sessi
 def await_session(config: Zenoh, stop: threading.Event) -> tuple[zenoh.Session, Material] | None:
     """Tries to open a session until it succeeds; None once `stop` is set. Once open, it reconnects by itself."""
     backoff, logged = Backoff(_FIRST, _LONGEST), ""
-    while not stop.is_set():
-        try:
-            material = material_of(config)
-            return open_session(config, material), material
-        except NetworkError as error:
-            if str(error) != logged:
-                logged = str(error)
-                log.warning("%s; retrying", error)
-        stop.wait(backoff.fail())
-    return None
+
+    def attempt() -> tuple[zenoh.Session, Material] | None:
+        if stop.is_set():
+            return None
+        material = material_of(config)
+        return open_session(config, material), material
+
+    def failed(error: NetworkError) -> float:
+        nonlocal logged
+        if str(error) != logged:
+            logged = str(error)
+            log.warning("%s; retrying", error)
+        return backoff.fail()
+
+    return retry(attempt, NetworkError, failed, stop.wait)
 
 
 class Connections:

@@ -20,11 +20,11 @@ from detector.engine.samples.liveliness import LIVELINESS
 from detector.streams.answering import Answering
 from detector.streams.bursts import Put
 from detector.streams.inlets import Inlet
-from detector.streams.layouts import Pump, pump_for
 from detector.streams.liveliness import TokenWatch
 from detector.streams.membership import Membership
 from detector.streams.renewal import LOOK_EVERY, CertificateState, Renewal
 from detector.streams.session import NetworkError, await_session, material_of, open_session
+from detector.streams.subscribing import Pump, pump_for
 from detector.streams.tally import Tally
 from wayside.api.stream import Stream
 from wayside.api.zenoh import Zenoh, ZenohMode

@@ -27,8 +27,8 @@ from detector.engine.episodes.events import Event
 from detector.engine.samples.sample import Arrival
 from detector.replay.latched import recorded_arrivals
 from detector.replay.recorded_types import with_recorded_types
-from detector.replay.replaying import Outcome, Replay
-from detector.replay.routing import Router
+from detector.replay.replaying import Replay, Replayed
+from detector.replay.routing import MessageRouter
 from detector.resources.files import load_rules
 from detector.testing import RefusedError
 from examples.running.scenario import START_NS
@@ -101,8 +101,8 @@ def play(folder: Path, recording: Path, output: Path) -> Played:
     if loaded.warnings:
         raise RefusedError("; ".join(loaded.warnings))
     detector = _at(with_recorded_types(loaded.rule_set.detector, [recording]), output)
-    arrivals = chain.from_iterable(recorded_arrivals([recording], Router(detector.spec.streams), detector))
-    wire, outcome = _Wire(), Outcome()
+    arrivals = chain.from_iterable(recorded_arrivals([recording], MessageRouter(detector.spec.streams), detector))
+    wire, outcome = _Wire(), Replayed()
     host = ActionHost(detector.name, wire)
     played = Played(output)
     versions: dict[str, ApplicationTask] = {}

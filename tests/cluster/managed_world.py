@@ -18,7 +18,7 @@ from application_manager.core.claims.claims import InvalidTemplate
 from application_manager.core.claims.operations import Standing
 from application_manager.core.demand.byhand import is_held
 from application_manager.core.demand.decisions import is_managed
-from application_manager.core.demand.demand import Outcome, demand
+from application_manager.core.demand.demand import NamespaceOutcome, demand
 from application_manager.core.holders.leases import LeaseView
 from application_manager.core.objects.policy import Policy
 from application_manager.core.objects.rendering import Renderer, RenderError
@@ -164,7 +164,7 @@ def _unlike(wanted: Any, live: Any, path: str) -> Iterator[str]:
         yield f"has {live!r} at {path}, not {wanted!r}"
 
 
-def _tasks(tasks: list[ApplicationTask], outcome: Outcome) -> Iterator[str]:
+def _tasks(tasks: list[ApplicationTask], outcome: NamespaceOutcome) -> Iterator[str]:
     for task in tasks:
         verdict = outcome.verdicts[task.name]
         if task.status is None:

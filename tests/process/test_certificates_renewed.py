@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import zenoh
 
-from detector.engine.samples.liveliness import LIVELINESS, Token
+from detector.engine.samples.liveliness import LIVELINESS, TokenState
 from detector.streams.session import open_session
 from detector.streams.zenoh import Network
 from tests.certificates import Authority
@@ -207,15 +207,15 @@ def test_tokens_and_latched_samples_are_reported_once(
         authority.mount(mounted, "detector")
         wait_for(lambda: running.certificate_state.renewals == 1)
         goes.undeclare()
-        arrivals.wait_for(lambda seen: (LIVELINESS, "alive/car2", Token.DROPPED.value) in seen)
+        arrivals.wait_for(lambda seen: (LIVELINESS, "alive/car2", TokenState.DROPPED.value) in seen)
         publisher.put("second")
         arrivals.wait_for(lambda seen: ("map", "maps/car1", b"second") in seen)
         assert sorted(arrivals.seen) == sorted(
             [
                 ("map", "maps/car1", b"first"),
-                (LIVELINESS, "alive/car1", Token.DECLARED.value),
-                (LIVELINESS, "alive/car2", Token.DECLARED.value),
-                (LIVELINESS, "alive/car2", Token.DROPPED.value),
+                (LIVELINESS, "alive/car1", TokenState.DECLARED.value),
+                (LIVELINESS, "alive/car2", TokenState.DECLARED.value),
+                (LIVELINESS, "alive/car2", TokenState.DROPPED.value),
                 ("map", "maps/car1", b"second"),
             ]
         )

@@ -13,7 +13,7 @@ import yaml
 from detector.actions import Surroundings
 from detector.actions.host import ActionHost
 from detector.assembly import inlets
-from detector.assembly.checking import check_documents
+from detector.assembly.checking import findings
 from tests.driving import a_detector, a_rule, a_stream, an_engine, arrival, at, compiled
 from tests.mongodb.way import Way
 from tests.process.database_desk import wait_until
@@ -32,7 +32,7 @@ def checked(tmp_path: Path, *objects: dict[str, Any]) -> list[str]:
     ]
     (tmp_path / "all.yaml").write_text(yaml.safe_dump_all(whole, sort_keys=False))
     try:
-        return [str(each) for each in check_documents(load_documents([tmp_path / "all.yaml"]))]
+        return [str(each) for each in findings(load_documents([tmp_path / "all.yaml"])).problems]
     except DocumentError as error:
         return [str(error)]
 

@@ -11,7 +11,7 @@ from detector.actions.deploy.file_store import FileTaskStore
 from detector.actions.deploy.reconciler import DemandReconciler
 from detector.assembly import DetectorError, inlets
 from detector.engine.samples import liveliness
-from detector.engine.samples.liveliness import LIVELINESS, Token
+from detector.engine.samples.liveliness import LIVELINESS, TokenState
 from detector.engine.samples.sample import Arrival
 from detector.live.restoring import Restored
 from detector.live.running import Running
@@ -30,7 +30,7 @@ FAST = a_rule("fast", signals=[{"name": "v", "stream": "speed", "value": "msg.v"
 HERE = a_rule("here", when="true", until="false")
 
 
-def alive(seconds: float, client: str, token: Token, session: str = "s1") -> Arrival:
+def alive(seconds: float, client: str, token: TokenState, session: str = "s1") -> Arrival:
     return Arrival(at(seconds), LIVELINESS, f"alive/{client}/{session}", token.value)
 
 
@@ -45,15 +45,15 @@ def detector(clock: Clock = Clock.WALL) -> Detector:
 
 def test_a_token_alone_makes_a_client_known_and_keeps_it_beyond_the_timeout() -> None:
     drive = Drive(detector(), HERE)
-    assert drive.take(alive(0.5, "car1", Token.DECLARED), until=1) == ["here car1 started 1"]
+    assert drive.take(alive(0.5, "car1", TokenState.DECLARED), until=1) == ["here car1 started 1"]
     assert drive.take(until=60) == []
-    assert drive.take(alive(60.5, "car1", Token.DROPPED), until=62) == ["here car1 ClientLost 61"]
+    assert drive.take(alive(60.5, "car1", TokenState.DROPPED), until=62) == ["here car1 ClientLost 61"]
 
 
 def test_a_dropped_token_ends_episodes_at_once_and_the_next_sample_brings_the_client_back() -> None:
     drive = Drive(detector(), FAST)
-    drive.take(alive(0.1, "car1", Token.DECLARED), arrival(0.2, "car1", {"v": 20}), until=1)
-    assert drive.take(arrival(1.1, "car1", {"v": 20}), alive(1.2, "car1", Token.DROPPED), until=2) == [
+    drive.take(alive(0.1, "car1", TokenState.DECLARED), arrival(0.2, "car1", {"v": 20}), until=1)
+    assert drive.take(arrival(1.1, "car1", {"v": 20}), alive(1.2, "car1", TokenState.DROPPED), until=2) == [
         "fast car1 ClientLost 2"
     ]
     assert drive.take(arrival(2.5, "car1", {"v": 20}), until=3) == ["fast car1 started 3"]
@@ -62,23 +62,23 @@ def test_a_dropped_token_ends_episodes_at_once_and_the_next_sample_brings_the_cl
 
 def test_a_client_is_lost_with_its_last_token_only_and_not_if_it_is_declared_again_before_the_tick() -> None:
     drive = Drive(detector(), HERE)
-    drive.take(alive(0.1, "car1", Token.DECLARED), alive(0.2, "car1", Token.DECLARED, "s2"), until=1)
-    assert drive.take(alive(1.1, "car1", Token.DROPPED), until=10) == []
-    again = [alive(10.1, "car1", Token.DROPPED, "s2"), alive(10.2, "car1", Token.DECLARED)]
+    drive.take(alive(0.1, "car1", TokenState.DECLARED), alive(0.2, "car1", TokenState.DECLARED, "s2"), until=1)
+    assert drive.take(alive(1.1, "car1", TokenState.DROPPED), until=10) == []
+    again = [alive(10.1, "car1", TokenState.DROPPED, "s2"), alive(10.2, "car1", TokenState.DECLARED)]
     assert drive.take(*again, until=20) == []
-    assert drive.take(alive(20.1, "car1", Token.DROPPED), until=21) == ["here car1 ClientLost 21"]
+    assert drive.take(alive(20.1, "car1", TokenState.DROPPED), until=21) == ["here car1 ClientLost 21"]
 
 
 def test_where_our_own_connection_was_lost_the_timeout_decides() -> None:
     drive = Drive(detector(), HERE)
-    drive.take(alive(0.1, "car1", Token.DECLARED), alive(0.1001, "car2", Token.DECLARED), until=10)
-    unsure = [alive(10.1, "car1", Token.UNSURE), alive(10.1001, "car2", Token.UNSURE)]
-    assert drive.take(*unsure, alive(12.0, "car2", Token.DECLARED), until=20) == ["here car1 ClientLost 14"]
+    drive.take(alive(0.1, "car1", TokenState.DECLARED), alive(0.1001, "car2", TokenState.DECLARED), until=10)
+    unsure = [alive(10.1, "car1", TokenState.UNSURE), alive(10.1001, "car2", TokenState.UNSURE)]
+    assert drive.take(*unsure, alive(12.0, "car2", TokenState.DECLARED), until=20) == ["here car1 ClientLost 14"]
 
 
 def test_what_names_no_client_or_means_nothing_is_counted() -> None:
     drive = Drive(detector(), HERE)
-    wrong = [alive(0.1, "car 1", Token.DECLARED), Arrival(at(0.2), LIVELINESS, "alive/car1/s1", b"?")]
+    wrong = [alive(0.1, "car 1", TokenState.DECLARED), Arrival(at(0.2), LIVELINESS, "alive/car1/s1", b"?")]
     assert drive.take(*wrong, until=1) == []
     assert drive.engine.counters.unnamed[LIVELINESS] == 2
     assert drive.engine.counters.samples[LIVELINESS] == 0
@@ -87,14 +87,14 @@ def test_what_names_no_client_or_means_nothing_is_counted() -> None:
 def test_tokens_beyond_the_bound_are_ignored_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(liveliness, "MAXIMUM_TOKENS", 1)
     drive = Drive(detector(), HERE)
-    both = [alive(0.1, "car1", Token.DECLARED), alive(0.2, "car2", Token.DECLARED)]
+    both = [alive(0.1, "car1", TokenState.DECLARED), alive(0.2, "car2", TokenState.DECLARED)]
     assert drive.take(*both, until=1) == ["here car1 started 1"]
     assert drive.engine.counters.crowded[LIVELINESS] == 1
 
 
 def test_when_the_detector_requests_other_tokens_the_timeout_decides_about_the_old_ones() -> None:
     drive = Drive(detector(), HERE)
-    drive.take(alive(0.1, "car1", Token.DECLARED), until=10)
+    drive.take(alive(0.1, "car1", TokenState.DECLARED), until=10)
     changed = a_detector(a_stream("speed"), clientTimeout="3s")
     entries = inlets(changed)
     drive.engine.set_detector(changed, entries.decoders, entries.read_key)
@@ -107,8 +107,10 @@ def test_with_clock_data_a_token_counts_after_the_samples_up_to_the_newest_stamp
     def fast(seconds: float, client: str) -> Arrival:
         return arrival(seconds + 100, client, {"v": 20, "t": (START + seconds * SECOND) / 1e9})
 
-    drive.take(alive(100, "car1", Token.DECLARED), fast(0.5, "car1"), fast(0.6, "car2"), until=200)
-    drive.take(fast(1.5, "car2"), fast(2.5, "car1"), alive(102.6, "car1", Token.DROPPED), fast(3.5, "car2"), until=200)
+    drive.take(alive(100, "car1", TokenState.DECLARED), fast(0.5, "car1"), fast(0.6, "car2"), until=200)
+    drive.take(
+        fast(1.5, "car2"), fast(2.5, "car1"), alive(102.6, "car1", TokenState.DROPPED), fast(3.5, "car2"), until=200
+    )
     assert drive.take(fast(4.5, "car2"), until=200) == []
     assert [line for line in _reported(drive) if "car1" in line] == ["fast car1 started 1", "fast car1 ClientLost 3"]
 
@@ -140,27 +142,29 @@ def watching(endpoint: str, arrivals: Arrivals) -> Iterator[Network]:
 
 
 def test_tokens_are_followed_over_the_network(endpoint: str, arrivals: Arrivals, watching: Network) -> None:
-    def report(*reported: tuple[str, Token]) -> list[tuple[str, str, bytes]]:
+    def report(*reported: tuple[str, TokenState]) -> list[tuple[str, str, bytes]]:
         return [(LIVELINESS, f"alive/{client}", token.value) for client, token in reported]
 
     with router(listen__endpoints=[endpoint]):
         car1, car2 = vehicle(endpoint), vehicle(endpoint)
         kept = car1.liveliness().declare_token("alive/car1")  # a token that nothing refers to is withdrawn
         token = car2.liveliness().declare_token("alive/car2")
-        arrivals.wait_for(lambda seen: sorted(seen) == report(("car1", Token.DECLARED), ("car2", Token.DECLARED)))
+        arrivals.wait_for(
+            lambda seen: sorted(seen) == report(("car1", TokenState.DECLARED), ("car2", TokenState.DECLARED))
+        )
         arrivals.seen.clear()
         token.undeclare()
-        arrivals.wait_for(lambda seen: seen == report(("car2", Token.DROPPED)))
-    arrivals.wait_for(lambda seen: seen[1:] == report(("car1", Token.UNSURE)))
+        arrivals.wait_for(lambda seen: seen == report(("car2", TokenState.DROPPED)))
+    arrivals.wait_for(lambda seen: seen[1:] == report(("car1", TokenState.UNSURE)))
     with router(listen__endpoints=[endpoint]):
-        arrivals.wait_for(lambda seen: seen[2:] == report(("car1", Token.DECLARED)))
+        arrivals.wait_for(lambda seen: seen[2:] == report(("car1", TokenState.DECLARED)))
         car1.close()
-        arrivals.wait_for(lambda seen: seen[3:] == report(("car1", Token.DROPPED)))
+        arrivals.wait_for(lambda seen: seen[3:] == report(("car1", TokenState.DROPPED)))
         car3 = vehicle(endpoint)
         last = car3.liveliness().declare_token("alive/car3")
-        arrivals.wait_for(lambda seen: seen[4:] == report(("car3", Token.DECLARED)))
+        arrivals.wait_for(lambda seen: seen[4:] == report(("car3", TokenState.DECLARED)))
         watching.close()
-        arrivals.wait_for(lambda seen: seen[5:] == report(("car3", Token.UNSURE)))
+        arrivals.wait_for(lambda seen: seen[5:] == report(("car3", TokenState.UNSURE)))
         car2.close()
         car3.close()
     del kept, last
@@ -171,7 +175,7 @@ def test_a_token_that_was_there_before_the_detector_counts(endpoint: str, arriva
         kept = car1.liveliness().declare_token("alive/car1")
         network = Network(Zenoh(connect=[endpoint], liveliness="alive/${client:*}"), [stream()], arrivals.putter)
         network.start()
-        arrivals.wait_for(lambda seen: seen == [(LIVELINESS, "alive/car1", Token.DECLARED.value)])
+        arrivals.wait_for(lambda seen: seen == [(LIVELINESS, "alive/car1", TokenState.DECLARED.value)])
         network.close()
         kept.undeclare()
 

@@ -55,7 +55,7 @@ def mine(folder: Path, output: str, *options: str, **more: Any) -> str:
     """Runs it here, with processes of its own; what it prints."""
     logged = io.StringIO()
     with contextlib.chdir(folder), contextlib.redirect_stderr(logged):
-        commandline.run(app, "detector", (), command(folder, output, *options, **more)[3:])
+        commandline.run_cli(app, "detector", (), command(folder, output, *options, **more)[3:])
     return logged.getvalue()
 
 

@@ -17,7 +17,7 @@ from tests.certificates import Authority
 from tests.networks import PATIENCE, Arrivals, stream, wait_for
 from tests.ports import free_port
 from tests.process.mqtt_broker import PASSWORD, broker, publisher
-from wayside.api.source import DataSource
+from wayside.api.plugin import DataSource
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from pydantic import ValidationError
 from detector.access.mounted import AccessError, Login, login, tls_files
 from detector.actions.deploy.file_store import FileTaskStore
 from detector.actions.deploy.reconciler import DemandReconciler
-from detector.engine.samples.liveliness import LIVELINESS, Token
+from detector.engine.samples.liveliness import LIVELINESS, TokenState
 from detector.live.restoring import Restored
 from detector.live.running import Running
 from detector.resources.selection import RuleSet
@@ -214,13 +214,13 @@ def test_a_killed_router_is_reported_and_so_is_its_return(
             token = vehicle.liveliness().declare_token("alive/car1")
             assert flows(vehicle, arrivals)
             wait_for(lambda: running.connected)
-            arrivals.wait_for(lambda seen: (LIVELINESS, "alive/car1", Token.DECLARED.value) in seen)
+            arrivals.wait_for(lambda seen: (LIVELINESS, "alive/car1", TokenState.DECLARED.value) in seen)
         wait_for(lambda: not running.connected)
         wait_for(lambda: "and no other is left" in caplog.text)
-        arrivals.wait_for(lambda seen: (LIVELINESS, "alive/car1", Token.UNSURE.value) in seen)
+        arrivals.wait_for(lambda seen: (LIVELINESS, "alive/car1", TokenState.UNSURE.value) in seen)
         arrivals.seen.clear()
         with router_process(endpoint):
-            arrivals.wait_for(lambda seen: seen == [(LIVELINESS, "alive/car1", Token.DECLARED.value)])
+            arrivals.wait_for(lambda seen: seen == [(LIVELINESS, "alive/car1", TokenState.DECLARED.value)])
             arrivals.seen.clear()
             assert flows(vehicle, arrivals)
             wait_for(lambda: running.connected)

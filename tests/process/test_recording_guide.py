@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import yaml
 
-from detector.assembly.checking import check_documents
+from detector.assembly.checking import findings
 from detector.status.model import read_status
 from detector.streams.querying import query_detectors
 from tests.process.running import PATIENCE, Process
@@ -29,7 +29,7 @@ DETECTOR, RECORD_ALL, THRESHOLD = (
 def test_the_examples_have_nothing_wrong(tmp_path: Path) -> None:
     path = tmp_path / "all.yaml"
     path.write_text(yaml.safe_dump_all([DETECTOR, RECORD_ALL, THRESHOLD]))
-    assert check_documents(load_documents([path])) == []
+    assert findings(load_documents([path])).problems == []
 
 
 @pytest.fixture

@@ -15,15 +15,14 @@ from msgspec.structs import replace
 from rosbags.rosbag2 import Writer as BagWriter
 
 from detector.assembly import inlets, make_engine
-from detector.assembly.checking import check_documents
+from detector.assembly.checking import findings
 from detector.engine.samples.intake import Intake
 from detector.findings.losses import Losses
 from detector.replay.recordings import open_recordings
 from detector.replay.replaying import replay_arrivals
-from detector.replay.routing import Router
+from detector.replay.routing import MessageRouter
 from detector.streams.codecs.ros import standard
-from detector.streams.rmw_zenoh import MisfitError, numbered, split
-from detector.streams.sequences import MAXIMUM_PUBLISHERS, Sequences
+from detector.streams.rmw_zenoh import MAXIMUM_PUBLISHERS, MisfitError, Sequences, numbered, split
 from detector.streams.tally import Cause, Tally
 from detector.streams.zenoh import Network
 from tests.driving import Drive, a_detector, a_rule, at, compiled, lines
@@ -205,7 +204,7 @@ def test_the_same_detector_gives_the_same_events_live_and_from_a_bag_of_topics(
         }
         for arrival in arrivals:
             bag.write(connections[arrival.key], arrival.received, arrival.payload)
-    router = Router(detector.spec.streams)
+    router = MessageRouter(detector.spec.streams)
     replayed = replay_arrivals(router.arrivals(open_recordings([tmp_path / "bag"])), detector, [MOVED])
     assert len(events) > 3
     assert lines(replayed.events) == lines(events)
@@ -284,7 +283,7 @@ spec:
 def test_what_does_not_go_together_is_reported_with_its_place(tmp_path: Path) -> None:
     (tmp_path / "detector.yaml").write_text(DETECTOR)
     with pytest.raises(DocumentError) as caught:
-        check_documents(load_documents([tmp_path / "detector.yaml"]))
+        findings(load_documents([tmp_path / "detector.yaml"]))
     first, second = caught.value.problems
     assert (first.line, first.field) == (6, "spec.streams[0]")
     assert "encoding must be cdr or raw; got json" in first.message

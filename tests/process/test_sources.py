@@ -26,7 +26,7 @@ from detector.streams.tally import Cause, Tally
 from tests.driving import a_detector, a_stream
 from tests.networks import PATIENCE, Arrivals, stream, wait_for
 from wayside.api import Detector
-from wayside.api.source import DataSource
+from wayside.api.plugin import DataSource
 
 
 class NoParameters(BaseModel):

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import yaml
 
-from detector.assembly.checking import check_documents
+from detector.assembly.checking import findings
 from tests.driving import a_detector, a_rule
 from tests.process.ros2_services import HASHES, Node
 from tests.process.running import Process
@@ -146,7 +146,7 @@ def test_what_is_wrong_with_a_call_is_reported_with_its_place(tmp_path: Path) ->
     ]
     documents[2]["metadata"]["name"] = "second"
     (tmp_path / "all.yaml").write_text(yaml.safe_dump_all(documents, sort_keys=False))
-    reported = [str(problem) for problem in check_documents(load_documents([tmp_path / "all.yaml"]))]
+    reported = [str(problem) for problem in findings(load_documents([tmp_path / "all.yaml"])).problems]
     assert [text.split("all.yaml:", 1)[1].split(" ", 1)[1] for text in reported] == [
         "spec.actions[0].trigger.ros2.start.type: unknown service type my/srv/Own: give its .srv file as definition",
         "spec.actions[0].trigger.ros2.stop.request: request.data must be of type bool; got 3",

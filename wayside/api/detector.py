@@ -26,10 +26,10 @@ from wayside.api.base import (
 from wayside.api.constants import Constants
 from wayside.api.database import DatabaseConnection
 from wayside.api.place import MapFile, Place
+from wayside.api.plugin import DataSource
 from wayside.api.pod import OF_ITS_OWN_POD, DetectorMode, DetectorPod
 from wayside.api.recordings import Recordings
 from wayside.api.selector import LabelSelector
-from wayside.api.source import DataSource
 from wayside.api.stream import (
     MessageDefinition,
     Stream,

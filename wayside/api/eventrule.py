@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import Field, model_validator
 
-from wayside.api.actions.action import Action
+from wayside.api.actions.action import ActionSpec
 from wayside.api.base import (
     ATOMIC_LIST,
     ClientName,
@@ -313,7 +313,7 @@ class EventRuleSpec(Model):
         description="An open episode ends with reason Unknown after its condition has been unknown for this time. "
         "Default: the Detector's clientTimeout.",
     )
-    actions: list[Action] = Field(
+    actions: list[ActionSpec] = Field(
         default_factory=list,
         max_length=16,
         description="The actions of an episode. Without actions, the rule only publishes events.",

@@ -17,7 +17,7 @@ from wayside.api.base import (
     PositiveQuantity,
     validations,
 )
-from wayside.api.source import ZENOH
+from wayside.api.plugin import ZENOH
 
 
 class Encoding(StrEnum):

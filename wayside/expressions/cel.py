@@ -33,9 +33,9 @@ from wayside.expressions.numbers import MAX_EXACT, doubled
 from wayside.expressions.projection import Leaf, missing_path, no_member, normalise, project, tree
 from wayside.expressions.regex import LARGEST_PATTERN, pattern_size
 from wayside.expressions.syntax import (
-    Constant,
     Node,
     Path,
+    Scalar,
     Select,
     arguments,
     calls,
@@ -333,7 +333,7 @@ def _check_patterns(node: Node, source: str) -> None:
     names = [each.start for each in tokens(source) if each.text == "matches"] if found else []
     for index, call in enumerate(found):
         pattern = call.arguments[-1] if call.arguments else None
-        literal = pattern.value if isinstance(pattern, Constant) else None
+        literal = pattern.value if isinstance(pattern, Scalar) else None
         if not isinstance(literal, str):
             message, hint = "the pattern of `matches` is not a literal text", _LITERAL
         elif (size := pattern_size(literal)) > LARGEST_PATTERN:

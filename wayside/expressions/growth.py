@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from wayside.expressions.syntax import Call, Collection, Constant, Loop, Name, Node, Select
+from wayside.expressions.syntax import Call, Collection, Loop, Name, Node, Scalar, Select
 
 MOST = 1000
 """The maximum number of copies of its parts in a value. Expressions in practice have a handful."""
@@ -36,7 +36,7 @@ def growth(node: Node) -> int:
 
     def weigh(node: Node, known: Mapping[str, int]) -> int:
         match node:
-            case Constant():
+            case Scalar():
                 return 1
             case Name(name):
                 return known.get(name, 1)

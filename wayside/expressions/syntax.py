@@ -16,7 +16,7 @@ Path = tuple[Step, ...]
 
 
 @dataclass(frozen=True, slots=True)
-class Constant:
+class Scalar:
     """A literal."""
 
     value: bool | int | float | str | bytes | None
@@ -67,7 +67,7 @@ class Loop:
     result: Node
 
 
-Node = Constant | Name | Select | Call | Collection | Loop
+Node = Scalar | Name | Select | Call | Collection | Loop
 
 
 def parse(serialized: bytes) -> Node:
@@ -150,7 +150,7 @@ def path_of(node: Node, free: frozenset[str]) -> Path | None:
         case Select(operand, field):
             above = path_of(operand, free)
             return None if above is None else (*above, field)
-        case Call("_[_]", None, (container, Constant(str() | int() as index))) if not isinstance(index, bool):
+        case Call("_[_]", None, (container, Scalar(str() | int() as index))) if not isinstance(index, bool):
             above = path_of(container, free)
             return None if above is None or (isinstance(index, int) and index < 0) else (*above, index)
     return None
@@ -209,23 +209,23 @@ def _node(data: bytes) -> Node:
     raise ValueError("an expression of a kind that this version of CEL should not produce")
 
 
-def _constant(fields: _Fields) -> Constant:
+def _constant(fields: _Fields) -> Scalar:
     for number, values in fields.items():
         value = values[-1]
         match number, value:
             case 2, int():
-                return Constant(bool(value))
+                return Scalar(bool(value))
             case 3, int():
-                return Constant(value - 2**64 if value >= 2**63 else value)
+                return Scalar(value - 2**64 if value >= 2**63 else value)
             case 4, int():
-                return Constant(value)
+                return Scalar(value)
             case 5, bytes():
-                return Constant(struct.unpack("<d", value)[0])
+                return Scalar(struct.unpack("<d", value)[0])
             case 6, bytes():
-                return Constant(value.decode())
+                return Scalar(value.decode())
             case 7, bytes():
-                return Constant(value)
-    return Constant(None)
+                return Scalar(value)
+    return Scalar(None)
 
 
 def _name(fields: _Fields) -> Name:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 import re
 import time
-from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Iterator, Mapping
+from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 from urllib.parse import urlencode
@@ -26,9 +26,6 @@ from wayside.kubernetes.errors import ApiError, NotActive, NotGranted, Unreachab
 from wayside.kubernetes.fence import FencedRequest, writing
 from wayside.kubernetes.pacing import Pacing
 from wayside.kubernetes.resources import Object, Resource
-
-_Operations = list[Object]
-"""Of a JSON patch."""
 
 _APPLY = "application/apply-patch+yaml"
 _MERGE = "application/merge-patch+json"
@@ -56,7 +53,7 @@ class _Request:
     method: str
     path: str
     query: Mapping[str, str]
-    body: Object | _Operations | None = None
+    body: Object | Sequence[Object] | None = None
     content_type: str = _JSON
     writes: bool = False
 
@@ -243,7 +240,9 @@ class Client:
             raise
         return True
 
-    async def patch(self, resource: Resource, namespace: str, name: str, uid: str, operations: _Operations) -> Object:
+    async def patch(
+        self, resource: Resource, namespace: str, name: str, uid: str, operations: Sequence[Object]
+    ) -> Object:
         """Apply a JSON patch to the object with this uid; as stored."""
         test = {"op": "test", "path": "/metadata/uid", "value": uid}
         return await self._request(
@@ -314,15 +313,14 @@ class Client:
         method: str,
         path: str,
         query: Mapping[str, str] | None = None,
-        body: Object | _Operations | None = None,
+        body: Object | Sequence[Object] | None = None,
         content_type: str = _JSON,
         *,
         writes: bool | None = None,
     ) -> Object:
         changes = method != "GET" if writes is None else writes
-        return cast(
-            "Object", self._decode(await self._send(_Request(method, path, query or {}, body, content_type, changes)))
-        )
+        raw = await self._send(_Request(method, path, query or {}, body, content_type, changes))
+        return cast("Object", self._decode(raw))
 
     async def check_granted(self, namespace: str) -> None:
         """Raise NotGranted unless the client may write in the namespace; each write checks this by itself."""

@@ -34,14 +34,14 @@ class ConfigurationError(InputError):
 
 
 @dataclass(frozen=True)
-class Access:
+class ApiAccess:
     """Where the API server is, with the account, and the account's own namespace."""
 
     configuration: Configuration
     namespace: str
 
 
-async def load_access(kubeconfig: Path | None = None, otherwise: str = "") -> Access:
+async def load_access(kubeconfig: Path | None = None, otherwise: str = "") -> ApiAccess:
     """The kubeconfig of KUBECONFIG; in a pod without it, the pod's account; else that of the default file.
 
     Args:
@@ -58,7 +58,7 @@ async def load_access(kubeconfig: Path | None = None, otherwise: str = "") -> Ac
     if not given and "KUBERNETES_SERVICE_HOST" in os.environ:
         try:
             use_pod_account(configuration)
-            return Access(configuration, pod_namespace() or "default")
+            return ApiAccess(configuration, pod_namespace() or "default")
         except AccountError as error:
             raise ConfigurationError(f"the pod's service account: {error}: mount its token, or {remedy}") from error
     written = (given or _DEFAULT_FILE).split(os.pathsep)
@@ -71,7 +71,7 @@ async def load_access(kubeconfig: Path | None = None, otherwise: str = "") -> Ac
             config_file=os.pathsep.join(map(str, files)), client_configuration=configuration, persist_config=False
         )
         await _ApiClient(configuration).close()  # reads the certificates that the file names
-        return Access(configuration, str(loader.current_context.get("context", {}).get("namespace") or "default"))
+        return ApiAccess(configuration, str(loader.current_context.get("context", {}).get("namespace") or "default"))
     except _BROKEN as error:
         raise ConfigurationError(f"kubeconfig {shown}: {_reason(error)}: correct the file, or {remedy}") from error
 

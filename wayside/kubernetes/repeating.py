@@ -9,6 +9,7 @@ from typing import TypeVar
 
 from wayside.kubernetes.connection import ConfigurationError
 from wayside.kubernetes.errors import ApiError, RequestError
+from wayside.process.backoff import retry_async
 
 _FAILURES = (RequestError, ConfigurationError)
 
@@ -30,20 +31,20 @@ async def until_answered(request: Callable[[], Awaitable[Answer]], pause: float 
         ApiError: what another attempt cannot change, such as missing rights or credentials.
     """
     waiting = False
-    while True:
-        try:
-            answer = await request()
-        except RequestError as error:
-            if isinstance(error, ApiError) and (error.permanent or error.code == 401):
-                raise
-            if not waiting:
-                log.warning("%s; retrying until the API server responds", error)
-            waiting = True
-            await asyncio.sleep(max(pause, error.retry_after or 0.0))
-        else:
-            if waiting:
-                log.info("the API server responds")
-            return answer
+
+    def failed(error: RequestError) -> float:
+        nonlocal waiting
+        if isinstance(error, ApiError) and (error.permanent or error.code == 401):
+            raise error
+        if not waiting:
+            log.warning("%s; retrying until the API server responds", error)
+        waiting = True
+        return max(pause, error.retry_after or 0.0)
+
+    answer = await retry_async(request, RequestError, failed)
+    if waiting:
+        log.info("the API server responds")
+    return answer
 
 
 async def repeatedly(look: Callable[[], Awaitable[object]], every: float, problem: str) -> None:

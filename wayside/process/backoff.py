@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import random
+import time
+from collections.abc import Awaitable, Callable
+from typing import TypeVar
+
+Failure = TypeVar("Failure", bound=BaseException)
+Result = TypeVar("Result")
 
 _DOUBLINGS = 30  # beyond them every pause has its cap
 
@@ -38,3 +45,40 @@ class Backoff:
     def succeed(self) -> None:
         """Start over: the next failure waits the first pause."""
         self.failures = 0
+
+
+def retry(
+    attempt: Callable[[], Result],
+    failure: type[Failure],
+    failed: Callable[[Failure], float],
+    sleep: Callable[[float], object] = time.sleep,
+) -> Result:
+    """The result of the first attempt that does not fail.
+
+    Args:
+        attempt: returns the result, also where nothing is wanted any more.
+        failure: what an attempt may raise to be repeated; all else is raised.
+        failed: handles a failure; returns the seconds until the next attempt. What it raises is raised.
+        sleep: waits that many seconds; may return earlier.
+    """
+    while True:
+        try:
+            return attempt()
+        except failure as error:
+            pause = failed(error)
+        sleep(pause)
+
+
+async def retry_async(
+    attempt: Callable[[], Awaitable[Result]],
+    failure: type[Failure],
+    failed: Callable[[Failure], float],
+    sleep: Callable[[float], Awaitable[object]] = asyncio.sleep,
+) -> Result:
+    """As `retry`, on the event loop."""
+    while True:
+        try:
+            return await attempt()
+        except failure as error:
+            pause = failed(error)
+        await sleep(pause)

@@ -11,9 +11,12 @@ import sys
 from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, NoReturn, cast
+from typing import TYPE_CHECKING, Annotated, NoReturn, cast
 
 import typer
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 
 class LogFormat(StrEnum):
@@ -38,15 +41,19 @@ IgnoredFindings = Annotated[
 ]
 ListFindings = Annotated[bool, typer.Option("--list", help="Print the names of all findings, and exit.")]
 
+_WIDTH = 160
+"""Width in columns of a table that goes into a pipe or a file."""
+
 BAD_INPUT = 2
 INTERRUPTED = 130
 DEBUG = "--debug"
+Debug = Annotated[bool, typer.Option(DEBUG, help="Show the stack trace of an error, and log more.")]
 
 _UsageError = cast("type[typer.BadParameter]", typer.BadParameter.__mro__[1])
 """The base class of all usage errors, which typer does not export."""
 
 
-def run(app: typer.Typer, program: str, expected: tuple[type[Exception], ...], arguments: Sequence[str]) -> int:
+def run_cli(app: typer.Typer, program: str, expected: tuple[type[Exception], ...], arguments: Sequence[str]) -> int:
     """Run the command line and report errors; return the exit code.
 
     Args:
@@ -68,6 +75,19 @@ def run(app: typer.Typer, program: str, expected: tuple[type[Exception], ...], a
         for each in causes:
             _report(program, each)
         return BAD_INPUT
+
+
+def log_to_stderr(form: str, *, debug: bool) -> None:
+    """Write log lines in this form to stderr; `debug`: more of them."""
+    logging.basicConfig(level=logging.DEBUG if debug else logging.INFO, format=form, stream=sys.stderr)
+
+
+def table_console(*, stderr: bool = False) -> Console:
+    """The console for tables: as wide as the terminal, and of a fixed width into a pipe or a file."""
+    from rich.console import Console  # noqa: PLC0415  not for `--help` alone
+
+    found = Console(stderr=stderr)
+    return found if found.is_terminal else Console(stderr=stderr, width=_WIDTH)
 
 
 def log_as(wanted: LogFormat) -> None:

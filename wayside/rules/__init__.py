@@ -24,8 +24,7 @@ from wayside.rules.fields import BYTES, Fields, ItemFields
 from wayside.rules.parameters import unknown_rules
 from wayside.rules.places import KnownPlaces, place_problems, places_of, shape_problems
 from wayside.rules.problems import RuleError, RuleProblem
-from wayside.rules.sources import source_problems
-from wayside.rules.streams import compile_stream, stream_problems
+from wayside.rules.streams import compile_stream, source_problems, stream_problems
 
 __all__ = [
     "BYTES",

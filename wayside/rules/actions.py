@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Protocol
 
 from wayside.api import Detector
-from wayside.api.actions.action import Action
+from wayside.api.actions.action import ActionSpec
 from wayside.api.actions.database import DatabaseAction
 from wayside.api.actions.deploy import Deploy
 from wayside.api.actions.window import Window, WindowClients
@@ -42,7 +42,7 @@ class Compiler(Protocol):
 
 
 def compile_deploys(
-    compiler: Compiler, actions: Iterable[tuple[int, Action]], environment: Environment
+    compiler: Compiler, actions: Iterable[tuple[int, ActionSpec]], environment: Environment
 ) -> list[CompiledDeploy]:
     """The deploy actions among these, which have their places; problems are reported to the compiler."""
     found = (
@@ -54,7 +54,7 @@ def compile_deploys(
 
 
 def compile_actions(
-    compiler: Compiler, actions: Iterable[tuple[int, Action]], environment: Environment
+    compiler: Compiler, actions: Iterable[tuple[int, ActionSpec]], environment: Environment
 ) -> list[CompiledAction]:
     """The actions other than deploy among these, which have their places; problems are reported to the compiler."""
     return [
@@ -86,7 +86,7 @@ def _deploy(
     )
 
 
-def _compiled(compiler: Compiler, at: FieldPath, action: Action, environment: Environment) -> CompiledAction:
+def _compiled(compiler: Compiler, at: FieldPath, action: ActionSpec, environment: Environment) -> CompiledAction:
     if action.record is not None and compiler.detector.spec.recordings is None:
         compiler.problem(
             (*at, "record"),
@@ -109,7 +109,7 @@ def _compiled(compiler: Compiler, at: FieldPath, action: Action, environment: En
     )
 
 
-def _window(compiler: Compiler, at: FieldPath, action: Action, window: Window) -> CompiledWindow:
+def _window(compiler: Compiler, at: FieldPath, action: ActionSpec, window: Window) -> CompiledWindow:
     if action.plugin is not None:
         at = (*at, "window")
     spec = compiler.detector.spec

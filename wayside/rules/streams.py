@@ -1,9 +1,12 @@
-"""The expressions of a Detector's streams: the sender's time, and the client of a message."""
+"""A Detector's streams: their expressions (the sender's time, and the client of a message), and their sources."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import difflib
+from collections.abc import Iterable, Iterator
 
+from wayside.api import Detector
+from wayside.api.plugin import ZENOH
 from wayside.api.stream import Stream
 from wayside.api.wording import FieldPath
 from wayside.expressions import CelType, ExpressionError, InterpolationError, compile_template
@@ -113,3 +116,38 @@ def _naming_problems(stream: Stream, path: FieldPath, fields: Fields | None) -> 
     for variable, known in (("msg", fields), ("item", item_fields(stream, fields))):
         if known is not None:
             yield from (RuleProblem(path, text) for text in unknown_fields(template.paths, variable, known))
+
+
+def source_problems(detector: Detector) -> Iterator[RuleProblem]:
+    """Sources that are named wrongly or not at all, sources without streams, and what only Zenoh can do."""
+    names = [source.name for source in detector.spec.sources]
+    for index, source in enumerate(detector.spec.sources):
+        if source.name == ZENOH:
+            yield RuleProblem(
+                ("spec", "sources", index, "name"),
+                f"{ZENOH} is the session of spec.zenoh, which always exists: choose another name",
+            )
+        elif not any(stream.source == source.name for stream in detector.spec.streams):
+            yield RuleProblem(
+                ("spec", "sources", index, "name"),
+                f"no stream uses {source.name}: set source: {source.name} in a stream, or remove it",
+            )
+    for index, stream in enumerate(detector.spec.streams):
+        if stream.source in (ZENOH, *names):
+            if stream.source != ZENOH and (stream.history is not None or stream.recover):
+                field = "recover" if stream.history is None else "history"
+                yield RuleProblem(
+                    ("spec", "streams", index, field),
+                    f"is valid only for streams over Zenoh, not for source {stream.source}: remove it",
+                )
+            continue
+        close = difflib.get_close_matches(stream.source, names, n=1)
+        hint = f"did you mean {close[0]}?" if close else f"there are {', '.join([ZENOH, *names])}"
+        yield RuleProblem(
+            ("spec", "streams", index, "source"), f"Detector {detector.name} has no source {stream.source}; {hint}"
+        )
+    if detector.spec.zenoh.liveliness is not None:
+        try:
+            KeyPattern.parse(detector.spec.zenoh.liveliness)
+        except KeyPatternError as error:
+            yield RuleProblem(("spec", "zenoh", "liveliness"), str(error))

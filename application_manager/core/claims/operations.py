@@ -12,9 +12,8 @@ from enum import StrEnum
 from typing import Any
 
 from application_manager.core.claims.claims import Claim, Refused, template_of_all
-from application_manager.core.claims.merging import Contribution, Merged, merge
+from application_manager.core.claims.merging import Contribution, Merged, merge, too_large
 from application_manager.core.claims.parameters import baseline, with_defaults
-from application_manager.core.claims.sizes import too_large
 from wayside.api import ApplicationTemplate
 from wayside.api.operation import Operation
 

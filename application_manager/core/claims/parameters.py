@@ -1,17 +1,24 @@
 """Checks the parameters of tasks against those that the template declares.
 
 Pure. A task whose values do not fit is refused as a whole, and then contributes nothing to any parameter.
+Patterns are matched by CEL's regular expressions (RE2), whose time is linear in the text: Python's own would let a
+template's pattern and a task's text hold up the manager for as long as they like.
 """
 
 from __future__ import annotations
 
 import difflib
+import json
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any
 
-from application_manager.core.claims import patterns, values
+from application_manager.core.claims import values
 from wayside.api import ApplicationTemplate, freedata
 from wayside.api.parameter import Parameter
+from wayside.expressions import CelType, Environment, Expression, ExpressionError
+from wayside.expressions.errors import EvaluationError
+from wayside.expressions.regex import LARGEST_PATTERN, LONGEST_INPUT, pattern_size
 
 Parameters = Mapping[str, Any]
 """Parameter names to JSON values."""
@@ -74,7 +81,7 @@ def _unknown(name: str, template: str, declared: Mapping[str, Parameter]) -> str
 def _problem(parameter: Parameter, value: Any) -> str | None:
     problem = parameter.problem(value)
     if problem is None and parameter.pattern is not None:
-        problem = patterns.mismatch(parameter.pattern, value)
+        problem = mismatch(parameter.pattern, value)
     return f"{problem}: {_remedy(parameter)}" if problem else None
 
 
@@ -111,9 +118,46 @@ def template_problems(template: ApplicationTemplate) -> list[str]:
     for name, parameter in declared.items():
         if parameter.pattern is None:
             continue
-        problem = patterns.pattern_problem(parameter.pattern)
+        problem = pattern_problem(parameter.pattern)
         if problem:
             found.append(f"spec.parameters.{name}.pattern: {problem}")
-        elif parameter.default is not None and (problem := patterns.mismatch(parameter.pattern, parameter.default)):
+        elif parameter.default is not None and (problem := mismatch(parameter.pattern, parameter.default)):
             found.append(f"spec.parameters.{name}.default: {problem}: correct the default or the bounds")
     return found
+
+
+_ENVIRONMENT = Environment({"text": CelType.STRING})
+
+
+def pattern_problem(pattern: str) -> str | None:
+    """Why the pattern is none, or None if it is."""
+    if (size := pattern_size(pattern)) > LARGEST_PATTERN:
+        return (
+            f"{values.shown(pattern)} takes {size} steps, more than {LARGEST_PATTERN}: use fewer repetitions, or "
+            "smaller character classes"
+        )
+    try:
+        _matcher(pattern).evaluate({"text": ""})
+    except (EvaluationError, ExpressionError) as error:
+        return f"{values.shown(pattern)} is not a regular expression: {error.message}: correct it (RE2 syntax)"
+    return None
+
+
+def mismatch(pattern: str, value: Any) -> str | None:
+    """Why the text, or the array of texts, does not match the pattern; None if it does, or if the pattern is none."""
+    if pattern_problem(pattern):
+        return None  # the status of the template reports it, not that of the task
+    for index, text in enumerate(value if isinstance(value, list) else [value]):
+        which = f"item {index}, {values.shown(text)}," if isinstance(value, list) else values.shown(text)
+        if (size := len(text.encode(errors="replace"))) > LONGEST_INPUT:
+            return f"{which} has {size} bytes: a pattern can match at most {LONGEST_INPUT}"
+        # CEL would see only what is before a NUL.
+        if "\0" in text or not _matcher(pattern).evaluate({"text": text}):
+            return f"{which} does not match the pattern {pattern}"
+    return None
+
+
+@lru_cache(maxsize=256)
+def _matcher(pattern: str) -> Expression:
+    literal = json.dumps(pattern, ensure_ascii=False)
+    return _ENVIRONMENT.compile(f"text.matches({literal})", result=CelType.BOOL)

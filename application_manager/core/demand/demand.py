@@ -38,7 +38,7 @@ from wayside.api import ApplicationInstance, ApplicationTask, ApplicationTemplat
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class NamespaceOutcome:
     """What should become of a whole namespace, by name.
 
     Attributes:
@@ -59,7 +59,7 @@ def demand(
     leases: Mapping[str, LeaseView],
     now: float,
     limit: int | None = None,
-) -> Outcome:
+) -> NamespaceOutcome:
     """What should run in one namespace.
 
     Args:
@@ -83,7 +83,7 @@ def demand(
     found = {name: decide(name, indexes, now).decision for name in indexes.names(now)}
     decisions = {name: each for name, each in found.items() if each is not None}
     changes = [each.next_change for each in decisions.values() if each.next_change is not None]
-    decided: dict[str, Decided] = {**decisions}
+    decided: dict[str, VerdictSource] = {**decisions}
     for name in {each.instance for each in claims if template_of_all(each.instance) is not None}:
         alone = decide(name, indexes, now).decision
         if alone is not None:
@@ -97,7 +97,7 @@ def demand(
             verdicts[each.task.name] = found_verdict.verdict
     shown = {name: each for name, each in decisions.items() if each.wanted or indexes.instance(name) is not None}
     waiting = {name: each for name, each in decisions.items() if name not in shown}
-    return Outcome(shown, verdicts, min(changes, default=None), waiting)
+    return NamespaceOutcome(shown, verdicts, min(changes, default=None), waiting)
 
 
 class _Snapshot:
@@ -168,7 +168,7 @@ class _Snapshot:
         return self._placement
 
 
-class Decided(Protocol):
+class VerdictSource(Protocol):
     """The part of a decision that verdicts need: for an instance, or for the tasks for all instances of a template."""
 
     @property
@@ -188,7 +188,7 @@ class TaskVerdict:
     serving: tuple[str, ...]
 
 
-def verdict_of(claimed: Claim, decided: Mapping[str, Decided], meant: Iterable[str]) -> TaskVerdict | None:
+def verdict_of(claimed: Claim, decided: Mapping[str, VerdictSource], meant: Iterable[str]) -> TaskVerdict | None:
     """What became of the task of a claim; None where its instance was not decided yet.
 
     Args:

@@ -16,7 +16,7 @@ from application_manager.core.claims.operations import Standing, Verdict
 from application_manager.core.conditions import find
 from application_manager.core.demand.deciding import precedence
 from application_manager.core.demand.decisions import Decision, is_managed
-from application_manager.core.demand.demand import Outcome, demand
+from application_manager.core.demand.demand import NamespaceOutcome, demand
 from application_manager.core.demand.placing import LIMIT_REACHED, PREEMPTED
 from application_manager.core.health.pods import trouble
 from application_manager.core.health.readiness import not_ready
@@ -84,7 +84,7 @@ def serving(found: Found, task: ApplicationTask, now: float) -> str | None:
     return verdict.instance or claimed or written
 
 
-def _outcome(found: Found, now: float) -> Outcome:
+def _outcome(found: Found, now: float) -> NamespaceOutcome:
     """What is demanded; where the manager has written that a limit holds which is its own alone, that."""
     outcome = demand(found.templates, found.tasks, found.instances, _written_leases(found.tasks), now)
     limited = {each.name: verdict for each in found.tasks if (verdict := _written_limit(each)) is not None}
@@ -105,7 +105,7 @@ def _written_limit(task: ApplicationTask) -> Verdict | None:
     return Verdict(Standing.WAITING, accepted.reason, accepted.message)
 
 
-def explain(found: Found, *, task: str | None, instance: str | None, now: float) -> Explanation:
+def explanation_of(found: Found, *, task: str | None, instance: str | None, now: float) -> Explanation:
     """The chain of a task, or of an instance where `task` is None.
 
     Args:

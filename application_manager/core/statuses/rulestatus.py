@@ -11,10 +11,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import TypeVar
 
-from application_manager.core.conditions import Aspect
+from application_manager.core.conditions import Aspect, concluded
 from application_manager.core.findings.findings import Findings
 from application_manager.core.findings.rulefindings import detector_findings, rule_findings, selecting, selects
-from application_manager.core.statuses.conclusions import concluded
 from application_manager.core.statuses.running import RUNNING
 from wayside.api import Detector, EventRule
 from wayside.api.detector import DetectorStatus

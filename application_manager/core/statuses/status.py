@@ -11,12 +11,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from application_manager.core.claims.operations import ACCEPTED, Standing, Verdict
-from application_manager.core.conditions import Aspect, find, updated
+from application_manager.core.conditions import STALLED, Aspect, concluded, find, updated
 from application_manager.core.demand import byhand, fallback
 from application_manager.core.demand.decisions import Decision
 from application_manager.core.findings.findings import Findings
 from application_manager.core.objects.suspension import autoscalers, pods_left
-from application_manager.core.statuses.conclusions import STALLED, concluded
 from wayside.api import ApplicationInstance, ApplicationTask
 from wayside.api.applicationinstance import ApplicationInstanceStatus, Demands, InstancePhase, ObjectReference
 from wayside.api.applicationtask import ApplicationTaskStatus, TaskPhase

@@ -81,7 +81,7 @@ class Database(Action[DatabaseAction]):
         streams = {stream.name: stream for stream in around.detector.spec.streams}
         if self._writer is not None:
             metadata: Mapping[str, JsonValue] = episode.rendered.get("metadata") or {}
-            for write in scenarios.begin(scenario, episode, metadata):
+            for write in scenarios.start_scenario(scenario, episode, metadata):
                 self._writer.put_change(write)
         return scenario, Documents(name, f"{database}/{rule.name}/{name}", streams, around.decoders, above)
 

@@ -70,7 +70,7 @@ def _text(rule: EventRule) -> str:
     return json.dumps(rule.spec.to_json(), ensure_ascii=False, sort_keys=True)
 
 
-def begin(scenario: Scenario, episode: Episode, metadata: Mapping[str, JsonValue]) -> list[Write]:
+def start_scenario(scenario: Scenario, episode: Episode, metadata: Mapping[str, JsonValue]) -> list[Write]:
     """Insert it, marked as incomplete."""
     rule = scenario.rule
     of_type = {

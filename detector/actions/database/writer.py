@@ -22,7 +22,7 @@ from detector.actions.database.server import DatabaseUnavailableError, Server, W
 from detector.actions.database.work import Write
 from detector.actions.store import StoreError
 from wayside.api.database import DatabaseConnection, DatabaseSpool, WriteConcern
-from wayside.process.backoff import Backoff
+from wayside.process.backoff import Backoff, retry
 
 _log = logging.getLogger(__name__)
 
@@ -133,19 +133,19 @@ class DatabaseWriter:
     # The thread; only this code uses the server.
 
     def _work(self) -> None:
-        while not self._late():
-            try:
-                write = self._next()
-                if write is None:
-                    break
-                if self._send(write) and not self._left:
-                    self._queue.done()
-            except Exception as error:  # noqa: BLE001  a defect, or a disk: the queue continues, since requests are idempotent
-                self._lose("times the database queue was restarted", 1, self._server.redact(error))
-                _log.error("database: restarting the queue: %s", type(error).__name__)
-                _log.debug("the database queue failed", exc_info=error)
-                time.sleep(_RESTART_DELAY)
+        retry(self._empty, Exception, self._restart)  # a defect, or a disk: requests are idempotent
         self._leave()
+
+    def _empty(self) -> None:
+        while not self._late() and (write := self._next()) is not None:
+            if self._send(write) and not self._left:
+                self._queue.done()
+
+    def _restart(self, error: Exception) -> float:
+        self._lose("times the database queue was restarted", 1, self._server.redact(error))
+        _log.error("database: restarting the queue: %s", type(error).__name__)
+        _log.debug("the database queue failed", exc_info=error)
+        return _RESTART_DELAY
 
     def _late(self) -> bool:
         return self._closing and time.monotonic() >= self._deadline
@@ -166,23 +166,18 @@ class DatabaseWriter:
         `patience`: after this number of connections lost during it, search for the documents that cause this.
         """
         backoff, broke = Backoff(_FIRST, _LONGEST), 0
-        while True:
+
+        def attempt() -> bool:
+            if broke >= patience:
+                return self._divide(write, "the server closes the connection when it receives it")
+            if backoff.failures and self._late():
+                return False
             try:
                 doubts = self._doubts or self._queue.damaged or self._queue.inherited
                 missing = self._server.lacks(write) if doubts else ""
                 matched, refused = self._server.write(scenarios.give_up(write, missing) if missing else write)
             except WriteRefusedError as error:
                 return self._divide(write, str(error))
-            except DatabaseUnavailableError as error:
-                self._note_away(str(error))
-                broke = broke + 1 if error.broke and self._server.answers() else 0
-                if broke >= patience:
-                    return self._divide(write, "the server closes the connection when it receives it")
-                if error.broke and broke:
-                    backoff.succeed()  # it is there
-                if not self._pause(backoff.fail()):
-                    return False
-                continue
             self._note_back()
             self.written += len(write.documents) - (len(refused) if write.documents else 0)
             if not all(self._reject(write, each.index, each.why) for each in refused):
@@ -190,6 +185,18 @@ class DatabaseWriter:
             if write.completes:
                 self._confirm(write, matched, missing or (refused[0].why if refused else ""))
             return True
+
+        def failed(error: DatabaseUnavailableError) -> float:
+            nonlocal broke
+            self._note_away(str(error))
+            broke = broke + 1 if error.broke and self._server.answers() else 0
+            if broke >= patience:
+                return 0.0
+            if error.broke and broke:
+                backoff.succeed()  # it is there
+            return backoff.fail()
+
+        return retry(attempt, DatabaseUnavailableError, failed, self._pause)
 
     def _divide(self, write: Write, why: str) -> bool:
         """Separate the documents that cannot be written from those that can."""
@@ -224,15 +231,15 @@ class DatabaseWriter:
         if confirm is not None:
             confirm(bool(matched) and not why, why or "the database rejected some of it")
 
-    def _pause(self, seconds: float) -> bool:
-        """Wait before the next attempt; new requests go to the disk. False if there is no more time."""
+    def _pause(self, seconds: float) -> None:
+        """Wait before the next attempt, but not beyond the end; new requests go to the disk."""
         until = time.monotonic() + seconds
         while True:
             self._queue.spill()
             with self._lock:
                 left = until - time.monotonic()
                 if left <= 0 or self._late():
-                    return not self._late()
+                    return
                 self._lock.wait(min(left, 0.2))
 
     def _leave(self) -> None:

@@ -32,7 +32,7 @@ from wayside.kubernetes.client import Client
 from wayside.kubernetes.errors import ApiError, RequestError
 from wayside.kubernetes.leases import DEFAULT_DURATION, HOLDER_LEASE_LABEL, LeaseCandidate, lease_name
 from wayside.kubernetes.resources import LEASES
-from wayside.process.backoff import Backoff
+from wayside.process.backoff import Backoff, retry_async
 
 _log = logging.getLogger(__name__)
 
@@ -116,25 +116,30 @@ class HolderLease:
     async def run(self) -> None:
         """Acquire and renew until `stop`, then release."""
         while not self._stopping.is_set():
-            self.attempts += 1
-            try:
-                delay = await self._once()
-                self._backoff.succeed()
-            except RequestError as error:
-                if not self._backoff.failures:
-                    _log.warning("cannot renew the Lease %s; retrying with backoff: %s", self.name, error)
-                self.failures += 1
-                delay = self._backoff.fail()
-            with suppress(TimeoutError):
-                await asyncio.wait_for(self._stopping.wait(), delay)
+            delay = await retry_async(self._once, RequestError, self._failed, self._pause)
+            self._backoff.succeed()
+            await self._pause(delay)
         await self._release()
 
     def stop(self) -> None:
         """Let `run` release the Lease and return."""
         self._stopping.set()
 
+    def _failed(self, error: RequestError) -> float:
+        if not self._backoff.failures:
+            _log.warning("cannot renew the Lease %s; retrying with backoff: %s", self.name, error)
+        self.failures += 1
+        return self._backoff.fail()
+
+    async def _pause(self, seconds: float) -> None:
+        with suppress(TimeoutError):
+            await asyncio.wait_for(self._stopping.wait(), seconds)
+
     async def _once(self) -> float:
         """Acquire or renew, or find that another process holds it; the seconds until the next time."""
+        if self._stopping.is_set():
+            return 0.0
+        self.attempts += 1
         candidate, lease = self._candidate, await self._client.get(LEASES, self._namespace, self.name)
         candidate.observe(lease, self._monotonic())
         if lease is None or self._identity.succeeds(candidate.holder) or candidate.may_take(self._monotonic()):

@@ -48,7 +48,7 @@ class Update:
     version: int
 
 
-class StoreError(Exception):
+class TaskStoreError(Exception):
     """The store could not carry out a request."""
 
     def __init__(self, reason: str, message: str) -> None:
@@ -57,7 +57,7 @@ class StoreError(Exception):
         """One word, for counting."""
 
 
-class StoreUnavailableError(StoreError):
+class StoreUnavailableError(TaskStoreError):
     """The store is unavailable or busy: a retry may succeed soon."""
 
     def __init__(self, reason: str, message: str, retry_after: float = 0.0) -> None:
@@ -66,16 +66,16 @@ class StoreUnavailableError(StoreError):
         """Seconds to wait as requested by the store; 0 if not given."""
 
 
-class TaskRefusedError(StoreError):
+class TaskRefusedError(TaskStoreError):
     """The store rejects it; retrying without a change is useless."""
 
 
-class TaskExistsError(StoreError):
+class TaskExistsError(TaskStoreError):
     """A task of this name exists, perhaps of another holder."""
 
 
 class TaskStore(Protocol):
-    """The tasks of one holder. Every method but `follow` raises a `StoreError`."""
+    """The tasks of one holder. Every method but `follow` raises a `TaskStoreError`."""
 
     def follow(self) -> AsyncGenerator[Snapshot | Update, None]:
         """A snapshot, then changes, with a new snapshot at least every half minute. Never ends, raises nothing."""

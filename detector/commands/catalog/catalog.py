@@ -1,14 +1,15 @@
-"""Rules by the dimensions and values of the scheme. Pure: other modules read and render them."""
+"""Rules by the dimensions and values of the scheme. Other modules render them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
-from pathlib import PurePath
+from pathlib import Path, PurePath
 
 from wayside.api import EventRule
 from wayside.api.classification import Classification
+from wayside.api.documents import load_documents
 from wayside.api.scheme import SCHEME, CharacteristicValue, Dimension
 
 Chosen = Mapping[Dimension, frozenset[CharacteristicValue]]
@@ -122,3 +123,18 @@ def _labelled(entries: Iterable[CatalogEntry]) -> Iterator[tuple[CatalogEntry, s
         paths = [PurePath(each.place).parts for each in same]
         common = next((i for i, parts in enumerate(zip(*paths, strict=False)) if len(set(parts)) > 1), 0)
         yield from ((each, f"{name} ({'/'.join(parts[common:])})") for each, parts in zip(same, paths, strict=True))
+
+
+def read_files(paths: Sequence[Path]) -> Read:
+    """The EventRules of the files and folders; other objects are ignored.
+
+    Raises:
+        DocumentError: with every problem of every file.
+    """
+    return Read(
+        tuple(
+            entry(document.object, f"{document.file}:{document.line}")
+            for document in load_documents(paths)
+            if isinstance(document.object, EventRule)
+        )
+    )

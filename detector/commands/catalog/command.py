@@ -54,8 +54,7 @@ def command(
     if namespace is not None and not cluster:
         refuse("--namespace requires --cluster; rules in files name their namespace themselves")
     with importing():
-        from detector.commands.catalog.catalog import ChoiceError, catalog, choose
-        from detector.commands.catalog.files import read_files
+        from detector.commands.catalog.catalog import ChoiceError, catalog, choose, read_files
 
     try:
         chosen = choose(only or ())
@@ -83,18 +82,15 @@ def _read_cluster(namespace: str | None) -> Read:
 
 def _text(found: Catalog, form: Format, *, into_file: bool) -> str:
     """The catalog in this format; the width of a table depends on the destination."""
+    from detector.commands.catalog import views
+    from detector.commands.catalog.page import page
+
     match form:
         case Format.MARKDOWN:
-            from detector.commands.catalog.markdown import markdown_view
-
-            return markdown_view(found)
+            return views.markdown_view(found)
         case Format.JSON:
-            from detector.commands.catalog.document import json_view
-
-            return json_view(found)
+            return views.json_view(found)
         case Format.HTML:
-            from detector.commands.catalog.page import page
-
             return page(found)
         case Format.TABLE:
             return _table(found, into_file=into_file)
@@ -103,7 +99,7 @@ def _text(found: Catalog, form: Format, *, into_file: bool) -> str:
 def _table(found: Catalog, *, into_file: bool) -> str:
     from rich.console import Console
 
-    from detector.commands.catalog.terminal import terminal_view
+    from detector.commands.catalog.views import terminal_view
 
     console = Console()
     if into_file or not console.is_terminal:

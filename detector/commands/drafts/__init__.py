@@ -21,7 +21,7 @@ def drafts() -> Mapping[str, str]:
     return {name.removesuffix(".yaml"): _text(name).split("\n", 1)[0].removeprefix("# ") for name in found}
 
 
-def draft(case: str, stream: str, name: str | None) -> str:
+def rule_draft(case: str, stream: str, name: str | None) -> str:
     """The draft of a use case, over this stream and under this name.
 
     Args:

@@ -15,7 +15,7 @@ from detector.engine.buffering.lanes import LaneMaker
 from detector.engine.buffering.messages import KeyReader
 from detector.engine.buffering.naming import MAXIMUM_ITEMS, MessageClients
 from detector.engine.counters import Counters
-from detector.engine.samples.liveliness import LIVELINESS, Token
+from detector.engine.samples.liveliness import LIVELINESS, TokenState
 from detector.engine.samples.sample import SAMPLE_OVERHEAD, Arrival, Before, Item, Linked, Sample, Stamped
 from wayside.api import Detector
 
@@ -224,13 +224,13 @@ class Ingest:
     def _token(self, key: str, payload: bytes, time: int) -> None:
         """Handle a change of a client's liveliness token."""
         try:
-            token = Token(payload)
+            token = TokenState(payload)
         except ValueError:
             self._counters.unnamed[LIVELINESS] += 1
             return
         tokens = self._clients.tokens
-        if token is not Token.DECLARED:
-            client = tokens.withdraw(key, lost=token is Token.DROPPED)
+        if token is not TokenState.DECLARED:
+            client = tokens.withdraw(key, lost=token is TokenState.DROPPED)
             if client is not None:
                 self._clients.still_heard(client, time)  # the timeout counts from here
             return

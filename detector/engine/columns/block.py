@@ -15,10 +15,10 @@ from detector.engine.buffering.possible import Possible
 from detector.engine.columns.past import Past
 from detector.engine.columns.table import Integers, Truths
 from detector.engine.columns.tables import Tables
-from detector.engine.columns.verdicts import Verdict
+from detector.engine.columns.verdicts import Ternary
 from detector.engine.counters import RuleCounters
 from detector.engine.episodes.subjects import FLEET, Subject
-from detector.engine.scoping.positions import Positions
+from detector.engine.scoping.positions import PositionLookup
 from detector.engine.signals.signals import Signals as OfStarts
 from detector.engine.signals.starts import Starts
 from wayside.expressions import UNKNOWN
@@ -36,7 +36,7 @@ class Context(NamedTuple):
     clients: Clients
     stale_after: Mapping[str, int | None]
     possible: Possible
-    positions: Positions
+    positions: PositionLookup
     starts: Starts
     of_starts: OfStarts
     """Computes signals over other rules' episodes."""
@@ -104,7 +104,7 @@ class Block:
         """Which rule evaluates which client; None: each rule all clients. Shape (tracks, clients)."""
         self.measured: dict[tuple[int, str], Column] = {}
         """By track and signal over the open episode, the values that the signal aggregates."""
-        self.verdicts: Mapping[str, Verdict] = {}
+        self.verdicts: Mapping[str, Ternary] = {}
         """By field, where conditions are true and where false; shape (tracks, points)."""
         self._context = context
 

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from detector.engine.columns.block import Block, Context, Track
 from detector.engine.columns.leaves import ClientLeaves, stacked
 from detector.engine.columns.table import Truths
-from detector.engine.columns.verdicts import Verdict
+from detector.engine.columns.verdicts import Ternary
 from detector.engine.episodes.episodes import FALSE, TRUE, UNSURE
 from wayside.expressions import Expression, Reason
-from wayside.expressions.columns.graph import Graph
+from wayside.expressions.columns.lowering import Graph
 from wayside.expressions.columns.program import Program
 from wayside.expressions.columns.values import Tag
 from wayside.rules import CompiledRule
@@ -87,16 +87,16 @@ class Conditions:
         """Which tracks have the condition; shape (tracks, 1)."""
         return self._has[field]
 
-    def verdicts(self, block: Block) -> dict[str, Verdict]:
+    def verdicts(self, block: Block) -> dict[str, Ternary]:
         """The verdicts, by field, shape (tracks, points); unknown in tracks without the field. Counts unknowns."""
         points = len(block.clients) * len(block.ticks)
         shape = (len(self._tracks), points)
-        found: dict[str, Verdict] = {}
+        found: dict[str, Ternary] = {}
         values, tags = stacked([self._leaves.at_points(block, each) for each in self._program.leaves], points)
         results = self._program.run(values, tags)
         strange = tags is not None and bool((tags > Tag.NUMBER).any())
         for field, chosen in self._chosen_by_field.items():
-            true, false = found[field] = Verdict(np.zeros(shape, bool), np.zeros(shape, bool))
+            true, false = found[field] = Ternary(np.zeros(shape, bool), np.zeros(shape, bool))
             ours = [(row, each.node) for row, each in chosen if each.node is not None]
             if ours:
                 rows = [row for row, _ in ours]

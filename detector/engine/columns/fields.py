@@ -27,7 +27,7 @@ OF_A_SAMPLE = frozenset(("msg", "item", "before"))
 """The variables whose fields are read here."""
 
 
-class Found(NamedTuple):
+class FoundFields(NamedTuple):
     """The fields of some samples."""
 
     columns: list[Column]
@@ -50,7 +50,7 @@ class SampleFields:
         self._messages = _reader(decoder, self._of["msg"])
         self._before = _reader(decoder, self._of["before"])
 
-    def read(self, samples: Sequence[Sample], texts: Texts) -> Found:
+    def read(self, samples: Sequence[Sample], texts: Texts) -> FoundFields:
         """The fields of these samples."""
         errors: dict[int, DecodeError] = {}
         odd: set[int] = set()
@@ -76,7 +76,7 @@ class SampleFields:
                 columns = self._read_before(before, odd)
             found["before"] = [column_of(values, texts) for values in columns]
         ready = {name: iter(columns) for name, columns in found.items()}
-        return Found([next(ready[str(path[0])]) for path in self._paths], errors, frozenset(odd))
+        return FoundFields([next(ready[str(path[0])]) for path in self._paths], errors, frozenset(odd))
 
     def _read_before(self, before: Sequence[Before | None], odd: set[int]) -> list[list[Any]]:
         """The fields of the previous messages, if there are some and they can be read."""

@@ -20,12 +20,11 @@ from detector.engine.columns.leaves import ClientLeaves, stacked
 from detector.engine.columns.reading import constant
 from detector.engine.columns.signals import SignalColumns
 from detector.engine.columns.table import Integers, Truths
-from detector.engine.columns.verdicts import Codes, Verdict, observed
+from detector.engine.columns.verdicts import Codes, Ternary, observed
 from detector.engine.episodes.subjects import FLEET, Subject
 from wayside.expressions import Expression, Path
 from wayside.expressions.columns.folds import Fold, How, folded
-from wayside.expressions.columns.graph import Graph
-from wayside.expressions.columns.lowering import Constant
+from wayside.expressions.columns.lowering import Constant, Graph
 from wayside.expressions.columns.program import Program, Results
 from wayside.expressions.columns.values import Column, Tag
 from wayside.rules import CompiledRule, FleetSubject
@@ -63,7 +62,7 @@ class FleetBlock:
         self.times = block.times
         self.of_clients = block
         self.members = members
-        self.verdicts: list[Mapping[str, Verdict]] = []
+        self.verdicts: list[Mapping[str, Ternary]] = []
         """By track and field, where conditions are true and false; shape (ticks,)."""
 
     def variables(self, track: Track, point: int) -> dict[str, Any]:
@@ -180,7 +179,7 @@ class FleetGroup:
             verdicts = {field: self._verdict(fleet, row, field, inner, outer) for field in conditions}
             fleet.verdicts.append(verdicts)
             when = verdicts["when"]
-            codes[row, 0] = observed(when, verdicts.get("until", Verdict(when.false, when.true)))
+            codes[row, 0] = observed(when, verdicts.get("until", Ternary(when.false, when.true)))
         return codes
 
     def _fold(self, fleet: FleetBlock, inner: Results | None, leaf: Any) -> Column:
@@ -203,14 +202,14 @@ class FleetGroup:
             values, tag, unsure = (~against).astype(float), Tag.BOOLEAN, unsure & ~against
         return Column(np.where(unsure, 0.0, values), np.where(unsure, Tag.ABSENT, tag).astype(np.uint8))
 
-    def _verdict(self, fleet: FleetBlock, row: int, field: str, inner: Results | None, outer: Results) -> Verdict:
+    def _verdict(self, fleet: FleetBlock, row: int, field: str, inner: Results | None, outer: Results) -> Ternary:
         condition, count = self._of[row][field], len(fleet.ticks)
         if condition.node is None:
-            verdict = Verdict(np.zeros(count, bool), np.zeros(count, bool))
+            verdict = Ternary(np.zeros(count, bool), np.zeros(count, bool))
             kinds = self._kinds(fleet, row, exact=True)
         else:
             true, false = outer.truths([condition.node])
-            verdict = Verdict(true[0].copy(), false[0].copy())
+            verdict = Ternary(true[0].copy(), false[0].copy())
             strange = self._strange(fleet, row, condition, inner, outer)
             kinds = np.where(strange, self._kinds(fleet, row, exact=True), -1) if strange.any() else np.full(count, -1)
             unknown = ~(verdict.true | verdict.false) & ~strange
@@ -255,7 +254,7 @@ class FleetGroup:
         found: Integers = kinds.reshape(count)
         return found
 
-    def _evaluate_by_cel(self, fleet: FleetBlock, row: int, field: str, kinds: Integers, verdict: Verdict) -> None:
+    def _evaluate_by_cel(self, fleet: FleetBlock, row: int, field: str, kinds: Integers, verdict: Ternary) -> None:
         """Evaluate a condition by CEL, once for the ticks of each kind; ticks of a negative kind are already
         decided."""
         track, expression = self.tracks[row], self._of[row][field].expression

@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from detector.engine.columns.leaves import stacked
 from detector.engine.columns.table import Truths
-from detector.engine.columns.verdicts import Verdict
+from detector.engine.columns.verdicts import Ternary
 from wayside.expressions import Expression, Path, Reason
-from wayside.expressions.columns.graph import Graph
-from wayside.expressions.columns.lowering import Constant
+from wayside.expressions.columns.lowering import Constant, Graph
 from wayside.expressions.columns.nodes import Op
 from wayside.expressions.columns.program import Program
 from wayside.expressions.columns.values import Column, Tag, Texts, column_of
@@ -54,22 +53,22 @@ class Formulas:
     def __bool__(self) -> bool:
         return bool(self._conditions)
 
-    def evaluate(self, rows: Rows) -> Mapping[str, Verdict]:
+    def evaluate(self, rows: Rows) -> Mapping[str, Ternary]:
         """The verdict of each condition on each row. Counts unknown results."""
         count = rows.size
         if not count or not self._conditions:
-            return {field: Verdict(np.zeros(count, bool), np.zeros(count, bool)) for field in self._conditions}
+            return {field: Ternary(np.zeros(count, bool), np.zeros(count, bool)) for field in self._conditions}
         columns = [rows.column(leaf) for leaf in self._program.leaves]
         values, tags = stacked(columns, count)
         results = self._program.run(values, tags)
-        found: dict[str, Verdict] = {}
+        found: dict[str, Ternary] = {}
         for field, node in self._nodes.items():
             if node is None:
-                verdict = Verdict(np.zeros(count, bool), np.zeros(count, bool))
+                verdict = Ternary(np.zeros(count, bool), np.zeros(count, bool))
                 self._evaluate_by_cel(field, rows, np.arange(count), verdict)
             else:
                 true, false = results.truths([node])
-                verdict = Verdict(true[0].copy(), false[0].copy())
+                verdict = Ternary(true[0].copy(), false[0].copy())
                 foreign = results.foreign(node)
                 self._note_unknown(field, rows, verdict, foreign, tags)
                 if foreign is not None:
@@ -77,7 +76,7 @@ class Formulas:
             found[field] = verdict
         return found
 
-    def _evaluate_by_cel(self, field: str, rows: Rows, at: NDArray[np.intp], verdict: Verdict) -> None:
+    def _evaluate_by_cel(self, field: str, rows: Rows, at: NDArray[np.intp], verdict: Ternary) -> None:
         """Evaluate a condition by CEL at some rows."""
         for row in at.tolist():
             value, why = self._conditions[field].explained(rows.variables(row))
@@ -86,7 +85,7 @@ class Formulas:
                 rows.note(field, row, *why, 1)
 
     def _note_unknown(
-        self, field: str, rows: Rows, verdict: Verdict, foreign: Truths | None, tags: NDArray[np.uint8] | None
+        self, field: str, rows: Rows, verdict: Ternary, foreign: Truths | None, tags: NDArray[np.uint8] | None
     ) -> None:
         unknown = ~(verdict.true | verdict.false)
         at = np.flatnonzero(unknown if foreign is None else unknown & ~foreign)

@@ -13,7 +13,7 @@ from detector.engine.columns.derived import ClientDerived
 from detector.engine.columns.signals import SignalColumns
 from detector.engine.columns.table import Truths
 from detector.engine.columns.tables import Tables
-from detector.engine.columns.verdicts import Codes, Verdict, observed
+from detector.engine.columns.verdicts import Codes, Ternary, observed
 from detector.engine.episodes.episodes import FALSE
 from detector.engine.episodes.subjects import Subject
 from wayside.api.eventrule import Aggregate
@@ -89,20 +89,20 @@ class ClientGroup:
     def _observed(self, block: Block) -> Codes:
         found = self._conditions.verdicts(block)
         when = found["when"]
-        until, scope = Verdict(when.false, when.true), None
+        until, scope = Ternary(when.false, when.true), None
         if "until" in found:
             until = self._where_any("until", found["until"], until)
         if "where" in found:
-            scope = self._where_any("where", found["where"], Verdict(np.array(True), np.array(False)))
+            scope = self._where_any("where", found["where"], Ternary(np.array(True), np.array(False)))
         codes = observed(when, until, scope).reshape(len(self.tracks), *block.shape)
         if block.present is not None:
             codes[:, ~block.present] = FALSE
         return codes
 
-    def _where_any(self, field: str, verdict: Verdict, otherwise: Verdict) -> Verdict:
+    def _where_any(self, field: str, verdict: Ternary, otherwise: Ternary) -> Ternary:
         """A condition's verdict; `otherwise` for the rules without the condition."""
         has = self._conditions.has(field)
-        return Verdict(np.where(has, verdict.true, otherwise.true), np.where(has, verdict.false, otherwise.false))
+        return Ternary(np.where(has, verdict.true, otherwise.true), np.where(has, verdict.false, otherwise.false))
 
     @property
     def room(self) -> int:

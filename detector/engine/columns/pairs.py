@@ -17,9 +17,9 @@ from detector.engine.columns.past import Evaluations
 from detector.engine.columns.places import Places, Whereabouts
 from detector.engine.columns.reading import constant
 from detector.engine.columns.signals import SignalColumns
-from detector.engine.columns.table import Integers, Truths, distinct
+from detector.engine.columns.table import Integers, Truths, sorted_rows
 from detector.engine.columns.tables import Tables
-from detector.engine.columns.verdicts import Codes, Verdict, observed
+from detector.engine.columns.verdicts import Codes, Ternary, observed
 from detector.engine.episodes.subjects import Subject
 from detector.engine.scoping.positions import described
 from detector.engine.scoping.scopes import CLOSING_NS
@@ -68,7 +68,7 @@ class PairBlock:
     """The signals over other signals, of each pair."""
     measured: dict[str, Column] = field(default_factory=dict)
     """By signal over the open episode, the values that it aggregates."""
-    verdicts: Mapping[str, Verdict] = field(default_factory=dict)
+    verdicts: Mapping[str, Ternary] = field(default_factory=dict)
     """By field, where conditions are true and where false."""
 
 
@@ -110,7 +110,7 @@ class PairColumns:
         clients = block.clients
         places, newest = self._where_abouts.now(block)
         seen, at = block, np.arange(len(clients))
-        roles: Mapping[str, Verdict] = {}
+        roles: Mapping[str, Ternary] = {}
         if any(self._roles.values()):
             self._signals.look(block, floor)
             roles = {role: self._role(role, block) for role in _ROLES}
@@ -118,7 +118,7 @@ class PairColumns:
         self._track.counters.crowded_pairs += near.left_out
         count = len(clients)
         keys = near.first * count + near.second
-        added = distinct(more[0] * count + more[1])
+        added = sorted_rows(more[0] * count + more[1])
         added = added[~np.isin(added, keys, assume_unique=True)]
         order = np.argsort(np.concatenate((keys, added)), kind="stable")
         is_near = (order < len(keys)).astype(bool)
@@ -191,7 +191,7 @@ class PairColumns:
     def _distances(self, places: Places, one: Integers, other: Integers) -> Doubles:
         return self._where_abouts.distances(places.of(one), places.of(other))
 
-    def _near(self, block: Block, places: Places, roles: Mapping[str, Verdict]) -> Nearby:
+    def _near(self, block: Block, places: Places, roles: Mapping[str, Ternary]) -> Nearby:
         possible = [places.known & ~roles[role].false if role in roles else places.known for role in _ROLES]
         crowd = Crowd(
             block.clients,
@@ -228,7 +228,7 @@ class PairColumns:
 
     # Conditions
 
-    def _role(self, role: str, block: Block) -> Verdict:
+    def _role(self, role: str, block: Block) -> Ternary:
         """Which clients can have the role."""
 
         def note(_: str, row: int, reason: Reason, message: str, times: int) -> None:
@@ -244,7 +244,7 @@ class PairColumns:
             note,
             not self._context.possible.limited,
         )
-        everybody = Verdict(np.ones(rows.size, bool), np.zeros(rows.size, bool))
+        everybody = Ternary(np.ones(rows.size, bool), np.zeros(rows.size, bool))
         return self._roles[role].evaluate(rows).get("where", everybody)
 
     def _rows(self, these: PairBlock, expressions: Mapping[str, Expression | None]) -> Rows:
@@ -269,21 +269,21 @@ class PairColumns:
             not self._context.possible.limited,
         )
 
-    def _observed(self, these: PairBlock, near: Truths, roles: Mapping[str, Verdict]) -> Codes:
+    def _observed(self, these: PairBlock, near: Truths, roles: Mapping[str, Ternary]) -> Codes:
         conditions = {"where": self._subject.where, "when": self._track.rule.when, "until": self._track.rule.until}
         rows = self._rows(these, conditions)
         found = these.verdicts = self._conditions.evaluate(rows)
         when = found["when"]
-        until = found.get("until", Verdict(when.false, when.true))
+        until = found.get("until", Ternary(when.false, when.true))
         inside, outside = np.ones(rows.size, bool), np.zeros(rows.size, bool)
         scope = [found["where"]] if "where" in found else []
         for role, at in zip(_ROLES, (these.first, these.second), strict=True):
             if role in roles:
-                scope.append(Verdict(roles[role].true[at], roles[role].false[at]))
+                scope.append(Ternary(roles[role].true[at], roles[role].false[at]))
         for each in scope:
             inside &= each.true
             outside |= each.false
-        return observed(when, until, Verdict(inside, outside), Verdict(near, these.placed & ~near))
+        return observed(when, until, Ternary(inside, outside), Ternary(near, these.placed & ~near))
 
     def _names(self, these: PairBlock, row: int) -> tuple[str, str]:
         return these.block.clients[int(these.first[row])], these.block.clients[int(these.second[row])]

@@ -8,7 +8,7 @@ import numpy as np
 
 from detector.engine.columns.block import Block, Context
 from detector.engine.columns.reading import Reading
-from detector.engine.columns.table import Integers, Table, Truths, distinct
+from detector.engine.columns.table import Integers, Table, Truths, sorted_rows
 from detector.engine.columns.watching import SampleAges
 from detector.engine.counters import RuleCounters
 from detector.engine.scoping.positions import FARTHEST, LIMITS, Place, distance, point
@@ -135,7 +135,7 @@ class Whereabouts:
     def _read(self, table: Table, block: Block, at: Integers, rows: Integers) -> tuple[Doubles, Truths]:
         """The places in rows of some clients, and which of them are known."""
         tables, stream = self._context.tables, self._position.stream
-        wanted = distinct(rows[~table.filled[rows]])
+        wanted = sorted_rows(rows[~table.filled[rows]])
         if len(wanted):
             tables.note_failures(stream, tables.readers[stream].read(table, wanted))
         axes = np.stack([table.columns[column].values[rows] for column in self._columns])

@@ -18,8 +18,7 @@ from detector.engine.columns.table import Integers, StoredColumn, Table
 from detector.engine.counters import Counters
 from detector.engine.samples.sample import DecodeError, Decoder, Sample
 from wayside.expressions import UNKNOWN, Expression, Path, Reason, Unknown, Value
-from wayside.expressions.columns.graph import Graph
-from wayside.expressions.columns.lowering import Constant
+from wayside.expressions.columns.lowering import Constant, Graph
 from wayside.expressions.columns.program import Program
 from wayside.expressions.columns.values import Column, Tag, Texts, column_of
 from wayside.rules import CompiledElement

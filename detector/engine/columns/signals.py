@@ -12,7 +12,7 @@ from detector.engine.columns.block import Block, Context, Track
 from detector.engine.columns.episodes import of_episodes
 from detector.engine.columns.named import NamedSignals
 from detector.engine.columns.reading import Reading, Used
-from detector.engine.columns.table import Integers, Truths, distinct, rows_between
+from detector.engine.columns.table import Integers, Truths, rows_between, sorted_rows
 from detector.engine.columns.watching import SampleAges
 from detector.engine.columns.windows import EXTREMES, Ranges, aggregated_ranges, extremes, misfits
 from wayside.api.eventrule import OF_A_SAMPLE, Aggregate
@@ -210,10 +210,10 @@ class SignalColumns:
         for key, low in windows:
             if not _needs_all(key) and key.used.value is not None:
                 at, some = _row(key.aggregate, low, high)
-                rows.append(distinct(at[some]))
+                rows.append(sorted_rows(at[some]))
                 if key.aggregate is Aggregate.PREVIOUS:
-                    rows.append(distinct(high[high > low] - 1))
-        wanted = rows[0] if len(rows) == 1 else distinct(np.concatenate(rows)) if rows else np.zeros(0, np.int64)
+                    rows.append(sorted_rows(high[high > low] - 1))
+        wanted = rows[0] if len(rows) == 1 else sorted_rows(np.concatenate(rows)) if rows else np.zeros(0, np.int64)
         wanted = wanted[~table.filled[wanted]]
         if len(wanted):
             tables.note_failures(stream, reader.read(table, wanted))

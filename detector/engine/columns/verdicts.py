@@ -14,14 +14,14 @@ Codes = NDArray[np.uint8]
 """Observations, see `SubjectState.run`."""
 
 
-class Verdict(NamedTuple):
+class Ternary(NamedTuple):
     """Where a condition is true and where it is false; it is unknown at all other points."""
 
     true: Truths
     false: Truths
 
 
-def observed(when: Verdict, until: Verdict, scope: Verdict | None = None, start: Verdict | None = None) -> Codes:
+def observed(when: Ternary, until: Ternary, scope: Ternary | None = None, start: Ternary | None = None) -> Codes:
     """The observations of arrays of points of any shape.
 
     `scope`: whether a point is in the rule's scope; outside, open episodes end. `start`: whether an episode may start

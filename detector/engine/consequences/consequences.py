@@ -14,7 +14,7 @@ import msgspec
 
 from detector.engine.buffering.buffer import Buffer
 from detector.engine.consequences.excerpts import EpisodeSample, Excerpt, Excerpts
-from detector.engine.episodes.episodes import Reason
+from detector.engine.episodes.episodes import Ending
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.rendering import Rendered
 from wayside.rules import CompiledAction, CompiledRule, CompiledWindow
@@ -197,7 +197,7 @@ class Consequences:
         excerpt = self._running.pop(run)
         begun = self._requested.pop(run, None)
         if begun is not None and excerpt is not None and not cut:
-            self._noted.append(Over(run, msgspec.structs.replace(begun, end_time=excerpt.until, reason=Reason.UNTIL)))
+            self._noted.append(Over(run, msgspec.structs.replace(begun, end_time=excerpt.until, reason=Ending.UNTIL)))
         if excerpt is not None and self.watch_late and not cut:
             self._complete_ones.append(excerpt)
         elif excerpt is not None:

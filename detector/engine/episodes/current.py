@@ -10,13 +10,13 @@ import msgspec
 
 from detector.engine.counters import RuleCounters
 from detector.engine.episodes.demands import Demand
-from detector.engine.episodes.episodes import Reason
+from detector.engine.episodes.episodes import Ending
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.following import followed
 from detector.engine.episodes.identifiers import episode_id
 from detector.engine.episodes.open_episodes import OpenEpisode
 from detector.engine.episodes.record import EpisodeRecord
-from detector.engine.episodes.rendering import Rendered, render
+from detector.engine.episodes.rendering import Rendered, render_templates
 from detector.engine.episodes.statistics import Statistics
 from detector.engine.episodes.subjects import Subject
 from wayside.expressions import InterpolationError
@@ -68,7 +68,9 @@ class EpisodeState:
 
     def started(self, rule: CompiledRule, identity: Identity) -> Event:
         """The start event, with the texts rendered for the rule's current actions."""
-        rendered = {action.name: render(action, self.variables) for action in rule.actions} if rule.actions else {}
+        rendered = (
+            {action.name: render_templates(action, self.variables) for action in rule.actions} if rule.actions else {}
+        )
         return self._event(rule, identity, self.record.values, rendered)
 
     def ended(
@@ -76,7 +78,7 @@ class EpisodeState:
         rule: CompiledRule,
         identity: Identity,
         now: int,
-        reason: Reason,
+        reason: Ending,
         values: Mapping[str, Any],
         variables: Mapping[str, Any],
     ) -> Event:
@@ -89,7 +91,7 @@ class EpisodeState:
             seen = {**(self.variables or {}), **variables}
             for action in rule.actions:
                 if any(names & template.names for template in action.templates.values()):
-                    rendered[action.name] = render(action, seen)
+                    rendered[action.name] = render_templates(action, seen)
         return self._event(rule, identity, values, rendered, now, reason)
 
     def kept(self) -> OpenEpisode:
@@ -161,7 +163,7 @@ class EpisodeState:
         values: Mapping[str, Any],
         rendered: Mapping[str, Rendered],
         end: int | None = None,
-        reason: Reason | None = None,
+        reason: Ending | None = None,
     ) -> Event:
         return Event(
             holder=identity.holder,

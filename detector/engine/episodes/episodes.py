@@ -19,7 +19,7 @@ from wayside.expressions import UNKNOWN, Unknown
 Truth = bool | Unknown
 
 
-class Reason(StrEnum):
+class Ending(StrEnum):
     """Why an episode ended."""
 
     UNTIL = "Until"
@@ -59,10 +59,10 @@ class Started(NamedTuple):
 class Ended(NamedTuple):
     """The open episode ended."""
 
-    reason: Reason
+    reason: Ending
 
 
-_UNTIL, _OUT_OF_SCOPE, _UNKNOWN = map(Ended, (Reason.UNTIL, Reason.OUT_OF_SCOPE, Reason.UNKNOWN))
+_UNTIL, _OUT_OF_SCOPE, _UNKNOWN = map(Ended, (Ending.UNTIL, Ending.OUT_OF_SCOPE, Ending.UNKNOWN))
 
 FALSE, UNSURE, TRUE = 0, 1, 2
 """Whether an episode may start: the lower two bits of an observation that is one byte."""
@@ -177,14 +177,14 @@ class SubjectState:
     def _open_step(self, now: int, timing: Timing, seen: Observation) -> Ended | None:
         reason = None
         if seen.in_scope is False:
-            reason = Reason.OUT_OF_SCOPE
+            reason = Ending.OUT_OF_SCOPE
         elif seen.until is True:
-            reason = Reason.UNTIL
+            reason = Ending.UNTIL
         elif seen.until is UNKNOWN:
             if self.unknown_since is None:
                 self.unknown_since = now
             if now - self.unknown_since >= timing.unknown_timeout:
-                reason = Reason.UNKNOWN
+                reason = Ending.UNKNOWN
         else:
             self.unknown_since = None
         if reason is None:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from detector.engine.episodes.episodes import Reason
+from detector.engine.episodes.episodes import Ending
 from detector.engine.episodes.plain import plain_text, quote, to_text
 from detector.engine.episodes.record import EpisodeRecord
 from detector.engine.episodes.rendering import Rendered
@@ -27,7 +27,7 @@ class Event(msgspec.Struct, frozen=True, gc=False):
     values: Mapping[str, JsonValue]
     """The rule's variables at the start or at the end; unknown ones are left out."""
     end_time: int | None = None
-    reason: Reason | None = None
+    reason: Ending | None = None
     models: Mapping[str, str] = msgspec.field(default_factory=dict)
     """By signal, the sha256 of the model that computes it."""
     dry_run: bool = False

@@ -19,7 +19,7 @@ class Rendered:
     problems: Mapping[str, str] = field(default_factory=dict)
 
 
-def render(action: CompiledAction, variables: Mapping[str, Any] | None) -> Rendered:
+def render_templates(action: CompiledAction, variables: Mapping[str, Any] | None) -> Rendered:
     """Render each template separately; `variables` is None if the episode was restored after a restart."""
     values: dict[str, JsonValue] = {}
     problems: dict[str, str] = {}

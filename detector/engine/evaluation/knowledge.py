@@ -22,7 +22,7 @@ from detector.engine.evaluation.rule import RuleRun
 from detector.engine.queries.queries import BufferQueries
 from detector.engine.queries.transforms import Transforms, TransformStream
 from detector.engine.samples.sample import Arrival, Decoder, Sample
-from detector.engine.scoping.positions import Positions
+from detector.engine.scoping.positions import PositionLookup
 from detector.engine.scoping.scopes import Views
 from detector.engine.signals.signals import Signals
 from detector.engine.signals.starts import Starts
@@ -110,7 +110,7 @@ class Knowledge:
         self.signals = Signals(
             self.buffer, self.clients, self.messages, self._stale_after, self._starts, possible, self._floor
         )
-        self._positions = Positions(self.buffer, self.messages, self._stale_after, possible, self._floor)
+        self._positions = PositionLookup(self.buffer, self.messages, self._stale_after, possible, self._floor)
         self.tables = Tables(self.buffer)
         self.tables.configure(detector, decoders, self.messages, self._counters)
         self.context = Context(

@@ -14,7 +14,7 @@ from detector.engine.counters import RuleCounters
 from detector.engine.episodes.budget import Budget
 from detector.engine.episodes.current import EpisodeState, Identity, new_record
 from detector.engine.episodes.demands import Demand, DemandChange
-from detector.engine.episodes.episodes import Ended, Observation, Reason, Started, SubjectState, Timing, Truth, negation
+from detector.engine.episodes.episodes import Ended, Ending, Observation, Started, SubjectState, Timing, Truth, negation
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.open_episodes import OpenEpisode
 from detector.engine.episodes.record import EpisodeRecord
@@ -203,7 +203,7 @@ class RuleRun:
             episode.change(rule, changed, gone)
             self._render(episode)
 
-    def end_all(self, now: int, reason: Reason) -> Iterator[Event]:
+    def end_all(self, now: int, reason: Ending) -> Iterator[Event]:
         """End every open episode, in order of the subjects, and discard pending ones."""
         self.disturbed = True
         for subject in sorted(self._open, key=lambda each: each.text):
@@ -233,11 +233,11 @@ class RuleRun:
                 if subject in self._muted:
                     self._muted.discard(subject)
                 else:
-                    yield self._cut_off(now, self._open.pop(subject), Reason.CLIENT_LOST)
+                    yield self._cut_off(now, self._open.pop(subject), Ending.CLIENT_LOST)
             else:
                 state.gap()
 
-    def _cut_off(self, now: int, episode: EpisodeState, reason: Reason) -> Event:
+    def _cut_off(self, now: int, episode: EpisodeState, reason: Ending) -> Event:
         """End an episode without an evaluation: only the statistics of the episode are known."""
         known = {} if episode.statistics is None else episode.statistics.values(now)
         return self._ended(now, episode, reason, known, known)
@@ -375,7 +375,7 @@ class RuleRun:
         return episode.started(rule, self._identity)
 
     def _ended(
-        self, now: int, episode: EpisodeState, reason: Reason, values: Mapping[str, Any], variables: Mapping[str, Any]
+        self, now: int, episode: EpisodeState, reason: Ending, values: Mapping[str, Any], variables: Mapping[str, Any]
     ) -> Event:
         self.counters.ended += 1
         self.version += 1

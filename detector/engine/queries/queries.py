@@ -20,7 +20,7 @@ from detector.engine.buffering.messages import Messages
 from detector.engine.queries.geometry import Pose
 from detector.engine.queries.poses import pose_in
 from detector.engine.queries.transforms import Transforms
-from detector.engine.queries.tuples import matched, nearest
+from detector.engine.queries.tuples import matched, nearest_index
 from detector.engine.samples.sample import Sample
 from wayside.expressions import UNKNOWN
 
@@ -252,7 +252,7 @@ class BufferQueries:
             )
             samples = list(filter(of_frame, samples))
         if samples:
-            decoded = self._decoded(client, stream, samples[nearest([each[0] for each in samples], stamp)])
+            decoded = self._decoded(client, stream, samples[nearest_index([each[0] for each in samples], stamp)])
             if decoded is not None:
                 yield decoded
 

@@ -31,8 +31,8 @@ def matched(stamps: Sequence[Sequence[int]], slop: int) -> list[tuple[int, ...]]
         for other in others:
             if not other:
                 return []
-            near = nearest(other, stamp)
-            if nearest(reference, other[near]) != index:
+            near = nearest_index(other, stamp)
+            if nearest_index(reference, other[near]) != index:
                 break
             members.append(near)
         else:
@@ -42,7 +42,7 @@ def matched(stamps: Sequence[Sequence[int]], slop: int) -> list[tuple[int, ...]]
     return found
 
 
-def nearest(stamps: Sequence[int], time: int) -> int:
+def nearest_index(stamps: Sequence[int], time: int) -> int:
     """The index of the stamp nearest to `time`; of two equally near ones the smaller, of equal ones the first.
 
     `stamps` is ascending and not empty.

@@ -15,7 +15,7 @@ MAXIMUM_TOKENS = 200_000
 """Maximum number of known tokens; further ones are ignored and counted."""
 
 
-class Token(Enum):
+class TokenState(Enum):
     """A change of a token: the payload of its arrival."""
 
     DECLARED = b"declared"

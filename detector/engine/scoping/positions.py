@@ -28,7 +28,7 @@ LIMITS: Mapping[str, float] = {"latitude": 90.0, "longitude": 360.0}
 """Degrees; some sources write longitudes from 0 to 360."""
 
 
-class Positions:
+class PositionLookup:
     """Looks up positions in the buffer."""
 
     def __init__(

@@ -12,7 +12,7 @@ from detector.engine.episodes.episodes import Truth, both
 from detector.engine.episodes.subjects import Subject
 from detector.engine.samples.sample import Sample
 from detector.engine.scoping.nearness import Search, near_pairs
-from detector.engine.scoping.positions import Place, Positions, described, distance, distance_of_order_1, point
+from detector.engine.scoping.positions import Place, PositionLookup, described, distance, distance_of_order_1, point
 from detector.engine.signals.models import add_models
 from detector.engine.signals.signals import Signals
 from detector.engine.timing.schedule import Only
@@ -62,7 +62,7 @@ class Views:
         clients: Clients,
         buffer: Buffer,
         signals: Signals,
-        positions: Positions,
+        positions: PositionLookup,
         stale_after: Mapping[str, int | None],
         counters: RuleCounters,
         *,

@@ -3,20 +3,40 @@
 A rule with a period is evaluated at its whole multiples, for all subjects. A rule with `onSample` is evaluated at the
 time of each sample of its stream, for the subjects that the sample's client belongs to; and for single subjects when
 one of their timers (for, cooldown, unknownTimeout) expires. A rule with `onDemand` is evaluated by
-`Engine.evaluate_now`. A paused rule is not evaluated at all. While the machine is too slow, evaluations are skipped
-(see load.py).
+`Engine.evaluate_now`. A paused rule is not evaluated at all.
+
+While the machine is too slow, evaluations are skipped, by a level that the caller gives. Each class of rules with the
+same priority, from the lowest, is thinned in three steps: every second evaluation, every fourth, every eighth. The next
+class begins when the one below it has reached its last step. At level 0 no evaluation is skipped.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 
 from detector.engine.buffering.clients import Clients
 from detector.engine.episodes.subjects import Subject
-from detector.engine.timing.load import highest_level, thinning
 from detector.engine.timing.ticks import Ticks
 from wayside.rules import CompiledRule
+
+STEPS = (1, 2, 4, 8)
+"""By level: one in this number of evaluations takes place."""
+
+
+def highest_level(priorities: Collection[int]) -> int:
+    """The level at which thinning reaches its maximum."""
+    return len(set(priorities)) * (len(STEPS) - 1)
+
+
+def thinning(level: int, priorities: Collection[int]) -> Mapping[int, int]:
+    """By priority of the rules: one in this number of evaluations takes place."""
+    found = {}
+    for priority in sorted(set(priorities)):
+        step = min(level, len(STEPS) - 1)
+        found[priority] = STEPS[step]
+        level -= step
+    return found
 
 
 @dataclass(frozen=True, slots=True)

@@ -44,7 +44,7 @@ def run_of(identity: str) -> Run:
     return Run(REQUESTED.rule, REQUESTED.action, identifier(identity.encode()))
 
 
-def begin(
+def begin_recording(
     consequences: Consequences,
     entry: RequestedRecording,
     detector: Detector,

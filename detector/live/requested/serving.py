@@ -13,7 +13,7 @@ from detector.actions.outcomes import Which
 from detector.actions.trigger.requests import RecordingReport, RecordingRequest, read_request, write_reports
 from detector.engine.engine import Engine
 from detector.live.requested.index import RecordingIndex, RequestedRecording
-from detector.live.requested.running import REQUESTED, begin, run_of
+from detector.live.requested.running import REQUESTED, begin_recording, run_of
 
 _log = logging.getLogger(__name__)
 
@@ -91,7 +91,7 @@ class Requested:
         """Runs on the evaluation thread. A recording that was stopped in the meantime is so short that its end is
         known."""
         engine = self._engine
-        begin(
+        begin_recording(
             engine.consequences,
             entry,
             engine.detector,

@@ -7,9 +7,20 @@ from detector.streams.codecs.cbor import CborDecoder
 from detector.streams.codecs.cdr import CdrDecoder
 from detector.streams.codecs.etsi import DefinitionError, EtsiDecoder, OwnDefinitions
 from detector.streams.codecs.json_ import JsonDecoder
-from detector.streams.codecs.raw import RawDecoder
 from detector.streams.codecs.ros import RosTypes, UnknownTypeError, standard
 from wayside.api.stream import Encoding, Stream
+
+
+class RawDecoder:
+    """Returns the payload itself; expressions can read its size (`sample.size`), and pass the bytes to functions."""
+
+    def decode(self, payload: bytes) -> bytes:
+        """The payload."""
+        return payload
+
+    def stamp(self, payload: bytes) -> int | None:
+        """None: the meaning of the bytes is unknown."""
+        return None
 
 
 def codec_for(stream: Stream, *, types: RosTypes | None = None, asn1: OwnDefinitions | None = None) -> Decoder:

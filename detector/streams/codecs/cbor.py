@@ -16,7 +16,7 @@ from typing import Any
 import cbor2
 
 from detector.engine.samples.sample import DecodeError
-from detector.streams.codecs.doubles import number
+from detector.streams.codecs.doubles import as_double
 
 MAX_DEPTH = 64
 """Maximum nesting of maps, lists and tags: no real message comes near it, and a hostile one must not exhaust the
@@ -54,7 +54,7 @@ def _plain(value: Any) -> Any:
     if kind is float or kind is str or kind is bool or value is None or kind is bytes:
         return value
     if kind is int:
-        return number(value)
+        return as_double(value)
     if kind is dict:
         return {key if type(key) is str else _key(key): _plain(item) for key, item in value.items()}
     if kind is list or kind is tuple:
@@ -64,7 +64,7 @@ def _plain(value: Any) -> Any:
 
 def _key(key: Any) -> str:
     if type(key) is int:
-        return str(number(key)).removesuffix(".0")
+        return str(as_double(key)).removesuffix(".0")
     raise DecodeError(f"unsupported CBOR: {type(key).__name__} as a key of a map; use text or integers")
 
 

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from detector.streams.codecs.doubles import EXACT, number
+from detector.streams.codecs.doubles import EXACT, as_double
 
 LEAST = 128
 """Minimum number of payloads with equal places: fewer are read faster one by one."""
@@ -34,7 +34,7 @@ Values = NDArray[Any]
 """Doubles, or objects: the values as decoded."""
 
 
-class Places(NamedTuple):
+class FieldPlaces(NamedTuple):
     """What is where in a payload: first byte, and the byte behind it."""
 
     lengths: Sequence[int]
@@ -48,7 +48,7 @@ class Places(NamedTuple):
 class CdrColumns(NamedTuple):
     """Reads fields, all of them numbers or texts, of payloads of one type and byte order."""
 
-    locate: Callable[[bytes], Places]
+    locate: Callable[[bytes], FieldPlaces]
     """Raises one of `refused` for a payload that cannot be read."""
     refused: tuple[type[Exception], ...]
     kinds: Sequence[np.dtype[Any] | None]
@@ -127,7 +127,7 @@ class CdrColumns(NamedTuple):
         if kind.kind == "b":
             return values.astype(object)
         if kind.kind in "iu" and kind.itemsize == 8 and ((values > EXACT) | (values < -EXACT)).any():
-            return np.fromiter(map(number, values.tolist()), object, len(values))
+            return np.fromiter(map(as_double, values.tolist()), object, len(values))
         return values.astype(np.float64)
 
 

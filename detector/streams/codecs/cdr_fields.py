@@ -17,7 +17,7 @@ import numpy as np
 from rosbags.interfaces import Nodetype
 
 from detector.engine.samples.sample import MISSING, FieldColumn, FieldReader, Fields
-from detector.streams.codecs.cdr_columns import LEAST, CdrColumns, Places
+from detector.streams.codecs.cdr_columns import LEAST, CdrColumns, FieldPlaces
 from detector.streams.codecs.cdr_source import CdrSource, UnwalkableError
 from detector.streams.codecs.cdr_values import PADDING
 from detector.streams.codecs.cdr_walk import Tree, Value, Walk
@@ -186,7 +186,7 @@ def _walk(
 
 def _compiled(type_name: str, lines: Sequence[str], source: CdrSource, texts: _Texts) -> Any:
     """The function `read` that these lines define."""
-    space = {**source.bound, "refused": _REFUSED, "texts": texts, "frombuffer": np.frombuffer, "Places": Places}
+    space = {**source.bound, "refused": _REFUSED, "texts": texts, "frombuffer": np.frombuffer, "Places": FieldPlaces}
     try:
         # The only external text in the source are quoted names of fields.
         exec(compile("\n".join(lines), f"<fields of {type_name}>", "exec"), space)  # noqa: S102

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from detector.streams.codecs.doubles import EXACT, number
+from detector.streams.codecs.doubles import EXACT, as_double
 
 Convert = Callable[[Any], Any]
 
@@ -41,7 +41,7 @@ def _small_integers(values: np.ndarray[Any, Any]) -> list[float]:
 
 def _large_integers(values: np.ndarray[Any, Any]) -> list[float | int]:
     if values.size and (int(values.max()) > EXACT or int(values.min()) < -EXACT):
-        return [number(int(value)) for value in values]
+        return [as_double(int(value)) for value in values]
     return list(_small_integers(values))
 
 
@@ -55,8 +55,8 @@ _SCALARS: dict[str, Convert | None] = {
     "float64": None,
     "string": None,
     "byte": _octet,
-    "int64": number,
-    "uint64": number,
+    "int64": as_double,
+    "uint64": as_double,
 }
 _ARRAYS: dict[str, Convert | None] = {
     "string": None,

@@ -97,7 +97,7 @@ def merged_types(definitions: Sequence[Definition]) -> Typesdict:
     return types
 
 
-def check(definitions: Sequence[Definition], new: Typesdict, known: Mapping[str, Any]) -> None:
+def check_definitions(definitions: Sequence[Definition], new: Typesdict, known: Mapping[str, Any]) -> None:
     """Check that fields are unique and of new or known types, and that no type contains itself.
 
     Raises DefinitionsError with the field.

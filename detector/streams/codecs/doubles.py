@@ -6,6 +6,6 @@ EXACT = 2**53
 """Every integer up to this one is a double."""
 
 
-def number(value: int) -> float | int:
+def as_double(value: int) -> float | int:
     """The integer as a double if that is exact, otherwise unchanged."""
     return float(value) if -EXACT <= value <= EXACT else value

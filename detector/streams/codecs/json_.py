@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 
 from detector.engine.samples.sample import DecodeError, FieldReader
-from detector.streams.codecs.doubles import number
+from detector.streams.codecs.doubles import as_double
 from detector.streams.codecs.json_fields import json_fields
 from detector.streams.codecs.paths import Path
 
@@ -49,7 +49,7 @@ def _with_doubles(value: Any, depth: int) -> Any:
     """The value with its integers as doubles; maps and lists are changed in place."""
     kind = type(value)
     if kind is int:
-        return number(value)
+        return as_double(value)
     if kind is dict:
         if depth == 0:
             raise _too_deep()

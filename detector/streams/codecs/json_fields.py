@@ -14,7 +14,7 @@ from typing import Any
 import msgspec
 
 from detector.engine.samples.sample import MISSING, FieldReader, Fields
-from detector.streams.codecs.doubles import number
+from detector.streams.codecs.doubles import as_double
 from detector.streams.codecs.paths import Path, complete, shortest, spread
 
 _SLICE = 64
@@ -110,7 +110,7 @@ def _converted(column: list[Any], plain: Callable[[Any], Any]) -> list[Any]:
         return column
     if dict in kinds or list in kinds:
         return [plain(value) for value in column]
-    return [number(value) if type(value) is int else value for value in column]
+    return [as_double(value) if type(value) is int else value for value in column]
 
 
 def _sure(payloads: Sequence[bytes], max_depth: int) -> bool:

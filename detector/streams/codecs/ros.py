@@ -12,7 +12,7 @@ from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.base import TypesysError
 from rosbags.typesys.store import Typestore
 
-from detector.streams.codecs.definitions import Definition, DefinitionsError, check, merged_types
+from detector.streams.codecs.definitions import Definition, DefinitionsError, check_definitions, merged_types
 
 HEADER = "std_msgs/msg/Header"
 TIME = "builtin_interfaces/msg/Time"
@@ -93,7 +93,7 @@ def types_with(definitions: tuple[Definition, ...]) -> RosTypes:
         return standard()
     given = standard().store
     new = merged_types(definitions)
-    check(definitions, new, given.fielddefs)
+    check_definitions(definitions, new, given.fielddefs)
     store = Typestore()
     store.fielddefs.update({name: parts for name, parts in given.fielddefs.items() if name not in new})
     store.types.update({name: of_type for name, of_type in given.types.items() if name not in new})

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from detector.plugins import Plugin, PluginParameters, Queries, Seconds, StreamName, Subject
+from detector.plugins import Plugin, PluginParameters, PluginSubject, Queries, Seconds, StreamName
 
 MetresPerSecond = Annotated[float, Field(ge=0, le=100)]
 
@@ -29,7 +29,7 @@ class StopAndGo(Plugin[StopAndGoParameters]):
 
     Parameters = StopAndGoParameters
 
-    def __init__(self, parameters: StopAndGoParameters, subject: Subject) -> None:
+    def __init__(self, parameters: StopAndGoParameters, subject: PluginSubject) -> None:
         super().__init__(parameters, subject)
         self.is_going = False
         self.seen = 0

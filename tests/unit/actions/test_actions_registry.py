@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from detector.actions import Action
 from detector.actions.registry import OFFERS, action_problems, prepare_action
 from detector.assembly import RuleIndex, inlets
-from detector.assembly.checking import check_documents
+from detector.assembly.checking import findings
 from detector.plugins import entrypoints
 from tests.driving import a_detector, a_rule
 from wayside.api.documents import load_documents
@@ -87,7 +87,7 @@ def test_check_reports_line_and_column(tmp_path: Path) -> None:
         "apiVersion: wayside.dev/v1alpha1\nkind: EventRule\nmetadata: {name: r}\nspec:\n  when: 'true'\n"
         "  actions:\n    - name: a\n      plugin: {name: lamp, parameters: {colour: 3}}\n"
     )
-    (problem,) = check_documents(load_documents([tmp_path]))
+    (problem,) = findings(load_documents([tmp_path])).problems
     assert "r.yaml:8:49: spec.actions[0].plugin.parameters.colour: must be a string; got 3" in str(problem)
 
 

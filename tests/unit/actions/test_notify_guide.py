@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from detector.actions.notify import Notify
-from detector.assembly.checking import check_documents
+from detector.assembly.checking import findings
 from tests.driving import a_detector
 from tests.guides import guide, yaml_blocks
 from wayside.api.actions.notify import NotifyAction as Parameters
@@ -23,7 +23,7 @@ def problems(folder: Path, rule: str) -> list[str]:
     (folder / "d.json").write_text(a_detector().model_dump_json(by_alias=True, exclude_none=True))
     (folder / "r.yaml").write_text(rule)
     try:
-        found = check_documents(load_documents([folder]))
+        found = findings(load_documents([folder])).problems
     except DocumentError as error:
         found = [*error.problems]
     return [str(each).removeprefix(f"{folder}/") for each in found]

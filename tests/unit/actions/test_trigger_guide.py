@@ -8,7 +8,7 @@ from typing import Any
 import yaml
 
 from detector.actions.trigger.services import KNOWN
-from detector.assembly.checking import check_documents
+from detector.assembly.checking import findings
 from tests.guides import guide, yaml_blocks
 from wayside.api.documents import load_documents
 
@@ -22,7 +22,7 @@ def test_the_examples_are_accepted(tmp_path: Path) -> None:
         rule["spec"]["actions"] += yaml.safe_load(block)
     assert len(rule["spec"]["actions"]) == 5
     (tmp_path / "all.yaml").write_text(yaml.safe_dump_all([rule, yaml.safe_load(blocks[1])], allow_unicode=True))
-    assert check_documents(load_documents([tmp_path / "all.yaml"])) == []
+    assert findings(load_documents([tmp_path / "all.yaml"])).problems == []
 
 
 def test_the_known_services_are_named() -> None:

@@ -106,7 +106,7 @@ def error(*arguments: str) -> str:
         patch.setenv("KUBECONFIG", "/nonexistent")
         reported: list[str] = []
         patch.setattr("builtins.print", lambda *words, **_: reported.append(" ".join(map(str, words))))
-        assert commandline.run(app, "application-manager", EXPECTED, ["inject", *arguments]) == 2
+        assert commandline.run_cli(app, "application-manager", EXPECTED, ["inject", *arguments]) == 2
     return "\n".join(reported)
 
 

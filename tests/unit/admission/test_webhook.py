@@ -186,7 +186,7 @@ def test_a_port_that_is_taken_is_reported(folder: Path) -> None:
 @pytest.fixture
 def command(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
     def command(*arguments: str) -> tuple[int, str, str]:
-        code = commandline.run(app, "application-manager", EXPECTED, arguments)
+        code = commandline.run_cli(app, "application-manager", EXPECTED, arguments)
         return code, *capsys.readouterr()
 
     return command

@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from detector.commands.catalog.catalog import Catalog, CatalogEntry, ChoiceError, catalog, choose
-from detector.commands.catalog.markdown import markdown_view
 from detector.commands.catalog.page import page
+from detector.commands.catalog.views import markdown_view
 from detector.commands.cli import app
 from wayside.api.classification import Classification
 from wayside.api.documents import DocumentError
@@ -171,7 +171,7 @@ def rules(tmp_path: Path) -> Path:
 
 
 def run(*arguments: str) -> int:
-    return commandline.run(app, "detector", (DocumentError, ConfigurationError, OSError), ["catalog", *arguments])
+    return commandline.run_cli(app, "detector", (DocumentError, ConfigurationError, OSError), ["catalog", *arguments])
 
 
 def test_the_command_prints_a_table_of_all_values(rules: Path, capsys: pytest.CaptureFixture[str]) -> None:

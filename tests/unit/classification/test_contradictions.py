@@ -303,7 +303,7 @@ def check(folder: Path, *options: str) -> int:
             {"apiVersion": "wayside.dev/v1alpha1", "kind": "Detector", "metadata": {"name": "d"}, "spec": detector}
         )
     )
-    return commandline.run(app, "detector", (), ["check", str(folder), *options])
+    return commandline.run_cli(app, "detector", (), ["check", str(folder), *options])
 
 
 def test_check_reports_where_it_is_and_only_strict_fails(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

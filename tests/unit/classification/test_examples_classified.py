@@ -9,9 +9,8 @@ from typing import Any
 import pytest
 
 from detector.assembly.checking import findings
-from detector.commands.catalog.catalog import catalog
-from detector.commands.catalog.document import json_view
-from detector.commands.catalog.files import read_files
+from detector.commands.catalog.catalog import catalog, read_files
+from detector.commands.catalog.views import json_view
 from tests.guides import ROOT
 from wayside.api.documents import load_documents
 

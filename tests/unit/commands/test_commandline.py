@@ -20,7 +20,7 @@ def test_bad_usage_is_one_line_that_names_program_and_help(
     app: typer.Typer, incomplete: list[str], lacks: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for arguments in (incomplete, [*incomplete, "--debug"], ["--debug", *incomplete]):
-        assert commandline.run(app, "program", (), arguments) == 2
+        assert commandline.run_cli(app, "program", (), arguments) == 2
         reported = capsys.readouterr().err
         assert reported.startswith("program: ")
         assert lacks in reported
@@ -42,7 +42,7 @@ def failing(error: Exception) -> typer.Typer:
 
 
 def reported(error: Exception, capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    assert commandline.run(failing(error), "program", (ValueError,), ["run", *arguments]) == 2
+    assert commandline.run_cli(failing(error), "program", (ValueError,), ["run", *arguments]) == 2
     return capsys.readouterr().err
 
 

@@ -41,7 +41,7 @@ class Result:
 @pytest.fixture
 def command(capsys: pytest.CaptureFixture[str]) -> Callable[..., Result]:
     def command(*arguments: str) -> Result:
-        code = commandline.run(app, "application-manager", EXPECTED, arguments)
+        code = commandline.run_cli(app, "application-manager", EXPECTED, arguments)
         return Result(code, *capsys.readouterr())
 
     return command

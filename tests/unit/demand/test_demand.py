@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from application_manager.core.claims.operations import Standing
-from application_manager.core.demand.demand import Outcome, demand
+from application_manager.core.demand.demand import NamespaceOutcome, demand
 from application_manager.core.holders.leases import LeaseView
 from tests.unit.manager_objects import NOW, instance, task, template
 
@@ -24,12 +24,12 @@ FUSION = {
 }
 
 
-def of(*tasks: Any, **others: Any) -> Outcome:
+def of(*tasks: Any, **others: Any) -> NamespaceOutcome:
     templates = others.pop("templates", [template(**FUSION)])
     return demand(templates, tasks, others.pop("instances", []), others.pop("leases", {}), others.pop("now", NOW))
 
 
-def only(outcome: Outcome) -> Any:
+def only(outcome: NamespaceOutcome) -> Any:
     assert len(outcome.instances) == 1, outcome.instances
     return next(iter(outcome.instances.values()))
 
@@ -218,7 +218,7 @@ RELEASE = {"lifecycle": {"onDetectorLoss": {"policy": "Release", "after": "10s"}
 HOLD = {"lifecycle": {"onDetectorLoss": {"policy": "Hold"}}}
 
 
-def lost(unchanged: float, spec: dict[str, Any] = RELEASE, *, renewed: bool = True, **more: Any) -> Outcome:
+def lost(unchanged: float, spec: dict[str, Any] = RELEASE, *, renewed: bool = True, **more: Any) -> NamespaceOutcome:
     held = more.pop("held", task("a", holder="det"))
     return of(held, templates=[template(**spec)], leases={"det": LeaseView(unchanged, 15, renewed)}, **more)
 

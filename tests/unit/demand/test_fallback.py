@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from application_manager.core.claims.claims import instance_name
 from application_manager.core.claims.operations import Standing
-from application_manager.core.demand.demand import Outcome, demand
+from application_manager.core.demand.demand import NamespaceOutcome, demand
 from application_manager.core.demand.fallback import aspects, overdue
 from application_manager.core.holders.leases import LeaseView
 from tests.unit.demand.test_manager_places import Manager
@@ -61,7 +61,7 @@ def wants(name: str = "a", region: str = "north", **more: Any) -> ApplicationTas
     return task(name, {"region": region, **more.pop("parameters", {})}, **more)
 
 
-def of(*tasks: ApplicationTask, **more: Any) -> Outcome:
+def of(*tasks: ApplicationTask, **more: Any) -> NamespaceOutcome:
     templates = more.pop("templates", None) or [template(**FULL), template("lite", **LITE)]
     return demand(
         templates, tasks, more.pop("instances", [late()]), more.pop("leases", {}), NOW, more.pop("limit", None)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from application_manager.core.claims.claims import instance_name
 from application_manager.core.claims.operations import Standing
-from application_manager.core.demand.demand import Outcome, demand
+from application_manager.core.demand.demand import NamespaceOutcome, demand
 from application_manager.core.demand.drafting import draft
 from tests.unit.manager_objects import NOW, instance, task, template
 from wayside.api import ApplicationInstance, ApplicationTask
@@ -50,18 +50,18 @@ def served(live: ApplicationTask) -> ApplicationTask:
     return ApplicationTask.model_validate(raw)
 
 
-def of(*tasks: ApplicationTask, limit: int | None = 1, **others: Any) -> Outcome:
+def of(*tasks: ApplicationTask, limit: int | None = 1, **others: Any) -> NamespaceOutcome:
     templates = others.pop("templates", None) or [limited(limit)]
     instances, now = others.pop("instances", []), others.pop("now", NOW)
     return demand(templates, tasks, instances, {}, now, others.pop("total", None))
 
 
-def running(outcome: Outcome) -> set[str]:
+def running(outcome: NamespaceOutcome) -> set[str]:
     """The keys of what may run."""
     return {str(each.key) for each in outcome.instances.values() if each.wanted}
 
 
-def going(outcome: Outcome) -> set[str]:
+def going(outcome: NamespaceOutcome) -> set[str]:
     """The keys of what goes now."""
     ends = {each.key: each.release_time for each in outcome.instances.values()}
     return {str(key) for key, end in ends.items() if end is not None and end <= NOW}
@@ -221,7 +221,7 @@ class Site:
         self.instances: dict[str, ApplicationInstance] = {}
         self.now = NOW
 
-    def outcome(self, live: list[ApplicationTask]) -> Outcome:
+    def outcome(self, live: list[ApplicationTask]) -> NamespaceOutcome:
         return demand(self.templates, live, self.instances.values(), {}, self.now, self.total)
 
     def step(self, live: list[ApplicationTask], source: random.Random | None = None) -> bool:

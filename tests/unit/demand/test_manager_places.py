@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from application_manager.cache.cluster_cache import INSTANCE, TASK, TEMPLATE, ClusterCache
 from application_manager.core.claims.claims import instance_name
 from application_manager.core.demand.decisions import Decision
-from application_manager.core.demand.demand import Outcome, demand
+from application_manager.core.demand.demand import NamespaceOutcome, demand
 from application_manager.core.objects.policy import Name, Policy
 from application_manager.watching.router import Router
 from application_manager.work.applying import Applier
@@ -90,7 +90,7 @@ class Manager:
             decided[name[1]] = found.decision
         return decided
 
-    def demand(self, limit: int | None) -> Outcome:
+    def demand(self, limit: int | None) -> NamespaceOutcome:
         """The pure function of all that the cache has."""
         return demand(
             self.cache.models(TEMPLATE, ApplicationTemplate, "site"),

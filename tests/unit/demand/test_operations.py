@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from application_manager.core.claims.claims import instance_name
 from application_manager.core.claims.operations import Standing
 from application_manager.core.demand.decisions import Decision
-from application_manager.core.demand.demand import Outcome, demand
+from application_manager.core.demand.demand import NamespaceOutcome, demand
 from application_manager.core.demand.drafting import draft
 from application_manager.core.holders.leases import LeaseView
 from application_manager.core.objects.policy import Policy
@@ -37,7 +37,7 @@ NORTH, SOUTH = instance_name("app", "north"), instance_name("app", "south")
 PLAIN = {"parameters": {**FUSION["parameters"], "region": {"type": "string"}}}
 
 
-def of(*tasks: ApplicationTask, spec: Any = None, **others: Any) -> Outcome:
+def of(*tasks: ApplicationTask, spec: Any = None, **others: Any) -> NamespaceOutcome:
     templates = others.pop("templates", [template(**(spec or FUSION))])
     return demand(templates, tasks, others.pop("instances", []), others.pop("leases", {}), others.pop("now", NOW))
 
@@ -54,7 +54,7 @@ def stop(name: str, parameters: dict[str, Any] | None = None, **more: Any) -> Ap
     return task(name, parameters, operation="Suspend", **more)
 
 
-def values(outcome: Outcome, name: str = NORTH) -> dict[str, Any]:
+def values(outcome: NamespaceOutcome, name: str = NORTH) -> dict[str, Any]:
     return {key: value for key, value in (outcome.instances[name].parameters or {}).items() if key != "region"}
 
 
@@ -270,7 +270,7 @@ def applications(decisions: Any) -> dict[str, tuple[Any, ...]]:
     }
 
 
-def made(outcome: Outcome, existing: list[ApplicationInstance]) -> list[ApplicationInstance]:
+def made(outcome: NamespaceOutcome, existing: list[ApplicationInstance]) -> list[ApplicationInstance]:
     """The instances after the manager has done what was decided; none is released."""
     known = {each.name: each for each in existing}
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from application_manager.core.claims.merging import Contribution
-from application_manager.core.claims.sizes import MAXIMUM_MERGED_BYTES, too_large
+from application_manager.core.claims.merging import MAXIMUM_MERGED_BYTES, Contribution, too_large
 from wayside.api import freedata
 
 

@@ -6,7 +6,7 @@ import re
 from fractions import Fraction
 from pathlib import Path
 
-from detector.assembly.checking import check_documents
+from detector.assembly.checking import findings
 from detector.streams.codecs.etsi.messages import KINDS, PREFIX
 from detector.streams.codecs.etsi.quantities import UNITS
 from tests.guides import guide, yaml_blocks
@@ -40,4 +40,4 @@ def test_the_example_is_accepted(tmp_path: Path) -> None:
     file.write_text(example)
     documents = load_documents([file])
     assert [type(document.object).__name__ for document in documents] == ["Detector", "EventRule"]
-    assert not check_documents(documents)
+    assert not findings(documents).problems

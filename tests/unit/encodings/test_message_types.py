@@ -20,7 +20,7 @@ from rosbags.typesys.store import Typestore
 from typer.testing import CliRunner
 
 from detector.assembly import DetectorError, inlets
-from detector.assembly.checking import check_documents
+from detector.assembly.checking import findings
 from detector.commands.cli import app
 from detector.engine.samples.sample import Arrival
 from detector.replay.errors import RecordingError
@@ -228,7 +228,7 @@ spec:
 def problems(path: Path, text: str) -> list[str]:
     path.write_text(text)
     try:
-        return [str(problem).removeprefix(f"{path}:") for problem in check_documents(load_documents([path]))]
+        return [str(problem).removeprefix(f"{path}:") for problem in findings(load_documents([path])).problems]
     except DocumentError as error:
         return [str(problem).removeprefix(f"{path}:") for problem in error.problems]
 

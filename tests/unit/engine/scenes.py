@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 from detector.assembly import RuleIndex, inlets, make_engine
 from detector.engine.counters import RuleCounters
-from detector.engine.engine import NoAnswerError
+from detector.engine.engine import NotEvaluableError
 from detector.engine.samples.sample import Arrival
 from detector.engine.scoping.scopes import Evaluated
 from tests.driving import SECOND, START, a_detector, a_stream
@@ -168,7 +168,7 @@ def driven(scene: Scene, cut: Callable[[], int], *, one_by_one: bool = False) ->
                 try:
                     found, answers = engine.evaluate_now(what)
                     events.append(str(answers))
-                except NoAnswerError:
+                except NotEvaluableError:
                     pass
             case "finish":
                 found += [event for some in engine.finish() for event in some]

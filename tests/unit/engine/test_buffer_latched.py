@@ -16,7 +16,7 @@ from detector.engine.buffering.latched import LatchedLane, by_key
 from detector.engine.samples.sample import SAMPLE_OVERHEAD, Sample, Stamped
 from detector.replay.latched import recorded_arrivals
 from detector.replay.replaying import replay_arrivals
-from detector.replay.routing import Router
+from detector.replay.routing import MessageRouter
 from tests.driving import START, Drive, a_detector, a_rule, a_stream, arrival, at
 from wayside.api import Detector
 
@@ -136,5 +136,5 @@ def _line(seconds: float, place: str, value: object) -> str:
 
 
 def _replayed(recording: Path, detector: Detector) -> list[dict[str, Any]]:
-    arrivals = recorded_arrivals([recording], Router(detector.spec.streams), detector)
+    arrivals = recorded_arrivals([recording], MessageRouter(detector.spec.streams), detector)
     return [json.loads(event.to_json()) for event in replay_arrivals(arrivals, detector, [ICY]).events]

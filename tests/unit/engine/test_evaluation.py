@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from detector.engine.engine import NoAnswerError
+from detector.engine.engine import NotEvaluableError
 from detector.engine.samples.sample import Arrival
-from detector.engine.timing.load import highest_level, thinning
+from detector.engine.timing.schedule import highest_level, thinning
 from detector.live.evaluator import Evaluator
 from detector.live.overload import CALM, LONG, Overload
 from detector.replay.intake_file import Control
@@ -143,12 +143,12 @@ def test_on_demand_a_rule_is_evaluated_on_request_and_reports_each_subject() -> 
 
 def test_only_rules_with_on_demand_can_be_evaluated_on_demand() -> None:
     drive = Drive(a_detector(), fast(), fast("q", evaluation={"onDemand": True}))
-    with pytest.raises(NoAnswerError, match="there is no rule x; the detector has q, r"):
+    with pytest.raises(NotEvaluableError, match="there is no rule x; the detector has q, r"):
         drive.engine.evaluate_now("x")
-    with pytest.raises(NoAnswerError, match="rule r is not evaluated on demand"):
+    with pytest.raises(NotEvaluableError, match="rule r is not evaluated on demand"):
         drive.engine.evaluate_now("r")
     drive.engine.set_paused({"q"})
-    with pytest.raises(NoAnswerError, match="rule q is paused"):
+    with pytest.raises(NotEvaluableError, match="rule q is paused"):
         drive.engine.evaluate_now("q")
 
 

@@ -18,8 +18,8 @@ from detector.engine.samples.sample import Arrival
 from detector.replay import parts, replaying
 from detector.replay.intake_file import Control
 from detector.replay.latched import recorded_arrivals
-from detector.replay.replaying import Outcome, replay_arrivals, replay_intake
-from detector.replay.routing import Router
+from detector.replay.replaying import Replayed, replay_arrivals, replay_intake
+from detector.replay.routing import MessageRouter
 from tests.driving import (
     POSITION,
     SECOND,
@@ -57,14 +57,14 @@ def line(step: int, client: str, stream: str, **message: float) -> str:
     return json.dumps({"t": time, "key": f"vehicles/{client}/{stream}", "value": value})
 
 
-def replayed(folder: Path, detector: Detector, rules: Sequence[Any], *recordings: Sequence[str]) -> Outcome:
+def replayed(folder: Path, detector: Detector, rules: Sequence[Any], *recordings: Sequence[str]) -> Replayed:
     """The replay of recordings, given as their lines."""
     paths = []
     for number, recording in enumerate(recordings):
         path = folder / f"{number}.jsonl"
         path.write_text("\n".join(recording))
         paths.append(path)
-    return replay_arrivals(recorded_arrivals(paths, Router(detector.spec.streams), detector), detector, rules)
+    return replay_arrivals(recorded_arrivals(paths, MessageRouter(detector.spec.streams), detector), detector, rules)
 
 
 APART = {"scope": {"pairs": {"position": POSITION, "within": 1000}}, "when": "distance > 0.0"}

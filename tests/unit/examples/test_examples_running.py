@@ -54,7 +54,7 @@ def test_a_use_case_is_reported_with_its_picture_and_files(ran: Ran) -> None:
 @pytest.mark.parametrize("name", use_cases())
 def test_its_files_are_accepted_without_a_word(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     files = sorted(map(str, folder_of(name).glob("*.yaml")))
-    assert commandline.run(cli.app, "detector", (), ["check", *files]) == 0
+    assert commandline.run_cli(cli.app, "detector", (), ["check", *files]) == 0
     logged = capsys.readouterr()
     assert logged.out == ""
     assert "nothing wrong" in logged.err

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from application_manager.core.claims.patterns import mismatch, pattern_problem
+from application_manager.core.claims.parameters import mismatch, pattern_problem
 from wayside.expressions import CelType, Environment, EvaluationError, ExpressionError
 from wayside.expressions.regex import LARGEST_PATTERN, LONGEST_INPUT, pattern_size
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from wayside.process.backoff import Backoff
+import pytest
+
+from wayside.process.backoff import Backoff, retry
 
 
 def test_delays_double_up_to_the_cap_and_start_over_after_a_success() -> None:
@@ -18,3 +20,23 @@ def test_delays_double_up_to_the_cap_and_start_over_after_a_success() -> None:
 def test_a_wait_that_the_server_requests_is_kept_up_to_the_cap() -> None:
     assert Backoff(first=0.1, cap=5.0).fail(at_least=3.0) == 3.0
     assert Backoff(first=0.1, cap=5.0).fail(at_least=600.0) == 5.0
+
+
+def test_an_attempt_is_repeated_until_it_succeeds_and_after_the_pause_that_its_failure_asks_for() -> None:
+    failures, pauses = [KeyError("one"), KeyError("two")], list[float]()
+
+    def attempt() -> str:
+        if failures:
+            raise failures.pop(0)
+        return "done"
+
+    assert retry(attempt, KeyError, lambda error: 1.0 if error.args == ("one",) else 2.0, pauses.append) == "done"
+    assert pauses == [1.0, 2.0]
+
+
+def test_another_error_than_the_expected_one_is_raised_at_once() -> None:
+    def attempt() -> None:
+        raise ValueError("a defect")
+
+    with pytest.raises(ValueError, match="a defect"):
+        retry(attempt, KeyError, lambda _: 0.0)

@@ -41,6 +41,11 @@ class Server:
         return self.lease
 
 
+def two_candidates() -> tuple[Server, LeaseCandidate, LeaseCandidate]:
+    """A server without a Lease, and two managers that want it."""
+    return Server(), LeaseCandidate("first", DURATION, DEADLINE), LeaseCandidate("second", DURATION, DEADLINE)
+
+
 def manager(
     candidate: LeaseCandidate,
     offset: float,
@@ -97,11 +102,7 @@ def stored(candidate: LeaseCandidate, server: Server, now: float) -> None:
 
 
 def test_a_standby_takes_the_lease_once_it_has_seen_it_unchanged_for_its_duration() -> None:
-    server, first, second = (
-        Server(),
-        LeaseCandidate("first", DURATION, DEADLINE),
-        LeaseCandidate("second", DURATION, DEADLINE),
-    )
+    server, first, second = two_candidates()
     stored(first, server, 0.0)
     assert first.remaining(1.0) == DEADLINE - 1.0
     second.observe(server.lease, 1000.0)
@@ -113,11 +114,7 @@ def test_a_standby_takes_the_lease_once_it_has_seen_it_unchanged_for_its_duratio
 
 
 def test_a_released_lease_is_taken_at_once() -> None:
-    server, first, second = (
-        Server(),
-        LeaseCandidate("first", DURATION, DEADLINE),
-        LeaseCandidate("second", DURATION, DEADLINE),
-    )
+    server, first, second = two_candidates()
     stored(first, server, 0.0)
     second.observe(server.lease, 0.0)
     released = first.released(1.0)
@@ -150,11 +147,7 @@ def test_a_lease_that_vanishes_is_not_taken_before_its_manager_must_have_noticed
 
 
 def test_one_whose_lease_was_taken_may_not_act_however_much_time_it_thinks_it_has() -> None:
-    server, first, second = (
-        Server(),
-        LeaseCandidate("first", DURATION, DEADLINE),
-        LeaseCandidate("second", DURATION, DEADLINE),
-    )
+    server, first, second = two_candidates()
     stored(first, server, 0.0)
     second.observe(server.lease, 0.0)
     stored(second, server, DURATION)

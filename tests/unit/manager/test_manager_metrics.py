@@ -13,14 +13,13 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from application_manager.cache.cluster_cache import ClusterCache
 from application_manager.core.objects.policy import Policy
-from application_manager.core.statuses.allowance import BURST, REFILL, Allowance
 from application_manager.measures import PREFIX, Measures
 from application_manager.observability.overview import Overview
 from application_manager.observability.pages import STALLED_AFTER, pages, stalled
 from application_manager.observability.tracing import LostSpans
 from application_manager.running.headroom import Headroom
 from application_manager.watching.pulse import Pulse
-from application_manager.work.recorder import Reason
+from application_manager.work.recorder import BURST, REFILL, Allowance, EventReason
 from tests.guides import guide
 from tests.unit.manager_objects import instance, task, template
 from wayside.kubernetes.connection import ConfigurationError
@@ -161,4 +160,4 @@ def test_the_guide_describes_every_metric() -> None:
 
 
 def test_the_guide_lists_every_reason_of_an_event() -> None:
-    assert {each.value for each in Reason if f"`{each.value}`" not in GUIDE} == set()
+    assert {each.value for each in EventReason if f"`{each.value}`" not in GUIDE} == set()

@@ -9,7 +9,7 @@ from typing import Any, cast
 import pytest
 
 from application_manager.work import recorder
-from application_manager.work.recorder import Reason, Recorder
+from application_manager.work.recorder import EventReason, Recorder
 from tests.unit.manager_objects import NOW, task
 from wayside.kubernetes.client import Client
 from wayside.kubernetes.errors import ApiError
@@ -30,7 +30,7 @@ def report(events: Recorder, first: int, count: int) -> None:
     for each in range(first, first + count):
         about = task(f"t{each}")
         about = about.model_copy(update={"metadata": about.metadata.model_copy(update={"uid": f"u{each}"})})
-        events.event(about, Reason.ACCEPTED, "counts", NOW)
+        events.event(about, EventReason.ACCEPTED, "counts", NOW)
 
 
 class Taking:
@@ -51,7 +51,7 @@ def test_namespaces_take_turns() -> None:
         report(events, 0, 100)
         one = task("one")
         quiet = one.metadata.model_copy(update={"namespace": "quiet", "uid": "quiet"})
-        events.event(one.model_copy(update={"metadata": quiet}), Reason.ACCEPTED, "counts", NOW)
+        events.event(one.model_copy(update={"metadata": quiet}), EventReason.ACCEPTED, "counts", NOW)
         events.finish()
         await events.run()
 

@@ -13,7 +13,7 @@ import pytest
 from kopf._cogs.clients import api, watching
 
 from application_manager.measures import Measures
-from application_manager.watching.relay import relaying
+from application_manager.watching.operator import relaying
 from wayside.kubernetes.errors import Unreachable
 
 RESOURCE = SimpleNamespace(plural="applicationtasks", get_url=lambda **_: "")

@@ -19,7 +19,7 @@ from detector.streams.tally import Tally
 from tests.driving import a_detector
 from tests.networks import PATIENCE, Arrivals, stream, wait_for
 from tests.recorded import messages_in
-from wayside.api.source import DataSource
+from wayside.api.plugin import DataSource
 from wayside.api.stream import Encoding, Stream
 
 POSE = "geometry_msgs/msg/PoseStamped"

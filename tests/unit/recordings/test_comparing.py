@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from detector.commands import cli
-from detector.engine.episodes.episodes import Reason
+from detector.engine.episodes.episodes import Ending
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.record import EpisodeRecord
 from detector.replay.comparing import compare
@@ -18,7 +18,7 @@ from tests import onnx_models
 from tests.driving import START, a_detector, a_rule, at
 from tests.recorded import write_json_lines
 from wayside.inputerror import InputError
-from wayside.process.commandline import run
+from wayside.process.commandline import run_cli
 
 
 def episodes(rule: str, *spans: tuple[float, float | None], subject: str = "car") -> list[Event]:
@@ -30,7 +30,7 @@ def episodes(rule: str, *spans: tuple[float, float | None], subject: str = "car"
         )
         for end in (None, last):
             if end is None or last is not None:
-                ended = () if end is None else (at(end), Reason.UNTIL)
+                ended = () if end is None else (at(end), Ending.UNTIL)
                 events.append(Event("h", episode, {}, *ended))
     return events
 
@@ -96,7 +96,7 @@ def test_a_learning_based_and_a_rule_based_rule_over_one_recording(
     )
     files = ["--detector", str(tmp_path / "detector.yaml"), "--rules", str(tmp_path / "rules.yaml")]
     command = ["replay", str(tmp_path / "drive.jsonl"), *files, "--output", str(tmp_path / "out")]
-    assert run(cli.app, "detector", (InputError,), [*command, "--set", "threshold=learned"]) == 0
+    assert run_cli(cli.app, "detector", (InputError,), [*command, "--set", "threshold=learned"]) == 0
     table = [line.split() for line in capsys.readouterr().err.splitlines()]
     assert ["threshold", "as", "written", "2"] in table
     assert ["rule", "learned", "1", "1", "+0", "-1", "+2.00", "s"] in [line[:8] for line in table]
@@ -105,5 +105,5 @@ def test_a_learning_based_and_a_rule_based_rule_over_one_recording(
     assert [each["startDifference"] for each in compared["both"]] == [2.0]
     events = (tmp_path / "out" / "events.jsonl").read_text()
     assert {json.loads(line)["data"]["rule"] for line in events.splitlines()} == {"threshold", "learned"}
-    assert run(cli.app, "detector", (InputError,), [*command, "--set", "threshold=lerned"]) == 2
+    assert run_cli(cli.app, "detector", (InputError,), [*command, "--set", "threshold=lerned"]) == 2
     assert "--set threshold=lerned: there is no rule lerned; did you mean learned?" in capsys.readouterr().err

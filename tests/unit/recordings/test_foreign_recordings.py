@@ -16,7 +16,7 @@ from detector.replay.intake_writer import IntakeWriter
 from detector.replay.latched import recorded_arrivals
 from detector.replay.recorded_types import with_recorded_types
 from detector.replay.replaying import replay_arrivals
-from detector.replay.routing import Router
+from detector.replay.routing import MessageRouter
 from tests.driving import a_detector, a_rule, at, reported
 from tests.recorded import messages_in
 from tests.ros_messages import cdr, odometry
@@ -91,7 +91,7 @@ def test_messages_of_another_encoder_read_as_they_were_written(recording: Path) 
 def test_a_recording_of_another_program_replays(recording: Path, clock: str) -> None:
     rule = a_rule("crowd", signals=[{"name": "n", "stream": "obstacles", "value": "size(msg.obstacles)"}], when="n > 2")
     completed = with_recorded_types(a_detector(STREAM, clock=clock, lateness="0ms"), [recording])
-    arrivals = recorded_arrivals([recording], Router(completed.spec.streams), completed)
+    arrivals = recorded_arrivals([recording], MessageRouter(completed.spec.streams), completed)
     events = reported(replay_arrivals(arrivals, completed, [rule]).events)
     assert events == ["crowd car started 4"]
 

@@ -14,7 +14,7 @@ from mcap.writer import Writer as PlainWriter
 from mcap_protobuf.writer import Writer
 
 from detector.replay.errors import RecordingError
-from detector.replay.routing import Router
+from detector.replay.routing import MessageRouter
 from detector.testing import run
 from tests.driving import a_detector, a_rule, a_stream, at
 from tests.recorded import arrivals_of, messages_in
@@ -83,7 +83,7 @@ def recording(tmp_path: Path) -> Path:
 
 def first(recording: Path, encoding: Encoding) -> bytes:
     stream = Stream(name="track", key="vehicles/${client:*}/track", encoding=encoding)
-    return next(arrivals_of(Router([stream]), messages_in([recording]))).payload
+    return next(arrivals_of(MessageRouter([stream]), messages_in([recording]))).payload
 
 
 def test_protobuf_messages_are_plain_values_in_json_and_cbor(recording: Path) -> None:
@@ -141,7 +141,7 @@ def test_another_encoding_than_replay_can_give_is_reported_with_those_it_can(rec
     with pytest.raises(
         RecordingError, match=r"track is recorded as protobuf.*streams\[t\].encoding is cdr: write json"
     ):
-        next(arrivals_of(Router([stream]), messages_in([recording])))
+        next(arrivals_of(MessageRouter([stream]), messages_in([recording])))
 
 
 def test_a_payload_that_is_no_message_is_counted_by_its_stream(recording: Path) -> None:
@@ -150,7 +150,7 @@ def test_a_payload_that_is_no_message_is_counted_by_its_stream(recording: Path) 
     with pytest.raises(ValueError, match=r"no lab\.Track"):
         message.decode(b"\xff")
     stream = Stream(name="track", key="vehicles/${client:*}/track", encoding=Encoding.JSON)
-    (arrival,) = arrivals_of(Router([stream]), [message._replace(payload=b"\xff")])
+    (arrival,) = arrivals_of(MessageRouter([stream]), [message._replace(payload=b"\xff")])
     assert arrival.payload == b"\xff"
 
 

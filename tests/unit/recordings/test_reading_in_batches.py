@@ -32,7 +32,7 @@ from detector.replay.batches import (
 from detector.replay.errors import DAMAGE, RecordingError
 from detector.replay.message import Cut, Message
 from detector.replay.recordings import open_recordings
-from detector.replay.routing import Router
+from detector.replay.routing import MessageRouter
 from tests.recorded import arrivals_of, messages_in
 from wayside.api.stream import Encoding, Stream
 
@@ -267,11 +267,11 @@ def test_what_lies_before_an_error_is_handed_over() -> None:
     for messages, error in ((broken(), "damaged"), ([*good, Message(10, "car/json", b"1", "cbor", None)], "cbor")):
         arrivals: list[Arrival] = []
         with pytest.raises(RecordingError, match=error):
-            arrivals.extend(arrivals_into(arrivals, Router([RAW, JSON]), messages))
+            arrivals.extend(arrivals_into(arrivals, MessageRouter([RAW, JSON]), messages))
         assert arrivals == [Arrival(number, "raw", "car/raw", b"x") for number in (1, 3, 5, 7, 9)]
 
 
-def arrivals_into(found: list[Arrival], router: Router, messages: Iterable[Message]) -> list[Arrival]:
+def arrivals_into(found: list[Arrival], router: MessageRouter, messages: Iterable[Message]) -> list[Arrival]:
     """Puts the arrivals into `found` up to an error."""
     for arrival in arrivals_of(router, messages):
         found.append(arrival)

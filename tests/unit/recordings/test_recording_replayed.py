@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from detector.assembly.checking import check_documents
+from detector.assembly.checking import findings
 from detector.replay.errors import RecordingError
 from detector.replay.recordings import types_of
 from detector.testing import run
@@ -79,7 +79,7 @@ def test_a_file_that_is_gone_is_reported(tmp_path: Path) -> None:
 def problems(tmp_path: Path, detector: str, rule: str) -> list[str]:
     path = tmp_path / "both.yaml"
     path.write_text(f"{detector}---{rule}")
-    return [str(each).removeprefix(f"{path}:") for each in check_documents(load_documents([path]))]
+    return [str(each).removeprefix(f"{path}:") for each in findings(load_documents([path])).problems]
 
 
 def test_a_rule_that_records_needs_to_know_where(tmp_path: Path) -> None:

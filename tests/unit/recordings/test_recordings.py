@@ -14,7 +14,7 @@ from detector.replay.errors import RecordingError
 from detector.replay.gathering import recordings_of
 from detector.replay.intake_writer import IntakeWriter
 from detector.replay.message import Cut, Message
-from detector.replay.routing import Router
+from detector.replay.routing import MessageRouter
 from detector.streams.codecs.ros import standard
 from tests.recorded import arrivals_of, messages_in
 from tests.ros_messages import cdr, odometry, pose_stamped
@@ -110,7 +110,7 @@ def test_an_intake_file_is_read_like_any_mcap_file(tmp_path: Path) -> None:
     writer.control(1, {"kind": "start"})
     writer.arrivals([Arrival(message.time, "pose", message.key, message.payload) for message in MESSAGES[:3]])
     writer.close()
-    assert list(messages_in([tmp_path / "intake.mcap"], Router([stream]).wanted)) == MESSAGES[:3]
+    assert list(messages_in([tmp_path / "intake.mcap"], MessageRouter([stream]).wanted)) == MESSAGES[:3]
 
 
 def test_several_recordings_are_merged_by_time(tmp_path: Path) -> None:
@@ -291,7 +291,7 @@ def stream(name: str, key: str, type_name: str | None = POSE_TYPE) -> Stream:
 
 
 def test_messages_go_to_every_stream_of_their_key_at_their_time_which_never_goes_back() -> None:
-    router = Router([stream("pose", "${client:*}/pose"), stream("all", "**/${client:*}/pose")])
+    router = MessageRouter([stream("pose", "${client:*}/pose"), stream("all", "**/${client:*}/pose")])
     assert router.route("car1/pose") == ("pose", "all")
     assert router.route("odom") == ()
     assert router.unrouted == ["odom"]
@@ -318,6 +318,6 @@ def test_a_message_of_another_type_than_its_streams_is_an_error_that_names_both(
     declared: Stream, words: list[str]
 ) -> None:
     with pytest.raises(RecordingError) as caught:
-        list(arrivals_of(Router([declared]), MESSAGES))
+        list(arrivals_of(MessageRouter([declared]), MESSAGES))
     for word in words:
         assert word in str(caught.value)

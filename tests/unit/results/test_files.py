@@ -18,7 +18,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from detector.commands.replay import replay_files
 from detector.engine.timing.timeline import ORDER
 from detector.replay.intake_writer import IntakeWriter
-from detector.results import installed
+from detector.results import kinds
 from detector.results.channels import message_path
 from detector.results.episodes import TIMES
 from detector.results.kinds import ResultKind, chosen
@@ -271,8 +271,8 @@ def test_each_of_several_recordings_has_files_of_its_own(tmp_path: Path) -> None
 
 def test_a_missing_package_is_named_before_the_replay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     recording, detector, rules = write(tmp_path)
-    monkeypatch.setattr(installed, "find_spec", lambda name: None)
-    with pytest.raises(installed.MissingExtraError, match=r"mcap needs foxglove: pip install 'wayside\[results\]'"):
+    monkeypatch.setattr(kinds, "find_spec", lambda name: None)
+    with pytest.raises(kinds.MissingExtraError, match=r"mcap needs foxglove: pip install 'wayside\[results\]'"):
         replay_files([recording], tmp_path / "out", detector, [rules], as_one=False, kinds=frozenset({ResultKind.MCAP}))
     assert not (tmp_path / "out").exists()
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from detector.results.series import Series
-from detector.results.thinning import thinned
+from detector.results.series import Series, thinned
 
 NOTHING = np.zeros(0, np.int64)
 

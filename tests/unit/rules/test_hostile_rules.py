@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from detector.actions.secrets import secret_problems
+from detector.actions.registry import secret_problems
 from detector.assembly import RuleIndex, inlets
 from tests.driving import Drive, a_detector, a_rule, arrival
 from wayside.expressions import CelType, Environment, ExpressionError

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from detector.assembly.checking import check_documents
+from detector.assembly.checking import findings
 from tests.driving import POSITION, Drive, a_deploy, a_detector, a_rule, arrival, compiled
 from wayside.api import Detector, EventRule
 from wayside.api.documents import load_documents
@@ -232,11 +232,11 @@ spec:
   when: v > parameters.maxSpeed
 """
     )
-    found = check_documents(load_documents([detector, rule]))
+    found = findings(load_documents([detector, rule])).problems
     texts = [str(problem).replace(f"{tmp_path}/", "") for problem in found]
     assert len(texts) == 2
     assert texts[0].startswith("detector.yaml:9:")
     assert "EventRule too-fast has no parameter maxSped; did you mean maxSpeed?" in texts[0]
     assert texts[1].startswith("detector.yaml:10:")
     assert "there is no EventRule too-slow here" in texts[1]
-    assert check_documents(load_documents([detector])) == []
+    assert findings(load_documents([detector])).problems == []

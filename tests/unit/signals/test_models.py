@@ -14,7 +14,7 @@ from onnx import helper
 from rosbags.typesys import Stores, get_typestore
 
 from detector.assembly import RuleIndex, inlets, make_engine
-from detector.assembly.checking import check_documents
+from detector.assembly.checking import findings
 from detector.engine.samples.sample import Arrival
 from tests import onnx_models
 from tests.driving import SPEED, Drive, a_detector, a_rule, a_stream, arrival, at
@@ -268,7 +268,7 @@ def problems(tmp_path: Path, signal: dict[str, Any], detector: Detector | None =
     rule = a_rule("r", signals=[SPEED, GAP, signal], when="true")
     (tmp_path / "d.json.yaml").write_text((detector or a_detector()).model_dump_json(by_alias=True, exclude_none=True))
     (tmp_path / "r.json.yaml").write_text(rule.model_dump_json(by_alias=True, exclude_none=True))
-    return [str(problem) for problem in check_documents(load_documents([tmp_path]))]
+    return [str(problem) for problem in findings(load_documents([tmp_path])).problems]
 
 
 @pytest.mark.parametrize(

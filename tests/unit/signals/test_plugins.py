@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from detector.assembly.checking import check_documents
-from detector.plugins.instances import LocalHost
+from detector.assembly.checking import findings
+from detector.plugins.instances import LocalHost, plain_value
 from detector.plugins.registry import OFFERS
-from detector.plugins.values import plain_value
 from tests.driving import POSITION, START, a_detector, a_stream, arrival, at
 from tests.plugins.rules import PluginDrive, plugin_rule, plugins
 from wayside.api import EventRule
@@ -43,7 +42,7 @@ def drive(*rules: EventRule, **spec: Any) -> PluginDrive:
 def problems(tmp_path: Path, plugin: str, parameters: str, when: str = "p.count > 3") -> list[str]:
     (tmp_path / "d.json").write_text(a_detector().model_dump_json(by_alias=True, exclude_none=True))
     (tmp_path / "r.yaml").write_text(RULES % (plugin, parameters, when))
-    found = check_documents(load_documents([tmp_path]))
+    found = findings(load_documents([tmp_path])).problems
     return [str(problem).removeprefix(f"{tmp_path}/") for problem in found]
 
 

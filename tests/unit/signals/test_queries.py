@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from detector.engine.queries.geometry import Pose, slerp, unit
 from detector.engine.queries.poses import PoseError, pose_in
 from detector.engine.queries.queries import BufferQueries
-from detector.engine.queries.tuples import matched, nearest
+from detector.engine.queries.tuples import matched, nearest_index
 from tests.driving import Drive, a_detector, a_stream, arrival, at
 
 STAMPED = {"stamp": "msg.t"}
@@ -177,7 +177,7 @@ def test_tuples_are_those_of_the_definition_and_share_no_sample(stamps: list[lis
 
 @given(st.lists(st.integers(0, 40), min_size=1).map(sorted), st.integers(-5, 50))
 def test_the_nearest_stamp_is_the_first_of_those_nearest(stamps: list[int], time: int) -> None:
-    assert nearest(stamps, time) == min(range(len(stamps)), key=lambda i: (abs(stamps[i] - time), stamps[i], i))
+    assert nearest_index(stamps, time) == min(range(len(stamps)), key=lambda i: (abs(stamps[i] - time), stamps[i], i))
 
 
 def test_samples_of_two_streams_are_matched_by_stamp_whenever_they_came() -> None:

@@ -6,7 +6,7 @@ import re
 from typing import Any
 
 from application_manager.commands.explanationtext import explanation_text
-from application_manager.core.statuses.explaining import Found, explain, serving
+from application_manager.core.statuses.explaining import Found, explanation_of, serving
 from application_manager.core.statuses.explanation import Explanation
 from tests.guides import guide
 from tests.unit.manager_objects import NOW, instance, task, template
@@ -79,7 +79,7 @@ TASKS = [
 def explained(about: str | None = "scene-a", tasks: Any = TASKS, **more: Any) -> Explanation:
     found = Found([template(**FUSION)], tasks, more.pop("instances", [running()]), **more)
     requested = next((each for each in tasks if each.name == about), None)
-    return explain(found, task=about, instance=serving(found, requested, NOW) if requested else NAME, now=NOW)
+    return explanation_of(found, task=about, instance=serving(found, requested, NOW) if requested else NAME, now=NOW)
 
 
 def contributions(explanation: Explanation, parameter: str) -> dict[str, str]:
@@ -122,7 +122,7 @@ def test_a_task_that_differs_where_all_must_agree_is_reported_among_those_of_the
         task("first", {"region": "north", "model": "a"}),
         task("other", {"region": "north", "model": "b"}, created=1),
     ]
-    found = explain(Found([template(**spec)], tasks, []), task="other", instance=NAME, now=NOW)
+    found = explanation_of(Found([template(**spec)], tasks, []), task="other", instance=NAME, now=NOW)
     assert {each.name: each.reason for each in found.tasks} == {"first": "Accepted", "other": "Conflict"}
     assert contributions(found, "model") == {"first": "decides", "other": "none"}
     assert found.instance is not None
@@ -137,7 +137,7 @@ def test_a_holder_that_the_manager_counts_as_lost_is_lost_in_the_explanation() -
 
 
 def test_a_missing_template_ends_the_chain() -> None:
-    found = explain(Found([], [TASKS[0]], []), task="scene-a", instance=None, now=NOW)
+    found = explanation_of(Found([], [TASKS[0]], []), task="scene-a", instance=None, now=NOW)
     assert found.template.problem == "does not exist"
     assert found.task is not None
     assert found.task.reason == "TemplateNotFound"
@@ -172,7 +172,7 @@ def test_the_text_shows_what_each_task_does_and_whose_values_lost_and_why() -> N
 def test_who_has_no_place_under_a_limit_waits_though_nobody_has_written_it() -> None:
     one, two = task("one", {"region": "north"}), task("two", {"region": "south"}, created=1)
     found = Found([template(**FUSION, maxInstances=1)], [one, two], [running()])
-    reported = explain(found, task="two", instance=serving(found, two, NOW), now=NOW)
+    reported = explanation_of(found, task="two", instance=serving(found, two, NOW), now=NOW)
     assert reported.task is not None
     assert (reported.task.standing, reported.task.reason) == ("Waiting", "LimitReached")
 
@@ -181,7 +181,7 @@ def test_a_sum_that_is_held_at_its_bound_reports_what_it_would_be() -> None:
     spec = {"parameters": {"uplink": {"type": "number", "maximum": 100, "merge": "Sum"}}}
     tasks = [task("one", {"uplink": 60}), task("two", {"uplink": 70})]
     found = Found([template(**spec)], tasks, [])
-    reported = explanation_text(explain(found, task="one", instance=serving(found, tasks[0], NOW), now=NOW))
+    reported = explanation_text(explanation_of(found, task="one", instance=serving(found, tasks[0], NOW), now=NOW))
     assert "  uplink = 100 (merge Sum): the sum of 2 values, 130, is capped at the maximum of 100\n" in reported
 
 

@@ -20,7 +20,7 @@ _KINDS = ("deploy", "record", "database", "trigger", "notify", "plugin")
 _ONE = f"give exactly one of {', '.join(_KINDS[:-1])} and {_KINDS[-1]}"
 
 
-class Action(Model):
+class ActionSpec(Model):
     """One action of an episode."""
 
     model_config = validations(
@@ -46,7 +46,7 @@ class Action(Model):
     plugin: ActionPlugin | None = Field(default=None, description="Runs an action of an installed package.")
 
     @model_validator(mode="after")
-    def _one_kind(self) -> Action:
+    def _one_kind(self) -> ActionSpec:
         if sum(getattr(self, kind) is not None for kind in _KINDS) != 1:
             raise ValueError(_ONE)
         return self

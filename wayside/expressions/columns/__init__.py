@@ -10,8 +10,7 @@ them into steps, and `operations` runs a step. Where a row holds what columns ca
 ordered, `Results.foreign` marks the row, and the caller evaluates the expression itself there.
 """
 
-from wayside.expressions.columns.graph import Graph
-from wayside.expressions.columns.lowering import Constant
+from wayside.expressions.columns.lowering import Constant, Graph
 from wayside.expressions.columns.program import Program, Results
 from wayside.expressions.columns.values import MISSING, NOWHERE, Column, Tag, Texts, column_of, value_at
 

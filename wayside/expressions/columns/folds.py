@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 
 from wayside.expressions.cel import CelType, Expression
 from wayside.expressions.columns.lowering import Part
-from wayside.expressions.syntax import Call, Collection, Constant, Loop, Name, Node, Select
+from wayside.expressions.syntax import Call, Collection, Loop, Name, Node, Scalar, Select
 
 
 class How(enum.Enum):
@@ -65,7 +65,7 @@ def _without_loops(node: Node, items: str, whole: Expression, folds: dict[str, F
         while name in whole.kinds:
             name += "_"
         folds[name] = Fold(how, variable, part)
-        return Call("_==_", None, (Name(name), Constant(1.0))) if one else Name(name)
+        return Call("_==_", None, (Name(name), Scalar(1.0))) if one else Name(name)
     match node:
         case Call(function, None, arguments):
             return Call(function, None, tuple(_without_loops(each, items, whole, folds) for each in arguments))
@@ -101,7 +101,7 @@ def _count(counted: Node, items: str) -> _Found | None:
             (variable,),
             total,
             Collection(False, ()),
-            (Constant(True), Call("_?_:_", None, (predicate, Call("_+_", None, (Name(one), added)), Name(other)))),
+            (Scalar(True), Call("_?_:_", None, (predicate, Call("_+_", None, (Name(one), added)), Name(other)))),
             Name(result),
         ) if over == items and one == other == result == total and added == Collection(False, (Name(variable),)):
             return How.COUNT, variable, predicate, False
@@ -111,15 +111,15 @@ def _count(counted: Node, items: str) -> _Found | None:
 def _of_loop(variable: str, total: str, start: Node, stop: Node, step: Node, end: Node) -> _Found | None:
     so_far = Name(total)
     match start, step:
-        case Constant(False), Call("_||_", None, (before, predicate)) if (before, end) == (so_far, so_far):
+        case Scalar(False), Call("_||_", None, (before, predicate)) if (before, end) == (so_far, so_far):
             return How.ANY, variable, predicate, False
-        case Constant(True), Call("_&&_", None, (before, predicate)) if (before, end) == (so_far, so_far):
+        case Scalar(True), Call("_&&_", None, (before, predicate)) if (before, end) == (so_far, so_far):
             return How.ALL, variable, predicate, False
-        case Constant(0), Call("_?_:_", None, (predicate, more, other)) if (
+        case Scalar(0), Call("_?_:_", None, (predicate, more, other)) if (
             other == so_far
-            and stop == Constant(True)
-            and more == Call("_+_", None, (so_far, Constant(1)))
-            and end == Call("_==_", None, (so_far, Constant(1)))
+            and stop == Scalar(True)
+            and more == Call("_+_", None, (so_far, Scalar(1)))
+            and end == Call("_==_", None, (so_far, Scalar(1)))
         ):
             return How.COUNT, variable, predicate, True
     return None

@@ -6,11 +6,11 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from wayside.expressions.columns.frame import Frame, Source
+from wayside.expressions.columns.frame import Array, Frame
 from wayside.expressions.columns.nodes import Concern, Holds, Nodes, Op, Watch
 from wayside.expressions.columns.values import Bools, Bytes, Tag
 
-Places = Mapping[int, tuple[Source, int]]
+Places = Mapping[int, tuple[Array, int]]
 Found = Mapping[int, Bools]
 """bool[n] by the number of a watch: the rows that it found, if any."""
 
@@ -32,7 +32,7 @@ class Foreign:
         self._rest: list[tuple[int, Watch]] = []
         for watch, number in numbers.items():
             rows = [places[node][1] for node in watch.nodes]
-            if watch.concern is Concern.UNEXPECTED or any(places[n][0] is not Source.LEAVES for n in watch.nodes):
+            if watch.concern is Concern.UNEXPECTED or any(places[n][0] is not Array.LEAVES for n in watch.nodes):
                 self._rest.append((number, watch))
             elif watch.concern is Concern.OTHER:
                 self._of_others[rows[0]] = number
@@ -83,9 +83,9 @@ class Foreign:
     def _tags(self, node: int, frame: Frame) -> Bytes | None:
         """The tags of a node; None: all are numbers."""
         source, row = self._places[node]
-        if source is Source.LEAVES and not frame.tagged:
+        if source is Array.LEAVES and not frame.tagged:
             return None
-        tags: Bytes = (frame.leaf_tags if source is Source.LEAVES else frame.mixed_tags)[row]
+        tags: Bytes = (frame.leaf_tags if source is Array.LEAVES else frame.mixed_tags)[row]
         return tags
 
 

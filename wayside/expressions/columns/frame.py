@@ -23,7 +23,7 @@ ONE: Final = np.uint8(1)
 THREE: Final = np.uint8(3)
 
 
-class Source(enum.IntEnum):
+class Array(enum.IntEnum):
     """The array that an operand lies in."""
 
     CONSTANT = 0
@@ -37,7 +37,7 @@ class Source(enum.IntEnum):
 class Operand:
     """k nodes as one operand of k operations."""
 
-    source: Source
+    source: Array
     rows: Rows
     """The index in that array; for constants, the index in `values`."""
     partial: bool
@@ -123,11 +123,11 @@ class Frame:
         """The operand's numbers, and where there is one; None: everywhere."""
         rows = operand.rows
         match operand.source:
-            case Source.LEAVES:
+            case Array.LEAVES:
                 return self.leaves[rows], self.leaf_known[rows] if self.tagged else None
-            case Source.NUMBERS:
+            case Array.NUMBERS:
                 return self.numbers[rows], self.known[rows] if self.tagged or operand.partial else None
-            case Source.CONSTANT:
+            case Array.CONSTANT:
                 return operand.values, None
         return self.mixed[rows], self.mixed_tags[rows] == NUMBER
 
@@ -135,15 +135,15 @@ class Frame:
         """The rows in which the operand is true, and those in which it is false."""
         rows = operand.rows
         match operand.source:
-            case Source.TRUTHS:
+            case Array.TRUTHS:
                 true = self.true[rows]
                 return true, self.false[rows] if self.tagged or operand.partial else ~true
-            case Source.LEAVES if not self.tagged:
+            case Array.LEAVES if not self.tagged:
                 never = np.zeros((1, self.leaves.shape[1]), bool)
                 return never, never
-            case Source.LEAVES:
+            case Array.LEAVES:
                 return _truths(self.leaves[rows], self.leaf_tags[rows])
-            case Source.CONSTANT:
+            case Array.CONSTANT:
                 true = operand.values != 0
                 return true, ~true
         return _truths(self.mixed[rows], self.mixed_tags[rows])
@@ -152,13 +152,13 @@ class Frame:
         """The operand's values and tags; None: they are all numbers."""
         rows = operand.rows
         match operand.source:
-            case Source.LEAVES:
+            case Array.LEAVES:
                 return self.leaves[rows], self.leaf_tags[rows] if self.tagged else None
-            case Source.MIXED:
+            case Array.MIXED:
                 return self.mixed[rows], self.mixed_tags[rows]
-            case Source.CONSTANT:
+            case Array.CONSTANT:
                 return operand.values, operand.tags
-            case Source.NUMBERS:
+            case Array.NUMBERS:
                 values, known = self.number(operand)
                 return values, None if known is None else known.view(np.uint8)  # True is the tag of a number
         true, false = self.truth(operand)

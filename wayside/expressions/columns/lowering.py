@@ -11,8 +11,7 @@ from wayside.expressions.columns.functions import about_place, takes_columns
 from wayside.expressions.columns.nodes import Holds, Nodes, Op
 from wayside.expressions.columns.values import Tag
 from wayside.expressions.projection import integer
-from wayside.expressions.syntax import Call, Collection, Node, Path, Select, path_of
-from wayside.expressions.syntax import Constant as Literal
+from wayside.expressions.syntax import Call, Collection, Node, Path, Scalar, Select, path_of
 from wayside.geo.geometry import shape_of
 
 _ARITHMETIC: Final = {"_+_": Op.ADD, "_-_": Op.SUBTRACT, "_*_": Op.MULTIPLY, "_/_": Op.DIVIDE}
@@ -89,7 +88,7 @@ class _Lowering:
         if path is not None and not (isinstance(node, Select) and node.test_only):
             return self._given(path)
         match node:
-            case Literal(bool() | float() | str() as value):
+            case Scalar(bool() | float() | str() as value):
                 return self._constant(value)
             case Select(_, _, True) if path is not None:
                 return self._has(path)
@@ -113,7 +112,7 @@ class _Lowering:
                 return self._in(a, elements)
             case Call("_?_:_", None, (condition, a, b)):
                 return self._choose(condition, a, b)
-            case Call(name, None, (*given, Literal(str() as key))) if about_place(name):
+            case Call(name, None, (*given, Scalar(str() as key))) if about_place(name):
                 return self._graph.node(
                     Op.CALL,
                     Holds.NUMBERS,
@@ -188,7 +187,7 @@ class _Lowering:
         return self._graph.node(Op.EQUAL, Holds.TRUTHS, (self._lower(a), self._lower(b)))
 
     def _in(self, sought: Node, elements: tuple[Node, ...]) -> int:
-        literals = [each.value for each in elements if isinstance(each, Literal)]
+        literals = [each.value for each in elements if isinstance(each, Scalar)]
         if not elements or len(literals) < len(elements) or len(elements) > _MOST_ELEMENTS:
             raise LoweringError
         self._check_not_null(sought)
@@ -229,3 +228,20 @@ def _check_text(text: str) -> None:
         text.encode()
     except UnicodeEncodeError:
         raise LoweringError from None
+
+
+class Graph(Nodes):
+    """Nodes that the expressions of all rules share: equal operations on equal operands are one node."""
+
+    def add(self, expression: Expression | Part, leaf: Leaves) -> int | None:
+        """The node of the expression's result; None where the columns cannot take it, and the graph stays as it was.
+
+        `leaf` names each literal path that the expression reads: the same name is the same leaf for all expressions.
+        It may give a Constant in its place, or None if there is no such column.
+        """
+        before = len(self.nodes)
+        try:
+            return lower(self, expression, leaf)
+        except LoweringError:
+            self.forget(before)
+            return None

@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from wayside.expressions.columns.frame import ABSENT, BOOLEAN, NUMBER, ONE, THREE, Frame, Operand, Source
+from wayside.expressions.columns.frame import ABSENT, BOOLEAN, NUMBER, ONE, THREE, Array, Frame, Operand
 from wayside.expressions.columns.functions import Called, calculate
 from wayside.expressions.columns.nodes import Op
 from wayside.expressions.columns.values import Bools, Bytes, Doubles, Tag
@@ -28,7 +28,7 @@ class Step:
     operands: tuple[Operand, ...]
     out: slice
     partial: bool
-    into: Source
+    into: Array
     function: Called = ("", 0)
 
     def __call__(self, frame: Frame) -> None:
@@ -92,7 +92,7 @@ def _call(frame: Frame, step: Step) -> None:
         given.append(x)
         if known is not None:
             wanted &= known
-        if operand.source is not Source.CONSTANT:
+        if operand.source is not Array.CONSTANT:
             wanted &= ~np.isnan(x)  # no function takes NaN
     results, answered = calculate(step.function, given, wanted)
     out[...] = results
@@ -119,7 +119,7 @@ def _order(comparison: np.ufunc, frame: Frame, step: Step) -> None:
 
 
 def _numeric(operand: Operand) -> bool:
-    return operand.source is Source.NUMBERS or (operand.source is Source.CONSTANT and operand.tags is None)
+    return operand.source is Array.NUMBERS or (operand.source is Array.CONSTANT and operand.tags is None)
 
 
 def _equal(frame: Frame, step: Step) -> None:
@@ -161,7 +161,7 @@ def _junction(frame: Frame, step: Step, of_true: np.ufunc, of_false: np.ufunc) -
 
 
 def _true(frame: Frame, operand: Operand) -> Bools:
-    return frame.true[operand.rows] if operand.source is Source.TRUTHS else frame.truth(operand)[0]
+    return frame.true[operand.rows] if operand.source is Array.TRUTHS else frame.truth(operand)[0]
 
 
 def _not(frame: Frame, step: Step) -> None:
@@ -195,14 +195,14 @@ def _choose(frame: Frame, step: Step) -> None:
     condition, first, second = step.operands
     yes, no = frame.truth(condition)
     match step.into:
-        case Source.NUMBERS:
+        case Array.NUMBERS:
             (x, x_known), (y, y_known) = frame.number(first), frame.number(second)
             frame.numbers[step.out] = np.where(yes, x, y)
             if frame.tagged or step.partial:
                 frame.known[step.out] = (yes if x_known is None else yes & x_known) | (
                     no if y_known is None else no & y_known
                 )
-        case Source.TRUTHS:
+        case Array.TRUTHS:
             (x_true, x_false), (y_true, y_false) = frame.truth(first), frame.truth(second)
             frame.true[step.out] = (yes & x_true) | (no & y_true)
             frame.false[step.out] = (yes & x_false) | (no & y_false)

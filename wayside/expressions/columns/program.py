@@ -12,13 +12,13 @@ from typing import Final
 import numpy as np
 
 from wayside.expressions.columns.foreign import Foreign, Found
-from wayside.expressions.columns.frame import ABSENT, NUMBER, Frame, Memory, Operand, Rows, Sizes, Source
+from wayside.expressions.columns.frame import ABSENT, NUMBER, Array, Frame, Memory, Operand, Rows, Sizes
 from wayside.expressions.columns.functions import Called
 from wayside.expressions.columns.nodes import GIVEN, Holds, Node, Nodes, Op
 from wayside.expressions.columns.operations import UNKNOWN_OF_NUMBERS, Step
 from wayside.expressions.columns.values import Bools, Bytes, Column, Doubles, Tag, Texts
 
-_SOURCES: Final = {Holds.NUMBERS: Source.NUMBERS, Holds.TRUTHS: Source.TRUTHS, Holds.ANY: Source.MIXED}
+_SOURCES: Final = {Holds.NUMBERS: Array.NUMBERS, Holds.TRUTHS: Array.TRUTHS, Holds.ANY: Array.MIXED}
 _NO_DOUBLES: Final = np.zeros((0, 1))
 _CACHE_SIZE: Final = 256
 _TAGS: Final[dict[type, Tag]] = {bool: Tag.BOOLEAN, str: Tag.TEXT}
@@ -36,13 +36,13 @@ class Program:
         wanted = sorted(_reachable(graph, roots))
         leaves = [number for number in wanted if self._nodes[number].op is Op.LEAF]
         self.leaves = tuple(self._nodes[number].detail for number in leaves)
-        self._places: dict[int, tuple[Source, int]] = {leaf: (Source.LEAVES, row) for row, leaf in enumerate(leaves)}
+        self._places: dict[int, tuple[Array, int]] = {leaf: (Array.LEAVES, row) for row, leaf in enumerate(leaves)}
         self._partial: dict[int, bool] = {}
         for number in wanted:
             node = self._nodes[number]
             self._partial[number] = self._is_partial(node)
             if node.op is Op.CONSTANT:
-                self._places[number] = (Source.CONSTANT, 0)
+                self._places[number] = (Array.CONSTANT, 0)
             elif node.op is Op.EXPECT:
                 self._places[number] = self._places[node.operands[0]]
         self._steps, self._sizes = self._put_into_steps(wanted)
@@ -121,7 +121,7 @@ class Program:
             for key in depths[depth]:
                 numbers = sorted(groups[key], key=lambda each: [self._places[o] for o in self._nodes[each].operands])
                 steps.append(self._step(numbers, counts))
-        return steps, Sizes(counts[Source.NUMBERS], counts[Source.TRUTHS], counts[Source.MIXED])
+        return steps, Sizes(counts[Array.NUMBERS], counts[Array.TRUTHS], counts[Array.MIXED])
 
     def _shape(self, node: Node) -> tuple[object, ...]:
         """The common properties of the operands of the nodes in one step."""
@@ -136,7 +136,7 @@ class Program:
             for number, operand in zip(node.operands, operands, strict=True)
         )
 
-    def _step(self, numbers: Sequence[int], counts: dict[Source, int]) -> Step:
+    def _step(self, numbers: Sequence[int], counts: dict[Array, int]) -> Step:
         node = self._nodes[numbers[0]]
         operands = tuple(
             self._operand([self._nodes[number].operands[position] for number in numbers])
@@ -152,7 +152,7 @@ class Program:
     def _operand(self, numbers: Sequence[int]) -> Operand:
         source, _ = self._places[numbers[0]]
         partial = any(self._partial[number] for number in numbers)
-        if source is not Source.CONSTANT:
+        if source is not Array.CONSTANT:
             return Operand(source, _rows([self._places[number][1] for number in numbers]), partial, _NO_DOUBLES, None)
         details = [self._nodes[number].detail for number in numbers]
         values = np.array([[self._double(each)] for each in details])
@@ -207,7 +207,7 @@ class Results:
         if not roots:
             return np.zeros((0, n), bool), np.zeros((0, n), bool)
         operand = self._program.operand(roots)
-        if operand.source is not Source.TRUTHS:
+        if operand.source is not Array.TRUTHS:
             raise ValueError("the roots are not boolean: use the nodes that Graph.truth returns for them")
         true, false = self._frame.truth(operand)
         if operand.partial and not self._frame.tagged:  # nobody wrote where the others are false

@@ -12,13 +12,12 @@ from typing import Final
 
 from wayside.expressions.functions import (
     angles,
-    bounded,
     comparing,
-    digits,
     motion,
     numbers,
     octets,
     places,
+    preparing,
     whereabouts,
 )
 from wayside.expressions.functions.declaring import Function
@@ -36,8 +35,7 @@ OF_FIELDS: Final[Mapping[str, Function]] = MappingProxyType({each.name: each for
 """Not for authors: the functions that fields of `at` and `seenFrom` become (see `expanding`)."""
 
 DECLARATIONS: Final = [
-    digits.DECLARATION,
-    bounded.DECLARATION,
+    *preparing.DECLARATIONS,
     *(function.declaration() for function in (*FUNCTIONS.values(), *OF_FIELDS.values())),
 ]
 """As CEL takes them."""

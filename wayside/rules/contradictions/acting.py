@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from wayside.api.actions.action import Action
+from wayside.api.actions.action import ActionSpec
 from wayside.api.actions.notify import NotifyAction
 from wayside.api.operation import Operation
 from wayside.api.scheme import TypeOfAction
@@ -52,7 +52,7 @@ _OF_OPERATION = {
 }
 
 
-def types(action: Action) -> Types:
+def types(action: ActionSpec) -> Types:
     """The types that the action can have."""
     if action.deploy is not None:
         return _OF_OPERATION[action.deploy.operation]
@@ -67,7 +67,7 @@ def types(action: Action) -> Types:
     return _CALLS
 
 
-def delay_ns(action: Action) -> int:
+def delay_ns(action: ActionSpec) -> int:
     """How long the action waits before it does anything, in nanoseconds."""
     notify: NotifyAction | None = action.notify
     return 0 if notify is None or notify.grouping is None else notify.grouping.wait.ns

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 from detector.engine.samples.sample import DecodeError
-from detector.streams.codecs.doubles import number
+from detector.streams.codecs.doubles import as_double
 from detector.streams.codecs.etsi.asn1 import Integer
 from detector.streams.codecs.etsi.times import unix_ns
 
@@ -109,7 +109,7 @@ def quantity(kind: Integer) -> Plain:
         return _time
     unit = _OF_OTHER_RELEASES.get((kind.name, kind.high or 0)) or UNITS.get(kind.name)
     if unit is None:
-        return number if not null else lambda value: None if value in null else number(value)
+        return as_double if not null else lambda value: None if value in null else as_double(value)
     null |= unit.null
     up, down = float(unit.step.numerator), float(unit.step.denominator)
     # One multiplication and one division of exact numbers: 4711 steps of 0.01 are 47.11, not 47.110000000000003.

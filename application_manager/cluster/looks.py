@@ -1,0 +1,92 @@
+"""Looks at objects that are not watched, where the account may list them.
+
+Nodes matter only while an application that is bound to some of them does not become ready, and show what the scheduler
+does not report. A cluster has many Events: those about a workload matter only while its pods cannot be created, and its
+own status does not give the reason.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+
+from application_manager.core.health.placement import Nodes
+from application_manager.core.health.refusals import FAILED_CREATE
+from wayside.kubernetes.client import Client
+from wayside.kubernetes.errors import ApiError, Unreachable
+from wayside.kubernetes.resources import EVENTS, Object, Resource
+
+NODES = Resource("v1", "Node", "nodes", namespaced=False)
+FRESH = 2.0  # s for which an answer is used again
+FORBIDDEN_FOR = 60.0  # s until what may not be listed is listed again
+_NEWEST = 50  # Events of one workload that are read; their number is bounded by the API server keeping them for an hour
+
+log = logging.getLogger(__name__)
+
+
+class _Look:
+    """Lists objects of a kind, and logs once that they cannot be listed."""
+
+    def __init__(self, client: Client, resource: Resource, without: str) -> None:
+        """`without`: the log's message, with a place for the error, about what is missing without them."""
+        self._client = client
+        self._resource = resource
+        self._without = without
+        self._forbidden_until = 0.0  # monotonic
+        self._logged = False
+
+    async def objects(self, namespace: str | None, fields: str = "", limit: int = 0) -> list[Object] | None:
+        """The objects; None where they may not be listed, or the API server does not answer."""
+        if time.monotonic() < self._forbidden_until:
+            return None
+        try:
+            found, _ = await self._client.list(self._resource, namespace, fields=fields, limit=limit)
+        except ApiError as error:
+            if error.code == 403:
+                self._forbidden_until = time.monotonic() + FORBIDDEN_FOR
+            if not self._logged:
+                log.info(self._without, error)
+                self._logged = True
+            return None
+        except Unreachable:
+            return None
+        return found
+
+
+class FailedPodsLook:
+    """The Events FailedCreate of workloads."""
+
+    def __init__(self, client: Client) -> None:
+        self._look = _Look(
+            client,
+            EVENTS,
+            "cannot list Events (%s): statuses do not give the reason why pods of a StatefulSet cannot be created",
+        )
+
+    async def events(self, namespace: str, uid: str) -> list[Object]:
+        """Those of the object with this uid; none where they may not be listed, or the API server does not answer."""
+        return await self._look.objects(namespace, f"regarding.uid={uid},reason={FAILED_CREATE}", _NEWEST) or []
+
+
+class NodeLook:
+    """The labels of all nodes, a few seconds old at most."""
+
+    def __init__(self, client: Client) -> None:
+        self._look = _Look(client, NODES, "cannot list nodes (%s): only the scheduler reports why a pod fits no node")
+        self._known: Nodes | None = None
+        self._until = 0.0  # monotonic time until which what is known is used
+        self._looking = asyncio.Lock()
+
+    async def labels(self) -> Nodes | None:
+        """The labels of nodes by name; None where they may not be listed, or the API server does not answer."""
+        async with self._looking:
+            if time.monotonic() >= self._until:
+                found = await self._look.objects(None)
+                self._until = time.monotonic() + FRESH
+                self._known = (
+                    None
+                    if found is None
+                    else {str(each["metadata"]["name"]): each["metadata"].get("labels") or {} for each in found}
+                )
+            return self._known
