@@ -319,12 +319,12 @@ class Client:
         writes: bool | None = None,
     ) -> Object:
         changes = method != "GET" if writes is None else writes
-        raw = await self._send(_Request(method, path, query or {}, body, content_type, changes))
-        return cast("Object", self._decode(raw))
+        request = _Request(method, path, query or {}, body, content_type, changes)
+        return cast("Object", self._decode(await self._send(request)))
 
     async def check_granted(self, namespace: str) -> None:
         """Raise NotGranted unless the client may write in the namespace; each write checks this by itself."""
-        if self.may_write is not None and not await self.may_write(namespace):
+        if namespace and self.may_write is not None and not await self.may_write(namespace):
             raise NotGranted(namespace)
 
     async def _send(self, request: _Request) -> bytes:
@@ -332,10 +332,8 @@ class Client:
         deadline = time.monotonic() + _PATIENCE
         found = _NAMESPACE.search(request.path)
         namespace = found[1] if found is not None and request.writes else ""
-        if namespace:
-            await self.check_granted(namespace)
-        pacing = self._pacing
-        if pacing is None:
+        await self.check_granted(namespace)
+        if (pacing := self._pacing) is None:
             return await self._send_once(request)
         while True:
             try:
