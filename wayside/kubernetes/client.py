@@ -240,14 +240,10 @@ class Client:
             raise
         return True
 
-    async def patch(
-        self, resource: Resource, namespace: str, name: str, uid: str, operations: Sequence[Object]
-    ) -> Object:
+    async def patch(self, resource: Resource, namespace: str, name: str, uid: str, changes: Sequence[Object]) -> Object:
         """Apply a JSON patch to the object with this uid; as stored."""
         test = {"op": "test", "path": "/metadata/uid", "value": uid}
-        return await self._request(
-            "PATCH", resource.path(namespace, name), self._ours, [test, *operations], _JSON_PATCH
-        )
+        return await self._request("PATCH", resource.path(namespace, name), self._ours, [test, *changes], _JSON_PATCH)
 
     async def merge_members(self, resource: Resource, name: str, body: Object) -> Object:
         """Merge into an object of the cluster, lists by their members' names."""
