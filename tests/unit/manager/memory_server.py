@@ -43,6 +43,9 @@ class MemoryServer:
         self.objects[raw["kind"], raw["metadata"]["name"]] = {**deepcopy(raw), "metadata": metadata}
         return deepcopy(self.objects[raw["kind"], raw["metadata"]["name"]])
 
+    async def check_granted(self, namespace: str) -> None:
+        """It may write in all namespaces."""
+
     async def get(self, resource: Resource, namespace: str, name: str) -> Object | None:
         return deepcopy(self.objects.get((resource.kind, name)))
 
