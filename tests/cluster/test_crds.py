@@ -219,7 +219,7 @@ class TestKubectl:
             ("eventrule.spec.when", "the condition that starts an episode"),
             ("detector.spec.streams.key", "captures the name of the client"),
             ("applicationtemplate.spec.parameters.merge", "Union, Intersection: the items"),
-            ("applicationtask.spec.endTime", "Absent while the demand holds"),
+            ("applicationtask.spec.endTime", "Absent while the demand is live"),
             ("applicationinstance.status.releaseTime", "The end of the linger time"),
         ],
     )

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 from detector.actions.deploy.kubernetes_store import KubernetesTaskStore
@@ -131,7 +132,9 @@ def test_a_demand_becomes_a_task_that_ends_with_it(api: Api, namespace: str, run
 
 
 def test_the_values_at_the_start_are_kept(api: Api, namespace: str, running: Running) -> None:
-    wanted = demand(namespace, values={"distance": 149.5, "a": {"client": "car1", "streams": ["pose"]}})
+    wanted = demand(namespace)
+    values = {"distance": 149.5, "a": {"client": "car1", "streams": ["pose"]}}
+    wanted = dataclasses.replace(wanted, episode=msgspec.structs.replace(wanted.episode, values=values))
     running.update(by_name(wanted))
     tasks_are(api, {wanted.name})
     assert running.restored() == [wanted]

@@ -67,7 +67,7 @@ def test_parameters_and_templates_that_are_too_large_are_refused_with_their_size
         "ApplicationTemplate", "large", lambda raw: bool(condition(raw, "Accepted")), what="it has a status"
     )
     assert condition(reported, "Accepted")["status"] == "False"
-    assert "more than the 262144" in condition(reported, "Accepted")["message"]
+    assert "at most 262144" in condition(reported, "Accepted")["message"]
     api.create(task("parameters", **{f"p{index}": "x" * 60_000 for index in range(3)}))
     refused = api.wait_for(
         "ApplicationTask", "parameters", lambda raw: bool(condition(raw, "Accepted")), what="it has a status"

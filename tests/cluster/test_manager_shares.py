@@ -66,7 +66,7 @@ def test_tasks_beyond_the_budget_of_their_namespace_wait_until_older_ones_end(
         _wait_accepted(api, name, ("LimitReached" if name == "c" else "Accepted"))
     waiting = api.get("ApplicationTask", "c")["status"]
     assert waiting["phase"] == "Waiting"
-    assert "may have 2 unfinished tasks" in waiting["message"]
+    assert "the limit of 2 unfinished tasks" in waiting["message"]
     assert api.find("Deployment", instance_name("app", "c")) is None
     end(api, "a")
     api.wait_for("Deployment", instance_name("app", "c"), lambda _: True, what="the next one is served")

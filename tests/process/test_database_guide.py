@@ -63,7 +63,7 @@ def test_a_rule_that_wants_files_needs_a_place_for_them(tmp_path: Path) -> None:
         ({"database": "a/b"}, "database"),
         ({"files": {"above": "0"}}, "quantity above zero"),
         ({"streams": ["odometri"]}, "odometry"),
-        ({"before": "1h"}, "more than the"),
+        ({"before": "1h"}, "exceeds the"),
     ],
 )
 def test_what_is_wrong_in_an_action_is_reported_with_its_place(
