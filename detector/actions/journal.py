@@ -107,7 +107,7 @@ class Journal:
             self._setting.lose("journal entries that could not be dropped", len(gone), str(error))
 
     def close(self) -> None:
-        """The last call: the next run takes over what is left."""
+        """Close the file: the next run takes over the remaining entries. The last call."""
         if self._store is None:
             return
         try:

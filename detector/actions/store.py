@@ -191,7 +191,9 @@ class DurableStore:
             self._open()
         except (sqlite3.Error, OSError) as refused:
             raise self._error(refused) from None
-        _log.error("cannot read %s; set it aside: `sqlite3 %s .recover` prints what is left", self._path, aside)
+        _log.error(
+            "cannot read %s; set it aside: `sqlite3 %s .recover` prints the remaining records", self._path, aside
+        )
 
     def _error(self, error: Exception) -> StoreError:
         if _code(error) == sqlite3.SQLITE_BUSY:
