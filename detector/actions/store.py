@@ -219,6 +219,7 @@ def action_store(folder: Path, name: str, lose: Lose) -> DurableStore:
         for key in other.keys(""):
             if (record := other.get(key)) is not None:
                 own.put(key, record)
+        own.sync()  # else a power failure could keep neither copy
         other.drop(*other.keys(""))
         other.close()
     return own
