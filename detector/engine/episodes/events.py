@@ -74,12 +74,12 @@ class Event(msgspec.Struct, frozen=True, gc=False):
         known = self.episode
         kind, what = (STARTED, "started") if self.reason is None else (ENDED, "ended")
         rule, episode, start = quote(known.rule), quote(known.id), format_time(known.start_time)
+        onset = start if known.onset_time == known.start_time else format_time(known.onset_time)
         time = start if self.end_time is None else format_time(self.end_time)
         trace = "" if self.traceparent is None else f',"traceparent":{quote(self.traceparent)}'
         recording = "" if self.recording is None else f',"recording":{quote(self.recording)}'
         element = "" if known.element is None else f',"element":{quote(known.element)}'
         reason = "" if self.end_time is None or self.reason is None else f',"endTime":"{time}","reason":"{self.reason}"'
-        values = plain_text(self.values)
         models = f',"models":{to_text(dict(self.models))}' if self.models else ""
         classification = (
             "" if known.classification is None else f',"classification":{to_text(dict(known.classification))}'
@@ -90,8 +90,8 @@ class Event(msgspec.Struct, frozen=True, gc=False):
             f',"type":"{kind}","subject":{quote(known.subject)},"time":"{time}","datacontenttype":"application/json"'
             f'{trace}{recording},"data":{{"rule":{rule},"episode":{episode}'
             f',"subjects":[{",".join(map(quote, known.clients))}]{element}'
-            f',"onsetTime":"{format_time(known.onset_time)}","startTime":"{start}"{reason}'
-            f',"values":{values}{models}{classification}{dry_run}}}}}'
+            f',"onsetTime":"{onset}","startTime":"{start}"{reason}'
+            f',"values":{plain_text(self.values)}{models}{classification}{dry_run}}}}}'
         )
 
 
