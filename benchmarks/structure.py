@@ -5,7 +5,7 @@
 For each program and the package that they share, into which much of both has moved, and for all together:
 
 - lines and modules of Python, and the longest module;
-- lines and modules without later features: without the folders of `LATER`, which came with other work;
+- lines and modules without new features: without what the commits of `FEATURES` added since the older revision;
 - small modules: under 30 lines, imported by exactly one other module;
 - loose modules: directly in the top folder, beside the folders;
 - floors: levels of the layers contract in pyproject.toml;
@@ -30,11 +30,19 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 PACKAGES = ("wayside", "detector", "application_manager")
-LATER = {
-    "detector/mining": "replays over many recordings, on one machine or on Dask (issue 20)",
+FEATURES = {
+    "the engine in columns": "f09295fc 522a3e33 eac9608b 48dcfa7e a9631c4f 83699c96 cf4b4220 21b4c109 fad1fe71 b329796e"
+    " 4dc68e97",
+    "the manager's isolation": "68ee06aa 5407f382 37f5a471 f2b5e78f f9f01a80 278afff6 6f56813c 36f5e20c 5fac8ee6"
+    " 895c5737 583ed297 fb6ad406 fbda38eb b8206c49 20548840 4f80f66a",
+    "rules for real data": "44ec28f7 53bd5d8e 7d79a0df e71c255c 75947dfb 352a701a dcf60957 ca463a37 bd21f50d 3bd1011a"
+    " 83c4af20 6cb020dc aa35da7c a6aea784 80413d11",
+    "results to look at": "98cf54c1 16f68ec6 95544d35 da3c5a53 515a246b 7d91d8cf 0135522d 07862a81",
+    "mining, pieces and regions": "b4432256 e7893edf 7ba46872 a5b5a43a eec14231 63d911ba c355b68f f6114099 21d8c0c3"
+    " cd71331e",
 }
-"""The folders of features that came after aa53a00a, where the count of this structure begins, and why they are there.
-None of them existed then, so that no revision is counted without what another one has elsewhere."""
+"""The commits that brought features while the structure changed. What they added, less what they removed, is set apart:
+it did not exist in the older revision, so that it shows nothing about the structure."""
 
 SMALL = 30
 _PAUSES = frozenset({"sleep", "wait", "wait_for", "pause"})
@@ -49,7 +57,6 @@ class Module:
     def __init__(self, root: Path, path: Path) -> None:
         self.name = ".".join(path.relative_to(root).with_suffix("").parts).removesuffix(".__init__")
         self.is_package = path.name == "__init__.py"
-        self.is_later = any(path.is_relative_to(root / folder) for folder in LATER)
         text = path.read_text(encoding="utf-8")
         self.lines = text.count("\n")
         self.tree = ast.parse(text)
@@ -86,9 +93,12 @@ def main() -> None:
         with tarfile.open(fileobj=io.BytesIO(archive)) as files:
             files.extractall(folder, filter="data")
         before, after = counted(Path(folder)), counted(root)
-    print(f"{'':44}{options.revision[:12]:>12}{'now':>12}")
+    added = brought(root, options.revision)
+    print(f"{'':52}{options.revision[:12]:>12}{'now':>12}")
     for name in after:
-        print(f"{name:44}{before.get(name, 0):>12,}{after[name]:>12,}")
+        print(f"{name:52}{before.get(name, 0):>12,}{after[name]:>12,}")
+        if name in added:
+            print(f"{name + ' without new features':52}{before.get(name, 0):>12,}{after[name] - added[name]:>12,}")
 
 
 def counted(root: Path) -> dict[str, int]:
@@ -101,19 +111,12 @@ def counted(root: Path) -> dict[str, int]:
         every += modules
         found[f"{package}: lines"] = sum(each.lines for each in modules)
         found[f"{package}: modules"] = len(modules)
-        if any(Path(folder).parts[0] == package for folder in LATER):
-            kept = [each for each in modules if not each.is_later]
-            found[f"{package}: lines without later features"] = sum(each.lines for each in kept)
-            found[f"{package}: modules without later features"] = len(kept)
         found[f"{package}: longest module, lines"] = max(each.lines for each in modules)
         found[f"{package}: loose modules"] = sum(each.name.count(".") == 1 and not each.is_package for each in modules)
         own = [each for each in layers if each.get("layers", [""])[0].startswith(f"{package}.")]
         found[f"{package}: floors"] = max((len(each["layers"]) for each in own), default=0)
-    kept = [each for each in every if not each.is_later]
     found["all: lines"] = sum(each.lines for each in every)
     found["all: modules"] = len(every)
-    found["all: lines without later features"] = sum(each.lines for each in kept)
-    found["all: modules without later features"] = len(kept)
     importers: Counter[str] = Counter(name for each in every for name in set(each.imports()))
     found["small modules with one importer"] = sum(
         each.lines < SMALL and not each.is_package and importers[each.name] == 1 for each in every
@@ -122,6 +125,32 @@ def counted(root: Path) -> dict[str, int]:
     found["public names defined twice or more"] = sum(count > 1 for count in names.values())
     found["retries written by hand"] = sum(each.retries() for each in every)
     return found
+
+
+def brought(root: Path, revision: str) -> Counter[str]:
+    """The lines and modules that the commits of `FEATURES` since a revision added, less what they removed."""
+    command = ["git", "-C", str(root), "log", "--no-merges", "--no-renames", "--numstat", "--summary", "--format=@%H"]
+    log = subprocess.run([*command, f"{revision}..HEAD"], check=True, capture_output=True, text=True).stdout
+    features = {commit for commits in FEATURES.values() for commit in commits.split()}
+    added: Counter[str] = Counter()
+    for entry in log.split("@")[1:]:
+        commit, *changes = entry.splitlines()
+        for change in changes if commit[:8] in features else ():
+            match change.split():
+                case [more, fewer, path] if _is_counted(path):
+                    figure, number = "lines", int(more) - int(fewer)
+                case ["create" | "delete" as verb, "mode", _, path] if _is_counted(path):
+                    figure, number = "modules", 1 if verb == "create" else -1
+                case _:
+                    continue
+            added[f"{path.partition('/')[0]}: {figure}"] += number
+            added[f"all: {figure}"] += number
+    return added
+
+
+def _is_counted(path: str) -> bool:
+    """Whether it is a module of the packages."""
+    return path.endswith(".py") and path.partition("/")[0] in PACKAGES
 
 
 def _is_retry(loop: ast.While | ast.For | ast.AsyncFor) -> bool:
