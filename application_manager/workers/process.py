@@ -56,12 +56,12 @@ def main() -> None:
     """Answer until the input ends. The first frame is the limit of CPU time of each job, in seconds."""
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what a library prints belongs to the log
-    _yield_to_others()
     resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # of a terminal: the manager ends us
     import application_manager.workers.jobs  # noqa: F401, PLC0415  before the first job, which is to be fast
 
+    _yield_to_others()  # after the imports: on a busy machine, they would take many seconds in the idle class
     questions = sys.stdin.buffer
     limit = _frame(questions)
     if limit is None:
