@@ -26,20 +26,14 @@ class Tls(Model):
 
     model_config = validations(("has(self.certificate) == has(self.key)", _BOTH, ".certificate"))
 
-    ca: FilePath | None = Field(
-        default=None,
-        description="The path of the CA certificates that verify the certificate of the other side. Default: the "
-        "public CAs.",
-    )
-    certificate: FilePath | None = Field(
-        default=None, description="The path of the detector's own certificate. Requires key."
-    )
-    key: FilePath | None = Field(
-        default=None, description="The path of the private key of the certificate. Requires certificate."
-    )
-    verify_name: bool = Field(
-        default=True, description="If true, the certificate of the other side must match the host name of the endpoint."
-    )
+    ca: FilePath | None = None
+    """The path of the CA certificates that verify the certificate of the other side. Default: the public CAs."""
+    certificate: FilePath | None = None
+    """The path of the detector's own certificate. Requires key."""
+    key: FilePath | None = None
+    """The path of the private key of the certificate. Requires certificate."""
+    verify_name: bool = True
+    """If true, the certificate of the other side must match the host name of the endpoint."""
 
     @model_validator(mode="after")
     def _coherent(self) -> Tls:
@@ -53,13 +47,12 @@ class Credentials(Model):
 
     model_config = validations(("has(self.passwordVariable) != has(self.passwordFile)", _ONE))
 
-    username: str = Field(min_length=1, max_length=255, description="The username of the detector.")
-    password_variable: Variable | None = Field(
-        default=None, description="The environment variable that contains the password."
-    )
-    password_file: FilePath | None = Field(
-        default=None, description="The file that contains the password. A trailing newline is ignored."
-    )
+    username: str = Field(min_length=1, max_length=255)
+    """The username of the detector."""
+    password_variable: Variable | None = None
+    """The environment variable that contains the password."""
+    password_file: FilePath | None = None
+    """The file that contains the password. A trailing newline is ignored."""
 
     @model_validator(mode="after")
     def _coherent(self) -> Credentials:
@@ -86,16 +79,14 @@ ACCESS_VALIDATIONS = (
 class Access(Model):
     """TLS and credentials, each by files or by a Secret."""
 
-    tls: Tls | None = Field(default=None, description="TLS certificates from files.")
-    tls_secret_name: ObjectName | None = Field(
-        default=None,
-        description="A Secret with the keys ca.crt and, if the detector authenticates with a certificate, tls.crt and "
-        "tls.key.",
-    )
-    credentials: Credentials | None = Field(default=None, description="A username, and the source of its password.")
-    credentials_secret_name: ObjectName | None = Field(
-        default=None, description="A Secret with the keys username and password."
-    )
+    tls: Tls | None = None
+    """TLS certificates from files."""
+    tls_secret_name: ObjectName | None = None
+    """A Secret with the keys ca.crt and, if the detector authenticates with a certificate, tls.crt and tls.key."""
+    credentials: Credentials | None = None
+    """A username, and the source of its password."""
+    credentials_secret_name: ObjectName | None = None
+    """A Secret with the keys username and password."""
 
     @model_validator(mode="after")
     def _given_once(self) -> Access:

@@ -10,13 +10,12 @@ from pydantic.config import JsonDict
 
 from wayside.api.base import (
     ATOMIC_LIST,
-    Condition,
+    Conditions,
     Identifier,
     Kind,
     Model,
     TemplateName,
     Time,
-    conditions_field,
     immutable,
     validation,
 )
@@ -28,28 +27,19 @@ _IMMUTABLE = "is immutable: delete this instance and create another"
 class ApplicationInstanceSpec(Model):
     """The template, and the values that result from merging the demands."""
 
-    template_name: TemplateName = Field(
-        description="The name of the ApplicationTemplate, in the same namespace. Immutable.",
-        json_schema_extra=immutable(_IMMUTABLE),
-    )
-    key: str | None = Field(
-        default=None,
-        max_length=1024,
-        description="The value of the template's key; a list or map is written as JSON. Absent if the template has no "
-        "key. Immutable.",
-    )
+    template_name: TemplateName = Field(json_schema_extra=immutable(_IMMUTABLE))
+    """The name of the ApplicationTemplate, in the same namespace. Immutable."""
+    key: str | None = Field(default=None, max_length=1024)
+    """The value of the template's key; a list or map is written as JSON. Absent if the template has no key.
+    Immutable."""
+    # Server-side apply makes a map null that loses the last entry which its manager had put there.
     parameters: dict[Identifier, NestedValue] = Field(
-        default_factory=dict,
-        max_length=64,
-        description="The merged values of the template's parameters.",
-        # Server-side apply makes a map null that loses the last entry which its manager had put there.
-        json_schema_extra={"nullable": True},
+        default_factory=dict, max_length=64, json_schema_extra={"nullable": True}
     )
-    suspended: bool = Field(
-        default=False,
-        description="If true, all workloads are scaled to zero regardless of Deploy tasks. status.suspendedReplicas "
-        "keeps their previous replica counts.",
-    )
+    """The merged values of the template's parameters."""
+    suspended: bool = False
+    """If true, all workloads are scaled to zero regardless of Deploy tasks. status.suspendedReplicas keeps their
+    previous replica counts."""
 
     @field_validator("parameters", mode="before")
     @classmethod
@@ -60,35 +50,38 @@ class ApplicationInstanceSpec(Model):
 class ObjectReference(Model):
     """A reference to an object of the instance."""
 
-    api_version: str = Field(max_length=255, description="The object's apiVersion.")
-    kind: str = Field(max_length=63, description="The object's kind.")
-    name: str = Field(max_length=253, description="The object's name.")
-    uid: str | None = Field(
-        default=None,
-        max_length=63,
-        description="The object's uid. Absent until the object has been applied for the first time.",
-    )
+    api_version: str = Field(max_length=255)
+    """The object's apiVersion."""
+    kind: str = Field(max_length=63)
+    """The object's kind."""
+    name: str = Field(max_length=253)
+    """The object's name."""
+    uid: str | None = Field(default=None, max_length=63)
+    """The object's uid. Absent until the object has been applied for the first time."""
 
 
 class SuspendedReplicas(Model):
     """A workload that is scaled to zero, and the replica count to restore."""
 
-    api_version: str = Field(max_length=255, description="The workload's apiVersion.")
-    kind: str = Field(max_length=63, description="The workload's kind.")
-    name: str = Field(max_length=253, description="The workload's name.")
-    replicas: int = Field(ge=0, description="The replica count to restore when the suspension ends.")
+    api_version: str = Field(max_length=255)
+    """The workload's apiVersion."""
+    kind: str = Field(max_length=63)
+    """The workload's kind."""
+    name: str = Field(max_length=253)
+    """The workload's name."""
+    replicas: int = Field(ge=0)
+    """The replica count to restore when the suspension ends."""
 
 
 class Demands(Model):
     """The live tasks that the instance serves."""
 
-    count: int = Field(default=0, description="The number of live tasks.")
+    count: int = 0
+    """The number of live tasks."""
     names: list[Annotated[str, Field(max_length=253)]] = Field(
-        default_factory=list,
-        max_length=20,
-        description="The names of the tasks, oldest first; at most 20.",
-        json_schema_extra=ATOMIC_LIST,
+        default_factory=list, max_length=20, json_schema_extra=ATOMIC_LIST
     )
+    """The names of the tasks, oldest first; at most 20."""
 
 
 class InstancePhase(StrEnum):
@@ -105,45 +98,32 @@ class InstancePhase(StrEnum):
 class ApplicationInstanceStatus(Model):
     """The observed state of the instance."""
 
-    phase: InstancePhase | None = Field(default=None, description="A one-word summary of the state.")
-    message: str | None = Field(
-        default=None,
-        max_length=512,
-        description="The reason why the instance is waiting or is being kept. Absent in normal operation.",
-    )
-    observed_generation: int = Field(
-        default=0, description="The metadata.generation that the status was computed from."
-    )
-    spec_hash: str | None = Field(
-        default=None, max_length=64, description="The digest of the manifests at the last complete apply."
-    )
-    release_time: Time | None = Field(
-        default=None,
-        description="The end of the linger time. The instance is then removed, unless a new demand arrives before.",
-    )
-    objects: list[ObjectReference] = Field(
-        default_factory=list,
-        max_length=128,
-        description="The objects of the instance. An object that is added later is listed before it is applied. Until "
-        "the list of a new instance is written, its objects are identified by label and controller reference.",
-        json_schema_extra=ATOMIC_LIST,
-    )
+    phase: InstancePhase | None = None
+    """A one-word summary of the state."""
+    message: str | None = Field(default=None, max_length=512)
+    """The reason why the instance is waiting or is being kept. Absent in normal operation."""
+    observed_generation: int = 0
+    """The metadata.generation that the status was computed from."""
+    spec_hash: str | None = Field(default=None, max_length=64)
+    """The digest of the manifests at the last complete apply."""
+    release_time: Time | None = None
+    """The end of the linger time. The instance is then removed, unless a new demand arrives before."""
+    objects: list[ObjectReference] = Field(default_factory=list, max_length=128, json_schema_extra=ATOMIC_LIST)
+    """The objects of the instance. An object that is added later is listed before it is applied. Until the list of a
+    new instance is written, its objects are identified by label and controller reference."""
     suspended_replicas: list[SuspendedReplicas] = Field(
-        default_factory=list,
-        max_length=64,
-        description="The replica counts to restore when the suspension ends. Written before any workload is scaled to "
-        "zero, removed once all are restored.",
-        json_schema_extra=ATOMIC_LIST,
+        default_factory=list, max_length=64, json_schema_extra=ATOMIC_LIST
     )
-    demands: Demands = Field(default=Demands(), description="The live tasks that the instance serves.")
-    conditions: list[Condition] = conditions_field(
-        "Applied: all objects match the template. Ready: the objects are applied and the workloads are ready. "
-        "Stalled: the objects were refused, or did not become ready in time. Capped: a merged Sum is limited to "
-        "its parameter's maximum. Suspended: the workloads are scaled to zero. Paused: the annotation "
-        "wayside.dev/pause stops changes to the instance. Held: the annotation wayside.dev/hold keeps the instance "
-        "without demand. TimedOut: the instance was not ready for the template's readyTimeout. StandsIn: the "
-        "instance is a fallback and serves tasks of instances that timed out."
-    )
+    """The replica counts to restore when the suspension ends. Written before any workload is scaled to zero, removed
+    once all are restored."""
+    demands: Demands = Demands()
+    """The live tasks that the instance serves."""
+    conditions: Conditions = Field(default_factory=list)
+    """Applied: all objects match the template. Ready: the objects are applied and the workloads are ready. Stalled: the
+    objects were refused, or did not become ready in time. Capped: a merged Sum is limited to its parameter's maximum.
+    Suspended: the workloads are scaled to zero. Paused: the annotation wayside.dev/pause stops changes to the instance.
+    Held: the annotation wayside.dev/hold keeps the instance without demand. TimedOut: the instance was not ready for
+    the template's readyTimeout. StandsIn: the instance is a fallback and serves tasks of instances that timed out."""
 
 
 class ApplicationInstance(Kind):
@@ -170,7 +150,7 @@ class ApplicationInstance(Kind):
     ]
 
     kind: str = "ApplicationInstance"
-    spec: ApplicationInstanceSpec = Field(description="The desired state: the template and its merged values.")
-    status: ApplicationInstanceStatus | None = Field(
-        default=None, description="The observed state: objects, demands and conditions."
-    )
+    spec: ApplicationInstanceSpec
+    """The desired state: the template and its merged values."""
+    status: ApplicationInstanceStatus | None = None
+    """The observed state: objects, demands and conditions."""

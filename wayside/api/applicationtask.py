@@ -10,14 +10,13 @@ from pydantic.config import JsonDict
 
 from wayside.api.base import (
     ATOMIC_LIST,
-    Condition,
+    Conditions,
     Identifier,
     Kind,
     Model,
     ObjectName,
     TemplateName,
     Time,
-    conditions_field,
     immutable,
     validation,
 )
@@ -39,73 +38,55 @@ Holder = Annotated[str, Field(min_length=1, max_length=253, pattern=r"^[a-z0-9](
 class Requester(Model):
     """The subjects on whose behalf the task was emitted, and the holder that emitted it."""
 
-    detector_name: ObjectName | None = Field(
-        default=None, description="The name of the Detector. Absent in a task that a person created."
-    )
-    holder: Holder | None = Field(
-        default=None,
-        description="The holder that emitted the task. The holder keeps the task alive by renewing the Lease "
-        "wayside-<holder>. A task without a holder never expires.",
-    )
+    detector_name: ObjectName | None = None
+    """The name of the Detector. Absent in a task that a person created."""
+    holder: Holder | None = None
+    """The holder that emitted the task. The holder keeps the task alive by renewing the Lease wayside-<holder>. A task
+    without a holder never expires."""
     subjects: list[Annotated[str, Field(max_length=256)]] = Field(
-        default_factory=list,
-        max_length=1024,
-        description="The clients of the episode.",
-        json_schema_extra=ATOMIC_LIST,
+        default_factory=list, max_length=1024, json_schema_extra=ATOMIC_LIST
     )
+    """The clients of the episode."""
 
 
 class TaskEvent(Model):
     """The event that caused the task."""
 
-    id: str = Field(max_length=64, description="The ID of the episode.")
-    rule: ObjectName = Field(description="The name of the EventRule.")
-    action: ObjectName = Field(description="The name of the rule's action.")
-    subject: str = Field(
-        max_length=512, description="The subject of the episode, as in the event's key, e.g. car1+car2."
-    )
-    onset_time: Time = Field(description="The time at which the rule's condition began to hold.")
-    start_time: Time = Field(description="The start of the episode.")
-    classification: Classification | None = Field(default=None, description="The classification of the rule.")
-    values: dict[str, NestedValue] = Field(
-        default_factory=dict,
-        max_length=256,
-        description="The values of the rule's variables at the start of the episode. If they exceed 64 KiB in "
-        "total, the detector omits the largest ones.",
-    )
+    id: str = Field(max_length=64)
+    """The ID of the episode."""
+    rule: ObjectName
+    """The name of the EventRule."""
+    action: ObjectName
+    """The name of the rule's action."""
+    subject: str = Field(max_length=512)
+    """The subject of the episode, as in the event's key, e.g. car1+car2."""
+    onset_time: Time
+    """The time at which the rule's condition began to hold."""
+    start_time: Time
+    """The start of the episode."""
+    classification: Classification | None = None
+    """The classification of the rule."""
+    values: dict[str, NestedValue] = Field(default_factory=dict, max_length=256)
+    """The values of the rule's variables at the start of the episode. If they exceed 64 KiB in total, the detector
+    omits the largest ones."""
 
 
 class ApplicationTaskSpec(Model):
     """One demand for an application, and its cause."""
 
-    template_name: TemplateName = Field(
-        description="The name of the ApplicationTemplate, in the same namespace. Immutable.",
-        json_schema_extra=immutable(_IMMUTABLE),
-    )
+    template_name: TemplateName = Field(json_schema_extra=immutable(_IMMUTABLE))
+    """The name of the ApplicationTemplate, in the same namespace. Immutable."""
     operation: Operation = Field(default=Operation.DEPLOY, description=MEANING, json_schema_extra=immutable(_IMMUTABLE))
-    priority: int = Field(
-        default=0,
-        ge=-1_000_000,
-        le=1_000_000,
-        description="The priority of the task; the highest comes first. Ties are ordered by creation time, then by "
-        "name. Immutable.",
-        json_schema_extra=immutable(_IMMUTABLE),
-    )
-    parameters: dict[Identifier, NestedValue] = Field(
-        default_factory=dict,
-        max_length=64,
-        description="The values for the template's parameters, at most 64 KiB in total. Can change while the task is "
-        "live.",
-    )
-    requester: Requester = Field(
-        default=Requester(),
-        description="The holder that emitted the task, and the clients of the episode. Immutable.",
-        json_schema_extra=immutable(_IMMUTABLE),
-    )
-    event: TaskEvent | None = Field(default=None, description="The event that caused the task. Immutable.")
-    end_time: Time | None = Field(
-        default=None, description="The end of the demand. Absent while the demand is live; immutable once set."
-    )
+    priority: int = Field(default=0, ge=-1_000_000, le=1_000_000, json_schema_extra=immutable(_IMMUTABLE))
+    """The priority of the task; the highest comes first. Ties are ordered by creation time, then by name. Immutable."""
+    parameters: dict[Identifier, NestedValue] = Field(default_factory=dict, max_length=64)
+    """The values for the template's parameters, at most 64 KiB in total. Can change while the task is live."""
+    requester: Requester = Field(default=Requester(), json_schema_extra=immutable(_IMMUTABLE))
+    """The holder that emitted the task, and the clients of the episode. Immutable."""
+    event: TaskEvent | None = None
+    """The event that caused the task. Immutable."""
+    end_time: Time | None = None
+    """The end of the demand. Absent while the demand is live; immutable once set."""
 
 
 class TaskPhase(StrEnum):
@@ -124,28 +105,21 @@ class TaskPhase(StrEnum):
 class ApplicationTaskStatus(Model):
     """The observed state of the demand."""
 
-    phase: TaskPhase | None = Field(default=None, description="A one-word summary of the state.")
-    instance_name: str | None = Field(
-        default=None, max_length=63, description="The name of the ApplicationInstance that serves the task."
-    )
-    message: str | None = Field(
-        default=None,
-        max_length=512,
-        description="The reason why the task is waiting or does not count. Absent in normal operation.",
-    )
-    observed_generation: int = Field(
-        default=0, description="The metadata.generation that the status was computed from."
-    )
-    applied_time: Time | None = Field(
-        default=None, description="The time at which the task's values were first applied to the instance."
-    )
-    ready_time: Time | None = Field(
-        default=None, description="The time at which the instance was first ready for the task."
-    )
-    conditions: list[Condition] = conditions_field(
-        "Accepted: the demand counts. Applied, Ready: the current state of the task's instance. Stalled: the task is "
-        "refused, and waiting does not help. Finished: the task has ended; Applied and Ready are removed."
-    )
+    phase: TaskPhase | None = None
+    """A one-word summary of the state."""
+    instance_name: str | None = Field(default=None, max_length=63)
+    """The name of the ApplicationInstance that serves the task."""
+    message: str | None = Field(default=None, max_length=512)
+    """The reason why the task is waiting or does not count. Absent in normal operation."""
+    observed_generation: int = 0
+    """The metadata.generation that the status was computed from."""
+    applied_time: Time | None = None
+    """The time at which the task's values were first applied to the instance."""
+    ready_time: Time | None = None
+    """The time at which the instance was first ready for the task."""
+    conditions: Conditions = Field(default_factory=list)
+    """Accepted: the demand counts. Applied, Ready: the current state of the task's instance. Stalled: the task is
+    refused, and waiting does not help. Finished: the task has ended; Applied and Ready are removed."""
 
 
 class ApplicationTask(Kind):
@@ -196,5 +170,7 @@ class ApplicationTask(Kind):
     ]
 
     kind: str = "ApplicationTask"
-    spec: ApplicationTaskSpec = Field(description="The demand and its cause.")
-    status: ApplicationTaskStatus | None = Field(default=None, description="The observed state of the demand.")
+    spec: ApplicationTaskSpec
+    """The demand and its cause."""
+    status: ApplicationTaskStatus | None = None
+    """The observed state of the demand."""

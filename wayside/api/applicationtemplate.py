@@ -10,7 +10,7 @@ from pydantic.config import JsonDict
 
 from wayside.api.base import (
     ATOMIC_LIST,
-    Condition,
+    Conditions,
     Duration,
     Expression,
     Identifier,
@@ -19,7 +19,6 @@ from wayside.api.base import (
     PositiveDuration,
     TemplateName,
     Time,
-    conditions_field,
     validation,
     validations,
 )
@@ -38,20 +37,17 @@ class LossPolicy(StrEnum):
 class OnDetectorLoss(Model):
     """The policy for demands whose holder's Lease has expired."""
 
-    policy: LossPolicy = Field(
-        default=LossPolicy.RELEASE,
-        description="Release: the demands stop counting. Hold: the demands count until they end.",
-    )
-    after: Duration = Field(
-        default=Duration("30s"),
-        description="With policy Release: how long the demands still count after the Lease has expired.",
-    )
+    policy: LossPolicy = LossPolicy.RELEASE
+    """Release: the demands stop counting. Hold: the demands count until they end."""
+    after: Duration = Duration("30s")
+    """With policy Release: how long the demands still count after the Lease has expired."""
 
 
 class FallbackTemplate(Model):
     """The template that replaces an application which does not become ready."""
 
-    template_name: TemplateName = Field(description="The name of another ApplicationTemplate, in the same namespace.")
+    template_name: TemplateName
+    """The name of another ApplicationTemplate, in the same namespace."""
 
 
 FALLBACK_WITHOUT_TIMEOUT = "fallback needs readyTimeout: set it, e.g. readyTimeout: 60s"
@@ -64,27 +60,19 @@ class Lifecycle(Model):
         ("!has(self.fallback) || has(self.readyTimeout)", FALLBACK_WITHOUT_TIMEOUT, ".readyTimeout", "Required")
     )
 
-    linger: Duration = Field(
-        default=Duration("30s"), description="How long an instance keeps running after its last demand has ended."
-    )
-    minimum_uptime: Duration = Field(
-        default=Duration("0s"),
-        description="The minimum lifetime of an instance, from its creation. During this time, the instance is "
-        "neither released nor preempted.",
-    )
-    ready_timeout: PositiveDuration | None = Field(
-        default=None,
-        description="How long an instance may stay not ready. After that, its condition TimedOut is True "
-        "until the instance has been ready for the same time. Default: no limit.",
-    )
-    fallback: FallbackTemplate | None = Field(
-        default=None,
-        description="The template that serves the tasks of an instance that exceeded its readyTimeout, until that "
-        "instance is ready again. It receives only the task parameters that it defines. Needs readyTimeout.",
-    )
-    on_detector_loss: OnDetectorLoss = Field(
-        default=OnDetectorLoss(), description="The policy for demands whose holder's Lease has expired."
-    )
+    linger: Duration = Duration("30s")
+    """How long an instance keeps running after its last demand has ended."""
+    minimum_uptime: Duration = Duration("0s")
+    """The minimum lifetime of an instance, from its creation. During this time, the instance is neither released nor
+    preempted."""
+    ready_timeout: PositiveDuration | None = None
+    """How long an instance may stay not ready. After that, its condition TimedOut is True until the instance has been
+    ready for the same time. Default: no limit."""
+    fallback: FallbackTemplate | None = None
+    """The template that serves the tasks of an instance that exceeded its readyTimeout, until that instance is ready
+    again. It receives only the task parameters that it defines. Needs readyTimeout."""
+    on_detector_loss: OnDetectorLoss = OnDetectorLoss()
+    """The policy for demands whose holder's Lease has expired."""
 
     @model_validator(mode="after")
     def _fallback_has_its_time(self) -> Lifecycle:
@@ -102,11 +90,9 @@ BASELINE_WITH_KEY = (
 class Baseline(Model):
     """An instance that always runs, with or without tasks."""
 
-    parameters: NamedData = Field(
-        default_factory=dict,
-        description="The parameter values of the baseline. With merge Same, tasks must agree with them. With any "
-        "other merge, they count as the values of a task of the lowest priority.",
-    )
+    parameters: NamedData = Field(default_factory=dict)
+    """The parameter values of the baseline. With merge Same, tasks must agree with them. With any other merge, they
+    count as the values of a task of the lowest priority."""
 
 
 Manifest = Annotated[dict[str, Any], Field(json_schema_extra={"x-kubernetes-preserve-unknown-fields": True})]
@@ -126,51 +112,32 @@ class ApplicationTemplateSpec(Model):
         ("!has(self.baseline) || !has(self.key)", BASELINE_WITH_KEY, ".baseline", "Forbidden"),
     )
 
-    description: str = Field(default="", max_length=1024, description="A description of the application, for people.")
-    parameters: dict[Identifier, Parameter] = Field(
-        default_factory=dict,
-        max_length=64,
-        description="The inputs of the template, by name: type, bounds, and how the values of several tasks merge.",
-    )
-    key: Expression | None = Field(
-        default=None,
-        description="The identity of an instance, e.g. ${parameters.region}. Tasks with the same key share one "
-        "instance. Without a key, the template has one instance. Immutable.",
-    )
-    baseline: Baseline | None = Field(
-        default=None,
-        description="One instance that always runs, with or without tasks. Only for a template without a key; with a "
-        "key, use a rule with `when: true` instead.",
-    )
-    max_instances: int | None = Field(
-        default=None,
-        ge=1,
-        le=100_000,
-        description="The maximum number of instances. At the limit, a demand waits or preempts an instance of lower "
-        "priority. Default: no limit.",
-    )
-    lifecycle: Lifecycle = Field(default=Lifecycle(), description="The lifetime of instances.")
-    configuration: dict[FileName, Value] = Field(
-        default_factory=dict,
-        max_length=64,
-        description="Files that can change while the application runs, by name, with ${…} as in manifests. They are "
-        "stored in a ConfigMap, named by ${instance.configMap}, which changes without a rollout. A text is written "
-        "unchanged; a map or list is written in the format of the file extension, .yaml or .json.",
-    )
-    manifests: list[Manifest] = Field(
-        default_factory=list,
-        min_length=1,
-        max_length=64,
-        description="The objects of an instance, with ${…} over parameters and instance (name, key, namespace, and "
-        "configMap if there is a configuration). apiVersion and kind must be literal. The namespace is that of the "
-        "template. With a key, every name must contain ${instance.name}.",
-        json_schema_extra=ATOMIC_LIST,
-    )
-    helm: Helm | None = Field(
-        default=None,
-        description="A Helm chart instead of manifests. The same kinds of object are allowed, and they are applied in "
-        "the same way. The release has the name of the instance.",
-    )
+    description: str = Field(default="", max_length=1024)
+    """A description of the application, for people."""
+    parameters: dict[Identifier, Parameter] = Field(default_factory=dict, max_length=64)
+    """The inputs of the template, by name: type, bounds, and how the values of several tasks merge."""
+    key: Expression | None = None
+    """The identity of an instance, e.g. ${parameters.region}. Tasks with the same key share one instance. Without a
+    key, the template has one instance. Immutable."""
+    baseline: Baseline | None = None
+    """One instance that always runs, with or without tasks. Only for a template without a key; with a key, use a rule
+    with `when: true` instead."""
+    max_instances: int | None = Field(default=None, ge=1, le=100_000)
+    """The maximum number of instances. At the limit, a demand waits or preempts an instance of lower priority. Default:
+    no limit."""
+    lifecycle: Lifecycle = Lifecycle()
+    """The lifetime of instances."""
+    configuration: dict[FileName, Value] = Field(default_factory=dict, max_length=64)
+    """Files that can change while the application runs, by name, with ${…} as in manifests. They are stored in a
+    ConfigMap, named by ${instance.configMap}, which changes without a rollout. A text is written unchanged; a map or
+    list is written in the format of the file extension, .yaml or .json."""
+    manifests: list[Manifest] = Field(default_factory=list, min_length=1, max_length=64, json_schema_extra=ATOMIC_LIST)
+    """The objects of an instance, with ${…} over parameters and instance (name, key, namespace, and configMap if there
+    is a configuration). apiVersion and kind must be literal. The namespace is that of the template. With a key, every
+    name must contain ${instance.name}."""
+    helm: Helm | None = None
+    """A Helm chart instead of manifests. The same kinds of object are allowed, and they are applied in the same way.
+    The release has the name of the instance."""
 
     @model_validator(mode="after")
     def _one_kind_of_objects(self) -> ApplicationTemplateSpec:
@@ -202,25 +169,23 @@ class ApplicationTemplateSpec(Model):
 class TemplateManager(Model):
     """An application manager, by its Lease."""
 
-    lease: str = Field(max_length=320, description="Namespace and name of its Lease.")
-    since: Time = Field(
-        description="The creation time of the Lease. Of two managers, the one with the older Lease is active."
-    )
+    lease: str = Field(max_length=320)
+    """Namespace and name of its Lease."""
+    since: Time
+    """The creation time of the Lease. Of two managers, the one with the older Lease is active."""
 
 
 class ApplicationTemplateStatus(Model):
     """The observed state of the template."""
 
-    observed_generation: int = Field(
-        default=0, description="The metadata.generation that the status was computed from."
-    )
-    instances: int = Field(default=0, description="The number of instances.")
-    manager: TemplateManager | None = Field(
-        default=None, description="The application manager that is active in the namespace."
-    )
-    conditions: list[Condition] = conditions_field(
-        "Accepted, Ready: the template can be rendered. Stalled: the template is invalid and must be corrected."
-    )
+    observed_generation: int = 0
+    """The metadata.generation that the status was computed from."""
+    instances: int = 0
+    """The number of instances."""
+    manager: TemplateManager | None = None
+    """The application manager that is active in the namespace."""
+    conditions: Conditions = Field(default_factory=list)
+    """Accepted, Ready: the template can be rendered. Stalled: the template is invalid and must be corrected."""
 
 
 class ApplicationTemplate(Kind):
@@ -253,7 +218,7 @@ class ApplicationTemplate(Kind):
     ]
 
     kind: str = "ApplicationTemplate"
-    spec: ApplicationTemplateSpec = Field(
-        description="The parameters, identity, lifetime and objects of an application."
-    )
-    status: ApplicationTemplateStatus | None = Field(default=None, description="The observed state of the template.")
+    spec: ApplicationTemplateSpec
+    """The parameters, identity, lifetime and objects of an application."""
+    status: ApplicationTemplateStatus | None = None
+    """The observed state of the template."""

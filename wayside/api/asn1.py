@@ -14,16 +14,11 @@ class Asn1Module(Model):
 
     model_config = validations(("has(self.definition) != has(self.file)", _ONE))
 
-    definition: str | None = Field(
-        default=None, min_length=1, max_length=500_000, description="The text of the modules."
-    )
-    file: str | None = Field(
-        default=None,
-        min_length=1,
-        max_length=1024,
-        description="The path of a file with the modules, as the detector sees it: relative to its working directory, "
-        "or on a mounted volume.",
-    )
+    definition: str | None = Field(default=None, min_length=1, max_length=500_000)
+    """The text of the modules."""
+    file: str | None = Field(default=None, min_length=1, max_length=1024)
+    """The path of a file with the modules, as the detector sees it: relative to its working directory, or on a mounted
+    volume."""
 
     @model_validator(mode="after")
     def _one(self) -> Asn1Module:

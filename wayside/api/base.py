@@ -22,7 +22,10 @@ MANAGED_BY = "wayside"
 
 
 class Model(BaseModel):
-    """Base of every part of a kind: camelCase on the wire, immutable, and a misspelt field is an error."""
+    """Base of every part of a kind: camelCase on the wire, immutable, and a misspelt field is an error.
+
+    The docstring below a field is its description in the CRD.
+    """
 
     model_config = ConfigDict(
         alias_generator=to_camel, validate_by_name=True, validate_by_alias=True, extra="forbid", frozen=True
@@ -274,28 +277,22 @@ class Metadata(BaseModel):
 class Condition(Model):
     """One condition of an object's state, in the standard form of Kubernetes."""
 
-    type: str = Field(description="The type of the condition, e.g. Ready.", max_length=63)
-    status: str = Field(description="True, False or Unknown.", json_schema_extra={"enum": ["True", "False", "Unknown"]})
-    reason: str = Field(
-        description="The machine-readable reason for the status, in CamelCase.",
-        max_length=63,
-        pattern=r"^[A-Za-z][A-Za-z0-9]*$",
-    )
-    message: str = Field(default="", description="The human-readable explanation of the status.", max_length=4096)
-    observed_generation: int = Field(
-        default=0, description="The metadata.generation that the condition was computed from."
-    )
-    last_transition_time: Time = Field(description="The time of the last change of the status.")
+    type: str = Field(max_length=63)
+    """The type of the condition, e.g. Ready."""
+    status: str = Field(json_schema_extra={"enum": ["True", "False", "Unknown"]})
+    """True, False or Unknown."""
+    reason: str = Field(max_length=63, pattern=r"^[A-Za-z][A-Za-z0-9]*$")
+    """The machine-readable reason for the status, in CamelCase."""
+    message: str = Field(default="", max_length=4096)
+    """The human-readable explanation of the status."""
+    observed_generation: int = 0
+    """The metadata.generation that the condition was computed from."""
+    last_transition_time: Time
+    """The time of the last change of the status."""
 
 
-def conditions_field(description: str) -> Any:
-    """A list of conditions, merged by type."""
-    return Field(
-        default_factory=list,
-        description=description,
-        max_length=16,
-        json_schema_extra=map_list("type"),
-    )
+Conditions = Annotated[list[Condition], Field(max_length=16, json_schema_extra=map_list("type"))]
+"""A list of conditions, merged by type."""
 
 
 class Kind(Model):

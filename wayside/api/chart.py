@@ -33,33 +33,21 @@ class Helm(Model):
         ),
     )
 
+    # No `-` at the beginning: it is an argument of a program.
     chart: str = Field(
-        min_length=1,
-        max_length=512,
-        # No `-` at the beginning: it is an argument of a program.
-        pattern=r"^(oci://[a-zA-Z0-9][^ ?#@]*|/[^ ]+|[a-zA-Z0-9][a-zA-Z0-9._-]*)$",
-        description="The chart: an OCI reference (oci://…), the name of a chart in `repository`, or an absolute path "
-        "in the manager's image.",
+        min_length=1, max_length=512, pattern=r"^(oci://[a-zA-Z0-9][^ ?#@]*|/[^ ]+|[a-zA-Z0-9][a-zA-Z0-9._-]*)$"
     )
-    version: str | None = Field(
-        default=None,
-        max_length=128,
-        pattern=_VERSION,
-        description="The exact version of the chart. Ranges are not allowed: the same template must always render the "
-        "same objects. Required unless chart is a path.",
-    )
-    repository: str | None = Field(
-        default=None,
-        max_length=512,
-        pattern=r"^https?://[^ ]+$",
-        description="The URL of the chart repository. Only for a chart given by name.",
-    )
+    """The chart: an OCI reference (oci://…), the name of a chart in `repository`, or an absolute path in the manager's
+    image."""
+    version: str | None = Field(default=None, max_length=128, pattern=_VERSION)
+    """The exact version of the chart. Ranges are not allowed: the same template must always render the same objects.
+    Required unless chart is a path."""
+    repository: str | None = Field(default=None, max_length=512, pattern=r"^https?://[^ ]+$")
+    """The URL of the chart repository. Only for a chart given by name."""
     values: dict[str, Any] = Field(
-        default_factory=dict,
-        description="The values of the chart, with ${…} over parameters and instance (name, key, namespace, "
-        "configMap).",
-        json_schema_extra={"x-kubernetes-preserve-unknown-fields": True},
+        default_factory=dict, json_schema_extra={"x-kubernetes-preserve-unknown-fields": True}
     )
+    """The values of the chart, with ${…} over parameters and instance (name, key, namespace, configMap)."""
 
     @model_validator(mode="after")
     def _one_place(self) -> Helm:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import StrEnum
 
-from pydantic import Field, model_validator
+from pydantic import model_validator
 
 from wayside.api.access import FilePath, Variable
 from wayside.api.base import Model, ObjectName, PositiveQuantity, validations
@@ -22,26 +22,22 @@ class WriteConcern(StrEnum):
 class DatabaseSpool(Model):
     """The buffer of documents on disk while the database is unavailable."""
 
-    path: FilePath = Field(
-        description="The spool folder, on a volume that outlives the process, e.g. /var/lib/wayside/spool. It is "
-        "created if missing. Each detector needs its own."
-    )
-    bytes: PositiveQuantity = Field(
-        default=PositiveQuantity("1Gi"),
-        description="The maximum size of the spool. At the limit, new documents are dropped and counted, so that "
-        "scenarios already in the spool stay complete.",
-    )
+    path: FilePath
+    """The spool folder, on a volume that outlives the process, e.g. /var/lib/wayside/spool. It is created if missing.
+    Each detector needs its own."""
+    bytes: PositiveQuantity = PositiveQuantity("1Gi")
+    """The maximum size of the spool. At the limit, new documents are dropped and counted, so that scenarios already in
+    the spool stay complete."""
 
 
 class DatabaseFiles(Model):
     """The storage of images, point clouds and other large data outside the database."""
 
-    path: FilePath = Field(description="The folder. Documents refer to the files by their path relative to it.")
-    bytes: PositiveQuantity | None = Field(
-        default=None,
-        description="The maximum size of the folder. At the limit, further data is omitted from the documents and "
-        "counted. Default: limited only by the disk.",
-    )
+    path: FilePath
+    """The folder. Documents refer to the files by their path relative to it."""
+    bytes: PositiveQuantity | None = None
+    """The maximum size of the folder. At the limit, further data is omitted from the documents and counted. Default:
+    limited only by the disk."""
 
 
 class DatabaseConnection(Model):
@@ -51,29 +47,20 @@ class DatabaseConnection(Model):
         ("[has(self.uriSecretName), has(self.uriVariable), has(self.uriFile)].filter(given, given).size() == 1", _ONE)
     )
 
-    uri_secret_name: ObjectName | None = Field(
-        default=None,
-        description="A Secret whose key `uri` contains the connection string, mongodb://… with credentials.",
-    )
-    uri_variable: Variable | None = Field(
-        default=None, description="The environment variable that contains the connection string."
-    )
-    uri_file: FilePath | None = Field(
-        default=None, description="The file that contains the connection string. A trailing newline is ignored."
-    )
-    write_concern: WriteConcern = Field(
-        default=WriteConcern.MAJORITY,
-        description="When a document counts as written. Majority: a majority of the replica set has it. One: the "
-        "primary has it; a failover can still roll the write back.",
-    )
-    spool: DatabaseSpool | None = Field(
-        default=None,
-        description="Buffers documents on disk while the database is unavailable. Without a spool, up to 64 MiB are "
-        "buffered in memory and lost when the process ends.",
-    )
-    files: DatabaseFiles | None = Field(
-        default=None, description="Stores large binary data in files. Without it, the data stays in the documents."
-    )
+    uri_secret_name: ObjectName | None = None
+    """A Secret whose key `uri` contains the connection string, mongodb://… with credentials."""
+    uri_variable: Variable | None = None
+    """The environment variable that contains the connection string."""
+    uri_file: FilePath | None = None
+    """The file that contains the connection string. A trailing newline is ignored."""
+    write_concern: WriteConcern = WriteConcern.MAJORITY
+    """When a document counts as written. Majority: a majority of the replica set has it. One: the primary has it; a
+    failover can still roll the write back."""
+    spool: DatabaseSpool | None = None
+    """Buffers documents on disk while the database is unavailable. Without a spool, up to 64 MiB are buffered in memory
+    and lost when the process ends."""
+    files: DatabaseFiles | None = None
+    """Stores large binary data in files. Without it, the data stays in the documents."""
 
     @model_validator(mode="after")
     def _one_place(self) -> DatabaseConnection:

@@ -12,14 +12,13 @@ from wayside.api.base import (
     ATOMIC_LIST,
     SET_LIST,
     ClientName,
-    Condition,
+    Conditions,
     Duration,
     Kind,
     Model,
     ObjectName,
     PositiveDuration,
     PositiveQuantity,
-    conditions_field,
     map_list,
     validations,
 )
@@ -43,33 +42,27 @@ STALE_AFTER = PositiveDuration("5s")
 class KnownClient(Model):
     """A client that is known in advance."""
 
-    name: ClientName = Field(description="The name of the client, as in the keys of the streams.")
+    name: ClientName
+    """The name of the client, as in the keys of the streams."""
     labels: dict[Annotated[str, Field(max_length=63)], Annotated[str, Field(max_length=256)]] = Field(
-        default_factory=dict, max_length=32, description="Labels that rules can use, e.g. labels.role."
+        default_factory=dict, max_length=32
     )
-    parameters: dict[ObjectName, Constants] = Field(
-        default_factory=dict,
-        max_length=64,
-        description="Values for this client that replace a rule's parameters, by rule and parameter name. In a pairs "
-        "scope, expressions read them as a.parameters or b.parameters.",
-    )
-    expected: bool = Field(
-        default=False,
-        description="If true, the client is known from the start of the detector, even without data, and is never "
-        "lost. A rule can then detect that, for example, a roadside station is silent.",
-    )
+    """Labels that rules can use, e.g. labels.role."""
+    parameters: dict[ObjectName, Constants] = Field(default_factory=dict, max_length=64)
+    """Values for this client that replace a rule's parameters, by rule and parameter name. In a pairs scope,
+    expressions read them as a.parameters or b.parameters."""
+    expected: bool = False
+    """If true, the client is known from the start of the detector, even without data, and is never lost. A rule can
+    then detect that, for example, a roadside station is silent."""
 
 
 class BufferLimits(Model):
     """The limits of the buffer of all streams."""
 
-    duration: PositiveDuration = Field(
-        default=PositiveDuration("10s"), description="How long samples are kept. A stream can set its own duration."
-    )
-    bytes: PositiveQuantity = Field(
-        default=PositiveQuantity("512Mi"),
-        description="The maximum size of all streams together. At the limit, the oldest samples are dropped.",
-    )
+    duration: PositiveDuration = PositiveDuration("10s")
+    """How long samples are kept. A stream can set its own duration."""
+    bytes: PositiveQuantity = PositiveQuantity("512Mi")
+    """The maximum size of all streams together. At the limit, the oldest samples are dropped."""
 
 
 class Clock(StrEnum):
@@ -82,12 +75,9 @@ class Clock(StrEnum):
 class State(Model):
     """The storage of open episodes, so that a restart does not lose them."""
 
-    path: str = Field(
-        min_length=1,
-        max_length=1024,
-        description="The folder, on a volume that outlives the process, e.g. /var/lib/wayside. It is created if "
-        "missing. A change takes effect at the next start.",
-    )
+    path: str = Field(min_length=1, max_length=1024)
+    """The folder, on a volume that outlives the process, e.g. /var/lib/wayside. It is created if missing. A change
+    takes effect at the next start."""
 
 
 _POD_WITHOUT_MODE = "pod has no effect without mode: set mode to Standalone or Sidecar, or remove pod"
@@ -118,102 +108,54 @@ class DetectorSpec(Model):
         ),
     )
 
-    mode: DetectorMode | None = Field(
-        default=None,
-        description="Standalone: the application manager runs the detector as a Deployment in this namespace. "
-        "Sidecar: the application manager injects the detector into the pods of this namespace that have the label "
-        "wayside.dev/detector: <name>. Default: the detector is run by other means.",
-    )
-    pod: DetectorPod | None = Field(
-        default=None,
-        description="The detector's pod (Standalone), or its container in other pods (Sidecar). Only with a mode.",
-    )
-    service_account_names: list[ObjectName] | None = Field(
-        default=None,
-        max_length=64,
-        description="The service accounts whose pods may run the detector. Only these accounts get the detector's "
-        "permissions. Only with mode Sidecar.",
-        json_schema_extra=SET_LIST,
-    )
-    zenoh: Zenoh = Field(default=Zenoh(), description="The Zenoh session.")
-    sources: list[DataSource] = Field(
-        default_factory=list,
-        max_length=16,
-        description="Sources of streams other than Zenoh.",
-        json_schema_extra=map_list("name"),
-    )
-    clients: list[KnownClient] = Field(
-        default_factory=list,
-        max_length=1024,
-        description="Clients that are known in advance. Other clients appear with their first sample.",
-        json_schema_extra=map_list("name"),
-    )
-    streams: list[Stream] = Field(
-        min_length=1,
-        max_length=128,
-        description="The data that the detector receives.",
-        json_schema_extra=map_list("name"),
-    )
-    asn1: list[Asn1Module] = Field(
-        default_factory=list,
-        max_length=32,
-        description="ASN.1 modules for uper streams. They define messages that no package defines, such as etsi/cpm, "
-        "or replace the definitions of the packages. Include all modules that they import.",
-        json_schema_extra=ATOMIC_LIST,
-    )
-    messages: list[MessageDefinition] = Field(
-        default_factory=list,
-        max_length=256,
-        description="Definitions of ROS 2 message types that the common packages lack or define differently.",
-        json_schema_extra=map_list("name"),
-    )
-    places: list[Place] = Field(
-        default_factory=list,
-        max_length=512,
-        description='The areas, lines and lanes that rules can name, as in at(position, "crossing").',
-        json_schema_extra=map_list("name"),
-    )
-    maps: list[MapFile] = Field(
-        default_factory=list,
-        max_length=16,
-        description="Files with more places. Lanelet2 maps and origin need pip install 'wayside[maps]'.",
-        json_schema_extra=ATOMIC_LIST,
-    )
-    buffer: BufferLimits = Field(default=BufferLimits(), description="The limits of the buffer of samples.")
-    client_timeout: PositiveDuration = Field(
-        default=PositiveDuration("30s"),
-        description="A client is lost after this time without data: its episodes end with reason ClientLost. Time "
-        "before the start of the detector does not count.",
-    )
-    clock: Clock = Field(
-        default=Clock.WALL,
-        description="The time of a sample. Wall: the time at which it was received. Data: its stamp, for simulated "
-        "time and recordings.",
-    )
-    lateness: Duration = Field(
-        default=Duration("200ms"),
-        description="Only with clock Data: how late samples may arrive. Tick t runs when the detector has received a "
-        "stamp that is later than t and not earlier than t + lateness.",
-    )
-    max_ahead: Duration = Field(
-        default=Duration("1s"),
-        description="Only with clock Data: the maximum time by which a stamp may be ahead of all others. A sample "
-        "further ahead is dropped and counted.",
-    )
-    state: State | None = Field(
-        default=None,
-        description="Persists open episodes. Without it, a restart restores only those episodes that have a live task.",
-    )
-    recordings: Recordings | None = Field(
-        default=None, description="The storage of record actions. Required by rules that record."
-    )
-    database: DatabaseConnection | None = Field(
-        default=None, description="The MongoDB database of database actions. Required by rules that use them."
-    )
-    rule_selector: LabelSelector = Field(
-        default=LabelSelector(),
-        description="Selects the EventRules of the namespace to evaluate, by their labels. Default: every rule.",
-    )
+    mode: DetectorMode | None = None
+    """Standalone: the application manager runs the detector as a Deployment in this namespace. Sidecar: the application
+    manager injects the detector into the pods of this namespace that have the label wayside.dev/detector: <name>.
+    Default: the detector is run by other means."""
+    pod: DetectorPod | None = None
+    """The detector's pod (Standalone), or its container in other pods (Sidecar). Only with a mode."""
+    service_account_names: list[ObjectName] | None = Field(default=None, max_length=64, json_schema_extra=SET_LIST)
+    """The service accounts whose pods may run the detector. Only these accounts get the detector's permissions. Only
+    with mode Sidecar."""
+    zenoh: Zenoh = Zenoh()
+    """The Zenoh session."""
+    sources: list[DataSource] = Field(default_factory=list, max_length=16, json_schema_extra=map_list("name"))
+    """Sources of streams other than Zenoh."""
+    clients: list[KnownClient] = Field(default_factory=list, max_length=1024, json_schema_extra=map_list("name"))
+    """Clients that are known in advance. Other clients appear with their first sample."""
+    streams: list[Stream] = Field(min_length=1, max_length=128, json_schema_extra=map_list("name"))
+    """The data that the detector receives."""
+    asn1: list[Asn1Module] = Field(default_factory=list, max_length=32, json_schema_extra=ATOMIC_LIST)
+    """ASN.1 modules for uper streams. They define messages that no package defines, such as etsi/cpm, or replace the
+    definitions of the packages. Include all modules that they import."""
+    messages: list[MessageDefinition] = Field(default_factory=list, max_length=256, json_schema_extra=map_list("name"))
+    """Definitions of ROS 2 message types that the common packages lack or define differently."""
+    places: list[Place] = Field(default_factory=list, max_length=512, json_schema_extra=map_list("name"))
+    """The areas, lines and lanes that rules can name, as in at(position, "crossing")."""
+    maps: list[MapFile] = Field(default_factory=list, max_length=16, json_schema_extra=ATOMIC_LIST)
+    """Files with more places. Lanelet2 maps and origin need pip install 'wayside[maps]'."""
+    buffer: BufferLimits = BufferLimits()
+    """The limits of the buffer of samples."""
+    client_timeout: PositiveDuration = PositiveDuration("30s")
+    """A client is lost after this time without data: its episodes end with reason ClientLost. Time before the start of
+    the detector does not count."""
+    clock: Clock = Clock.WALL
+    """The time of a sample. Wall: the time at which it was received. Data: its stamp, for simulated time and
+    recordings."""
+    lateness: Duration = Duration("200ms")
+    """Only with clock Data: how late samples may arrive. Tick t runs when the detector has received a stamp that is
+    later than t and not earlier than t + lateness."""
+    max_ahead: Duration = Duration("1s")
+    """Only with clock Data: the maximum time by which a stamp may be ahead of all others. A sample further ahead is
+    dropped and counted."""
+    state: State | None = None
+    """Persists open episodes. Without it, a restart restores only those episodes that have a live task."""
+    recordings: Recordings | None = None
+    """The storage of record actions. Required by rules that record."""
+    database: DatabaseConnection | None = None
+    """The MongoDB database of database actions. Required by rules that use them."""
+    rule_selector: LabelSelector = LabelSelector()
+    """Selects the EventRules of the namespace to evaluate, by their labels. Default: every rule."""
 
     @model_validator(mode="after")
     def _unique_names(self) -> DetectorSpec:
@@ -300,15 +242,14 @@ class DetectorSpec(Model):
 class DetectorStatus(Model):
     """The observed state of the detector."""
 
-    observed_generation: int = Field(
-        default=0, description="The metadata.generation that the status was computed from."
-    )
-    rules: int = Field(default=0, description="The number of EventRules that the detector selects.")
-    conditions: list[Condition] = conditions_field(
-        "Accepted: the specification is valid. Running (only with a mode): the detector runs; otherwise the reason "
-        "explains why not. Ready: Accepted and, with a mode, Running are True. Stalled: the specification is invalid "
-        "and must be corrected."
-    )
+    observed_generation: int = 0
+    """The metadata.generation that the status was computed from."""
+    rules: int = 0
+    """The number of EventRules that the detector selects."""
+    conditions: Conditions = Field(default_factory=list)
+    """Accepted: the specification is valid. Running (only with a mode): the detector runs; otherwise the reason
+    explains why not. Ready: Accepted and, with a mode, Running are True. Stalled: the specification is invalid and must
+    be corrected."""
 
 
 class Detector(Kind):
@@ -331,5 +272,7 @@ class Detector(Kind):
     ]
 
     kind: str = "Detector"
-    spec: DetectorSpec = Field(description="The streams, buffer, clock and rules of the detector.")
-    status: DetectorStatus | None = Field(default=None, description="The observed state of the detector.")
+    spec: DetectorSpec
+    """The streams, buffer, clock and rules of the detector."""
+    status: DetectorStatus | None = None
+    """The observed state of the detector."""

@@ -21,26 +21,16 @@ class Evaluation(Model):
     )
 
     every: Duration | None = Field(
-        default=None,
-        description="Evaluate the rule at whole multiples of this period, 10ms or more. Default: 1s.",
-        json_schema_extra=checked(("duration(self) >= duration('10ms')", "give 10ms or more")),
+        default=None, json_schema_extra=checked(("duration(self) >= duration('10ms')", "give 10ms or more"))
     )
-    on_sample: ObjectName | None = Field(
-        default=None,
-        description="Evaluate the rule at each sample of this stream, for the subjects of the sample's client, and "
-        "whenever a `for`, a cooldown or an unknownTimeout expires.",
-    )
-    on_demand: bool | None = Field(
-        default=None,
-        description="If true, evaluate the rule only on request.",
-        json_schema_extra=checked(("self", "write true, or leave it out")),
-    )
-    priority: int = Field(
-        default=0,
-        ge=-1_000,
-        le=1_000,
-        description="Under overload, the detector evaluates rules of lower priority less often, the lowest first.",
-    )
+    """Evaluate the rule at whole multiples of this period, 10ms or more. Default: 1s."""
+    on_sample: ObjectName | None = None
+    """Evaluate the rule at each sample of this stream, for the subjects of the sample's client, and whenever a `for`, a
+    cooldown or an unknownTimeout expires."""
+    on_demand: bool | None = Field(default=None, json_schema_extra=checked(("self", "write true, or leave it out")))
+    """If true, evaluate the rule only on request."""
+    priority: int = Field(default=0, ge=-1_000, le=1_000)
+    """Under overload, the detector evaluates rules of lower priority less often, the lowest first."""
 
     @property
     def period_ns(self) -> int | None:

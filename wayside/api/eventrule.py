@@ -11,7 +11,7 @@ from wayside.api.actions.action import ActionSpec
 from wayside.api.base import (
     ATOMIC_LIST,
     ClientName,
-    Condition,
+    Conditions,
     Duration,
     Expression,
     Identifier,
@@ -20,7 +20,6 @@ from wayside.api.base import (
     ObjectName,
     PositiveDuration,
     WindowLength,
-    conditions_field,
     map_list,
     validations,
 )
@@ -136,81 +135,55 @@ class Signal(Model):
         ),
     )
 
-    name: Identifier = Field(description="The name of the variable in expressions.")
-    stream: ObjectName | None = Field(default=None, description="The name of a stream of the Detector.")
-    rule_name: ObjectName | None = Field(
-        default=None,
-        description="Instead of a stream: another rule that the Detector selects. Its samples are the starts "
-        "(or ends, see samples) of those episodes of that rule in which the client is a subject. msg contains "
-        "episode, subject, subjects, onsetTime and startTime (seconds since the epoch), and the values at the start.",
-    )
-    samples: Samples = Field(
-        default=Samples.STARTS,
-        description="Only with ruleName. Starts: the samples are the starts of episodes. Ends: the samples are the "
-        "ends of episodes; msg also contains endTime, reason and the values at the end.",
-    )
-    model: ModelSource | None = Field(
-        default=None, description="Instead of a stream: an ONNX model over other signals, an image or a point cloud."
-    )
-    plugin: SignalPlugin | None = Field(
-        default=None,
-        description="Instead of a stream: Python code that computes the value for the rule's subject at each "
-        "evaluation. In a pairs scope, the value belongs to the pair: expressions use its name without a or b.",
-    )
-    of: Expression | None = Field(
-        default=None,
-        description="Instead of a stream: CEL over the variables of `when`, such as another signal or the distance "
-        "of a pair. Each evaluation of the subject adds one sample, the value of the expression. "
-        "Without over and lag, the signal is the value itself. In a pairs scope, the value belongs to "
-        "the pair: expressions use its name without a or b. Samples that over and lag need are kept, with at most "
-        "25 bytes each.",
-    )
-    client: ClientName | None = Field(
-        default=None,
-        description="Only with stream or ruleName: the client whose samples or episodes the signal uses for every "
-        "subject, e.g. a traffic light. The signal is unknown while the detector does not know this "
-        "client. Default: the subject's own client.",
-    )
-    value: Expression | None = Field(
-        default=None,
-        description="CEL over msg (the decoded sample), item (its item, if the stream has items), before (the "
-        "client's previous message or item, unless that was stale already), key (the captured chunks), "
-        "sample (stamp, received, latency, size) and parameters. Required, except with the aggregates "
-        "Count, Age and Active.",
-    )
-    where: Expression | None = Field(
-        default=None, description="CEL over msg, key, sample and parameters. Only samples for which it is true count."
-    )
-    over: WindowLength | None = Field(
-        default=None,
-        description="The length of the window: at tick t the window is (t - over, t]. Required, except with the "
-        "aggregates Last, First, Previous, Age and Active. Episode (only with of): the window is the open "
-        "episode, from its start to its end. Such a signal is known only while an episode is "
-        "open. Events and actions can use it; conditions and other signals cannot.",
-    )
-    lag: PositiveDuration | None = Field(
-        default=None,
-        description="Only with of: how far in the past the window ends. At tick t the window is "
-        "(t - lag - over, t - lag].",
-    )
-    aggregate: Aggregate = Field(
-        default=Aggregate.LAST,
-        description="How the samples become one value. Last, Previous, First: the newest, the second newest, the "
-        "oldest value. Min, Max, Mean, Sum, StdDev (of the population), Quantile: of numbers. Delta: "
-        "last - first. Rate: Delta per second. Slope: the slope of the least-squares line, per second. "
-        "All, Any: of booleans. Distinct: the list of distinct values. Count: the number of samples. "
-        "Age: seconds since the last sample was received; over an episode, since its start. Active "
-        "(only with ruleName): whether an episode is open. MinTime, MaxTime: the time of the first "
-        "smallest or largest number, in seconds since the epoch.",
-    )
+    name: Identifier
+    """The name of the variable in expressions."""
+    stream: ObjectName | None = None
+    """The name of a stream of the Detector."""
+    rule_name: ObjectName | None = None
+    """Instead of a stream: another rule that the Detector selects. Its samples are the starts (or ends, see samples) of
+    those episodes of that rule in which the client is a subject. msg contains episode, subject, subjects, onsetTime and
+    startTime (seconds since the epoch), and the values at the start."""
+    samples: Samples = Samples.STARTS
+    """Only with ruleName. Starts: the samples are the starts of episodes. Ends: the samples are the ends of episodes;
+    msg also contains endTime, reason and the values at the end."""
+    model: ModelSource | None = None
+    """Instead of a stream: an ONNX model over other signals, an image or a point cloud."""
+    plugin: SignalPlugin | None = None
+    """Instead of a stream: Python code that computes the value for the rule's subject at each evaluation. In a pairs
+    scope, the value belongs to the pair: expressions use its name without a or b."""
+    of: Expression | None = None
+    """Instead of a stream: CEL over the variables of `when`, such as another signal or the distance of a pair. Each
+    evaluation of the subject adds one sample, the value of the expression. Without over and lag, the signal is the
+    value itself. In a pairs scope, the value belongs to the pair: expressions use its name without a or b. Samples that
+    over and lag need are kept, with at most 25 bytes each."""
+    client: ClientName | None = None
+    """Only with stream or ruleName: the client whose samples or episodes the signal uses for every subject, e.g. a
+    traffic light. The signal is unknown while the detector does not know this client. Default: the subject's own
+    client."""
+    value: Expression | None = None
+    """CEL over msg (the decoded sample), item (its item, if the stream has items), before (the client's previous
+    message or item, unless that was stale already), key (the captured chunks), sample (stamp, received, latency, size)
+    and parameters. Required, except with the aggregates Count, Age and Active."""
+    where: Expression | None = None
+    """CEL over msg, key, sample and parameters. Only samples for which it is true count."""
+    over: WindowLength | None = None
+    """The length of the window: at tick t the window is (t - over, t]. Required, except with the aggregates Last,
+    First, Previous, Age and Active. Episode (only with of): the window is the open episode, from its start to its end.
+    Such a signal is known only while an episode is open. Events and actions can use it; conditions and other signals
+    cannot."""
+    lag: PositiveDuration | None = None
+    """Only with of: how far in the past the window ends. At tick t the window is (t - lag - over, t - lag]."""
+    aggregate: Aggregate = Aggregate.LAST
+    """How the samples become one value. Last, Previous, First: the newest, the second newest, the oldest value. Min,
+    Max, Mean, Sum, StdDev (of the population), Quantile: of numbers. Delta: last - first. Rate: Delta per second.
+    Slope: the slope of the least-squares line, per second. All, Any: of booleans. Distinct: the list of distinct
+    values. Count: the number of samples. Age: seconds since the last sample was received; over an episode, since its
+    start. Active (only with ruleName): whether an episode is open. MinTime, MaxTime: the time of the first smallest or
+    largest number, in seconds since the epoch."""
 
-    quantile: float | None = Field(
-        default=None,
-        ge=0,
-        le=1,
-        description="Only with aggregate Quantile: 0.5 for the median, 0.95 for the 95th percentile. Interpolated "
-        "linearly between two values.",
-    )
+    quantile: float | None = Field(default=None, ge=0, le=1)
+    """Only with aggregate Quantile: 0.5 for the median, 0.95 for the 95th percentile. Interpolated linearly between two
+    values."""
 
     @property
     def is_derived(self) -> bool:
@@ -255,70 +228,47 @@ class Signal(Model):
 class EventRuleSpec(Model):
     """An event and its actions."""
 
-    description: str = Field(default="", max_length=1024, description="A description of the event, for people.")
-    classification: Classification | None = Field(default=None, description="The classification of the use case.")
-    enabled: bool = Field(
-        default=True,
-        description="If false, the rule is loaded and validated, but not evaluated, and its open episodes end.",
-    )
-    dry_run: bool = Field(
-        default=False, description="If true, events are published with the mark dryRun, but no action runs."
-    )
-    scope: Scope = Field(default=Scope(client=ClientScope()), description="The subjects of the rule.")
-    each: Each | None = Field(
-        default=None, description="The elements of the rule. The rule is evaluated once for each element."
-    )
-    evaluation: Evaluation = Field(default=Evaluation(), description="When the rule is evaluated.")
-    parameters: Constants = Field(
-        default_factory=dict,
-        description="Constants for expressions, used as parameters.<name>: numbers, texts, booleans, and lists and "
-        "maps of them, such as polygons; at most 64 KiB in total. A Detector can override them per client.",
-    )
-    signals: list[Signal] = Field(
-        default_factory=list,
-        max_length=64,
-        description="The values that conditions use. In a pairs scope, each client has its own: a.speed, b.speed.",
-        json_schema_extra=map_list("name"),
-    )
-    when: Expression = Field(description="CEL, boolean: the condition that starts an episode.")
-    margin: dict[Identifier, Annotated[float, Field(gt=0)]] | None = Field(
-        default=None,
-        max_length=64,
-        description="Adds a signal named margin to the rule: how far `when` is from changing. It is positive while "
-        "`when` is true, and negative while `when` is false. The margin of a comparison is the distance to its "
-        "threshold; && takes the smaller margin of its two sides, || the larger; ! negates. If `when` compares "
-        "several quantities, give a scale for each: the signal (or distance, closingSpeed) and the "
-        "difference that counts as 1. The results of a replay list the ten largest margins without an episode.",
-    )
-    until: Expression | None = Field(
-        default=None,
-        description="CEL, boolean: the condition that ends an open episode. Default: the negation of `when`.",
-    )
-    for_: Duration = Field(
-        default=Duration("0s"), alias="for", description="How long `when` must hold before an episode starts."
-    )
-    cooldown: Duration = Field(
-        default=Duration("0s"),
-        description="The time after the end of an episode during which the subject cannot have a new onset.",
-    )
-    max_episodes_per_hour: int | None = Field(
-        default=None,
-        ge=1,
-        le=1_000_000,
-        description="The maximum number of episodes per client and hour. Further episodes are skipped and counted. "
-        "Default: no limit.",
-    )
-    unknown_timeout: Duration | None = Field(
-        default=None,
-        description="An open episode ends with reason Unknown after its condition has been unknown for this time. "
-        "Default: the Detector's clientTimeout.",
-    )
-    actions: list[ActionSpec] = Field(
-        default_factory=list,
-        max_length=16,
-        description="The actions of an episode. Without actions, the rule only publishes events.",
-        json_schema_extra=map_list("name"),
-    )
+    description: str = Field(default="", max_length=1024)
+    """A description of the event, for people."""
+    classification: Classification | None = None
+    """The classification of the use case."""
+    enabled: bool = True
+    """If false, the rule is loaded and validated, but not evaluated, and its open episodes end."""
+    dry_run: bool = False
+    """If true, events are published with the mark dryRun, but no action runs."""
+    scope: Scope = Scope(client=ClientScope())
+    """The subjects of the rule."""
+    each: Each | None = None
+    """The elements of the rule. The rule is evaluated once for each element."""
+    evaluation: Evaluation = Evaluation()
+    """When the rule is evaluated."""
+    parameters: Constants = Field(default_factory=dict)
+    """Constants for expressions, used as parameters.<name>: numbers, texts, booleans, and lists and maps of them, such
+    as polygons; at most 64 KiB in total. A Detector can override them per client."""
+    signals: list[Signal] = Field(default_factory=list, max_length=64, json_schema_extra=map_list("name"))
+    """The values that conditions use. In a pairs scope, each client has its own: a.speed, b.speed."""
+    when: Expression
+    """CEL, boolean: the condition that starts an episode."""
+    margin: dict[Identifier, Annotated[float, Field(gt=0)]] | None = Field(default=None, max_length=64)
+    """Adds a signal named margin to the rule: how far `when` is from changing. It is positive while `when` is true, and
+    negative while `when` is false. The margin of a comparison is the distance to its threshold; && takes the smaller
+    margin of its two sides, || the larger; ! negates. If `when` compares several quantities, give a scale for each: the
+    signal (or distance, closingSpeed) and the difference that counts as 1. The results of a replay list the ten largest
+    margins without an episode."""
+    until: Expression | None = None
+    """CEL, boolean: the condition that ends an open episode. Default: the negation of `when`."""
+    for_: Duration = Field(default=Duration("0s"), alias="for")
+    """How long `when` must hold before an episode starts."""
+    cooldown: Duration = Duration("0s")
+    """The time after the end of an episode during which the subject cannot have a new onset."""
+    max_episodes_per_hour: int | None = Field(default=None, ge=1, le=1_000_000)
+    """The maximum number of episodes per client and hour. Further episodes are skipped and counted. Default: no
+    limit."""
+    unknown_timeout: Duration | None = None
+    """An open episode ends with reason Unknown after its condition has been unknown for this time. Default: the
+    Detector's clientTimeout."""
+    actions: list[ActionSpec] = Field(default_factory=list, max_length=16, json_schema_extra=map_list("name"))
+    """The actions of an episode. Without actions, the rule only publishes events."""
 
     @model_validator(mode="after")
     def _unique_names(self) -> EventRuleSpec:
@@ -332,23 +282,16 @@ class EventRuleSpec(Model):
 class EventRuleStatus(Model):
     """The observed state of the rule."""
 
-    observed_generation: int = Field(
-        default=0, description="The metadata.generation that the status was computed from."
-    )
+    observed_generation: int = 0
+    """The metadata.generation that the status was computed from."""
     detectors: list[Annotated[str, Field(max_length=63)]] = Field(
-        default_factory=list,
-        max_length=256,
-        description="The Detectors that select the rule.",
-        json_schema_extra=ATOMIC_LIST,
+        default_factory=list, max_length=256, json_schema_extra=ATOMIC_LIST
     )
-    selected_by: str = Field(
-        default="",
-        max_length=1024,
-        description="The names of the Detectors that select the rule, as one text for tables.",
-    )
-    conditions: list[Condition] = conditions_field(
-        "Accepted, Ready: the rule can be evaluated. Stalled: the rule is invalid and must be corrected."
-    )
+    """The Detectors that select the rule."""
+    selected_by: str = Field(default="", max_length=1024)
+    """The names of the Detectors that select the rule, as one text for tables."""
+    conditions: Conditions = Field(default_factory=list)
+    """Accepted, Ready: the rule can be evaluated. Stalled: the rule is invalid and must be corrected."""
 
 
 class EventRule(Kind):
@@ -366,8 +309,10 @@ class EventRule(Kind):
     ]
 
     kind: str = "EventRule"
-    spec: EventRuleSpec = Field(description="The definition of the event, and its actions.")
-    status: EventRuleStatus | None = Field(default=None, description="The observed state of the rule.")
+    spec: EventRuleSpec
+    """The definition of the event, and its actions."""
+    status: EventRuleStatus | None = None
+    """The observed state of the rule."""
 
     def semantics(self) -> dict[str, Any]:
         """The fields that decide which episodes there are; another value of any of them ends open episodes."""

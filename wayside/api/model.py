@@ -16,30 +16,17 @@ TensorName = Annotated[str, Field(min_length=1, max_length=128)]
 class ModelWindow(Model):
     """The latest values of signals over a stream: the newest samples, or a time span resampled at equal steps."""
 
-    signals: list[Identifier] = Field(
-        min_length=1,
-        max_length=64,
-        description="Signals of this rule that read a stream. The input consists of the values of their samples; "
-        "their aggregates are ignored.",
-        json_schema_extra=ATOMIC_LIST,
-    )
-    last: int | None = Field(
-        default=None,
-        ge=1,
-        le=10_000,
-        description="The number of newest samples. The signal is unknown while there are fewer.",
-    )
-    over: PositiveDuration | None = Field(
-        default=None, description="Instead of last: the time span up to now, resampled at `samples` equal steps."
-    )
-    samples: int | None = Field(
-        default=None,
-        ge=2,
-        le=10_000,
-        description="With over: the number of values; the last one is at the current time. Values between two samples "
-        "are interpolated linearly; after the newest sample, its value is held. The signal is unknown while no sample "
-        "is as old as the first step.",
-    )
+    signals: list[Identifier] = Field(min_length=1, max_length=64, json_schema_extra=ATOMIC_LIST)
+    """Signals of this rule that read a stream. The input consists of the values of their samples; their aggregates are
+    ignored."""
+    last: int | None = Field(default=None, ge=1, le=10_000)
+    """The number of newest samples. The signal is unknown while there are fewer."""
+    over: PositiveDuration | None = None
+    """Instead of last: the time span up to now, resampled at `samples` equal steps."""
+    samples: int | None = Field(default=None, ge=2, le=10_000)
+    """With over: the number of values; the last one is at the current time. Values between two samples are interpolated
+    linearly; after the newest sample, its value is held. The signal is unknown while no sample is as old as the first
+    step."""
 
     @model_validator(mode="after")
     def _complete(self) -> ModelWindow:
@@ -73,33 +60,22 @@ class ImageLayout(StrEnum):
 class ModelImage(Model):
     """The newest sensor_msgs/msg/Image of a stream: (pixel * scale - mean) / std of each channel."""
 
-    stream: ObjectName = Field(description="A stream of type sensor_msgs/msg/Image.")
-    width: int = Field(
-        ge=1, le=4096, description="The width in pixels. An image of another size is resampled (nearest pixel)."
-    )
-    height: int = Field(ge=1, le=4096, description="The height in pixels.")
-    channels: Channels = Field(
-        default=Channels.RGB, description="The channels of a pixel: Gray, Rgb or Bgr. The image is converted to them."
-    )
-    layout: ImageLayout = Field(
-        default=ImageLayout.CHW,
-        description="The order of the axes. Chw: channels, rows, columns. Hwc: rows, columns, channels.",
-    )
-    scale: float = Field(
-        default=1.0, description="The factor for each pixel value, e.g. 0.00392157 to map 0…255 to 0…1."
-    )
-    mean: list[float] = Field(
-        default_factory=list,
-        max_length=3,
-        description="The values to subtract after scaling, one per channel. Default: 0.",
-        json_schema_extra=ATOMIC_LIST,
-    )
-    std: list[Annotated[float, Field(gt=0)]] = Field(
-        default_factory=list,
-        max_length=3,
-        description="The values to divide by after subtracting the mean, one per channel. Default: 1.",
-        json_schema_extra=ATOMIC_LIST,
-    )
+    stream: ObjectName
+    """A stream of type sensor_msgs/msg/Image."""
+    width: int = Field(ge=1, le=4096)
+    """The width in pixels. An image of another size is resampled (nearest pixel)."""
+    height: int = Field(ge=1, le=4096)
+    """The height in pixels."""
+    channels: Channels = Channels.RGB
+    """The channels of a pixel: Gray, Rgb or Bgr. The image is converted to them."""
+    layout: ImageLayout = ImageLayout.CHW
+    """The order of the axes. Chw: channels, rows, columns. Hwc: rows, columns, channels."""
+    scale: float = 1.0
+    """The factor for each pixel value, e.g. 0.00392157 to map 0…255 to 0…1."""
+    mean: list[float] = Field(default_factory=list, max_length=3, json_schema_extra=ATOMIC_LIST)
+    """The values to subtract after scaling, one per channel. Default: 0."""
+    std: list[Annotated[float, Field(gt=0)]] = Field(default_factory=list, max_length=3, json_schema_extra=ATOMIC_LIST)
+    """The values to divide by after subtracting the mean, one per channel. Default: 1."""
 
     @model_validator(mode="after")
     def _one_for_each_channel(self) -> ModelImage:
@@ -117,26 +93,17 @@ class ModelImage(Model):
 class ModelPoints(Model):
     """The newest sensor_msgs/msg/PointCloud2 of a stream: `count` points, with the fields in this order."""
 
-    stream: ObjectName = Field(description="A stream of type sensor_msgs/msg/PointCloud2.")
+    stream: ObjectName
+    """A stream of type sensor_msgs/msg/PointCloud2."""
     fields: list[Annotated[str, Field(min_length=1, max_length=64)]] = Field(
-        default_factory=lambda: ["x", "y", "z"],
-        min_length=1,
-        max_length=16,
-        description="The fields of each point, e.g. x, y, z and intensity.",
-        json_schema_extra=ATOMIC_LIST,
+        default_factory=lambda: ["x", "y", "z"], min_length=1, max_length=16, json_schema_extra=ATOMIC_LIST
     )
-    count: int = Field(
-        ge=1,
-        le=1_000_000,
-        description="The number of points. A larger cloud is thinned to every n-th point; a smaller one is padded "
-        "with zeros. Points with a NaN in a field or in x, y, z are omitted.",
-    )
-    scale: list[float] = Field(
-        default_factory=list,
-        max_length=16,
-        description="The factors for the fields, one per field. Default: 1.",
-        json_schema_extra=ATOMIC_LIST,
-    )
+    """The fields of each point, e.g. x, y, z and intensity."""
+    count: int = Field(ge=1, le=1_000_000)
+    """The number of points. A larger cloud is thinned to every n-th point; a smaller one is padded with zeros. Points
+    with a NaN in a field or in x, y, z are omitted."""
+    scale: list[float] = Field(default_factory=list, max_length=16, json_schema_extra=ATOMIC_LIST)
+    """The factors for the fields, one per field. Default: 1."""
 
     @model_validator(mode="after")
     def _one_for_each_field(self) -> ModelPoints:
@@ -150,21 +117,16 @@ class ModelPoints(Model):
 class ModelInput(Model):
     """One input of the model: exactly one of signals, window, image and points."""
 
-    name: TensorName = Field(description="The input's name in the model file.")
-    signals: list[Identifier] = Field(
-        default_factory=list,
-        max_length=64,
-        description="Signals of the rule. The input is a vector of their current values, numbers or booleans.",
-        json_schema_extra=ATOMIC_LIST,
-    )
-    window: ModelWindow | None = Field(
-        default=None,
-        description="The latest values of signals: a vector of one signal, or a matrix with one column per signal.",
-    )
-    image: ModelImage | None = Field(default=None, description="The newest image of a camera.")
-    points: ModelPoints | None = Field(
-        default=None, description="The newest point cloud of a lidar, as a matrix with one row per point."
-    )
+    name: TensorName
+    """The input's name in the model file."""
+    signals: list[Identifier] = Field(default_factory=list, max_length=64, json_schema_extra=ATOMIC_LIST)
+    """Signals of the rule. The input is a vector of their current values, numbers or booleans."""
+    window: ModelWindow | None = None
+    """The latest values of signals: a vector of one signal, or a matrix with one column per signal."""
+    image: ModelImage | None = None
+    """The newest image of a camera."""
+    points: ModelPoints | None = None
+    """The newest point cloud of a lidar, as a matrix with one row per point."""
 
     @model_validator(mode="after")
     def _exactly_one(self) -> ModelInput:
@@ -190,29 +152,15 @@ class ModelInput(Model):
 class ModelSource(Model):
     """An ONNX model. Its first axis is the batch of clients, which are computed together."""
 
-    file: str = Field(
-        min_length=1,
-        max_length=1024,
-        description="The path of the .onnx file, e.g. on a volume: /models/risk.onnx. Events contain its SHA-256 "
-        "digest.",
-    )
-    sha256: str | None = Field(
-        default=None,
-        pattern=r"^[0-9a-f]{64}$",
-        max_length=64,
-        description="The expected SHA-256 digest of the file. Any other file is refused.",
-    )
-    inputs: list[ModelInput] = Field(
-        min_length=1,
-        max_length=16,
-        description="The inputs of the model, all of them.",
-        json_schema_extra=map_list("name"),
-    )
-    output: TensorName | None = Field(
-        default=None,
-        description="The output to use as the signal: a number, or a list if it has several values. Default: the only "
-        "output, or a map of all outputs by name.",
-    )
+    file: str = Field(min_length=1, max_length=1024)
+    """The path of the .onnx file, e.g. on a volume: /models/risk.onnx. Events contain its SHA-256 digest."""
+    sha256: str | None = Field(default=None, pattern=r"^[0-9a-f]{64}$", max_length=64)
+    """The expected SHA-256 digest of the file. Any other file is refused."""
+    inputs: list[ModelInput] = Field(min_length=1, max_length=16, json_schema_extra=map_list("name"))
+    """The inputs of the model, all of them."""
+    output: TensorName | None = None
+    """The output to use as the signal: a number, or a list if it has several values. Default: the only output, or a map
+    of all outputs by name."""
 
     @model_validator(mode="after")
     def _unique_names(self) -> ModelSource:

@@ -100,42 +100,31 @@ class Parameter(Model):
         ),
     )
 
-    type: ParameterType = Field(description="The JSON type of the value; integer is a number without a fraction.")
-    items: ItemType | None = Field(default=None, description="The JSON type of an array's items. Default: any type.")
-    description: str = Field(default="", max_length=1024, description="The meaning of the parameter, with its unit.")
-    required: bool = Field(
-        default=False, description="If true, every task must set the parameter. A required parameter has no default."
-    )
-    default: JsonValue = Field(default=None, description="The value if no task sets the parameter.")
-    minimum: float | None = Field(
-        default=None, description="The minimum of a number. A task with a smaller value is refused."
-    )
-    maximum: float | None = Field(
-        default=None,
-        description="The maximum of a number. A task with a larger value is refused. A larger merged Sum is capped, "
-        "and the condition Capped of the instance reports it.",
-    )
-    pattern: str | None = Field(
-        default=None,
-        min_length=1,
-        max_length=256,
-        description="A regular expression (RE2 syntax) for a text, or for each text of an array. It may match "
-        "anywhere in the text; use ^…$ to match the whole text.",
-    )
-    enum: list[JsonValue] | None = Field(
-        default=None,
-        min_length=1,
-        max_length=64,
-        description="The allowed values. Not with merge Union, Intersection or Sum, whose results may be other values.",
-        json_schema_extra=ATOMIC_LIST,
-    )
-    merge: Merge = Field(
-        default=Merge.SAME,
-        description="How the values of several tasks become one. Same: tasks must agree; a task that differs is "
-        "refused with reason Conflict. Union, Intersection: the items of any array, or of all arrays, sorted. Max, "
-        "Min, Sum: the maximum, minimum or sum of the numbers. All, Any: true if all, or any, of the booleans are "
-        "true. HighestPriority: the value of the task with the highest priority.",
-    )
+    type: ParameterType
+    """The JSON type of the value; integer is a number without a fraction."""
+    items: ItemType | None = None
+    """The JSON type of an array's items. Default: any type."""
+    description: str = Field(default="", max_length=1024)
+    """The meaning of the parameter, with its unit."""
+    required: bool = False
+    """If true, every task must set the parameter. A required parameter has no default."""
+    default: JsonValue = None
+    """The value if no task sets the parameter."""
+    minimum: float | None = None
+    """The minimum of a number. A task with a smaller value is refused."""
+    maximum: float | None = None
+    """The maximum of a number. A task with a larger value is refused. A larger merged Sum is capped, and the condition
+    Capped of the instance reports it."""
+    pattern: str | None = Field(default=None, min_length=1, max_length=256)
+    """A regular expression (RE2 syntax) for a text, or for each text of an array. It may match anywhere in the text;
+    use ^…$ to match the whole text."""
+    enum: list[JsonValue] | None = Field(default=None, min_length=1, max_length=64, json_schema_extra=ATOMIC_LIST)
+    """The allowed values. Not with merge Union, Intersection or Sum, whose results may be other values."""
+    merge: Merge = Merge.SAME
+    """How the values of several tasks become one. Same: tasks must agree; a task that differs is refused with reason
+    Conflict. Union, Intersection: the items of any array, or of all arrays, sorted. Max, Min, Sum: the maximum, minimum
+    or sum of the numbers. All, Any: true if all, or any, of the booleans are true. HighestPriority: the value of the
+    task with the highest priority."""
 
     @model_validator(mode="after")
     def _coherent(self) -> Parameter:

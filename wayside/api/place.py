@@ -31,30 +31,17 @@ class Place(Model):
         ("!has(self.width) || (has(self.line) && !has(self.area))", _WIDTH),
     )
 
-    name: ClientName = Field(description='The name of the place in expressions, as in at(position, "crossing").')
-    frame: CoordinateFrame = Field(
-        default=CoordinateFrame.METRES,
-        description="Metres: the points are x and y in the frame of the positions. Wgs84: they are latitude and "
-        "longitude in degrees.",
-    )
-    area: list[Corner] | None = Field(
-        default=None,
-        min_length=3,
-        max_length=1000,
-        description="The corners of an area. It is closed automatically, and its edges must not cross.",
-        json_schema_extra=ATOMIC_LIST,
-    )
-    line: list[Corner] | None = Field(
-        default=None,
-        min_length=2,
-        max_length=1000,
-        description="The points of a line, in its direction. With an area: the centreline of the lane, whose "
-        "surface is the area.",
-        json_schema_extra=ATOMIC_LIST,
-    )
-    width: float | None = Field(
-        default=None, gt=0, le=1000, description="The width in metres of a lane. Its centreline is line."
-    )
+    name: ClientName
+    """The name of the place in expressions, as in at(position, "crossing")."""
+    frame: CoordinateFrame = CoordinateFrame.METRES
+    """Metres: the points are x and y in the frame of the positions. Wgs84: they are latitude and longitude in
+    degrees."""
+    area: list[Corner] | None = Field(default=None, min_length=3, max_length=1000, json_schema_extra=ATOMIC_LIST)
+    """The corners of an area. It is closed automatically, and its edges must not cross."""
+    line: list[Corner] | None = Field(default=None, min_length=2, max_length=1000, json_schema_extra=ATOMIC_LIST)
+    """The points of a line, in its direction. With an area: the centreline of the lane, whose surface is the area."""
+    width: float | None = Field(default=None, gt=0, le=1000)
+    """The width in metres of a lane. Its centreline is line."""
 
     @model_validator(mode="after")
     def _complete(self) -> Place:
@@ -68,8 +55,10 @@ class Place(Model):
 class Origin(Model):
     """The point of the Earth at which the metres of a map begin."""
 
-    latitude: float = Field(ge=-90, le=90, description="Degrees north (WGS 84).")
-    longitude: float = Field(ge=-180, le=180, description="Degrees east (WGS 84).")
+    latitude: float = Field(ge=-90, le=90)
+    """Degrees north (WGS 84)."""
+    longitude: float = Field(ge=-180, le=180)
+    """Degrees east (WGS 84)."""
 
 
 class Projection(StrEnum):
@@ -82,20 +71,12 @@ class Projection(StrEnum):
 class MapFile(Model):
     """A file with places."""
 
-    file: str = Field(
-        min_length=1,
-        max_length=1024,
-        description="The path of a GeoJSON file (.geojson, .json) or a lanelet2 map (.osm), as the detector sees "
-        "it: relative to its working directory, or on a mounted volume. The name of a place is the "
-        "property or tag `name`, or else the id.",
-    )
-    origin: Origin | None = Field(
-        default=None,
-        description="The point at which x and y are 0. With it, places are in metres, by projection. Default: "
-        "places are in degrees (WGS 84).",
-    )
-    projection: Projection = Field(
-        default=Projection.UTM,
-        description="Only with origin. Utm: metres of the UTM zone of the origin. LocalCartesian: metres east and "
-        "north on the plane that touches the Earth at the origin.",
-    )
+    file: str = Field(min_length=1, max_length=1024)
+    """The path of a GeoJSON file (.geojson, .json) or a lanelet2 map (.osm), as the detector sees it: relative to its
+    working directory, or on a mounted volume. The name of a place is the property or tag `name`, or else the id."""
+    origin: Origin | None = None
+    """The point at which x and y are 0. With it, places are in metres, by projection. Default: places are in degrees
+    (WGS 84)."""
+    projection: Projection = Projection.UTM
+    """Only with origin. Utm: metres of the UTM zone of the origin. LocalCartesian: metres east and north on the plane
+    that touches the Earth at the origin."""

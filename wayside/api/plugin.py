@@ -20,42 +20,32 @@ PluginName = Annotated[str, Field(min_length=1, max_length=63, pattern=r"^[a-z0-
 class DataSource(Model):
     """A plugin that receives samples, and its parameters."""
 
-    name: ObjectName = Field(description="The name by which streams refer to the source.")
-    plugin: PluginName = Field(
-        description="The plugin: mqtt, bag, or the name of a wayside.sources entry point of an installed package."
-    )
-    parameters: FreeData = Field(
-        default_factory=dict,
-        description="The parameters of the plugin; see its documentation.",
-    )
+    name: ObjectName
+    """The name by which streams refer to the source."""
+    plugin: PluginName
+    """The plugin: mqtt, bag, or the name of a wayside.sources entry point of an installed package."""
+    parameters: FreeData = Field(default_factory=dict)
+    """The parameters of the plugin; see its documentation."""
 
 
 class SignalPlugin(Model):
     """A plugin that computes a signal, and its parameters."""
 
-    name: PluginName = Field(
-        description="The plugin: unmatched-objects, or the name of a wayside.signals entry point of an installed "
-        "package."
-    )
-    parameters: FreeData = Field(
-        default_factory=dict,
-        description="The parameters of the plugin; see its documentation.",
-    )
+    name: PluginName
+    """The plugin: unmatched-objects, or the name of a wayside.signals entry point of an installed package."""
+    parameters: FreeData = Field(default_factory=dict)
+    """The parameters of the plugin; see its documentation."""
 
 
 class ActionPlugin(Model):
     """An action of an installed package, and its parameters."""
 
-    name: PluginName = Field(
-        description="The plugin: the name of a wayside.actions entry point of an installed package."
-    )
-    parameters: FreeData = Field(
-        default_factory=dict,
-        description="The parameters of the plugin; see its documentation.",
-    )
-    values: NamedData = Field(
-        default_factory=dict,
-        description="Values that the plugin receives for each episode, with ${…} over the rule's variables at the "
-        "start of the episode.",
-    )
-    window: Window | None = Field(default=None, description="The samples that the plugin receives. Default: none.")
+    name: PluginName
+    """The plugin: the name of a wayside.actions entry point of an installed package."""
+    parameters: FreeData = Field(default_factory=dict)
+    """The parameters of the plugin; see its documentation."""
+    values: NamedData = Field(default_factory=dict)
+    """Values that the plugin receives for each episode, with ${…} over the rule's variables at the start of the
+    episode."""
+    window: Window | None = None
+    """The samples that the plugin receives. Default: none."""

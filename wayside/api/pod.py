@@ -67,26 +67,22 @@ class DetectorVolume(Model):
         (f"!self.name.matches('{_OWN_VOLUMES}')", _OWN_VOLUME, ".name", "Forbidden"),
     )
 
-    name: ObjectName = Field(description="The name of the volume.")
-    persistent_volume_claim: Embedded | None = Field(
-        default=None, description="A PersistentVolumeClaim in the namespace: claimName, readOnly."
-    )
-    ephemeral: Embedded | None = Field(
-        default=None, description="A claim that is created and deleted with the pod: volumeClaimTemplate."
-    )
-    empty_dir: Embedded | None = Field(
-        default=None, description="A folder that is removed with the pod: sizeLimit, medium."
-    )
-    config_map: Embedded | None = Field(
-        default=None, description="Files from a ConfigMap: name, items, defaultMode, optional."
-    )
-    secret: Embedded | None = Field(
-        default=None, description="Files from a Secret: secretName, items, defaultMode, optional."
-    )
-    projected: Embedded | None = Field(default=None, description="Files from several sources: sources, defaultMode.")
-    csi: Embedded | None = Field(
-        default=None, description="A volume of a CSI driver: driver, volumeAttributes, readOnly."
-    )
+    name: ObjectName
+    """The name of the volume."""
+    persistent_volume_claim: Embedded | None = None
+    """A PersistentVolumeClaim in the namespace: claimName, readOnly."""
+    ephemeral: Embedded | None = None
+    """A claim that is created and deleted with the pod: volumeClaimTemplate."""
+    empty_dir: Embedded | None = None
+    """A folder that is removed with the pod: sizeLimit, medium."""
+    config_map: Embedded | None = None
+    """Files from a ConfigMap: name, items, defaultMode, optional."""
+    secret: Embedded | None = None
+    """Files from a Secret: secretName, items, defaultMode, optional."""
+    projected: Embedded | None = None
+    """Files from several sources: sources, defaultMode."""
+    csi: Embedded | None = None
+    """A volume of a CSI driver: driver, volumeAttributes, readOnly."""
 
     @model_validator(mode="after")
     def _one_source(self) -> DetectorVolume:
@@ -100,26 +96,24 @@ class DetectorVolume(Model):
 class DetectorVolumeMount(Model):
     """The mount of a volume, as in a PodSpec."""
 
-    name: ObjectName = Field(description="The name of the volume.")
-    mount_path: MountPath = Field(description="The path in the container, e.g. /var/lib/wayside.")
-    sub_path: Annotated[str, Field(min_length=1, max_length=1024)] | None = Field(
-        default=None, description="A path within the volume. Default: its root."
-    )
-    read_only: bool = Field(default=False, description="If true, the container cannot write to it.")
+    name: ObjectName
+    """The name of the volume."""
+    mount_path: MountPath
+    """The path in the container, e.g. /var/lib/wayside."""
+    sub_path: Annotated[str, Field(min_length=1, max_length=1024)] | None = None
+    """A path within the volume. Default: its root."""
+    read_only: bool = False
+    """If true, the container cannot write to it."""
 
 
 class DetectorResources(Model):
     """The compute resources of the detector: requests and limits."""
 
-    requests: Amounts = Field(
-        default_factory=lambda: {"cpu": Quantity("100m"), "memory": Quantity("256Mi")},
-        description="The resources that a node must have available. Default: cpu 100m, memory 256Mi.",
-    )
-    limits: Amounts = Field(
-        default_factory=lambda: {"memory": Quantity("1Gi")},
-        description="The maximum resources. The memory limit must cover the buffer (spec.buffer.bytes) plus some "
-        "200Mi. Default: memory 1Gi.",
-    )
+    requests: Amounts = Field(default_factory=lambda: {"cpu": Quantity("100m"), "memory": Quantity("256Mi")})
+    """The resources that a node must have available. Default: cpu 100m, memory 256Mi."""
+    limits: Amounts = Field(default_factory=lambda: {"memory": Quantity("1Gi")})
+    """The maximum resources. The memory limit must cover the buffer (spec.buffer.bytes) plus some 200Mi. Default:
+    memory 1Gi."""
 
     @model_validator(mode="after")
     def _fits(self) -> DetectorResources:
@@ -146,30 +140,28 @@ _RESOURCES = ("cpu", "memory", "ephemeral-storage")
 class KeySelector(Model):
     """A key of a Secret or ConfigMap, as in a PodSpec."""
 
-    name: ObjectName = Field(description="The name of the object, in the namespace of the Detector.")
-    key: Annotated[str, Field(min_length=1, max_length=253, pattern=r"^[-._A-Za-z0-9]+$")] = Field(
-        description="The key in the object."
-    )
-    optional: bool | None = Field(
-        default=None, description="If true, the detector starts without the object or the key. Default: false."
-    )
+    name: ObjectName
+    """The name of the object, in the namespace of the Detector."""
+    key: Annotated[str, Field(min_length=1, max_length=253, pattern=r"^[-._A-Za-z0-9]+$")]
+    """The key in the object."""
+    optional: bool | None = None
+    """If true, the detector starts without the object or the key. Default: false."""
 
 
 class FieldSelector(Model):
     """A field of the pod, as in a PodSpec."""
 
-    field_path: Annotated[str, Field(min_length=1, max_length=317)] = Field(
-        description="The path of the field, e.g. spec.nodeName."
-    )
+    field_path: Annotated[str, Field(min_length=1, max_length=317)]
+    """The path of the field, e.g. spec.nodeName."""
 
 
 class ResourceSelector(Model):
     """A resource of the detector's container, as in a PodSpec."""
 
-    resource: Annotated[str, Field(min_length=1, max_length=317)] = Field(
-        description="The resource, e.g. limits.memory."
-    )
-    divisor: PositiveQuantity | None = Field(default=None, description="The unit of the value. Default: 1.")
+    resource: Annotated[str, Field(min_length=1, max_length=317)]
+    """The resource, e.g. limits.memory."""
+    divisor: PositiveQuantity | None = None
+    """The unit of the value. Default: 1."""
 
 
 class VariableSource(Model):
@@ -183,12 +175,14 @@ class VariableSource(Model):
         )
     )
 
-    secret_key_ref: KeySelector | None = Field(default=None, description="A key of a Secret.")
-    config_map_key_ref: KeySelector | None = Field(default=None, description="A key of a ConfigMap.")
-    field_ref: FieldSelector | None = Field(default=None, description="A field of the pod.")
-    resource_field_ref: ResourceSelector | None = Field(
-        default=None, description="A request or limit of the detector's container."
-    )
+    secret_key_ref: KeySelector | None = None
+    """A key of a Secret."""
+    config_map_key_ref: KeySelector | None = None
+    """A key of a ConfigMap."""
+    field_ref: FieldSelector | None = None
+    """A field of the pod."""
+    resource_field_ref: ResourceSelector | None = None
+    """A request or limit of the detector's container."""
 
     @model_validator(mode="after")
     def _one_reference(self) -> VariableSource:
@@ -210,9 +204,12 @@ class DetectorVariable(Model):
         ),
     )
 
-    name: Identifier = Field(description="The name of the variable, e.g. OTEL_RESOURCE_ATTRIBUTES.")
-    value: Annotated[str, Field(max_length=4096)] | None = Field(default=None, description="The literal value.")
-    value_from: VariableSource | None = Field(default=None, description="The source of the value.")
+    name: Identifier
+    """The name of the variable, e.g. OTEL_RESOURCE_ATTRIBUTES."""
+    value: Annotated[str, Field(max_length=4096)] | None = None
+    """The literal value."""
+    value_from: VariableSource | None = None
+    """The source of the value."""
 
     @model_validator(mode="after")
     def _consistent(self) -> DetectorVariable:
@@ -226,7 +223,8 @@ class DetectorVariable(Model):
 class ObjectNameReference(Model):
     """A reference to an object of the same namespace."""
 
-    name: ObjectName = Field(description="The name of the object.")
+    name: ObjectName
+    """The name of the object."""
 
 
 class TolerationOperator(StrEnum):
@@ -256,21 +254,16 @@ class DetectorToleration(Model):
         )
     )
 
-    key: Annotated[str, Field(min_length=1, max_length=317)] | None = Field(
-        default=None, description="The taint key. Default, with operator Exists: every key."
-    )
-    operator: TolerationOperator | None = Field(
-        default=None, description="Equal: the values must match. Exists: any value matches. Default: Equal."
-    )
-    value: Annotated[str, Field(max_length=63)] | None = Field(
-        default=None, description="The taint value. Not with operator Exists."
-    )
-    effect: TaintEffect | None = Field(default=None, description="The taint effect. Default: every effect.")
-    toleration_seconds: Annotated[int, Field(ge=0, le=2**31 - 1)] | None = Field(
-        default=None,
-        description="With effect NoExecute: how long the pod stays on a node with the taint, in seconds. "
-        "Default: forever.",
-    )
+    key: Annotated[str, Field(min_length=1, max_length=317)] | None = None
+    """The taint key. Default, with operator Exists: every key."""
+    operator: TolerationOperator | None = None
+    """Equal: the values must match. Exists: any value matches. Default: Equal."""
+    value: Annotated[str, Field(max_length=63)] | None = None
+    """The taint value. Not with operator Exists."""
+    effect: TaintEffect | None = None
+    """The taint effect. Default: every effect."""
+    toleration_seconds: Annotated[int, Field(ge=0, le=2**31 - 1)] | None = None
+    """With effect NoExecute: how long the pod stays on a node with the taint, in seconds. Default: forever."""
 
     @model_validator(mode="after")
     def _consistent(self) -> DetectorToleration:
@@ -287,73 +280,42 @@ class DetectorPod(Model):
     the detector as a sidecar keep it as it is.
     """
 
-    image: Annotated[str, Field(min_length=1, max_length=512, pattern=r"^[^\s]+$")] | None = Field(
-        default=None, description="The image. Default: the value of the manager's option --detector-image."
-    )
-    resources: DetectorResources = Field(
-        default_factory=DetectorResources, description="The compute resources of the detector: requests and limits."
-    )
+    image: Annotated[str, Field(min_length=1, max_length=512, pattern=r"^[^\s]+$")] | None = None
+    """The image. Default: the value of the manager's option --detector-image."""
+    resources: DetectorResources = Field(default_factory=DetectorResources)
+    """The compute resources of the detector: requests and limits."""
     node_selector: dict[Annotated[str, Field(max_length=317)], Annotated[str, Field(max_length=63)]] = Field(
-        default_factory=dict,
-        max_length=16,
-        description="The labels that a node must have. Not with mode Sidecar.",
+        default_factory=dict, max_length=16
     )
-    affinity: Embedded | None = Field(
-        default=None,
-        description="The affinity to nodes and other pods, as in a PodSpec. Not with mode Sidecar.",
-    )
-    tolerations: list[DetectorToleration] = Field(
-        default_factory=list,
-        max_length=16,
-        description="The node taints that the pod tolerates. Not with mode Sidecar.",
-        json_schema_extra=ATOMIC_LIST,
-    )
-    priority_class_name: Annotated[str, Field(min_length=1, max_length=253)] | None = Field(
-        default=None, description="The PriorityClass of the pod. Not with mode Sidecar."
-    )
-    runtime_class_name: Annotated[str, Field(min_length=1, max_length=253)] | None = Field(
-        default=None, description="The RuntimeClass of the pod. Not with mode Sidecar."
-    )
+    """The labels that a node must have. Not with mode Sidecar."""
+    affinity: Embedded | None = None
+    """The affinity to nodes and other pods, as in a PodSpec. Not with mode Sidecar."""
+    tolerations: list[DetectorToleration] = Field(default_factory=list, max_length=16, json_schema_extra=ATOMIC_LIST)
+    """The node taints that the pod tolerates. Not with mode Sidecar."""
+    priority_class_name: Annotated[str, Field(min_length=1, max_length=253)] | None = None
+    """The PriorityClass of the pod. Not with mode Sidecar."""
+    runtime_class_name: Annotated[str, Field(min_length=1, max_length=253)] | None = None
+    """The RuntimeClass of the pod. Not with mode Sidecar."""
     image_pull_secrets: list[ObjectNameReference] = Field(
-        default_factory=list,
-        max_length=16,
-        description="The Secrets to pull the image with, in addition to those of the manager's option "
-        "--detector-pull-secret.",
-        json_schema_extra=map_list("name"),
+        default_factory=list, max_length=16, json_schema_extra=map_list("name")
     )
-    security_context: Embedded | None = Field(
-        default=None,
-        description="Fields of the pod's security context, as in a PodSpec, e.g. fsGroup. They override the "
-        "defaults. The defaults meet the restricted Pod Security Standard. Not with mode Sidecar.",
-    )
-    env: list[DetectorVariable] = Field(
-        default_factory=list,
-        max_length=64,
-        description="Environment variables. They are added to those of the manager's option --detector-env and take "
-        "precedence over them.",
-        json_schema_extra=map_list("name"),
-    )
-    volumes: list[DetectorVolume] = Field(
-        default_factory=list,
-        max_length=16,
-        description="Volumes for volumeMounts.",
-        json_schema_extra=map_list("name"),
-    )
+    """The Secrets to pull the image with, in addition to those of the manager's option --detector-pull-secret."""
+    security_context: Embedded | None = None
+    """Fields of the pod's security context, as in a PodSpec, e.g. fsGroup. They override the defaults. The defaults
+    meet the restricted Pod Security Standard. Not with mode Sidecar."""
+    env: list[DetectorVariable] = Field(default_factory=list, max_length=64, json_schema_extra=map_list("name"))
+    """Environment variables. They are added to those of the manager's option --detector-env and take precedence over
+    them."""
+    volumes: list[DetectorVolume] = Field(default_factory=list, max_length=16, json_schema_extra=map_list("name"))
+    """Volumes for volumeMounts."""
     volume_mounts: list[DetectorVolumeMount] = Field(
-        default_factory=list,
-        max_length=16,
-        description="The mounts of the volumes, e.g. for the folders of the state, the recordings, the database spool "
-        "and the database files. A folder outside all mounts gets a volume that is removed with the pod.",
-        json_schema_extra=map_list("mountPath"),
+        default_factory=list, max_length=16, json_schema_extra=map_list("mountPath")
     )
-    secret_names: list[ObjectName] = Field(
-        default_factory=list,
-        max_length=32,
-        description="The Secrets that rules may use. A Secret that the Detector itself refers to is available to "
-        "rules only if it is listed here as well. Anyone who can write rules can send the contents of these Secrets "
-        "elsewhere.",
-        json_schema_extra=SET_LIST,
-    )
+    """The mounts of the volumes, e.g. for the folders of the state, the recordings, the database spool and the database
+    files. A folder outside all mounts gets a volume that is removed with the pod."""
+    secret_names: list[ObjectName] = Field(default_factory=list, max_length=32, json_schema_extra=SET_LIST)
+    """The Secrets that rules may use. A Secret that the Detector itself refers to is available to rules only if it is
+    listed here as well. Anyone who can write rules can send the contents of these Secrets elsewhere."""
 
     @model_validator(mode="after")
     def _unique(self) -> DetectorPod:

@@ -19,58 +19,30 @@ class WhenFull(StrEnum):
 class OnRequest(Model):
     """Recordings that others request over Zenoh: a trigger of another detector, or any other peer."""
 
-    streams: list[ObjectName] | None = Field(
-        default=None,
-        min_length=1,
-        max_length=128,
-        description="The streams that may be recorded. Latched streams are always included. Default: all.",
-        json_schema_extra=SET_LIST,
-    )
-    maximum_duration: PositiveDuration = Field(
-        default=PositiveDuration("1h"),
-        description="The maximum duration of a recording. A recording ends after this time, even if the request "
-        "exceeds it.",
-    )
-    maximum_recordings: int = Field(
-        default=8,
-        ge=1,
-        le=100,
-        description="The maximum number of concurrent recordings on request. Further requests are refused.",
-    )
+    streams: list[ObjectName] | None = Field(default=None, min_length=1, max_length=128, json_schema_extra=SET_LIST)
+    """The streams that may be recorded. Latched streams are always included. Default: all."""
+    maximum_duration: PositiveDuration = PositiveDuration("1h")
+    """The maximum duration of a recording. A recording ends after this time, even if the request exceeds it."""
+    maximum_recordings: int = Field(default=8, ge=1, le=100)
+    """The maximum number of concurrent recordings on request. Further requests are refused."""
 
 
 class Recordings(Model):
     """The folder of all recordings of a Detector, with limits for all rules together."""
 
-    path: str = Field(
-        min_length=1,
-        max_length=1024,
-        description="The folder, e.g. /var/lib/wayside/recordings. It is created if missing. Each detector needs its "
-        "own, since the limits apply to everything in the folder and assume a single writer.",
-    )
-    bytes: PositiveQuantity = Field(
-        default=PositiveQuantity("16Gi"),
-        description="The maximum size of all recordings together. At the limit, whenFull applies.",
-    )
-    files: int | None = Field(
-        default=None,
-        ge=1,
-        le=10_000_000,
-        description="The maximum number of MCAP files. At the limit, whenFull applies. Default: no limit.",
-    )
-    age: PositiveDuration | None = Field(
-        default=None,
-        description="Recordings are deleted this long after their end, regardless of whenFull. Default: never.",
-    )
-    reserve: Quantity = Field(
-        default=Quantity("1Gi"),
-        description="The minimum free disk space. Files of other programs count too. At the limit, whenFull applies.",
-    )
-    when_full: WhenFull = Field(
-        default=WhenFull.DROP_OLDEST,
-        description="DropOldest: the oldest complete recordings are deleted. Stop: existing recordings are kept; a "
-        "recording that reaches the limit ends and is marked as cut.",
-    )
-    on_request: OnRequest | None = Field(
-        default=None, description="Allows others to request recordings. Default: not allowed."
-    )
+    path: str = Field(min_length=1, max_length=1024)
+    """The folder, e.g. /var/lib/wayside/recordings. It is created if missing. Each detector needs its own, since the
+    limits apply to everything in the folder and assume a single writer."""
+    bytes: PositiveQuantity = PositiveQuantity("16Gi")
+    """The maximum size of all recordings together. At the limit, whenFull applies."""
+    files: int | None = Field(default=None, ge=1, le=10_000_000)
+    """The maximum number of MCAP files. At the limit, whenFull applies. Default: no limit."""
+    age: PositiveDuration | None = None
+    """Recordings are deleted this long after their end, regardless of whenFull. Default: never."""
+    reserve: Quantity = Quantity("1Gi")
+    """The minimum free disk space. Files of other programs count too. At the limit, whenFull applies."""
+    when_full: WhenFull = WhenFull.DROP_OLDEST
+    """DropOldest: the oldest complete recordings are deleted. Stop: existing recordings are kept; a recording that
+    reaches the limit ends and is marked as cut."""
+    on_request: OnRequest | None = None
+    """Allows others to request recordings. Default: not allowed."""

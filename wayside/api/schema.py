@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import ast
+import inspect
+import sys
+from collections.abc import Iterator, Sequence
+from functools import cache
+from itertools import pairwise
 from typing import Any
 
-from wayside.api.base import GROUP, VERSION, Kind
+from pydantic import BaseModel
+from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
+from pydantic_core.core_schema import ModelSchema
+
+from wayside.api.base import GROUP, VERSION, Kind, Model
 
 _KEPT = {
     "type", "description", "pattern", "minLength", "maxLength", "minimum", "maximum", "exclusiveMinimum",
@@ -48,7 +57,7 @@ def crd(kind: type[Kind]) -> dict[str, Any]:
 
 def field_names_at(kind: type[Kind], path: Sequence[str | int]) -> list[str]:
     """The names of the fields that an object of the kind has at a path; empty where any name is allowed."""
-    node = _object_schema(kind)
+    node = _object_schema(kind, GenerateJsonSchema)
     for part in path:
         inner = node.get("items") if isinstance(part, int) else node.get("properties", {}).get(part)
         node = inner or node.get("additionalProperties") or {}
@@ -59,8 +68,36 @@ def _column(column: dict[str, str]) -> dict[str, Any]:
     return {**column, "priority": int(column["priority"])} if "priority" in column else dict(column)
 
 
-def _object_schema(kind: type[Kind]) -> dict[str, Any]:
-    source = kind.model_json_schema(by_alias=True)
+class _Described(GenerateJsonSchema):
+    """The docstrings below fields are their descriptions. Read here alone: a program's start has no time for it."""
+
+    def model_schema(self, schema: ModelSchema) -> JsonSchemaValue:
+        """As pydantic has it, with the descriptions."""
+        found = super().model_schema(schema)
+        fields = schema["cls"].model_fields
+        for name, text in _docstrings(schema["cls"]):
+            found["properties"][fields[name].alias]["description"] = text
+        return found
+
+
+def _docstrings(model: type[BaseModel]) -> Iterator[tuple[str, str]]:
+    """The docstrings of the model's fields, inherited ones included, each in one line."""
+    for each in reversed(model.__mro__):
+        definition = _classes(each.__module__).get(each.__name__) if issubclass(each, Model) else None
+        for field, below in pairwise(definition.body if definition is not None else ()):
+            match field, below:
+                case ast.AnnAssign(ast.Name(name)), ast.Expr(ast.Constant(str() as text)):
+                    yield name, " ".join(text.split())
+
+
+@cache
+def _classes(module: str) -> dict[str, ast.ClassDef]:
+    tree = ast.parse(inspect.getsource(sys.modules[module]))
+    return {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
+
+
+def _object_schema(kind: type[Kind], generator: type[GenerateJsonSchema] = _Described) -> dict[str, Any]:
+    source = kind.model_json_schema(by_alias=True, schema_generator=generator)
     definitions = source.get("$defs", {})
     properties = {field: _structural(source["properties"][field], definitions) for field in ("spec", "status")}
     return {

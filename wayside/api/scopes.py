@@ -32,28 +32,22 @@ class Position(Model):
         ),
     )
 
-    stream: ObjectName = Field(
-        description="The stream whose newest sample contains the position. If x, y, latitude and "
-        "longitude are all omitted, the stream's own position in the Detector is used."
-    )
-    x: Expression | None = Field(
-        default=None, description="CEL over msg: the position on the first axis in metres, e.g. msg.pose.position.x."
-    )
-    y: Expression | None = Field(default=None, description="CEL over msg: the position on the second axis in metres.")
-    z: Expression | None = Field(
-        default=None, description="CEL over msg: the position on the third axis in metres. Default: 0."
-    )
-    latitude: Expression | None = Field(
-        default=None, description="CEL over msg: the latitude in degrees north (WGS 84), e.g. msg.latitude."
-    )
-    longitude: Expression | None = Field(
-        default=None, description="CEL over msg: the longitude in degrees east (WGS 84), e.g. msg.longitude."
-    )
-    max_age: PositiveDuration | None = Field(
-        default=None,
-        description="The maximum age of the newest sample. The position of a client is unknown if the sample is "
-        "older, or if the stream is stale. Default: 1s; no limit if the stream never goes stale.",
-    )
+    stream: ObjectName
+    """The stream whose newest sample contains the position. If x, y, latitude and longitude are all omitted, the
+    stream's own position in the Detector is used."""
+    x: Expression | None = None
+    """CEL over msg: the position on the first axis in metres, e.g. msg.pose.position.x."""
+    y: Expression | None = None
+    """CEL over msg: the position on the second axis in metres."""
+    z: Expression | None = None
+    """CEL over msg: the position on the third axis in metres. Default: 0."""
+    latitude: Expression | None = None
+    """CEL over msg: the latitude in degrees north (WGS 84), e.g. msg.latitude."""
+    longitude: Expression | None = None
+    """CEL over msg: the longitude in degrees east (WGS 84), e.g. msg.longitude."""
+    max_age: PositiveDuration | None = None
+    """The maximum age of the newest sample. The position of a client is unknown if the sample is older, or if the
+    stream is stale. Default: 1s; no limit if the stream never goes stale."""
 
     def max_age_ns(self, *, never_stale: bool) -> int | None:
         """The maximum age of a position in nanoseconds; None: no limit while its stream is not stale."""
@@ -72,20 +66,17 @@ class Position(Model):
 class ClientScope(Model):
     """The rule is evaluated once for each client."""
 
-    where: Expression | None = Field(
-        default=None,
-        description="CEL over client, labels and streams. The rule applies only to clients for which it is true. An "
-        "open episode ends with reason OutOfScope when it becomes false.",
-    )
+    where: Expression | None = None
+    """CEL over client, labels and streams. The rule applies only to clients for which it is true. An open episode ends
+    with reason OutOfScope when it becomes false."""
 
 
 class Role(Model):
     """Selects the clients for one side of a pair."""
 
-    where: Expression = Field(
-        description="CEL over client, labels and streams. Only clients for which it is true can take this role. An "
-        "open episode ends with reason OutOfScope when it becomes false."
-    )
+    where: Expression
+    """CEL over client, labels and streams. Only clients for which it is true can take this role. An open episode ends
+    with reason OutOfScope when it becomes false."""
 
 
 class PairsScope(Model):
@@ -94,45 +85,31 @@ class PairsScope(Model):
     Without roles, a is the one with the smaller name. With a role, each ordered pair of clients that fit is a subject.
     """
 
-    position: Position = Field(description="The position of a client.")
-    within: float = Field(
-        gt=0,
-        le=1_000_000,
-        description="The maximum distance in metres at which a pair can start an episode. A pair with an open episode "
-        "is always evaluated.",
-    )
-    where: Expression | None = Field(
-        default=None,
-        description="CEL over a, b, distance (metres) and closingSpeed (m/s). The rule applies only to pairs for "
-        "which it is true. An open episode ends with reason OutOfScope when it becomes false.",
-    )
-    a: Role | None = Field(
-        default=None,
-        description="Selects the clients that can be a. If a or b is set, pairs are ordered: car1+car2 and "
-        "car2+car1 are separate subjects if both match.",
-    )
-    b: Role | None = Field(
-        default=None,
-        description="Selects the clients that can be b. If a or b is set, pairs are ordered: car1+car2 and "
-        "car2+car1 are separate subjects if both match.",
-    )
-    max_pairs: int = Field(
-        default=10_000,
-        ge=1,
-        le=1_000_000,
-        description="The maximum number of pairs per evaluation. At the limit, the nearest pairs are "
-        "evaluated; the others are skipped and counted. Pairs with an open episode, or whose condition already holds, "
-        "are always evaluated.",
-    )
+    position: Position
+    """The position of a client."""
+    within: float = Field(gt=0, le=1_000_000)
+    """The maximum distance in metres at which a pair can start an episode. A pair with an open episode is always
+    evaluated."""
+    where: Expression | None = None
+    """CEL over a, b, distance (metres) and closingSpeed (m/s). The rule applies only to pairs for which it is true. An
+    open episode ends with reason OutOfScope when it becomes false."""
+    a: Role | None = None
+    """Selects the clients that can be a. If a or b is set, pairs are ordered: car1+car2 and car2+car1 are separate
+    subjects if both match."""
+    b: Role | None = None
+    """Selects the clients that can be b. If a or b is set, pairs are ordered: car1+car2 and car2+car1 are separate
+    subjects if both match."""
+    max_pairs: int = Field(default=10_000, ge=1, le=1_000_000)
+    """The maximum number of pairs per evaluation. At the limit, the nearest pairs are evaluated; the others are skipped
+    and counted. Pairs with an open episode, or whose condition already holds, are always evaluated."""
 
 
 class FleetScope(Model):
     """The rule is evaluated once for all clients together, even if there are none."""
 
-    members: Expression = Field(
-        description="CEL over one client (client, labels, streams and the signals). Clients for which it is true are "
-        "members; false and unknown are not."
-    )
+    members: Expression
+    """CEL over one client (client, labels, streams and the signals). Clients for which it is true are members; false
+    and unknown are not."""
 
 
 class Scope(Model):
@@ -142,9 +119,12 @@ class Scope(Model):
         ("[has(self.client), has(self.pairs), has(self.fleet)].filter(given, given).size() == 1", _SCOPE),
     )
 
-    client: ClientScope | None = Field(default=None, description="Each client is a subject. The default.")
-    pairs: PairsScope | None = Field(default=None, description="Each pair of clients near each other is a subject.")
-    fleet: FleetScope | None = Field(default=None, description="All member clients together are one subject.")
+    client: ClientScope | None = None
+    """Each client is a subject. The default."""
+    pairs: PairsScope | None = None
+    """Each pair of clients near each other is a subject."""
+    fleet: FleetScope | None = None
+    """All member clients together are one subject."""
 
     @model_validator(mode="after")
     def _exactly_one(self) -> Scope:
@@ -158,21 +138,17 @@ class Element(Model):
 
     model_config = ConfigDict(extra="allow", json_schema_extra={"x-kubernetes-preserve-unknown-fields": True})
 
-    name: ClientName = Field(description="The name of the element. It is part of the subject, as in car1~north.")
+    name: ClientName
+    """The name of the element. It is part of the subject, as in car1~north."""
 
 
 class Each(Model):
     """The rule is evaluated once for each element."""
 
-    as_: Identifier = Field(
-        alias="as", description="The name of the variable for the element in expressions, e.g. site."
-    )
-    of: list[Element] = Field(
-        min_length=1,
-        max_length=256,
-        description="The elements. Each has a name and any other fields; at most 64 KiB in total.",
-        json_schema_extra=map_list("name"),
-    )
+    as_: Identifier = Field(alias="as")
+    """The name of the variable for the element in expressions, e.g. site."""
+    of: list[Element] = Field(min_length=1, max_length=256, json_schema_extra=map_list("name"))
+    """The elements. Each has a name and any other fields; at most 64 KiB in total."""
 
     @model_validator(mode="after")
     def _unique_names(self) -> Each:

@@ -40,17 +40,13 @@ class LabelRequirement(Model):
         ("(self.operator in ['In', 'NotIn']) == (has(self.values) && self.values.size() > 0)", _VALUES, ".values")
     )
 
-    key: LabelKey = Field(description="The key of the label.")
-    operator: LabelOperator = Field(
-        description="In, NotIn: the value is, or is not, one of values; NotIn also matches without the label. Exists, "
-        "DoesNotExist: the label is present, or absent."
-    )
-    values: list[LabelValue] = Field(
-        default_factory=list,
-        max_length=64,
-        description="The values for operators In and NotIn.",
-        json_schema_extra=ATOMIC_LIST,
-    )
+    key: LabelKey
+    """The key of the label."""
+    operator: LabelOperator
+    """In, NotIn: the value is, or is not, one of values; NotIn also matches without the label. Exists, DoesNotExist:
+    the label is present, or absent."""
+    values: list[LabelValue] = Field(default_factory=list, max_length=64, json_schema_extra=ATOMIC_LIST)
+    """The values for operators In and NotIn."""
 
     @model_validator(mode="after")
     def _fitting_values(self) -> LabelRequirement:
@@ -84,17 +80,12 @@ class LabelRequirement(Model):
 class LabelSelector(Model):
     """Selects objects by their labels. An object must meet all requirements; an empty selector selects every object."""
 
-    match_labels: dict[LabelKey, LabelValue] = Field(
-        default_factory=dict,
-        max_length=16,
-        description="The labels that an object must have, all of them.",
-    )
+    match_labels: dict[LabelKey, LabelValue] = Field(default_factory=dict, max_length=16)
+    """The labels that an object must have, all of them."""
     match_expressions: list[LabelRequirement] = Field(
-        default_factory=list,
-        max_length=16,
-        description="Further requirements, all of which an object must meet.",
-        json_schema_extra=ATOMIC_LIST,
+        default_factory=list, max_length=16, json_schema_extra=ATOMIC_LIST
     )
+    """Further requirements, all of which an object must meet."""
 
     def matches(self, labels: Mapping[str, str]) -> bool:
         """Whether an object with these labels is selected."""

@@ -44,39 +44,31 @@ MessageType = Annotated[str, Field(max_length=255, pattern=r"^[A-Za-z][A-Za-z0-9
 class MessageDefinition(Model):
     """The definition of a ROS 2 message type."""
 
-    name: MessageType = Field(description="The type, e.g. my_package/msg/Track.")
-    definition: str = Field(
-        max_length=65_536,
-        description="The definition in the format of .msg files. Each type that it refers to needs a "
-        "definition as well: an entry of its own in messages, or a part of this text, after a line of = and a "
-        "line `MSG: <type>`, as `ros2 bag` writes it.",
-    )
+    name: MessageType
+    """The type, e.g. my_package/msg/Track."""
+    definition: str = Field(max_length=65_536)
+    """The definition in the format of .msg files. Each type that it refers to needs a definition as well: an entry of
+    its own in messages, or a part of this text, after a line of = and a line `MSG: <type>`, as `ros2 bag` writes it."""
 
 
 class History(Model):
     """How much history to request from publishers. Without limits: all of it."""
 
-    samples: int | None = Field(
-        default=None, ge=1, le=100_000, description="The maximum number of samples per key; the newest."
-    )
-    age: PositiveDuration | None = Field(default=None, description="The maximum age of the samples.")
+    samples: int | None = Field(default=None, ge=1, le=100_000)
+    """The maximum number of samples per key; the newest."""
+    age: PositiveDuration | None = None
+    """The maximum age of the samples."""
 
 
 class StreamBuffer(Model):
     """The limits of the stream's buffer, per client."""
 
-    duration: PositiveDuration | None = Field(
-        default=None, description="How long samples are kept. Default: the Detector's buffer.duration."
-    )
-    bytes: PositiveQuantity | None = Field(
-        default=None, description="The maximum size. At the limit, the oldest samples are dropped."
-    )
-    count: int | None = Field(
-        default=None,
-        ge=1,
-        le=1_000_000,
-        description="The maximum number of samples. At the limit, the oldest samples are dropped.",
-    )
+    duration: PositiveDuration | None = None
+    """How long samples are kept. Default: the Detector's buffer.duration."""
+    bytes: PositiveQuantity | None = None
+    """The maximum size. At the limit, the oldest samples are dropped."""
+    count: int | None = Field(default=None, ge=1, le=1_000_000)
+    """The maximum number of samples. At the limit, the oldest samples are dropped."""
 
 
 _POSITION = "give x and y (and z, yaw) in metres and radians, or latitude and longitude (and heading) in degrees"
@@ -94,28 +86,22 @@ class StreamPosition(Model):
         ),
     )
 
-    x: Expression | None = Field(
-        default=None, description="CEL over msg: the position on the first axis in metres, e.g. msg.pose.position.x."
-    )
-    y: Expression | None = Field(default=None, description="CEL over msg: the position on the second axis in metres.")
-    z: Expression | None = Field(default=None, description="CEL over msg: the position on the third axis in metres.")
-    yaw: Expression | None = Field(
-        default=None,
-        description="CEL over msg: the direction in radians, counter-clockwise from the first axis, e.g. "
-        "yaw(msg.pose.orientation).",
-    )
-    latitude: Expression | None = Field(
-        default=None, description="CEL over msg: the latitude in degrees north (WGS 84), e.g. msg.latitude."
-    )
-    longitude: Expression | None = Field(
-        default=None, description="CEL over msg: the longitude in degrees east (WGS 84), e.g. msg.longitude."
-    )
-    heading: Expression | None = Field(
-        default=None, description="CEL over msg: the direction in degrees, clockwise from north."
-    )
-    speed: Expression | None = Field(
-        default=None, description="CEL over msg: the speed in the direction of yaw or heading, in m/s."
-    )
+    x: Expression | None = None
+    """CEL over msg: the position on the first axis in metres, e.g. msg.pose.position.x."""
+    y: Expression | None = None
+    """CEL over msg: the position on the second axis in metres."""
+    z: Expression | None = None
+    """CEL over msg: the position on the third axis in metres."""
+    yaw: Expression | None = None
+    """CEL over msg: the direction in radians, counter-clockwise from the first axis, e.g. yaw(msg.pose.orientation)."""
+    latitude: Expression | None = None
+    """CEL over msg: the latitude in degrees north (WGS 84), e.g. msg.latitude."""
+    longitude: Expression | None = None
+    """CEL over msg: the longitude in degrees east (WGS 84), e.g. msg.longitude."""
+    heading: Expression | None = None
+    """CEL over msg: the direction in degrees, clockwise from north."""
+    speed: Expression | None = None
+    """CEL over msg: the speed in the direction of yaw or heading, in m/s."""
 
     @property
     def axes(self) -> dict[str, str]:
@@ -194,78 +180,50 @@ class Stream(Model):
         ),
     )
 
-    name: ObjectName = Field(description="The name by which rules refer to the stream.")
-    key: Key = Field(
-        description="The Zenoh key expression in key-format notation. ${client:*} captures the name of the client, "
-        "e.g. vehicles/${client:*}/pose. The leading slash of a ROS topic is optional.",
-    )
-    source: ObjectName = Field(
-        default=ZENOH, description="The source of the samples: zenoh, or the name of one of the Detector's sources."
-    )
-    history: History | None = Field(
-        default=None,
-        description="Only with source zenoh: request samples that were published before the detector or its publisher "
-        "started. Needs Advanced Publishers with a cache.",
-    )
-    recover: bool = Field(
-        default=False,
-        description="Only with source zenoh: request lost samples again. Needs Advanced Publishers with sequence "
-        "numbers and a cache. Samples that cannot be recovered are counted.",
-    )
-    layout: Layout = Field(
-        default=Layout.PLAIN,
-        description="Plain: samples arrive on the key itself, also with zenoh-bridge-ros2dds. RmwZenoh: samples "
-        "arrive on the keys of rmw_zenoh nodes, which add the domain before the topic, and the type and type hash "
-        "after it; key is the topic.",
-    )
-    domain: int | None = Field(
-        default=None,
-        ge=0,
-        le=232,
-        description="The ROS domain ID of a stream with layout RmwZenoh. Default: every domain.",
-    )
+    name: ObjectName
+    """The name by which rules refer to the stream."""
+    key: Key
+    """The Zenoh key expression in key-format notation. ${client:*} captures the name of the client, e.g.
+    vehicles/${client:*}/pose. The leading slash of a ROS topic is optional."""
+    source: ObjectName = ZENOH
+    """The source of the samples: zenoh, or the name of one of the Detector's sources."""
+    history: History | None = None
+    """Only with source zenoh: request samples that were published before the detector or its publisher started. Needs
+    Advanced Publishers with a cache."""
+    recover: bool = False
+    """Only with source zenoh: request lost samples again. Needs Advanced Publishers with sequence numbers and a cache.
+    Samples that cannot be recovered are counted."""
+    layout: Layout = Layout.PLAIN
+    """Plain: samples arrive on the key itself, also with zenoh-bridge-ros2dds. RmwZenoh: samples arrive on the keys of
+    rmw_zenoh nodes, which add the domain before the topic, and the type and type hash after it; key is the topic."""
+    domain: int | None = Field(default=None, ge=0, le=232)
+    """The ROS domain ID of a stream with layout RmwZenoh. Default: every domain."""
     client: str | None = Field(
-        default=None,
-        min_length=1,
-        max_length=512,
-        pattern=r"^([A-Za-z0-9._:-]{1,63}|.*[$][{].*)$",
-        description="The client of the samples, if the key does not capture it: a name, or a template over the "
-        "message such as its-${msg.header.stationId}. Expressions in the template can use msg, key "
-        "(the captured chunks) and, with items, item.",
+        default=None, min_length=1, max_length=512, pattern=r"^([A-Za-z0-9._:-]{1,63}|.*[$][{].*)$"
     )
-    items: Expression | None = Field(
-        default=None,
-        description="CEL over msg: a list, e.g. msg.objects. Each item becomes a sample of the client that "
-        "`client` names, e.g. ${item.id}, and expressions over the stream can use item and msg. Such a "
-        "client is lost when its newest sample is older than staleAfter; a later item with the same "
-        "name is a new client.",
-    )
-    encoding: Encoding = Field(
-        description="The encoding of the payload: cdr (ROS 2 messages), json, cbor, uper (ETSI ITS messages), or raw "
-        "(bytes)."
-    )
+    """The client of the samples, if the key does not capture it: a name, or a template over the message such as
+    its-${msg.header.stationId}. Expressions in the template can use msg, key (the captured chunks) and, with items,
+    item."""
+    items: Expression | None = None
+    """CEL over msg: a list, e.g. msg.objects. Each item becomes a sample of the client that `client` names, e.g.
+    ${item.id}, and expressions over the stream can use item and msg. Such a client is lost when its newest sample is
+    older than staleAfter; a later item with the same name is a new client."""
+    encoding: Encoding
+    """The encoding of the payload: cdr (ROS 2 messages), json, cbor, uper (ETSI ITS messages), or raw (bytes)."""
     type: str | None = Field(
-        default=None,
-        max_length=255,
-        pattern=r"^([A-Za-z][A-Za-z0-9_]*/msg/[A-Za-z][A-Za-z0-9_]*|etsi/[a-z]+)$",
-        description="The message type. Required with encoding cdr: a ROS 2 type, e.g. geometry_msgs/msg/PoseStamped. "
-        "Optional with encoding uper: an ETSI ITS message, e.g. etsi/cam. Default: all ETSI ITS messages.",
+        default=None, max_length=255, pattern=r"^([A-Za-z][A-Za-z0-9_]*/msg/[A-Za-z][A-Za-z0-9_]*|etsi/[a-z]+)$"
     )
-    stamp: Expression | None = Field(
-        default=None,
-        description="CEL over msg: the sender's time in seconds since the epoch, e.g. msg.time_ms / 1000; or "
-        "sample.received, the receive time (t of JSON lines). Default: header.stamp if the type has one, the "
-        "generation time of an ETSI ITS message, otherwise none.",
-    )
-    position: StreamPosition | None = Field(
-        default=None,
-        description="The position of the client in a sample. Expressions over a sample use it as position, and "
-        "pairs scopes can refer to it.",
-    )
+    """The message type. Required with encoding cdr: a ROS 2 type, e.g. geometry_msgs/msg/PoseStamped. Optional with
+    encoding uper: an ETSI ITS message, e.g. etsi/cam. Default: all ETSI ITS messages."""
+    stamp: Expression | None = None
+    """CEL over msg: the sender's time in seconds since the epoch, e.g. msg.time_ms / 1000; or sample.received, the
+    receive time (t of JSON lines). Default: header.stamp if the type has one, the generation time of an ETSI ITS
+    message, otherwise none."""
+    position: StreamPosition | None = None
+    """The position of the client in a sample. Expressions over a sample use it as position, and pairs scopes can refer
+    to it."""
     stale_after: Duration | str | None = Field(
         default=None,
-        description="The signals of the stream are unknown if its newest sample is older than this. Never: no limit, "
-        "for latched topics. Default: 5s, or clientTimeout if that is shorter; Never for latched streams.",
         json_schema_extra={
             "type": "string",
             "pattern": f"^({PositiveDuration.pattern}|Never)$",
@@ -273,23 +231,17 @@ class Stream(Model):
             "x-kubernetes-validations": list(PositiveDuration.rules),
         },
     )
-    buffer: StreamBuffer = Field(
-        default=StreamBuffer(),
-        description="The limits of the stream's buffer, per client. Default: the limits of the Detector's buffer.",
-    )
+    """The signals of the stream are unknown if its newest sample is older than this. Never: no limit, for latched
+    topics. Default: 5s, or clientTimeout if that is shorter; Never for latched streams."""
+    buffer: StreamBuffer = StreamBuffer()
+    """The limits of the stream's buffer, per client. Default: the limits of the Detector's buffer."""
 
-    latched: bool = Field(
-        default=False,
-        description="If true, the last sample of each key stays valid until replaced, e.g. /tf_static or a map. It is "
-        "kept beyond the buffer's duration, staleAfter defaults to Never, and a replay delivers it first.",
-    )
-    frame_prefix: str | None = Field(
-        default=None,
-        min_length=1,
-        max_length=128,
-        description="Only with type tf2_msgs/msg/TFMessage: a prefix to remove from the names of the frames, so that "
-        "they are the same for every client. ${client} stands for the client's name, e.g. ${client}/.",
-    )
+    latched: bool = False
+    """If true, the last sample of each key stays valid until replaced, e.g. /tf_static or a map. It is kept beyond the
+    buffer's duration, staleAfter defaults to Never, and a replay delivers it first."""
+    frame_prefix: str | None = Field(default=None, min_length=1, max_length=128)
+    """Only with type tf2_msgs/msg/TFMessage: a prefix to remove from the names of the frames, so that they are the same
+    for every client. ${client} stands for the client's name, e.g. ${client}/."""
 
     @model_validator(mode="after")
     def _coherent(self) -> Stream:

@@ -41,37 +41,20 @@ class Zenoh(Access):
         ),
     )
 
-    mode: ZenohMode = Field(
-        default=ZenohMode.PEER,
-        description="The mode of the session: client (of a router), peer, or router (others can connect through it).",
-    )
-    connect: list[Endpoint] = Field(
-        default_factory=list,
-        max_length=16,
-        description="The endpoints to connect to, e.g. tcp/zenoh:7447 or tls/zenoh:7447. Lost connections are "
-        "re-established.",
-        json_schema_extra=ATOMIC_LIST,
-    )
-    listen: list[Endpoint] = Field(
-        default_factory=list,
-        max_length=16,
-        description="The endpoints to listen on, e.g. tcp/0.0.0.0:7447. Default: a free port (peer) or port 7447 "
-        "(router).",
-        json_schema_extra=ATOMIC_LIST,
-    )
-    scouting: bool = Field(default=False, description="If true, discovers other Zenoh nodes by multicast.")
-    shared_memory: bool = Field(
-        default=False,
-        description="If true, publishers on the same machine can pass samples in shared memory. The pods must then "
-        "share /dev/shm.",
-    )
+    mode: ZenohMode = ZenohMode.PEER
+    """The mode of the session: client (of a router), peer, or router (others can connect through it)."""
+    connect: list[Endpoint] = Field(default_factory=list, max_length=16, json_schema_extra=ATOMIC_LIST)
+    """The endpoints to connect to, e.g. tcp/zenoh:7447 or tls/zenoh:7447. Lost connections are re-established."""
+    listen: list[Endpoint] = Field(default_factory=list, max_length=16, json_schema_extra=ATOMIC_LIST)
+    """The endpoints to listen on, e.g. tcp/0.0.0.0:7447. Default: a free port (peer) or port 7447 (router)."""
+    scouting: bool = False
+    """If true, discovers other Zenoh nodes by multicast."""
+    shared_memory: bool = False
+    """If true, publishers on the same machine can pass samples in shared memory. The pods must then share /dev/shm."""
 
-    liveliness: Key | None = Field(
-        default=None,
-        description="The key expression of the clients' liveliness tokens, e.g. vehicles/${client:*}. A client with a "
-        "token is present even if it sends no data. It is lost as soon as its last token disappears.",
-        json_schema_extra=checked(("self.contains('${client:')", _NO_CLIENT)),
-    )
+    liveliness: Key | None = Field(default=None, json_schema_extra=checked(("self.contains('${client:')", _NO_CLIENT)))
+    """The key expression of the clients' liveliness tokens, e.g. vehicles/${client:*}. A client with a token is present
+    even if it sends no data. It is lost as soon as its last token disappears."""
 
     @model_validator(mode="after")
     def _names_clients(self) -> Zenoh:

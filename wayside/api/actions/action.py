@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from pydantic import Field, model_validator
+from pydantic import model_validator
 
 from wayside.api.actions.database import DatabaseAction
 from wayside.api.actions.deploy import Deploy
@@ -27,23 +27,20 @@ class ActionSpec(Model):
         (f"[{', '.join(f'has(self.{kind})' for kind in _KINDS)}].filter(given, given).size() == 1", _ONE)
     )
 
-    name: ObjectName = Field(description="The name of the action, unique within the rule.")
-    deploy: Deploy | None = Field(
-        default=None, description="Emits an ApplicationTask that is live while the episode lasts."
-    )
-    record: RecordAction | None = Field(
-        default=None, description="Records the samples around the episode as rosbag2 with MCAP files."
-    )
-    trigger: TriggerAction | None = Field(
-        default=None, description="Makes another system record while the episode lasts."
-    )
-    database: DatabaseAction | None = Field(
-        default=None, description="Writes the samples around the episode to the Detector's database (MongoDB)."
-    )
-    notify: NotifyAction | None = Field(
-        default=None, description="Sends notifications over HTTP, to an Alertmanager or on a Zenoh key."
-    )
-    plugin: ActionPlugin | None = Field(default=None, description="Runs an action of an installed package.")
+    name: ObjectName
+    """The name of the action, unique within the rule."""
+    deploy: Deploy | None = None
+    """Emits an ApplicationTask that is live while the episode lasts."""
+    record: RecordAction | None = None
+    """Records the samples around the episode as rosbag2 with MCAP files."""
+    trigger: TriggerAction | None = None
+    """Makes another system record while the episode lasts."""
+    database: DatabaseAction | None = None
+    """Writes the samples around the episode to the Detector's database (MongoDB)."""
+    notify: NotifyAction | None = None
+    """Sends notifications over HTTP, to an Alertmanager or on a Zenoh key."""
+    plugin: ActionPlugin | None = None
+    """Runs an action of an installed package."""
 
     @model_validator(mode="after")
     def _one_kind(self) -> ActionSpec:

@@ -18,36 +18,27 @@ DatabaseName = Annotated[str, Field(min_length=1, max_length=63, pattern=r"^[A-Z
 class Attachments(Model):
     """Which data is written to files outside the database."""
 
-    above: PositiveQuantity = Field(
-        default=PositiveQuantity("64Ki"),
-        description="Binary fields larger than this are written to files: images as PNG, point clouds as PCD, other "
-        "data unchanged. Smaller fields stay in the documents.",
-    )
+    above: PositiveQuantity = PositiveQuantity("64Ki")
+    """Binary fields larger than this are written to files: images as PNG, point clouds as PCD, other data unchanged.
+    Smaller fields stay in the documents."""
 
 
 class DatabaseAction(Window):
     """Writes the samples of the episode's window to the Detector's database, as one scenario."""
 
-    database: DatabaseName = Field(default="wayside", description="The name of the database on the server.")
-    metadata: NamedData = Field(
-        default_factory=dict,
-        description="Additional fields of the scenario, such as the driver, with ${…} over the rule's variables at "
-        "the start of the episode.",
-    )
-    renew_after: PositiveDuration | None = Field(
-        default=None,
-        description="Complete the scenario after this time and continue the episode in a new one. Each sample is "
-        "in exactly one of them. For rules whose episodes never end. Default: one scenario per episode.",
-    )
-    files: Attachments | None = Field(
-        default=None,
-        description="Which data is written to files. Default: binary fields above 64Ki if the Detector has "
-        "database.files, otherwise none.",
-    )
-    dry_run: bool = Field(
-        default=False,
-        description="If true, documents are built, counted and measured, but not written.",
-    )
+    database: DatabaseName = "wayside"
+    """The name of the database on the server."""
+    metadata: NamedData = Field(default_factory=dict)
+    """Additional fields of the scenario, such as the driver, with ${…} over the rule's variables at the start of the
+    episode."""
+    renew_after: PositiveDuration | None = None
+    """Complete the scenario after this time and continue the episode in a new one. Each sample is in exactly one of
+    them. For rules whose episodes never end. Default: one scenario per episode."""
+    files: Attachments | None = None
+    """Which data is written to files. Default: binary fields above 64Ki if the Detector has database.files, otherwise
+    none."""
+    dry_run: bool = False
+    """If true, documents are built, counted and measured, but not written."""
 
     @property
     def templates(self) -> Mapping[str, JsonValue]:

@@ -12,24 +12,13 @@ from wayside.api.operation import MEANING, Operation
 class Deploy(Model):
     """Deploys, reconfigures or suspends an application while the episode lasts."""
 
-    template_name: TemplateName = Field(
-        description="The name of the ApplicationTemplate, in the namespace of the rule."
-    )
+    template_name: TemplateName
+    """The name of the ApplicationTemplate, in the namespace of the rule."""
     operation: Operation = Field(default=Operation.DEPLOY, description=MEANING)
-    priority: int = Field(
-        default=0,
-        ge=-1_000_000,
-        le=1_000_000,
-        description="The priority of the task; the highest comes first. Ties are ordered by creation time, then by "
-        "name.",
-    )
-    parameters: NamedData = Field(
-        default_factory=dict,
-        description="The values for the template's parameters, with ${…} over the rule's variables at the start of "
-        "the episode.",
-    )
-    follow: bool = Field(
-        default=False,
-        description="If true, the parameters are computed again at each evaluation while the episode lasts, and the "
-        "task is patched when they change. A parameter that is unknown or fails keeps its last value.",
-    )
+    priority: int = Field(default=0, ge=-1_000_000, le=1_000_000)
+    """The priority of the task; the highest comes first. Ties are ordered by creation time, then by name."""
+    parameters: NamedData = Field(default_factory=dict)
+    """The values for the template's parameters, with ${…} over the rule's variables at the start of the episode."""
+    follow: bool = False
+    """If true, the parameters are computed again at each evaluation while the episode lasts, and the task is patched
+    when they change. A parameter that is unknown or fails keeps its last value."""

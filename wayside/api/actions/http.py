@@ -27,10 +27,10 @@ HttpUrl = Annotated[str, Field(max_length=2048, pattern=r"^https?://[^\s/?#@\\]+
 class SecretKey(Model):
     """A key of a Secret that is mounted for the detector."""
 
-    name: ObjectName = Field(description="The name of the Secret.")
-    key: str = Field(
-        min_length=1, max_length=253, pattern=r"^[A-Za-z0-9_-][A-Za-z0-9._-]*$", description="The key in the Secret."
-    )
+    name: ObjectName
+    """The name of the Secret."""
+    key: str = Field(min_length=1, max_length=253, pattern=r"^[A-Za-z0-9_-][A-Za-z0-9._-]*$")
+    """The key in the Secret."""
 
 
 class HttpHeader(Model):
@@ -40,20 +40,14 @@ class HttpHeader(Model):
         ("[has(self.value), has(self.variable), has(self.secretKeyRef)].filter(given, given).size() == 1", _VALUE_ONCE)
     )
 
-    name: str = Field(
-        min_length=1, max_length=128, pattern=_TOKEN, description="The name of the header, e.g. Authorization."
-    )
-    value: str | None = Field(
-        default=None, max_length=2048, pattern=r"^[^\r\n\x00]*$", description="The literal value. Not for secrets."
-    )
-    variable: str | None = Field(
-        default=None,
-        max_length=255,
-        pattern=_VARIABLE,
-        description="The environment variable of the detector that contains the value. Its name must begin with "
-        "WAYSIDE_.",
-    )
-    secret_key_ref: SecretKey | None = Field(default=None, description="The Secret key that contains the value.")
+    name: str = Field(min_length=1, max_length=128, pattern=_TOKEN)
+    """The name of the header, e.g. Authorization."""
+    value: str | None = Field(default=None, max_length=2048, pattern=r"^[^\r\n\x00]*$")
+    """The literal value. Not for secrets."""
+    variable: str | None = Field(default=None, max_length=255, pattern=_VARIABLE)
+    """The environment variable of the detector that contains the value. Its name must begin with WAYSIDE_."""
+    secret_key_ref: SecretKey | None = None
+    """The Secret key that contains the value."""
 
     @model_validator(mode="after")
     def _coherent(self) -> HttpHeader:
@@ -69,25 +63,16 @@ class HttpAccess(Model):
 
     model_config = validations(("!(has(self.tls) && has(self.tlsSecretName))", TLS_ONCE, ".tlsSecretName", "Forbidden"))
 
-    headers: list[HttpHeader] = Field(
-        default_factory=list,
-        max_length=32,
-        description="Additional headers of each request.",
-        json_schema_extra=map_list("name"),
-    )
-    timeout: PositiveDuration = Field(
-        default=PositiveDuration("10s"),
-        description="The total timeout of one attempt, from name resolution to the end of the response.",
-    )
-    tls: Tls | None = Field(default=None, description="TLS certificates from files.")
-    tls_secret_name: ObjectName | None = Field(
-        default=None,
-        description="A Secret with the keys ca.crt and, if the detector authenticates with a certificate, tls.crt and "
-        "tls.key.",
-    )
-    credentials_secret_name: ObjectName | None = Field(
-        default=None, description="A Secret with the keys username and password, for HTTP Basic authentication."
-    )
+    headers: list[HttpHeader] = Field(default_factory=list, max_length=32, json_schema_extra=map_list("name"))
+    """Additional headers of each request."""
+    timeout: PositiveDuration = PositiveDuration("10s")
+    """The total timeout of one attempt, from name resolution to the end of the response."""
+    tls: Tls | None = None
+    """TLS certificates from files."""
+    tls_secret_name: ObjectName | None = None
+    """A Secret with the keys ca.crt and, if the detector authenticates with a certificate, tls.crt and tls.key."""
+    credentials_secret_name: ObjectName | None = None
+    """A Secret with the keys username and password, for HTTP Basic authentication."""
 
     @model_validator(mode="after")
     def _given_once(self) -> HttpAccess:

@@ -44,15 +44,13 @@ class NotifyHttp(HttpAccess):
         ("has(self.url) != has(self.urlSecretKeyRef)", _URL_ONCE),
     )
 
-    url: HttpUrl | None = Field(default=None, description="The URL of the endpoint, e.g. https://events.example/city.")
-    url_secret_key_ref: SecretKey | None = Field(
-        default=None, description="The Secret key that contains the URL, if the URL itself grants access."
-    )
-    mode: ContentMode = Field(
-        default=ContentMode.STRUCTURED,
-        description="Structured: the body is the whole event. Binary: the body is the data of the event; the "
-        "attributes are headers.",
-    )
+    url: HttpUrl | None = None
+    """The URL of the endpoint, e.g. https://events.example/city."""
+    url_secret_key_ref: SecretKey | None = None
+    """The Secret key that contains the URL, if the URL itself grants access."""
+    mode: ContentMode = ContentMode.STRUCTURED
+    """Structured: the body is the whole event. Binary: the body is the data of the event; the attributes are
+    headers."""
 
     @model_validator(mode="after")
     def _one_url(self) -> NotifyHttp:
@@ -64,54 +62,39 @@ class NotifyHttp(HttpAccess):
 class NotifyAlertmanager(HttpAccess):
     """An Alertmanager, or a server with the same API (v2)."""
 
-    url: HttpUrl = Field(
-        description="The base URL, e.g. http://alertmanager:9093. The path /api/v2/alerts is appended.",
-    )
-    repeat: PositiveDuration = Field(
-        default=PositiveDuration("1m"),
-        description="The interval at which an alert is sent again while its episode lasts. The alert resolves after "
-        "four intervals without an update.",
-    )
+    url: HttpUrl
+    """The base URL, e.g. http://alertmanager:9093. The path /api/v2/alerts is appended."""
+    repeat: PositiveDuration = PositiveDuration("1m")
+    """The interval at which an alert is sent again while its episode lasts. The alert resolves after four intervals
+    without an update."""
 
 
 class NotifyZenoh(Model):
     """A key of the detector's Zenoh session."""
 
-    key: str = Field(
-        min_length=1,
-        max_length=255,
-        pattern=r"^[^/*$#?]+(/[^/*$#?]+)*$",
-        description="The key on which the event is published, in addition to its own key, e.g. city/alerts.",
-    )
+    key: str = Field(min_length=1, max_length=255, pattern=r"^[^/*$#?]+(/[^/*$#?]+)*$")
+    """The key on which the event is published, in addition to its own key, e.g. city/alerts."""
 
 
 class Grouping(Model):
     """Groups several events into one message."""
 
-    wait: PositiveDuration = Field(
-        default=PositiveDuration("10s"),
-        description="How long to collect events after the first one of a group, before the message is sent.",
-    )
-    by: list[Identifier] = Field(
-        default_factory=list,
-        max_length=8,
-        description="The names of labels. Events with the same values of these labels share a message. Default: all "
-        "events of the rule share messages.",
-        json_schema_extra=SET_LIST,
-    )
-    maximum: int = Field(
-        default=20,
-        ge=1,
-        le=1000,
-        description="The maximum number of events that a message contains in full. All events are counted.",
-    )
+    wait: PositiveDuration = PositiveDuration("10s")
+    """How long to collect events after the first one of a group, before the message is sent."""
+    by: list[Identifier] = Field(default_factory=list, max_length=8, json_schema_extra=SET_LIST)
+    """The names of labels. Events with the same values of these labels share a message. Default: all events of the rule
+    share messages."""
+    maximum: int = Field(default=20, ge=1, le=1000)
+    """The maximum number of events that a message contains in full. All events are counted."""
 
 
 class Rate(Model):
     """The maximum rate of messages. Further messages wait."""
 
-    messages: int = Field(ge=1, le=100_000, description="The maximum number of messages per period, retries included.")
-    per: PositiveDuration = Field(default=PositiveDuration("1m"), description="The period.")
+    messages: int = Field(ge=1, le=100_000)
+    """The maximum number of messages per period, retries included."""
+    per: PositiveDuration = PositiveDuration("1m")
+    """The period."""
 
 
 class NotifyAction(Model):
@@ -122,44 +105,28 @@ class NotifyAction(Model):
         ("!has(self.alertmanager) || !(has(self.grouping) || has(self.events))", _ALERTS, ".alertmanager", "Forbidden"),
     )
 
-    http: NotifyHttp | None = Field(default=None, description="An HTTP endpoint that receives CloudEvents.")
-    alertmanager: NotifyAlertmanager | None = Field(
-        default=None, description="An Alertmanager. An alert fires while the episode lasts."
-    )
-    zenoh: NotifyZenoh | None = Field(default=None, description="A Zenoh key on which the event is published.")
-    events: list[Moment] | None = Field(
-        default=None,
-        min_length=1,
-        max_length=2,
-        description="The events that cause a notification. Default: Started and Ended.",
-        json_schema_extra=SET_LIST,
-    )
-    title: Template | None = Field(
-        default=None, description="The title of the message, with ${…}; the summary of an alert."
-    )
-    text: Template | None = Field(
-        default=None, description="The text of the message, with ${…}; the description of an alert."
-    )
-    labels: dict[Identifier, Annotated[str, Field(max_length=1024)]] = Field(
-        default_factory=dict,
-        max_length=32,
-        description="Labels for the receiver to filter or route by, such as severity, with ${…}. An alert has them "
-        "as its labels.",
-    )
-    grouping: Grouping | None = Field(
-        default=None, description="Groups several events into one message. Default: one message per event."
-    )
-    rate: Rate | None = Field(default=None, description="The maximum rate of messages. Default: no limit.")
-    waiting: int = Field(
-        default=1000,
-        ge=1,
-        le=100_000,
-        description="The maximum number of waiting messages. Further messages become dead letters.",
-    )
-    give_up_after: Duration = Field(
-        default=Duration("1h"),
-        description="A message becomes a dead letter after delivery has failed for this time, over several attempts.",
-    )
+    http: NotifyHttp | None = None
+    """An HTTP endpoint that receives CloudEvents."""
+    alertmanager: NotifyAlertmanager | None = None
+    """An Alertmanager. An alert fires while the episode lasts."""
+    zenoh: NotifyZenoh | None = None
+    """A Zenoh key on which the event is published."""
+    events: list[Moment] | None = Field(default=None, min_length=1, max_length=2, json_schema_extra=SET_LIST)
+    """The events that cause a notification. Default: Started and Ended."""
+    title: Template | None = None
+    """The title of the message, with ${…}; the summary of an alert."""
+    text: Template | None = None
+    """The text of the message, with ${…}; the description of an alert."""
+    labels: dict[Identifier, Annotated[str, Field(max_length=1024)]] = Field(default_factory=dict, max_length=32)
+    """Labels for the receiver to filter or route by, such as severity, with ${…}. An alert has them as its labels."""
+    grouping: Grouping | None = None
+    """Groups several events into one message. Default: one message per event."""
+    rate: Rate | None = None
+    """The maximum rate of messages. Default: no limit."""
+    waiting: int = Field(default=1000, ge=1, le=100_000)
+    """The maximum number of waiting messages. Further messages become dead letters."""
+    give_up_after: Duration = Duration("1h")
+    """A message becomes a dead letter after delivery has failed for this time, over several attempts."""
 
     @model_validator(mode="after")
     def _coherent(self) -> NotifyAction:

@@ -24,8 +24,10 @@ class Compression(StrEnum):
 class Split(Model):
     """When a recording continues in a new file. Each file is readable on its own."""
 
-    bytes: PositiveQuantity | None = Field(default=None, description="The approximate maximum size of a file.")
-    duration: PositiveDuration | None = Field(default=None, description="The maximum time span of a file.")
+    bytes: PositiveQuantity | None = None
+    """The approximate maximum size of a file."""
+    duration: PositiveDuration | None = None
+    """The maximum time span of a file."""
 
 
 class RecordAction(Window):
@@ -33,21 +35,15 @@ class RecordAction(Window):
 
     templates_in: ClassVar[tuple[str, ...]] = ("metadata",)
 
-    compression: Compression = Field(
-        default=Compression.NONE,
-        description="The compression of chunks: None, Lz4 (fast) or Zstd (smaller). Readers detect it.",
-    )
-    split: Split = Field(default=Split(), description="When to continue in a new file. Default: never.")
-    renew_after: PositiveDuration | None = Field(
-        default=None,
-        description="Complete the recording after this time and continue the episode in a new one. Each sample is "
-        "in exactly one of them. For rules whose episodes never end. Default: one recording per episode.",
-    )
-    metadata: FreeData = Field(
-        default_factory=dict,
-        description="Additional metadata of the recording, with ${…} over the rule's variables at the start of the "
-        "episode.",
-    )
+    compression: Compression = Compression.NONE
+    """The compression of chunks: None, Lz4 (fast) or Zstd (smaller). Readers detect it."""
+    split: Split = Split()
+    """When to continue in a new file. Default: never."""
+    renew_after: PositiveDuration | None = None
+    """Complete the recording after this time and continue the episode in a new one. Each sample is in exactly one of
+    them. For rules whose episodes never end. Default: one recording per episode."""
+    metadata: FreeData = Field(default_factory=dict)
+    """Additional metadata of the recording, with ${…} over the rule's variables at the start of the episode."""
 
     @property
     def templates(self) -> Mapping[str, JsonValue]:

@@ -40,55 +40,34 @@ _DOMAIN = "domain is valid only with layout RmwZenoh: remove it"
 class TriggerDetector(Model):
     """A recording by another detector of the same Zenoh network, which must allow it (spec.recordings.onRequest)."""
 
-    name: str = Field(
-        min_length=1,
-        max_length=512,
-        pattern=r"^([A-Za-z0-9_.-]{1,253}|.*[$][{].*)$",
-        description="The holder name of the other detector: the name of the Detector, or <detector>.<pod> for a "
-        "Sidecar. With ${…} over the rule's variables, e.g. recorder.${client}.",
-    )
-    streams: list[ObjectName] | None = Field(
-        default=None,
-        min_length=1,
-        max_length=128,
-        description="The streams of the other detector. Default: all that it records on request.",
-        json_schema_extra=SET_LIST,
-    )
-    clients: WindowClients = Field(
-        default=WindowClients.ALL,
-        description="All: every client that the other detector knows. Subjects: the clients of the episode.",
-    )
-    with_clients: list[ClientName] = Field(
-        default_factory=list,
-        max_length=64,
-        description="With `clients: Subjects`: additional clients.",
-        json_schema_extra=SET_LIST,
-    )
-    before: Duration = Field(
-        default=Duration("0s"),
-        description="How long before the onset the recording begins, as far as the other detector's buffer reaches.",
-    )
-    after: Duration = Field(
-        default=Duration("0s"), description="How long after the end of the episode the recording ends."
-    )
+    name: str = Field(min_length=1, max_length=512, pattern=r"^([A-Za-z0-9_.-]{1,253}|.*[$][{].*)$")
+    """The holder name of the other detector: the name of the Detector, or <detector>.<pod> for a Sidecar. With ${…}
+    over the rule's variables, e.g. recorder.${client}."""
+    streams: list[ObjectName] | None = Field(default=None, min_length=1, max_length=128, json_schema_extra=SET_LIST)
+    """The streams of the other detector. Default: all that it records on request."""
+    clients: WindowClients = WindowClients.ALL
+    """All: every client that the other detector knows. Subjects: the clients of the episode."""
+    with_clients: list[ClientName] = Field(default_factory=list, max_length=64, json_schema_extra=SET_LIST)
+    """With `clients: Subjects`: additional clients."""
+    before: Duration = Duration("0s")
+    """How long before the onset the recording begins, as far as the other detector's buffer reaches."""
+    after: Duration = Duration("0s")
+    """How long after the end of the episode the recording ends."""
 
 
 class ServiceCall(Model):
     """A call of a ROS 2 service."""
 
-    service: ServiceName = Field(description="The name of the service, e.g. /rosbag2_recorder/resume.")
-    type: ServiceType = Field(description="The type of the service, e.g. rosbag2_interfaces/srv/Resume.")
-    definition: str | None = Field(
-        default=None,
-        max_length=16_384,
-        description="The definition of the type, in the format of .srv files. Not needed for the services of "
-        "rosbag2's recorder and of std_srvs (ROS 2 Jazzy).",
-    )
-    request: NamedData = Field(
-        default_factory=dict,
-        description="The fields of the request, with ${…} over the rule's variables at the start of the episode. "
-        "Omitted fields are zero or empty.",
-    )
+    service: ServiceName
+    """The name of the service, e.g. /rosbag2_recorder/resume."""
+    type: ServiceType
+    """The type of the service, e.g. rosbag2_interfaces/srv/Resume."""
+    definition: str | None = Field(default=None, max_length=16_384)
+    """The definition of the type, in the format of .srv files. Not needed for the services of rosbag2's recorder and of
+    std_srvs (ROS 2 Jazzy)."""
+    request: NamedData = Field(default_factory=dict)
+    """The fields of the request, with ${…} over the rule's variables at the start of the episode. Omitted fields are
+    zero or empty."""
 
 
 class TriggerRos2(Model):
@@ -99,19 +78,15 @@ class TriggerRos2(Model):
         ("!has(self.domain) || !has(self.layout) || self.layout == 'RmwZenoh'", _DOMAIN, ".domain", "Forbidden"),
     )
 
-    layout: Layout = Field(
-        default=Layout.RMW_ZENOH,
-        description="RmwZenoh: nodes that use rmw_zenoh. Plain: nodes behind zenoh-bridge-ros2dds.",
-    )
-    domain: int | None = Field(
-        default=None, ge=0, le=232, description="With layout RmwZenoh: the ROS domain ID of the nodes. Default: 0."
-    )
-    start: ServiceCall | None = Field(
-        default=None,
-        description="The call at the start of the episode. With both start and stop, overlapping episodes share one "
-        "recording: it starts with the first and stops with the last.",
-    )
-    stop: ServiceCall | None = Field(default=None, description="The call at the end of the episode.")
+    layout: Layout = Layout.RMW_ZENOH
+    """RmwZenoh: nodes that use rmw_zenoh. Plain: nodes behind zenoh-bridge-ros2dds."""
+    domain: int | None = Field(default=None, ge=0, le=232)
+    """With layout RmwZenoh: the ROS domain ID of the nodes. Default: 0."""
+    start: ServiceCall | None = None
+    """The call at the start of the episode. With both start and stop, overlapping episodes share one recording: it
+    starts with the first and stops with the last."""
+    stop: ServiceCall | None = None
+    """The call at the end of the episode."""
 
     @model_validator(mode="after")
     def _coherent(self) -> TriggerRos2:
@@ -139,15 +114,13 @@ class HttpMethod(StrEnum):
 class HttpCall(Model):
     """One HTTP request. Its header Idempotency-Key consists of the recording's ID and .start or .stop."""
 
-    method: HttpMethod = Field(default=HttpMethod.POST, description="The method: POST, PUT, PATCH or DELETE.")
-    url: HttpUrl = Field(
-        description="The URL, e.g. https://recorder/recordings/{id}. {id} is replaced with the ID of the recording."
-    )
-    body: FreeData | None = Field(
-        default=None,
-        description="The JSON body, with ${…} over the rule's variables at the start of the episode. Default: id, do "
-        "(start or stop), maximumDuration, and event: the CloudEvent of the start.",
-    )
+    method: HttpMethod = HttpMethod.POST
+    """The method: POST, PUT, PATCH or DELETE."""
+    url: HttpUrl
+    """The URL, e.g. https://recorder/recordings/{id}. {id} is replaced with the ID of the recording."""
+    body: FreeData | None = None
+    """The JSON body, with ${…} over the rule's variables at the start of the episode. Default: id, do (start or stop),
+    maximumDuration, and event: the CloudEvent of the start."""
 
     @field_validator("url")
     @classmethod
@@ -165,8 +138,10 @@ class TriggerHttp(HttpAccess):
         ("has(self.start) || has(self.stop)", _CALL),
     )
 
-    start: HttpCall | None = Field(default=None, description="The request at the start of the episode.")
-    stop: HttpCall | None = Field(default=None, description="The request at the end of the episode.")
+    start: HttpCall | None = None
+    """The request at the start of the episode."""
+    stop: HttpCall | None = None
+    """The request at the end of the episode."""
 
     @model_validator(mode="after")
     def _any_call(self) -> TriggerHttp:
@@ -191,22 +166,20 @@ class TriggerAction(Model):
         (f"[{', '.join(f'has(self.{each})' for each in _SYSTEMS)}].filter(given, given).size() == 1", _ONE)
     )
 
-    detector: TriggerDetector | None = Field(default=None, description="A recording by another detector.")
-    ros2: TriggerRos2 | None = Field(default=None, description="Calls of ROS 2 services, e.g. of rosbag2.")
-    http: TriggerHttp | None = Field(default=None, description="Requests to an HTTP endpoint.")
-    maximum_duration: PositiveDuration = Field(
-        default=PositiveDuration("10m"),
-        description="The maximum duration of the recording. The recording ends after this time even without a stop. "
-        "Another detector enforces the limit itself. For ROS 2 services and HTTP endpoints, this detector sends the "
-        "stop, and must be running to do so.",
-    )
-    give_up_after: PositiveDuration = Field(
-        default=PositiveDuration("5m"),
-        description="How long to retry a start or stop that is not confirmed.",
-    )
-    timeout: PositiveDuration = Field(
-        default=PositiveDuration("3s"), description="The timeout of one reply over Zenoh."
-    )
+    detector: TriggerDetector | None = None
+    """A recording by another detector."""
+    ros2: TriggerRos2 | None = None
+    """Calls of ROS 2 services, e.g. of rosbag2."""
+    http: TriggerHttp | None = None
+    """Requests to an HTTP endpoint."""
+    maximum_duration: PositiveDuration = PositiveDuration("10m")
+    """The maximum duration of the recording. The recording ends after this time even without a stop. Another detector
+    enforces the limit itself. For ROS 2 services and HTTP endpoints, this detector sends the stop, and must be running
+    to do so."""
+    give_up_after: PositiveDuration = PositiveDuration("5m")
+    """How long to retry a start or stop that is not confirmed."""
+    timeout: PositiveDuration = PositiveDuration("3s")
+    """The timeout of one reply over Zenoh."""
 
     @model_validator(mode="after")
     def _one_system(self) -> TriggerAction:

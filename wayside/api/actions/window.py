@@ -19,28 +19,14 @@ class WindowClients(StrEnum):
 class Window(Model):
     """Samples around an episode. Samples of latched streams, such as /tf_static, are always included."""
 
-    streams: list[ObjectName] | None = Field(
-        default=None,
-        min_length=1,
-        max_length=128,
-        description="The streams. Latched streams are always included. Default: all streams of the Detector.",
-        json_schema_extra=SET_LIST,
-    )
-    clients: WindowClients = Field(
-        default=WindowClients.SUBJECTS,
-        description="Subjects: the clients of the episode (in a fleet scope: all clients). All: every client.",
-    )
-    with_clients: list[ClientName] = Field(
-        default_factory=list,
-        max_length=64,
-        description="Additional clients, such as a roadside unit that observes the scene.",
-        json_schema_extra=SET_LIST,
-    )
-    before: Duration = Field(
-        default=Duration("0s"),
-        description="How long before the onset the window begins. The sum of this and the rule's `for` must not "
-        "exceed the buffer duration of the streams.",
-    )
-    after: Duration = Field(
-        default=Duration("0s"), description="How long after the end of the episode the window ends."
-    )
+    streams: list[ObjectName] | None = Field(default=None, min_length=1, max_length=128, json_schema_extra=SET_LIST)
+    """The streams. Latched streams are always included. Default: all streams of the Detector."""
+    clients: WindowClients = WindowClients.SUBJECTS
+    """Subjects: the clients of the episode (in a fleet scope: all clients). All: every client."""
+    with_clients: list[ClientName] = Field(default_factory=list, max_length=64, json_schema_extra=SET_LIST)
+    """Additional clients, such as a roadside unit that observes the scene."""
+    before: Duration = Duration("0s")
+    """How long before the onset the window begins. The sum of this and the rule's `for` must not exceed the buffer
+    duration of the streams."""
+    after: Duration = Duration("0s")
+    """How long after the end of the episode the window ends."""
