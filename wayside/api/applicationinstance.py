@@ -16,9 +16,8 @@ from wayside.api.base import (
     Model,
     TemplateName,
     Time,
-    immutable,
-    validation,
 )
+from wayside.api.constraints import immutable, validation
 from wayside.api.freedata import NestedValue
 
 _IMMUTABLE = "is immutable: delete this instance and create another"

@@ -17,10 +17,9 @@ from wayside.api.base import (
     ObjectName,
     TemplateName,
     Time,
-    immutable,
-    validation,
 )
 from wayside.api.classification import Classification
+from wayside.api.constraints import immutable, validation
 from wayside.api.freedata import NestedValue
 from wayside.api.operation import MEANING, Operation
 

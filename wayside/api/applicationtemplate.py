@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import Annotated, Any, ClassVar
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, field_validator
 from pydantic.config import JsonDict
 
 from wayside.api.base import (
@@ -19,10 +19,9 @@ from wayside.api.base import (
     PositiveDuration,
     TemplateName,
     Time,
-    validation,
-    validations,
 )
 from wayside.api.chart import Helm
+from wayside.api.constraints import constraint, exactly_one, validation
 from wayside.api.freedata import NamedData, Value
 from wayside.api.parameter import Parameter
 
@@ -50,14 +49,17 @@ class FallbackTemplate(Model):
     """The name of another ApplicationTemplate, in the same namespace."""
 
 
-FALLBACK_WITHOUT_TIMEOUT = "fallback needs readyTimeout: set it, e.g. readyTimeout: 60s"
-
-
 class Lifecycle(Model):
     """The lifetime of instances."""
 
-    model_config = validations(
-        ("!has(self.fallback) || has(self.readyTimeout)", FALLBACK_WITHOUT_TIMEOUT, ".readyTimeout", "Required")
+    constraints = (
+        constraint(
+            "!has(self.fallback) || has(self.readyTimeout)",
+            "fallback needs readyTimeout: set it, e.g. readyTimeout: 60s",
+            ".readyTimeout",
+            "Required",
+            holds=lambda lifecycle: lifecycle.fallback is None or lifecycle.ready_timeout is not None,
+        ),
     )
 
     linger: Duration = Duration("30s")
@@ -74,18 +76,6 @@ class Lifecycle(Model):
     on_detector_loss: OnDetectorLoss = OnDetectorLoss()
     """The policy for demands whose holder's Lease has expired."""
 
-    @model_validator(mode="after")
-    def _fallback_has_its_time(self) -> Lifecycle:
-        if self.fallback is not None and self.ready_timeout is None:
-            raise ValueError(FALLBACK_WITHOUT_TIMEOUT)
-        return self
-
-
-BASELINE_WITH_KEY = (
-    "baseline is only for a template without key, which has one instance: remove baseline or key; with key, use a rule "
-    "with `when: true` to select the instances that always run"
-)
-
 
 class Baseline(Model):
     """An instance that always runs, with or without tasks."""
@@ -101,15 +91,20 @@ Manifest = Annotated[dict[str, Any], Field(json_schema_extra={"x-kubernetes-pres
 FileName = Annotated[str, Field(min_length=1, max_length=253, pattern=r"^[-._a-zA-Z0-9]+$")]
 """A file's name, as ConfigMaps allow it."""
 
-_ONE_OF = "give exactly one of manifests and helm"
-
 
 class ApplicationTemplateSpec(Model):
     """Parameters, identity and manifests of an application."""
 
-    model_config = validations(
-        ("has(self.manifests) != has(self.helm)", _ONE_OF),
-        ("!has(self.baseline) || !has(self.key)", BASELINE_WITH_KEY, ".baseline", "Forbidden"),
+    constraints = (
+        exactly_one("manifests", "helm"),
+        constraint(
+            "!has(self.baseline) || !has(self.key)",
+            "baseline is only for a template without key, which has one instance: remove baseline or key; with key, "
+            "use a rule with `when: true` to select the instances that always run",
+            ".baseline",
+            "Forbidden",
+            holds=lambda template: template.baseline is None or template.key is None,
+        ),
     )
 
     description: str = Field(default="", max_length=1024)
@@ -138,18 +133,6 @@ class ApplicationTemplateSpec(Model):
     helm: Helm | None = None
     """A Helm chart instead of manifests. The same kinds of object are allowed, and they are applied in the same way.
     The release has the name of the instance."""
-
-    @model_validator(mode="after")
-    def _one_kind_of_objects(self) -> ApplicationTemplateSpec:
-        if bool(self.manifests) == (self.helm is not None):
-            raise ValueError(_ONE_OF)
-        return self
-
-    @model_validator(mode="after")
-    def _one_baseline(self) -> ApplicationTemplateSpec:
-        if self.baseline is not None and self.key is not None:
-            raise ValueError(BASELINE_WITH_KEY)
-        return self
 
     @field_validator("manifests")
     @classmethod

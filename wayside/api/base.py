@@ -7,11 +7,21 @@ import re
 from decimal import Decimal
 from typing import Annotated, Any, ClassVar, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetCoreSchemaHandler, GetJsonSchemaHandler
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    GetJsonSchemaHandler,
+    model_validator,
+)
 from pydantic.alias_generators import to_camel
 from pydantic.config import JsonDict
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, core_schema
+
+from wayside.api.constraints import Constraint
 
 GROUP = "wayside.dev"
 VERSION = "v1alpha1"
@@ -30,6 +40,14 @@ class Model(BaseModel):
     model_config = ConfigDict(
         alias_generator=to_camel, validate_by_name=True, validate_by_alias=True, extra="forbid", frozen=True
     )
+    constraints: ClassVar[tuple[Constraint, ...]] = ()
+
+    @model_validator(mode="after")
+    def _fulfils_constraints(self) -> Self:
+        for constraint in self.constraints:
+            if (problem := constraint.problem(self)) is not None:
+                raise ValueError(problem)
+        return self
 
     def to_json(self) -> dict[str, Any]:
         """The object as it goes to the API server or into a file: camelCase, absent fields left out."""
@@ -214,35 +232,6 @@ SET_LIST: JsonDict = {"x-kubernetes-list-type": "set"}
 def map_list(key: str) -> JsonDict:
     """Of a field: server-side apply merges the items by this field of theirs, whose values are unique."""
     return {"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": [key]}
-
-
-def validation(rule: str, message: str, field: str = "", reason: str = "") -> JsonDict:
-    """A CEL validation for the CRD.
-
-    Args:
-        rule: the CEL source.
-        message: what is wrong, and the remedy.
-        field: the path of the field that the refusal names, relative to the object, e.g. `.over`; empty: the object
-            itself, for rules about several fields of equal standing.
-        reason: Required, Forbidden or Duplicate; empty: Invalid.
-    """
-    made: JsonDict = {"rule": rule, "message": message}
-    return made | ({"fieldPath": field} if field else {}) | ({"reason": f"FieldValue{reason}"} if reason else {})
-
-
-def checked(*rules: tuple[str, str]) -> JsonDict:
-    """The same for one field: what its schema has in addition."""
-    return {"x-kubernetes-validations": [validation(*rule) for rule in rules]}
-
-
-def immutable(message: str) -> JsonDict:
-    """A field that cannot change, with the remedy in the message."""
-    return {"x-kubernetes-validations": [validation("self == oldSelf", message, reason="Forbidden")]}
-
-
-def validations(*rules: tuple[str, str] | tuple[str, str, str] | tuple[str, str, str, str]) -> ConfigDict:
-    """Model configuration with CEL validations for the CRD; each as for `validation`."""
-    return ConfigDict(json_schema_extra={"x-kubernetes-validations": [validation(*rule) for rule in rules]})
 
 
 class OwnerReference(BaseModel):

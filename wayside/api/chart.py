@@ -6,7 +6,8 @@ from typing import Any
 
 from pydantic import Field, model_validator
 
-from wayside.api.base import Model, validations
+from wayside.api.base import Model
+from wayside.api.constraints import constraint
 
 OCI = "oci://"
 
@@ -20,13 +21,13 @@ _VERSION = r"^v?[0-9]+(\.[0-9]+){0,2}(-[0-9A-Za-z.-]+)?(\+[0-9A-Za-z.-]+)?$"
 class Helm(Model):
     """A chart and its values."""
 
-    model_config = validations(
-        (
+    constraints = (
+        constraint(
             "self.chart.startsWith('/') ? !has(self.version) && !has(self.repository) : has(self.version)",
             "a chart from a registry or repository needs version; for a path, remove version and repository",
             ".version",
         ),
-        (
+        constraint(
             "self.chart.startsWith('/') || self.chart.startsWith('oci://') != has(self.repository)",
             "a chart name needs repository; for oci://…, remove repository",
             ".repository",

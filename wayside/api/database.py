@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from enum import StrEnum
 
-from pydantic import model_validator
-
 from wayside.api.access import FilePath, Variable
-from wayside.api.base import Model, ObjectName, PositiveQuantity, validations
-
-_ONE = "give exactly one of uriSecretName, uriVariable and uriFile"
+from wayside.api.base import Model, ObjectName, PositiveQuantity
+from wayside.api.constraints import exactly_one
 
 
 class WriteConcern(StrEnum):
@@ -43,9 +40,7 @@ class DatabaseFiles(Model):
 class DatabaseConnection(Model):
     """A MongoDB server or replica set, with the storage beside it."""
 
-    model_config = validations(
-        ("[has(self.uriSecretName), has(self.uriVariable), has(self.uriFile)].filter(given, given).size() == 1", _ONE)
-    )
+    constraints = (exactly_one("uri_secret_name", "uri_variable", "uri_file"),)
 
     uri_secret_name: ObjectName | None = None
     """A Secret whose key `uri` contains the connection string, mongodb://… with credentials."""
@@ -61,9 +56,3 @@ class DatabaseConnection(Model):
     and lost when the process ends."""
     files: DatabaseFiles | None = None
     """Stores large binary data in files. Without it, the data stays in the documents."""
-
-    @model_validator(mode="after")
-    def _one_place(self) -> DatabaseConnection:
-        if [self.uri_secret_name, self.uri_variable, self.uri_file].count(None) != 2:
-            raise ValueError(_ONE)
-        return self

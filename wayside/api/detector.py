@@ -20,9 +20,9 @@ from wayside.api.base import (
     PositiveDuration,
     PositiveQuantity,
     map_list,
-    validations,
 )
 from wayside.api.constants import Constants
+from wayside.api.constraints import GIVEN_TWICE, constraint, unique
 from wayside.api.database import DatabaseConnection
 from wayside.api.place import MapFile, Place
 from wayside.api.plugin import DataSource
@@ -80,32 +80,36 @@ class State(Model):
     takes effect at the next start."""
 
 
-_POD_WITHOUT_MODE = "pod has no effect without mode: set mode to Standalone or Sidecar, or remove pod"
-_ACCOUNTS_WITHOUT_SIDECAR = "serviceAccountNames has no effect without mode Sidecar: set mode: Sidecar, or remove it"
-_SIDECAR_ON_NODES = (
-    f"{', '.join(f'pod.{field}' for field in OF_ITS_OWN_POD)} have no effect with mode Sidecar, which uses an existing "
-    "pod: remove them"
-)
 _ITS_OWN_POD = " || ".join(f"has(self.pod.{field})" for field in OF_ITS_OWN_POD)
 
 
 class DetectorSpec(Model):
     """Streams, buffer, time and rules of a detector."""
 
-    model_config = validations(
-        ("has(self.mode) || !has(self.pod)", _POD_WITHOUT_MODE, ".pod", "Forbidden"),
-        (
+    constraints = (
+        unique("streams", "sources", "clients", "places", "messages"),
+        constraint(
+            "has(self.mode) || !has(self.pod)",
+            "pod has no effect without mode: set mode to Standalone or Sidecar, or remove pod",
+            ".pod",
+            "Forbidden",
+            holds=lambda detector: detector.mode is not None or detector.pod is None,
+        ),
+        constraint(
             "!has(self.serviceAccountNames) || (has(self.mode) && self.mode == 'Sidecar')",
-            _ACCOUNTS_WITHOUT_SIDECAR,
+            "serviceAccountNames has no effect without mode Sidecar: set mode: Sidecar, or remove it",
             ".serviceAccountNames",
             "Forbidden",
+            holds=lambda detector: detector.service_account_names is None or detector.mode is DetectorMode.SIDECAR,
         ),
-        (
+        constraint(
             f"!has(self.mode) || self.mode != 'Sidecar' || !has(self.pod) || !({_ITS_OWN_POD})",
-            _SIDECAR_ON_NODES,
+            f"{', '.join(f'pod.{field}' for field in OF_ITS_OWN_POD)} have no effect with mode Sidecar, which uses an "
+            "existing pod: remove them",
             ".pod",
             "Forbidden",
         ),
+        unique("service_account_names", wording=GIVEN_TWICE),
     )
 
     mode: DetectorMode | None = None
@@ -158,36 +162,8 @@ class DetectorSpec(Model):
     """Selects the EventRules of the namespace to evaluate, by their labels. Default: every rule."""
 
     @model_validator(mode="after")
-    def _unique_names(self) -> DetectorSpec:
-        for field, names in (
-            ("streams", [s.name for s in self.streams]),
-            ("sources", [s.name for s in self.sources]),
-            ("clients", [c.name for c in self.clients]),
-            ("places", [p.name for p in self.places]),
-            ("messages", [m.name for m in self.messages]),
-        ):
-            twice = sorted({name for name in names if names.count(name) > 1})
-            if twice:
-                raise ValueError(f"{field}: the name {twice[0]!r} is used twice: names must be unique")
-        return self
-
-    @model_validator(mode="after")
-    def _accounts(self) -> DetectorSpec:
-        names = self.service_account_names
-        if names is None:
-            return self
-        if self.mode is not DetectorMode.SIDECAR:
-            raise ValueError(_ACCOUNTS_WITHOUT_SIDECAR)
-        twice = sorted({each for each in names if names.count(each) > 1})
-        if twice:
-            raise ValueError(f"serviceAccountNames: {twice[0]} is given twice: give it once")
-        return self
-
-    @model_validator(mode="after")
     def _in_a_pod(self) -> DetectorSpec:
         if self.mode is None:
-            if self.pod is not None:
-                raise ValueError(_POD_WITHOUT_MODE)
             return self
         if self.mode is DetectorMode.SIDECAR and self.pod is not None and (given := self.pod.on_its_own):
             fields = " and ".join(f"pod.{field}" for field in given)

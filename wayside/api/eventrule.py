@@ -21,10 +21,10 @@ from wayside.api.base import (
     PositiveDuration,
     WindowLength,
     map_list,
-    validations,
 )
 from wayside.api.classification import Classification
 from wayside.api.constants import Constants
+from wayside.api.constraints import constraint, unique
 from wayside.api.evaluation import Evaluation
 from wayside.api.model import ModelSource
 from wayside.api.plugin import SignalPlugin
@@ -95,41 +95,43 @@ _ENDS = "samples: Ends needs a signal with ruleName and an aggregate other than 
 class Signal(Model):
     """A value computed from samples, from another rule's episodes, from other signals, by a model, or by a plugin."""
 
-    model_config = validations(
-        (
+    constraints = (
+        constraint(
             "self.aggregate in ['Last', 'First', 'Previous', 'Age', 'Active'] || has(self.over)",
             "all aggregates but Last, First, Previous, Age and Active need a window: give over, e.g. over: 5s",
             ".over",
             "Required",
         ),
-        (
+        constraint(
             "has(self.model) || has(self.plugin) || has(self.of) || "
             "(self.aggregate in ['Count', 'Age', 'Active']) != has(self.value)",
             "give value, e.g. value: msg.speed, except with the aggregates Count, Age and Active, which use no value",
             ".value",
         ),
-        (
+        constraint(
             "self.aggregate != 'Active' || (has(self.ruleName) && !has(self.over) && !has(self.where))",
             "aggregate Active needs a signal with ruleName, without over and where",
             ".aggregate",
         ),
-        (
+        constraint(
             "[has(self.stream), has(self.ruleName), has(self.model), has(self.plugin), has(self.of)]"
             ".filter(given, given).size() == "
             "(self.aggregate == 'Age' && has(self.over) && self.over == 'Episode' ? 0 : 1)",
             _SOURCE,
         ),
-        ("!has(self.of) || !(has(self.value) || has(self.where) || self.aggregate in ['Age', 'Active'])", _OF),
-        ("!has(self.lag) || (has(self.of) && !(has(self.over) && self.over == 'Episode'))", _LAG),
-        (
+        constraint(
+            "!has(self.of) || !(has(self.value) || has(self.where) || self.aggregate in ['Age', 'Active'])", _OF
+        ),
+        constraint("!has(self.lag) || (has(self.of) && !(has(self.over) && self.over == 'Episode'))", _LAG),
+        constraint(
             "!has(self.over) || self.over != 'Episode' || "
             f"(self.aggregate == 'Age') != has(self.of) && self.aggregate in {sorted(map(str, OF_AN_EPISODE))}",
             _EPISODE,
         ),
-        ("(self.aggregate == 'Quantile') == has(self.quantile)", _QUANTILE),
-        ("!has(self.client) || has(self.stream) || has(self.ruleName)", _CLIENT, ".client", "Forbidden"),
-        ("self.samples == 'Starts' || (has(self.ruleName) && self.aggregate != 'Active')", _ENDS, ".samples"),
-        (
+        constraint("(self.aggregate == 'Quantile') == has(self.quantile)", _QUANTILE),
+        constraint("!has(self.client) || has(self.stream) || has(self.ruleName)", _CLIENT, ".client", "Forbidden"),
+        constraint("self.samples == 'Starts' || (has(self.ruleName) && self.aggregate != 'Active')", _ENDS, ".samples"),
+        constraint(
             "!(has(self.model) || has(self.plugin)) || !(has(self.where) || has(self.over) || has(self.value))",
             "the signal of a model or plugin cannot have value, where or over: remove them",
         ),
@@ -228,6 +230,8 @@ class Signal(Model):
 class EventRuleSpec(Model):
     """An event and its actions."""
 
+    constraints = (unique("signals", "actions"),)
+
     description: str = Field(default="", max_length=1024)
     """A description of the event, for people."""
     classification: Classification | None = None
@@ -269,14 +273,6 @@ class EventRuleSpec(Model):
     Detector's clientTimeout."""
     actions: list[ActionSpec] = Field(default_factory=list, max_length=16, json_schema_extra=map_list("name"))
     """The actions of an episode. Without actions, the rule only publishes events."""
-
-    @model_validator(mode="after")
-    def _unique_names(self) -> EventRuleSpec:
-        for field, names in (("signals", [s.name for s in self.signals]), ("actions", [a.name for a in self.actions])):
-            twice = sorted({name for name in names if names.count(name) > 1})
-            if twice:
-                raise ValueError(f"{field}: the name {twice[0]!r} is used twice: names must be unique")
-        return self
 
 
 class EventRuleStatus(Model):

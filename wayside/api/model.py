@@ -8,6 +8,7 @@ from typing import Annotated
 from pydantic import Field, model_validator
 
 from wayside.api.base import ATOMIC_LIST, Identifier, Model, ObjectName, PositiveDuration, map_list
+from wayside.api.constraints import unique
 
 TensorName = Annotated[str, Field(min_length=1, max_length=128)]
 """The name of an input or output, as the model file has it."""
@@ -152,6 +153,8 @@ class ModelInput(Model):
 class ModelSource(Model):
     """An ONNX model. Its first axis is the batch of clients, which are computed together."""
 
+    constraints = (unique("inputs", wording="the name {!r} is used twice: give each input once"),)
+
     file: str = Field(min_length=1, max_length=1024)
     """The path of the .onnx file, e.g. on a volume: /models/risk.onnx. Events contain its SHA-256 digest."""
     sha256: str | None = Field(default=None, pattern=r"^[0-9a-f]{64}$", max_length=64)
@@ -161,11 +164,3 @@ class ModelSource(Model):
     output: TensorName | None = None
     """The output to use as the signal: a number, or a list if it has several values. Default: the only output, or a map
     of all outputs by name."""
-
-    @model_validator(mode="after")
-    def _unique_names(self) -> ModelSource:
-        names = [each.name for each in self.inputs]
-        twice = sorted({name for name in names if names.count(name) > 1})
-        if twice:
-            raise ValueError(f"inputs: the name {twice[0]!r} is used twice: give each input once")
-        return self

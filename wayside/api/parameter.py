@@ -7,7 +7,8 @@ from enum import StrEnum
 
 from pydantic import Field, model_validator
 
-from wayside.api.base import ATOMIC_LIST, JsonValue, Model, validations
+from wayside.api.base import ATOMIC_LIST, JsonValue, Model
+from wayside.api.constraints import constraint
 
 
 class ParameterType(StrEnum):
@@ -65,34 +66,34 @@ class Parameter(Model):
     """One parameter of the template."""
 
     # The manager validates `default` and the items of `enum`, which have no type for the CRD's CEL.
-    model_config = validations(
-        (
+    constraints = (
+        constraint(
             "!has(self.merge) || !(self.merge in ['Union', 'Intersection']) || self.type == 'array'",
             "merge Union and Intersection need type array",
             ".merge",
         ),
-        (
+        constraint(
             "!has(self.merge) || !(self.merge in ['Max', 'Min', 'Sum']) || self.type in ['number', 'integer']",
             "merge Max, Min and Sum need type number or integer",
             ".merge",
         ),
-        (
+        constraint(
             "!has(self.merge) || !(self.merge in ['All', 'Any']) || self.type == 'boolean'",
             "merge All and Any need type boolean",
             ".merge",
         ),
-        (
+        constraint(
             "(!has(self.minimum) && !has(self.maximum)) || self.type in ['number', 'integer']",
             "minimum and maximum need type number or integer",
             ".type",
         ),
-        (
+        constraint(
             "!has(self.minimum) || !has(self.maximum) || self.minimum <= self.maximum",
             "minimum is above maximum: no value is valid",
             ".minimum",
         ),
-        ("!has(self.items) || self.type == 'array'", "items needs type array", ".items"),
-        (
+        constraint("!has(self.items) || self.type == 'array'", "items needs type array", ".items"),
+        constraint(
             "!has(self.pattern) || self.type == 'string'"
             " || (self.type == 'array' && has(self.items) && self.items == 'string')",
             "pattern needs type string, or type array with items string",

@@ -5,12 +5,10 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import Annotated
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from wayside.api.base import ATOMIC_LIST, ClientName, Model, validations
-
-_SHAPE = "give area, line, or both"
-_WIDTH = "width is valid only for a line without area: remove width or area"
+from wayside.api.base import ATOMIC_LIST, ClientName, Model
+from wayside.api.constraints import constraint
 
 Corner = Annotated[list[float], Field(min_length=2, max_length=2, json_schema_extra=ATOMIC_LIST)]
 """x and y, or latitude and longitude."""
@@ -26,9 +24,17 @@ class CoordinateFrame(StrEnum):
 class Place(Model):
     """A named area, line or lane."""
 
-    model_config = validations(
-        ("has(self.area) || has(self.line)", _SHAPE),
-        ("!has(self.width) || (has(self.line) && !has(self.area))", _WIDTH),
+    constraints = (
+        constraint(
+            "has(self.area) || has(self.line)",
+            "give area, line, or both",
+            holds=lambda place: place.area is not None or place.line is not None,
+        ),
+        constraint(
+            "!has(self.width) || (has(self.line) && !has(self.area))",
+            "width is valid only for a line without area: remove width or area",
+            holds=lambda place: place.width is None or (place.line is not None and place.area is None),
+        ),
     )
 
     name: ClientName
@@ -42,14 +48,6 @@ class Place(Model):
     """The points of a line, in its direction. With an area: the centreline of the lane, whose surface is the area."""
     width: float | None = Field(default=None, gt=0, le=1000)
     """The width in metres of a lane. Its centreline is line."""
-
-    @model_validator(mode="after")
-    def _complete(self) -> Place:
-        if self.area is None and self.line is None:
-            raise ValueError(_SHAPE)
-        if self.width is not None and (self.line is None or self.area is not None):
-            raise ValueError(_WIDTH)
-        return self
 
 
 class Origin(Model):

@@ -18,21 +18,14 @@ from wayside.api.base import (
     PositiveQuantity,
     Quantity,
     map_list,
-    validations,
 )
+from wayside.api.constraints import GIVEN_TWICE, constraint, exactly_one, unique
 from wayside.api.freedata import of_bounded_size
 
-_SOURCES = ("persistentVolumeClaim", "ephemeral", "emptyDir", "configMap", "secret", "projected", "csi")
-_ONE_VOLUME = f"give exactly one of {', '.join(_SOURCES[:-1])} and {_SOURCES[-1]}"
 _OWN_VOLUMES = "^(scratch|folder-[0-9]+|secret-[0-9]+)$"
-_OWN_VOLUME = "the names scratch, folder-<n> and secret-<n> are reserved: choose another name"
-_ONE_SOURCE = "give exactly one of value and valueFrom"
-_ONE_REFERENCE = "give exactly one of secretKeyRef, configMapKeyRef, fieldRef and resourceFieldRef"
-_ANY_KEY = "without key, operator must be Exists; with operator Exists, remove value"
 
 RESERVED_VARIABLES = frozenset({"POD_NAME", "POD_NAMESPACE", "POD_UID"})
 """Environment variables by which the detector knows its pod."""
-_RESERVED = f"{', '.join(sorted(RESERVED_VARIABLES))} are set automatically in each pod: remove them"
 
 
 class DetectorMode(StrEnum):
@@ -62,9 +55,15 @@ Amounts = Annotated[
 class DetectorVolume(Model):
     """A volume, as in a PodSpec, of one of the sources that the restricted Pod Security Standard allows."""
 
-    model_config = validations(
-        (f"[{', '.join(f'has(self.{source})' for source in _SOURCES)}].filter(given, given).size() == 1", _ONE_VOLUME),
-        (f"!self.name.matches('{_OWN_VOLUMES}')", _OWN_VOLUME, ".name", "Forbidden"),
+    constraints = (
+        exactly_one("persistent_volume_claim", "ephemeral", "empty_dir", "config_map", "secret", "projected", "csi"),
+        constraint(
+            f"!self.name.matches('{_OWN_VOLUMES}')",
+            "the names scratch, folder-<n> and secret-<n> are reserved: choose another name",
+            ".name",
+            "Forbidden",
+            holds=lambda volume: re.match(_OWN_VOLUMES, volume.name) is None,
+        ),
     )
 
     name: ObjectName
@@ -83,14 +82,6 @@ class DetectorVolume(Model):
     """Files from several sources: sources, defaultMode."""
     csi: Embedded | None = None
     """A volume of a CSI driver: driver, volumeAttributes, readOnly."""
-
-    @model_validator(mode="after")
-    def _one_source(self) -> DetectorVolume:
-        if sum(getattr(self, to_snake(source)) is not None for source in _SOURCES) != 1:
-            raise ValueError(_ONE_VOLUME)
-        if re.match(_OWN_VOLUMES, self.name):
-            raise ValueError(_OWN_VOLUME)
-        return self
 
 
 class DetectorVolumeMount(Model):
@@ -167,13 +158,7 @@ class ResourceSelector(Model):
 class VariableSource(Model):
     """The source of a variable's value, as in a PodSpec."""
 
-    model_config = validations(
-        (
-            "[has(self.secretKeyRef), has(self.configMapKeyRef), has(self.fieldRef), has(self.resourceFieldRef)]"
-            ".filter(given, given).size() == 1",
-            _ONE_REFERENCE,
-        )
-    )
+    constraints = (exactly_one("secret_key_ref", "config_map_key_ref", "field_ref", "resource_field_ref"),)
 
     secret_key_ref: KeySelector | None = None
     """A key of a Secret."""
@@ -184,23 +169,18 @@ class VariableSource(Model):
     resource_field_ref: ResourceSelector | None = None
     """A request or limit of the detector's container."""
 
-    @model_validator(mode="after")
-    def _one_reference(self) -> VariableSource:
-        if [self.secret_key_ref, self.config_map_key_ref, self.field_ref, self.resource_field_ref].count(None) != 3:
-            raise ValueError(_ONE_REFERENCE)
-        return self
-
 
 class DetectorVariable(Model):
     """An environment variable, as in a PodSpec."""
 
-    model_config = validations(
-        ("has(self.value) != has(self.valueFrom)", _ONE_SOURCE),
-        (
+    constraints = (
+        exactly_one("value", "value_from"),
+        constraint(
             f"!(self.name in {sorted(RESERVED_VARIABLES)})".replace("'", '"'),
-            _RESERVED,
+            f"{', '.join(sorted(RESERVED_VARIABLES))} are set automatically in each pod: remove them",
             ".name",
             "Forbidden",
+            holds=lambda variable: variable.name not in RESERVED_VARIABLES,
         ),
     )
 
@@ -210,14 +190,6 @@ class DetectorVariable(Model):
     """The literal value."""
     value_from: VariableSource | None = None
     """The source of the value."""
-
-    @model_validator(mode="after")
-    def _consistent(self) -> DetectorVariable:
-        if (self.value is None) == (self.value_from is None):
-            raise ValueError(_ONE_SOURCE)
-        if self.name in RESERVED_VARIABLES:
-            raise ValueError(_RESERVED)
-        return self
 
 
 class ObjectNameReference(Model):
@@ -245,13 +217,16 @@ class TaintEffect(StrEnum):
 class DetectorToleration(Model):
     """A toleration of a node taint, as in a PodSpec."""
 
-    model_config = validations(
-        (
+    constraints = (
+        constraint(
             "(has(self.key) || (has(self.operator) && self.operator == 'Exists')) && "
             "!(has(self.value) && has(self.operator) && self.operator == 'Exists')",
-            _ANY_KEY,
+            "without key, operator must be Exists; with operator Exists, remove value",
             ".operator",
-        )
+            holds=lambda toleration: (
+                toleration.value is None if toleration.operator == "Exists" else toleration.key is not None
+            ),
+        ),
     )
 
     key: Annotated[str, Field(min_length=1, max_length=317)] | None = None
@@ -265,13 +240,6 @@ class DetectorToleration(Model):
     toleration_seconds: Annotated[int, Field(ge=0, le=2**31 - 1)] | None = None
     """With effect NoExecute: how long the pod stays on a node with the taint, in seconds. Default: forever."""
 
-    @model_validator(mode="after")
-    def _consistent(self) -> DetectorToleration:
-        exists = self.operator is TolerationOperator.EXISTS
-        if (self.key is None and not exists) or (exists and self.value is not None):
-            raise ValueError(_ANY_KEY)
-        return self
-
 
 class DetectorPod(Model):
     """The pod, or the container in others' pods.
@@ -279,6 +247,11 @@ class DetectorPod(Model):
     A change of it, or of the paths of files and Secrets in the Detector, restarts a Standalone detector. Pods that have
     the detector as a sidecar keep it as it is.
     """
+
+    constraints = (
+        unique("volumes", "secret_names", "env", "image_pull_secrets", wording=GIVEN_TWICE),
+        unique("volume_mounts", by="mount_path", wording=GIVEN_TWICE),
+    )
 
     image: Annotated[str, Field(min_length=1, max_length=512, pattern=r"^[^\s]+$")] | None = None
     """The image. Default: the value of the manager's option --detector-image."""
@@ -318,21 +291,8 @@ class DetectorPod(Model):
     listed here as well. Anyone who can write rules can send the contents of these Secrets elsewhere."""
 
     @model_validator(mode="after")
-    def _unique(self) -> DetectorPod:
-        volumes = [each.name for each in self.volumes]
-        paths = [each.mount_path for each in self.volume_mounts]
-        variables = [each.name for each in self.env]
-        keys = [each.name for each in self.image_pull_secrets]
-        for field, names in (
-            ("volumes", volumes),
-            ("volumeMounts", paths),
-            ("secretNames", self.secret_names),
-            ("env", variables),
-            ("imagePullSecrets", keys),
-        ):
-            twice = sorted({each for each in names if names.count(each) > 1})
-            if twice:
-                raise ValueError(f"{field}: {twice[0]} is given twice: give it once")
+    def _mounts_volumes(self) -> DetectorPod:
+        volumes = {each.name for each in self.volumes}
         for mount in self.volume_mounts:
             if mount.name not in volumes:
                 raise ValueError(f"volumeMounts: {mount.mount_path}: volumes has no {mount.name}: add it")

@@ -69,15 +69,20 @@ def _column(column: dict[str, str]) -> dict[str, Any]:
 
 
 class _Described(GenerateJsonSchema):
-    """The docstrings below fields are their descriptions. Read here alone: a program's start has no time for it."""
+    """With the descriptions of fields, which are the docstrings below them, and the constraints of models.
+
+    The sources are read here alone: a program's start has no time for it.
+    """
 
     def model_schema(self, schema: ModelSchema) -> JsonSchemaValue:
-        """As pydantic has it, with the descriptions."""
+        """As pydantic has it, with these."""
         found = super().model_schema(schema)
         fields = schema["cls"].model_fields
         for name, text in _docstrings(schema["cls"]):
             found["properties"][fields[name].alias]["description"] = text
-        return found
+        constraints = schema["cls"].constraints if issubclass(schema["cls"], Model) else ()
+        rules = [each.validation for each in constraints if each.validation is not None]
+        return {**found, "x-kubernetes-validations": rules} if rules else found
 
 
 def _docstrings(model: type[BaseModel]) -> Iterator[tuple[str, str]]:

@@ -12,23 +12,25 @@ from wayside.api.base import (
     ObjectName,
     PositiveDuration,
     map_list,
-    validations,
 )
+from wayside.api.constraints import constraint, exactly_one, unique
 from wayside.api.freedata import bounded
 
-_POSITION = "give x and y (and z, if it matters) in metres, or latitude and longitude in degrees"
 _MAX_AGE = PositiveDuration("1s")
-_SCOPE = "give exactly one of client, pairs and fleet"
 
 
 class Position(Model):
     """The position of a client: in metres in a common frame, or in degrees on the Earth."""
 
-    model_config = validations(
-        (
+    constraints = (
+        constraint(
             "has(self.x) == has(self.y) && has(self.latitude) == has(self.longitude)"
             " && !(has(self.x) && has(self.latitude)) && (!has(self.z) || has(self.x))",
-            _POSITION,
+            "give x and y (and z, if it matters) in metres, or latitude and longitude in degrees",
+            holds=lambda position: (
+                {axis for axis in ("x", "y", "z", "latitude", "longitude") if getattr(position, axis) is not None}
+                in (set(), {"x", "y"}, {"x", "y", "z"}, {"latitude", "longitude"})
+            ),
         ),
     )
 
@@ -54,13 +56,6 @@ class Position(Model):
         if self.max_age is not None:
             return self.max_age.ns
         return None if never_stale else _MAX_AGE.ns
-
-    @model_validator(mode="after")
-    def _complete(self) -> Position:
-        given = frozenset(axis for axis in ("x", "y", "z", "latitude", "longitude") if getattr(self, axis) is not None)
-        if given and given not in ({"x", "y"}, {"x", "y", "z"}, {"latitude", "longitude"}):
-            raise ValueError(_POSITION)
-        return self
 
 
 class ClientScope(Model):
@@ -115,9 +110,7 @@ class FleetScope(Model):
 class Scope(Model):
     """The subjects of the rule: exactly one of the fields."""
 
-    model_config = validations(
-        ("[has(self.client), has(self.pairs), has(self.fleet)].filter(given, given).size() == 1", _SCOPE),
-    )
+    constraints = (exactly_one("client", "pairs", "fleet"),)
 
     client: ClientScope | None = None
     """Each client is a subject. The default."""
@@ -125,12 +118,6 @@ class Scope(Model):
     """Each pair of clients near each other is a subject."""
     fleet: FleetScope | None = None
     """All member clients together are one subject."""
-
-    @model_validator(mode="after")
-    def _exactly_one(self) -> Scope:
-        if [self.client, self.pairs, self.fleet].count(None) != 2:
-            raise ValueError(_SCOPE)
-        return self
 
 
 class Element(Model):
@@ -145,19 +132,17 @@ class Element(Model):
 class Each(Model):
     """The rule is evaluated once for each element."""
 
+    constraints = (unique("of"),)
+
     as_: Identifier = Field(alias="as")
     """The name of the variable for the element in expressions, e.g. site."""
     of: list[Element] = Field(min_length=1, max_length=256, json_schema_extra=map_list("name"))
     """The elements. Each has a name and any other fields; at most 64 KiB in total."""
 
     @model_validator(mode="after")
-    def _unique_names(self) -> Each:
-        names = [element.name for element in self.of]
+    def _bounded(self) -> Each:
         try:
             bounded({element.name: element.model_extra or {} for element in self.of})
         except ValueError as error:
             raise ValueError(f"of: {error}") from None
-        twice = sorted({name for name in names if names.count(name) > 1})
-        if twice:
-            raise ValueError(f"of: the name {twice[0]!r} is used twice: names must be unique")
         return self

@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from enum import StrEnum
 from typing import Annotated
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from wayside.api.base import ATOMIC_LIST, Model, validations
+from wayside.api.base import ATOMIC_LIST, Model
+from wayside.api.constraints import constraint
 
 LabelKey = Annotated[
     str, Field(min_length=1, max_length=317, pattern=r"^([-a-z0-9.]{1,253}/)?[A-Za-z0-9]([-_.A-Za-z0-9]*[A-Za-z0-9])?$")
@@ -17,8 +18,6 @@ LabelKey = Annotated[
 
 LabelValue = Annotated[str, Field(max_length=63, pattern=r"^([A-Za-z0-9]([-_.A-Za-z0-9]*[A-Za-z0-9])?)?$")]
 """The value of a label."""
-
-_VALUES = "operators In and NotIn need values; Exists and DoesNotExist have none"
 
 
 class LabelOperator(StrEnum):
@@ -30,14 +29,16 @@ class LabelOperator(StrEnum):
     DOES_NOT_EXIST = "DoesNotExist"
 
 
-_WITH_VALUES = (LabelOperator.IN, LabelOperator.NOT_IN)
-
-
 class LabelRequirement(Model):
     """A requirement on one label."""
 
-    model_config = validations(
-        ("(self.operator in ['In', 'NotIn']) == (has(self.values) && self.values.size() > 0)", _VALUES, ".values")
+    constraints = (
+        constraint(
+            "(self.operator in ['In', 'NotIn']) == (has(self.values) && self.values.size() > 0)",
+            "operators In and NotIn need values; Exists and DoesNotExist have none",
+            ".values",
+            holds=lambda required: (required.operator in ("In", "NotIn")) == bool(required.values),
+        ),
     )
 
     key: LabelKey
@@ -47,12 +48,6 @@ class LabelRequirement(Model):
     the label is present, or absent."""
     values: list[LabelValue] = Field(default_factory=list, max_length=64, json_schema_extra=ATOMIC_LIST)
     """The values for operators In and NotIn."""
-
-    @model_validator(mode="after")
-    def _fitting_values(self) -> LabelRequirement:
-        if (self.operator in _WITH_VALUES) != bool(self.values):
-            raise ValueError(_VALUES)
-        return self
 
     def matches(self, labels: Mapping[str, str]) -> bool:
         """Whether the labels meet the requirement."""

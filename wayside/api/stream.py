@@ -15,8 +15,8 @@ from wayside.api.base import (
     ObjectName,
     PositiveDuration,
     PositiveQuantity,
-    validations,
 )
+from wayside.api.constraints import constraint
 from wayside.api.plugin import ZENOH
 
 
@@ -71,18 +71,19 @@ class StreamBuffer(Model):
     """The maximum number of samples. At the limit, the oldest samples are dropped."""
 
 
-_POSITION = "give x and y (and z, yaw) in metres and radians, or latitude and longitude (and heading) in degrees"
-
-
 class StreamPosition(Model):
     """The position of the client that a sample contains."""
 
-    model_config = validations(
-        (
+    constraints = (
+        constraint(
             "has(self.x) == has(self.y) && has(self.latitude) == has(self.longitude)"
             " && has(self.x) != has(self.latitude)"
             " && (has(self.x) || !(has(self.z) || has(self.yaw))) && (has(self.latitude) || !has(self.heading))",
-            _POSITION,
+            "give x and y (and z, yaw) in metres and radians, or latitude and longitude (and heading) in degrees",
+            holds=lambda position: any(
+                needed <= position.axes.keys() - {"speed"} <= {*needed, *further}
+                for needed, further in (({"x", "y"}, ("z", "yaw")), ({"latitude", "longitude"}, ("heading",)))
+            ),
         ),
     )
 
@@ -113,15 +114,6 @@ class StreamPosition(Model):
         """Whether it is on the Earth, else in metres."""
         return self.latitude is not None
 
-    @model_validator(mode="after")
-    def _complete(self) -> StreamPosition:
-        given = self.axes.keys() - {"speed"}
-        if not ({"x", "y"} <= given <= {"x", "y", "z", "yaw"}) and not (
-            {"latitude", "longitude"} <= given <= {"latitude", "longitude", "heading"}
-        ):
-            raise ValueError(_POSITION)
-        return self
-
 
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 
@@ -129,50 +121,50 @@ TRANSFORMS = "tf2_msgs/msg/TFMessage"
 class Stream(Model):
     """One kind of data that every client sends."""
 
-    model_config = validations(
-        (
+    constraints = (
+        constraint(
             "self.encoding == 'uper' || (self.encoding == 'cdr') == has(self.type)",
             "type is required with encoding cdr, optional with uper, and not allowed otherwise",
             ".type",
         ),
-        (
+        constraint(
             "!has(self.type) || (self.encoding == 'uper') == self.type.startsWith('etsi/')",
             "type must be a ROS 2 message with encoding cdr, and an ETSI ITS message with uper, e.g. etsi/cam",
             ".type",
         ),
-        (
+        constraint(
             "self.key.contains('${client:') != has(self.client)",
             "key must capture the client, as ${client:*}, or client must name it; not both",
             ".client",
         ),
-        (
+        constraint(
             "!has(self.framePrefix) || (has(self.type) && self.type == 'tf2_msgs/msg/TFMessage')",
             "framePrefix is valid only for streams of type tf2_msgs/msg/TFMessage",
             ".framePrefix",
             "Forbidden",
         ),
-        (
+        constraint(
             "self.layout != 'RmwZenoh' || self.encoding in ['cdr', 'raw']",
             "layout RmwZenoh needs ROS 2 messages: encoding must be cdr or raw",
             ".layout",
         ),
-        (
+        constraint(
             "self.layout != 'RmwZenoh' || self.source == 'zenoh'",
             "layout RmwZenoh needs source zenoh: remove one of them",
             ".layout",
         ),
-        (
+        constraint(
             "!has(self.domain) || self.layout == 'RmwZenoh'",
             "domain is valid only with layout RmwZenoh: remove it",
             ".domain",
             "Forbidden",
         ),
-        (
+        constraint(
             "!has(self.items) || (has(self.client) && self.client.contains('item'))",
             "items needs client, a template that names the client of each item, e.g. ${item.id}",
             ".items",
         ),
-        (
+        constraint(
             "!has(self.items) || !(self.latched || (has(self.type) && self.type == 'tf2_msgs/msg/TFMessage'))",
             "items is not valid for latched streams and transforms: remove items or latched",
             ".items",

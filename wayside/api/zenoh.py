@@ -7,17 +7,14 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from wayside.api.access import ACCESS_VALIDATIONS, Access
-from wayside.api.base import ATOMIC_LIST, Key, checked, validations
+from wayside.api.access import Access
+from wayside.api.base import ATOMIC_LIST, Key
+from wayside.api.constraints import checked, constraint
 
 Endpoint = Annotated[str, Field(min_length=1, max_length=256, pattern=r"^[a-z]+/.+$")]
 """A Zenoh endpoint such as tcp/zenoh:7447."""
 
-_ENCRYPTED = ("tls/", "quic/")
-
 _NO_CLIENT = "liveliness does not capture the client: write ${client:*} in place of its name"
-
-_NO_CERTIFICATE = "a TLS endpoint in listen needs a certificate: set tls.certificate and tls.key, or tlsSecretName"
 
 
 class ZenohMode(StrEnum):
@@ -31,13 +28,18 @@ class ZenohMode(StrEnum):
 class Zenoh(Access):
     """The detector's Zenoh session."""
 
-    model_config = validations(
-        *ACCESS_VALIDATIONS,
-        (
+    constraints = (
+        *Access.constraints,
+        constraint(
             "!has(self.listen) || !self.listen.exists(e, e.startsWith('tls/') || e.startsWith('quic/')) || "
             "has(self.tlsSecretName) || (has(self.tls) && has(self.tls.certificate))",
-            _NO_CERTIFICATE,
+            "a TLS endpoint in listen needs a certificate: set tls.certificate and tls.key, or tlsSecretName",
             ".listen",
+            holds=lambda zenoh: (
+                not any(endpoint.startswith(("tls/", "quic/")) for endpoint in zenoh.listen)
+                or zenoh.tls_secret_name is not None
+                or (zenoh.tls is not None and zenoh.tls.certificate is not None)
+            ),
         ),
     )
 
@@ -52,7 +54,7 @@ class Zenoh(Access):
     shared_memory: bool = False
     """If true, publishers on the same machine can pass samples in shared memory. The pods must then share /dev/shm."""
 
-    liveliness: Key | None = Field(default=None, json_schema_extra=checked(("self.contains('${client:')", _NO_CLIENT)))
+    liveliness: Key | None = Field(default=None, json_schema_extra=checked("self.contains('${client:')", _NO_CLIENT))
     """The key expression of the clients' liveliness tokens, e.g. vehicles/${client:*}. A client with a token is present
     even if it sends no data. It is lost as soon as its last token disappears."""
 
@@ -60,11 +62,4 @@ class Zenoh(Access):
     def _names_clients(self) -> Zenoh:
         if self.liveliness is not None and "${client:" not in self.liveliness:
             raise ValueError(_NO_CLIENT)
-        return self
-
-    @model_validator(mode="after")
-    def _has_certificate(self) -> Zenoh:
-        listens = any(endpoint.startswith(_ENCRYPTED) for endpoint in self.listen)
-        if listens and self.tls_secret_name is None and (self.tls is None or self.tls.certificate is None):
-            raise ValueError(_NO_CERTIFICATE)
         return self

@@ -5,27 +5,23 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from pydantic import model_validator
-
 from wayside.api.actions.database import DatabaseAction
 from wayside.api.actions.deploy import Deploy
 from wayside.api.actions.notify import NotifyAction
 from wayside.api.actions.record import RecordAction
 from wayside.api.actions.trigger import TriggerAction
 from wayside.api.actions.window import Window
-from wayside.api.base import JsonValue, Model, ObjectName, validations
+from wayside.api.base import JsonValue, Model, ObjectName
+from wayside.api.constraints import exactly_one
 from wayside.api.plugin import ActionPlugin
 
 _KINDS = ("deploy", "record", "database", "trigger", "notify", "plugin")
-_ONE = f"give exactly one of {', '.join(_KINDS[:-1])} and {_KINDS[-1]}"
 
 
 class ActionSpec(Model):
     """One action of an episode."""
 
-    model_config = validations(
-        (f"[{', '.join(f'has(self.{kind})' for kind in _KINDS)}].filter(given, given).size() == 1", _ONE)
-    )
+    constraints = (exactly_one(*_KINDS),)
 
     name: ObjectName
     """The name of the action, unique within the rule."""
@@ -41,12 +37,6 @@ class ActionSpec(Model):
     """Sends notifications over HTTP, to an Alertmanager or on a Zenoh key."""
     plugin: ActionPlugin | None = None
     """Runs an action of an installed package."""
-
-    @model_validator(mode="after")
-    def _one_kind(self) -> ActionSpec:
-        if sum(getattr(self, kind) is not None for kind in _KINDS) != 1:
-            raise ValueError(_ONE)
-        return self
 
     @property
     def field(self) -> str:

@@ -6,19 +6,17 @@ environment variables that are meant for rules, and no other files or variables.
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from pydantic import Field, model_validator
 
 from wayside.api.access import Access, Tls
-from wayside.api.base import Model, ObjectName, PositiveDuration, map_list, validations
+from wayside.api.base import Model, ObjectName, PositiveDuration, map_list
+from wayside.api.constraints import Constraint, exactly_one, not_both
 
 _VARIABLE = r"^WAYSIDE_[A-Z0-9_]+$"
 _TOKEN = r"^[A-Za-z0-9!#$%&'*+.^_`|~-]+$"  # noqa: S105  RFC 9110, section 5.6.2: what a header's name is made of
 _OURS = ("host", "content-length", "content-type", "transfer-encoding", "connection", "expect", "te", "upgrade")
-TLS_ONCE = "give tls or tlsSecretName, not both"
-_VALUE_ONCE = "give exactly one of value, variable and secretKeyRef"
-
 
 HttpUrl = Annotated[str, Field(max_length=2048, pattern=r"^https?://[^\s/?#@\\]+([/?][^\s#]*)?$")]
 """The URL of a request."""
@@ -36,9 +34,7 @@ class SecretKey(Model):
 class HttpHeader(Model):
     """A header of each request, with its value or the source of its value."""
 
-    model_config = validations(
-        ("[has(self.value), has(self.variable), has(self.secretKeyRef)].filter(given, given).size() == 1", _VALUE_ONCE)
-    )
+    constraints = (exactly_one("value", "variable", "secret_key_ref"),)
 
     name: str = Field(min_length=1, max_length=128, pattern=_TOKEN)
     """The name of the header, e.g. Authorization."""
@@ -51,8 +47,6 @@ class HttpHeader(Model):
 
     @model_validator(mode="after")
     def _coherent(self) -> HttpHeader:
-        if sum(given is not None for given in (self.value, self.variable, self.secret_key_ref)) != 1:
-            raise ValueError(_VALUE_ONCE)
         if self.name.lower() in _OURS or self.name.lower().startswith("ce-"):
             raise ValueError(f"the header {self.name} is set by the detector: remove it")
         return self
@@ -61,7 +55,7 @@ class HttpHeader(Model):
 class HttpAccess(Model):
     """Access to an HTTP endpoint. Its certificate is always verified; redirects are never followed."""
 
-    model_config = validations(("!(has(self.tls) && has(self.tlsSecretName))", TLS_ONCE, ".tlsSecretName", "Forbidden"))
+    constraints: ClassVar[tuple[Constraint, ...]] = (not_both("tls", "tls_secret_name"),)
 
     headers: list[HttpHeader] = Field(default_factory=list, max_length=32, json_schema_extra=map_list("name"))
     """Additional headers of each request."""
@@ -75,9 +69,7 @@ class HttpAccess(Model):
     """A Secret with the keys username and password, for HTTP Basic authentication."""
 
     @model_validator(mode="after")
-    def _given_once(self) -> HttpAccess:
-        if self.tls is not None and self.tls_secret_name is not None:
-            raise ValueError(TLS_ONCE)
+    def _unique_headers(self) -> HttpAccess:
         names = [header.name.lower() for header in self.headers]
         if len(set(names)) < len(names):
             raise ValueError("headers: give each name only once (names are case-insensitive)")

@@ -9,14 +9,8 @@ from typing import Annotated
 from pydantic import Field, model_validator
 
 from wayside.api.actions.http import HttpAccess, HttpUrl, SecretKey
-from wayside.api.base import SET_LIST, Duration, Identifier, JsonValue, Model, PositiveDuration, validations
-
-_TLS_ONCE = "give tls or tlsSecretName, not both"
-_URL_ONCE = "give exactly one of url and urlSecretKeyRef"
-_TARGETS = ("http", "alertmanager", "zenoh")
-_ONE_TARGET = "give exactly one of http, alertmanager and zenoh"
-_ALERTS = "an Alertmanager groups alerts itself and receives all starts and ends: remove grouping and events"
-_NO_LABEL = "grouping.by refers to a label that labels does not contain: add it to labels, or remove it"
+from wayside.api.base import SET_LIST, Duration, Identifier, JsonValue, Model, PositiveDuration
+from wayside.api.constraints import constraint, exactly_one
 
 Template = Annotated[str, Field(min_length=1, max_length=4096)]
 """Text with ${…} over the rule's variables at the start of the episode."""
@@ -39,10 +33,7 @@ class ContentMode(StrEnum):
 class NotifyHttp(HttpAccess):
     """An endpoint that receives CloudEvents by POST."""
 
-    model_config = validations(
-        ("!(has(self.tls) && has(self.tlsSecretName))", _TLS_ONCE, ".tlsSecretName", "Forbidden"),
-        ("has(self.url) != has(self.urlSecretKeyRef)", _URL_ONCE),
-    )
+    constraints = (*HttpAccess.constraints, exactly_one("url", "url_secret_key_ref"))
 
     url: HttpUrl | None = None
     """The URL of the endpoint, e.g. https://events.example/city."""
@@ -51,12 +42,6 @@ class NotifyHttp(HttpAccess):
     mode: ContentMode = ContentMode.STRUCTURED
     """Structured: the body is the whole event. Binary: the body is the data of the event; the attributes are
     headers."""
-
-    @model_validator(mode="after")
-    def _one_url(self) -> NotifyHttp:
-        if (self.url is None) == (self.url_secret_key_ref is None):
-            raise ValueError(_URL_ONCE)
-        return self
 
 
 class NotifyAlertmanager(HttpAccess):
@@ -100,9 +85,15 @@ class Rate(Model):
 class NotifyAction(Model):
     """Sends notifications of the rule's episodes."""
 
-    model_config = validations(
-        (f"[{', '.join(f'has(self.{kind})' for kind in _TARGETS)}].filter(given, given).size() == 1", _ONE_TARGET),
-        ("!has(self.alertmanager) || !(has(self.grouping) || has(self.events))", _ALERTS, ".alertmanager", "Forbidden"),
+    constraints = (
+        exactly_one("http", "alertmanager", "zenoh"),
+        constraint(
+            "!has(self.alertmanager) || !(has(self.grouping) || has(self.events))",
+            "an Alertmanager groups alerts itself and receives all starts and ends: remove grouping and events",
+            ".alertmanager",
+            "Forbidden",
+            holds=lambda notify: notify.alertmanager is None or (notify.grouping is None and notify.events is None),
+        ),
     )
 
     http: NotifyHttp | None = None
@@ -129,13 +120,11 @@ class NotifyAction(Model):
     """A message becomes a dead letter after delivery has failed for this time, over several attempts."""
 
     @model_validator(mode="after")
-    def _coherent(self) -> NotifyAction:
-        if sum(getattr(self, kind) is not None for kind in _TARGETS) != 1:
-            raise ValueError(_ONE_TARGET)
-        if self.alertmanager is not None and (self.grouping is not None or self.events is not None):
-            raise ValueError(_ALERTS)
+    def _groups_by_labels(self) -> NotifyAction:
         if self.grouping is not None and not set(self.grouping.by) <= set(self.labels):
-            raise ValueError(_NO_LABEL)
+            raise ValueError(
+                "grouping.by refers to a label that labels does not contain: add it to labels, or remove it"
+            )
         return self
 
     @property

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from enum import StrEnum
 from typing import Annotated
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, field_validator
 
-from wayside.api.actions.http import TLS_ONCE, HttpAccess, HttpUrl
+from wayside.api.actions.http import HttpAccess, HttpUrl
 from wayside.api.actions.window import WindowClients
 from wayside.api.base import (
     SET_LIST,
@@ -18,8 +18,8 @@ from wayside.api.base import (
     Model,
     ObjectName,
     PositiveDuration,
-    validations,
 )
+from wayside.api.constraints import constraint, exactly_one
 from wayside.api.freedata import FreeData, NamedData
 from wayside.api.stream import Layout
 
@@ -33,8 +33,11 @@ ServiceType = Annotated[
 ]
 """The type of a ROS 2 service, e.g. rosbag2_interfaces/srv/Snapshot."""
 
-_CALL = "give start, stop or both: otherwise nothing is called"
-_DOMAIN = "domain is valid only with layout RmwZenoh: remove it"
+_ANY_CALL = constraint(
+    "has(self.start) || has(self.stop)",
+    "give start, stop or both: otherwise nothing is called",
+    holds=lambda trigger: trigger.start is not None or trigger.stop is not None,
+)
 
 
 class TriggerDetector(Model):
@@ -73,9 +76,15 @@ class ServiceCall(Model):
 class TriggerRos2(Model):
     """Calls of ROS 2 services over Zenoh, at the start and the end of the episode."""
 
-    model_config = validations(
-        ("has(self.start) || has(self.stop)", _CALL),
-        ("!has(self.domain) || !has(self.layout) || self.layout == 'RmwZenoh'", _DOMAIN, ".domain", "Forbidden"),
+    constraints = (
+        _ANY_CALL,
+        constraint(
+            "!has(self.domain) || !has(self.layout) || self.layout == 'RmwZenoh'",
+            "domain is valid only with layout RmwZenoh: remove it",
+            ".domain",
+            "Forbidden",
+            holds=lambda trigger: trigger.domain is None or trigger.layout is Layout.RMW_ZENOH,
+        ),
     )
 
     layout: Layout = Layout.RMW_ZENOH
@@ -87,14 +96,6 @@ class TriggerRos2(Model):
     starts with the first and stops with the last."""
     stop: ServiceCall | None = None
     """The call at the end of the episode."""
-
-    @model_validator(mode="after")
-    def _coherent(self) -> TriggerRos2:
-        if self.start is None and self.stop is None:
-            raise ValueError(_CALL)
-        if self.domain is not None and self.layout is not Layout.RMW_ZENOH:
-            raise ValueError(_DOMAIN)
-        return self
 
     @property
     def calls(self) -> Mapping[str, ServiceCall]:
@@ -133,21 +134,12 @@ class HttpCall(Model):
 class TriggerHttp(HttpAccess):
     """Requests to an HTTP endpoint, at the start and the end of the episode."""
 
-    model_config = validations(
-        ("!(has(self.tls) && has(self.tlsSecretName))", TLS_ONCE, ".tlsSecretName", "Forbidden"),
-        ("has(self.start) || has(self.stop)", _CALL),
-    )
+    constraints = (*HttpAccess.constraints, _ANY_CALL)
 
     start: HttpCall | None = None
     """The request at the start of the episode."""
     stop: HttpCall | None = None
     """The request at the end of the episode."""
-
-    @model_validator(mode="after")
-    def _any_call(self) -> TriggerHttp:
-        if self.start is None and self.stop is None:
-            raise ValueError(_CALL)
-        return self
 
     @property
     def calls(self) -> Mapping[str, HttpCall]:
@@ -155,16 +147,10 @@ class TriggerHttp(HttpAccess):
         return {name: call for name, call in (("start", self.start), ("stop", self.stop)) if call is not None}
 
 
-_SYSTEMS = ("detector", "ros2", "http")
-_ONE = f"give exactly one of {', '.join(_SYSTEMS[:-1])} and {_SYSTEMS[-1]}"
-
-
 class TriggerAction(Model):
     """Makes another system record, from the start of the episode to its end."""
 
-    model_config = validations(
-        (f"[{', '.join(f'has(self.{each})' for each in _SYSTEMS)}].filter(given, given).size() == 1", _ONE)
-    )
+    constraints = (exactly_one("detector", "ros2", "http"),)
 
     detector: TriggerDetector | None = None
     """A recording by another detector."""
@@ -180,12 +166,6 @@ class TriggerAction(Model):
     """How long to retry a start or stop that is not confirmed."""
     timeout: PositiveDuration = PositiveDuration("3s")
     """The timeout of one reply over Zenoh."""
-
-    @model_validator(mode="after")
-    def _one_system(self) -> TriggerAction:
-        if sum(getattr(self, each) is not None for each in _SYSTEMS) != 1:
-            raise ValueError(_ONE)
-        return self
 
     @property
     def templates(self) -> Mapping[str, JsonValue]:
