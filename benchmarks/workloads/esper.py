@@ -25,6 +25,8 @@ class Run(NamedTuple):
     """CPU time of the whole JVM, that of this thread being 1."""
     wall: float
     """Median wall time in seconds."""
+    tick: float
+    """Median over the rounds of a tick's median CPU time on that thread, in seconds; a round's first does not count."""
     samples: int
     ticks: int
     starts: int
@@ -53,7 +55,8 @@ def run(mode: list[str], *, samples: int, rounds: int) -> Run:
         raise PeerError(f"the rounds differ in (samples, ticks, starts, ends): {sorted(found)}")
     thread, process, wall = ([line["seconds"][name] for line in lines] for name in ("thread", "process", "wall"))
     jvm = max(1.0, sum(process) / sum(thread))  # the JVM counts its time in steps of 10 ms
-    return Run(statistics.median(thread), jvm, statistics.median(wall), *found.pop())
+    tick = statistics.median(line["tick"] for line in lines)
+    return Run(statistics.median(thread), jvm, statistics.median(wall), tick, *found.pop())
 
 
 def _output(command: list[str]) -> str:

@@ -137,10 +137,9 @@ class Lane:
         samples, horizon = self.samples, now - self.duration
         if not samples or samples[0].received > horizon:
             return 0
-        newest = len(samples) - 1
-        if newest > 1 and samples[1].received > horizon:  # at low rates, one a second
-            newest = 1
-        freed = self._drop(bisect_right(samples, horizon, 0, newest, key=_RECEIVED))
+        if len(samples) > 2 and samples[1].received > horizon:  # at low rates, one a second
+            return self.drop_oldest()
+        freed = self._drop(bisect_right(samples, horizon, 0, len(samples) - 1, key=_RECEIVED))
         self.bytes -= freed
         return freed
 

@@ -14,6 +14,13 @@ from wayside.expressions.columns.values import Doubles
 from wayside.rules import PairSubject
 
 
+_MANY = 1 << 17
+"""Up to this number of possible pairs, they are created without being counted first."""
+
+_HASHES = np.array([1, 0x9E3779B1, 0x85EBCA77])
+"""Spread the cells of a grid over buckets, by axis."""
+
+
 class Nearby(NamedTuple):
     """Pairs, in order of the names of their first and second clients."""
 
@@ -42,18 +49,20 @@ def nearby(crowd: Crowd, subject: PairSubject) -> Nearby:
     first, second = np.flatnonzero(crowd.first), np.flatnonzero(crowd.second)
     if len(first) * len(second) <= FEW:
         i, j = np.repeat(first, len(second)), np.tile(second, len(first))
-        found = None
     else:
         # Not at the top: the import takes half a second, which a detector with few clients can save.
         from scipy.spatial import cKDTree  # noqa: PLC0415
 
         radius, same = reach(subject.within), np.array_equal(first, second)
-        one = cKDTree(crowd.points(first))
-        other = one if same else cKDTree(crowd.points(second))
-        themselves = int((crowd.first & crowd.second).sum())
-        found = (int(one.count_neighbors(other, radius)) - themselves) // (1 if subject.ordered else 2)
-        if found > subject.maximum * ROOM:
-            return _crowded(crowd, subject, first, second)
+        # Trees that are not balanced are built in half the time, and searched as fast where points are spread.
+        one = cKDTree(crowd.points(first), balanced_tree=False, compact_nodes=False)
+        other = one if same else cKDTree(crowd.points(second), balanced_tree=False, compact_nodes=False)
+        points = crowd.points(np.flatnonzero(crowd.first | crowd.second))
+        if _most(points, radius) > max(subject.maximum * ROOM, _MANY):
+            themselves = int((crowd.first & crowd.second).sum())
+            found = (int(one.count_neighbors(other, radius)) - themselves) // (1 if subject.ordered else 2)
+            if found > subject.maximum * ROOM:
+                return _crowded(crowd, subject, first, second)
         if not subject.ordered:
             pairs = one.query_pairs(radius, output_type="ndarray")
             i, j = first[pairs[:, 0]], first[pairs[:, 1]]
@@ -66,11 +75,25 @@ def nearby(crowd: Crowd, subject: PairSubject) -> Nearby:
     distance = crowd.distances(i, j)
     near = (distance <= subject.within) & (i != j if subject.ordered else i < j)
     i, j, distance = i[near], j[near], distance[near]
-    found = len(i) if found is None else found
+    found = len(i)
     if len(i) > subject.maximum:
         nearest = np.lexsort((j, i, distance))[: subject.maximum]
         i, j, distance = i[nearest], j[nearest], distance[nearest]
     return _in_order(i, j, distance, found - len(i))
+
+
+def _most(points: Doubles, radius: float) -> int:
+    """An upper bound of the ordered pairs of points within the radius; takes a tenth of the time to count them.
+
+    Such a pair lies in one cell of a grid or in two neighbouring ones, and over all cells c the sum of the products of
+    neighbours' counts n(c)·n(c + d) is at most that of n(c)² (Cauchy and Schwarz). Cells that share a bucket only
+    increase the bound.
+    """
+    axes = points.shape[1]
+    buckets = 1 << (len(points).bit_length() + 3)
+    cells = np.floor(points / radius).astype(np.int64) @ _HASHES[:axes] & (buckets - 1)
+    counts = np.bincount(cells)
+    return 3**axes * int(counts @ counts)
 
 
 def _crowded(crowd: Crowd, subject: PairSubject, first: Integers, second: Integers) -> Nearby:
@@ -97,5 +120,5 @@ def _point(x: float, y: float, z: float = 0.0) -> Point:
 
 
 def _in_order(i: Integers, j: Integers, distance: Doubles, left_out: int) -> Nearby:
-    order = np.lexsort((j, i))
+    order = np.argsort((i << 32) + j)  # in half the time of np.lexsort
     return Nearby(i[order], j[order], distance[order], left_out)

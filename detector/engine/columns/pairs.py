@@ -17,7 +17,7 @@ from detector.engine.columns.past import Evaluations
 from detector.engine.columns.places import Places, Whereabouts
 from detector.engine.columns.reading import constant
 from detector.engine.columns.signals import SignalColumns
-from detector.engine.columns.table import Integers, Truths, sorted_rows
+from detector.engine.columns.table import Integers, Truths, find_rows, sorted_rows
 from detector.engine.columns.tables import Tables
 from detector.engine.columns.verdicts import Codes, Ternary, observed
 from detector.engine.episodes.subjects import Subject
@@ -119,10 +119,11 @@ class PairColumns:
         count = len(clients)
         keys = near.first * count + near.second
         added = sorted_rows(more[0] * count + more[1])
-        added = added[~np.isin(added, keys, assume_unique=True)]
-        order = np.argsort(np.concatenate((keys, added)), kind="stable")
-        is_near = (order < len(keys)).astype(bool)
-        first, second = np.divmod(np.concatenate((keys, added))[order], count)
+        where, known = find_rows(keys, added)
+        where, added = where[~known], added[~known]
+        first, second = np.divmod(np.insert(keys, where, added), count)
+        is_near = np.insert(np.ones(len(keys), bool), where, False)
+        distance = np.insert(near.distance, where, self._distances(places, added // count, added % count))
         if not roles and self._reads_streams:
             looked = np.flatnonzero(np.bincount(np.concatenate((first, second)), minlength=count))
             at = np.full(count, -1)
@@ -130,7 +131,6 @@ class PairColumns:
             names = [clients[each] for each in looked.tolist()]
             seen = Block(self._context, block.ticks, names, block.numbers[looked])
             self._signals.look(seen, floor)
-        distance = np.concatenate((near.distance, self._distances(places, added // count, added % count)))[order]
         these = PairBlock(block, places, seen, at, first, second, distance, places.known[first] & places.known[second])
         if self._subject.closing_speed:
             self._measure_closing(these, newest, floor)
@@ -177,15 +177,16 @@ class PairColumns:
         """What is known of a pair; `view` gives the variables of a client, by its index in `these.seen`."""
         found: dict[str, Any] = {}
         for role, each in (("a", these.first), ("b", these.second)):
-            index = int(each[row])
-            found[role] = view(int(these.at[index]))
-            if these.places.known[index]:
+            index = each.item(row)
+            found[role] = view(these.at.item(index))
+            if these.places.known.item(index):
                 found[role]["position"] = described(self._subject.position, these.places.place(index))
-        if these.placed[row]:
-            found["distance"] = float(these.distance[row])
-        if these.closing is not None and these.closing_known is not None and these.closing_known[row]:
-            found["closingSpeed"] = float(these.closing[row])
-        found.update(self._known(these.derived, row))
+        if these.placed.item(row):
+            found["distance"] = these.distance.item(row)
+        if these.closing is not None and these.closing_known is not None and these.closing_known.item(row):
+            found["closingSpeed"] = these.closing.item(row)
+        if these.derived:
+            found.update(self._known(these.derived, row))
         return found
 
     def _distances(self, places: Places, one: Integers, other: Integers) -> Doubles:

@@ -227,3 +227,11 @@ def sorted_rows(rows: Integers) -> Integers:
     ordered = np.sort(rows)
     first: Truths = np.concatenate((ordered[:1] == ordered[:1], ordered[1:] != ordered[:-1]))
     return ordered[first]
+
+
+def find_rows(ordered: Integers, wanted: Integers) -> tuple[Integers, Truths]:
+    """Where each wanted row is among rows in ascending order, or would be inserted; and whether it is there."""
+    at = np.searchsorted(ordered, wanted)
+    found: Truths = at < len(ordered)
+    found[found] = ordered[at[found]] == wanted[found]
+    return at, found

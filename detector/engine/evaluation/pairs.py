@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from detector.engine.columns.block import Block, Context, Track
 from detector.engine.columns.pairs import PairBlock, PairColumns
-from detector.engine.columns.table import Integers, Truths
+from detector.engine.columns.table import Integers, Truths, find_rows
 from detector.engine.episodes.episodes import NO_WAKE, TRUE, UNSEEN
 from detector.engine.episodes.events import Happened
 from detector.engine.episodes.subjects import Subject
@@ -98,11 +98,10 @@ class PairGroup:
         these = self._columns.evaluate(block, floor, (first[look], second[look]))
         if self.observer is not None:
             self.observer.pairs(self._track, these)
-        # Where each watched pair is among the evaluated ones; -1: it was not evaluated.
+        # Where each watched pair is among the evaluated ones.
         pairs = these.first * count + these.second
-        rows = np.searchsorted(pairs, first * count + second)
-        rows[rows == len(pairs)] = 0
-        seen = there & (pairs[rows] == first * count + second) if len(pairs) else np.zeros(len(rows), bool)
+        rows, seen = find_rows(pairs, first * count + second)
+        seen &= there
         rows = rows[seen]
         changed = these.codes & 3 == TRUE
         differs = (these.codes[rows] ^ watched.last[seen]) & watched.matters[seen] != 0
@@ -162,7 +161,7 @@ class PairGroup:
 
     def _key(self, these: PairBlock, row: int) -> int:
         numbers = these.block.numbers
-        return int(numbers[these.first[row]]) << _SHIFT | int(numbers[these.second[row]])
+        return numbers.item(these.first.item(row)) << _SHIFT | numbers.item(these.second.item(row))
 
     def _followed(self, these: PairBlock, rows: Integers, in_progress: Truths) -> Truths:
         """Which of these pairs have demands that an evaluation may change although the observation is the same."""
@@ -177,7 +176,7 @@ class PairGroup:
 
     def _step(self, tick: int, these: PairBlock, row: int, kept: list[Entry]) -> Iterator[Happened]:
         """Advance one pair's state, and add it to the kept ones if it is still needed."""
-        run, key, code = self._run, self._key(these, row), int(these.codes[row])
+        run, key, code = self._run, self._key(these, row), these.codes.item(row)
         subject = self._subject(key)
         state = run.state(subject) or run.new_state(subject)
         stays = state.is_open and run.needs_every_tick(subject)

@@ -130,7 +130,9 @@ class PositionLookup:
 def described(position: CompiledPosition, place: Place) -> dict[str, float]:
     """The members of a place in expressions: x, y and z in metres, or latitude and longitude in degrees."""
     found = dict(zip(position.axes, place, strict=True))
-    return found if position.geographic else {**found, "z": found.get("z", 0.0)}
+    if not position.geographic:
+        found.setdefault("z", 0.0)
+    return found
 
 
 def distance(position: CompiledPosition, one: Place, other: Place) -> float:

@@ -4,6 +4,7 @@ import com.sun.management.OperatingSystemMXBean;
 import java.io.IOException;
 import java.lang.management.ManagementFactory;
 import java.lang.management.ThreadMXBean;
+import java.util.Arrays;
 import java.util.List;
 import java.util.Locale;
 
@@ -68,13 +69,14 @@ final class Measurement {
             task.reset();
             System.gc();
             Spent begin = Spent.now();
-            play(task, shift);
+            double tick = play(task, shift);
             Spent spent = Spent.now().since(begin);
             if (round >= warmup) {
                 System.out.printf(
                         Locale.ROOT,
-                        "{\"samples\": %d, \"ticks\": %d, \"starts\": %d, \"ends\": %d, \"seconds\": %s}%n",
-                        samples.size(), length / period, task.starts(), task.ends(), spent.json());
+                        "{\"samples\": %d, \"ticks\": %d, \"starts\": %d, \"ends\": %d, \"tick\": %.6f,"
+                                + " \"seconds\": %s}%n",
+                        samples.size(), length / period, task.starts(), task.ends(), tick / 1e9, spent.json());
             }
             idle(task, last + period + shift, last + period + rest + shift);
             shift += length + rest;
@@ -89,20 +91,27 @@ final class Measurement {
         }
     }
 
-    private void play(Task task, long shift) throws IOException {
+    /** Returns the median CPU time of a tick with its samples, in nanoseconds; the first one does not count. */
+    private double play(Task task, long shift) throws IOException {
         int next = 0;
         int count = samples.size();
+        long[] spent = new long[(int) ((last - first) / period) + 1];
         for (long tick = first; tick <= last; tick += period) {
+            long begin = THREADS.getCurrentThreadCpuTime();
             task.before(tick + shift);
             long end = tick * 1_000_000;
             for (; next < count && samples.get(next).time() <= end; next++) {
                 task.take(samples.get(next));
             }
             task.tick(tick + shift);
+            spent[(int) ((tick - first) / period)] = THREADS.getCurrentThreadCpuTime() - begin;
         }
         task.before(last + period + shift);
         for (; next < count; next++) {
             task.take(samples.get(next));
         }
+        long[] counted = Arrays.copyOfRange(spent, Math.min(1, spent.length - 1), spent.length);
+        Arrays.sort(counted);
+        return (counted[(counted.length - 1) / 2] + counted[counted.length / 2]) / 2.0;
     }
 }
