@@ -9,7 +9,7 @@ from application_manager.core.conditions import Aspect
 from application_manager.core.demand import drafting
 from application_manager.core.objects.policy import Policy
 from application_manager.core.objects.rendering import Rendering
-from application_manager.workers.jobs import RenderJob, RenderProblem
+from application_manager.workers.jobs import RenderProblem, render
 from application_manager.workers.process import Job
 from wayside.api import ApplicationInstance, ApplicationTemplate
 
@@ -21,17 +21,14 @@ class InProcess:
 
     async def run(self, namespace: str, job: Job[Result]) -> Result:
         """What the job gives."""
-        return job.run()
+        return job()
 
 
 def objects(wanted: ApplicationInstance, template: drafting.TemplateState) -> Rendering | Aspect | None:
     """The instance's objects, or why it has none."""
     if not isinstance(template, ApplicationTemplate):
         return drafting.without_template(wanted, template)
-    metadata = template.metadata
-    found = RenderJob(
-        f"{metadata.uid} {template.to_json()}", metadata.generation, pickle.dumps(template), Policy(), wanted
-    ).run()
+    found = render(pickle.dumps(template), Policy(), wanted)
     if isinstance(found, RenderProblem):
         return drafting.problem(template, found.reason, found.message)
     assert isinstance(found, Rendering)

@@ -22,7 +22,7 @@ class Evaluation:
 
     items: int
 
-    def run(self) -> object:
+    def __call__(self) -> object:
         """The number of items that match."""
         expression = Environment({"l": CelType.LIST, "s": CelType.STRING}).compile(BOMB)
         return expression.evaluate({"l": [0.0] * self.items, "s": TEXT})
@@ -32,7 +32,7 @@ class Evaluation:
 class Where:
     """Which process it is."""
 
-    def run(self) -> int:
+    def __call__(self) -> int:
         """The process id."""
         return os.getpid()
 
@@ -43,7 +43,7 @@ class KilledOnce:
 
     marker: Path
 
-    def run(self) -> str:
+    def __call__(self) -> str:
         """Where it was not killed."""
         if not self.marker.exists():
             self.marker.touch()
@@ -55,7 +55,7 @@ class KilledOnce:
 class Greedy:
     """Takes more memory than a process may have."""
 
-    def run(self) -> int:
+    def __call__(self) -> int:
         """A number that never comes."""
         return len(b" " * (2 * 1024**3))
 
@@ -64,6 +64,6 @@ class Greedy:
 class Defective:
     """Raises what no job should."""
 
-    def run(self) -> object:
+    def __call__(self) -> object:
         """Nothing."""
         raise RuntimeError("a defect")

@@ -13,17 +13,19 @@ import time
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 from application_manager.cache.cluster_cache import DETECTOR, EVENT_RULE, TEMPLATE, ClusterCache, surroundings
 from application_manager.core.findings.checks import BROKEN_RULE, INVALID_RULE
 from application_manager.core.findings.findings import Findings
 from application_manager.core.findings.reviews import Request, ReviewError, Weight, answer, read
+from application_manager.core.findings.templatefindings import template_findings
 from application_manager.core.objects.detectors import deployment_to_try
 from application_manager.core.objects.poddefaults import PodDefaults
 from application_manager.core.objects.policy import KindKey
 from application_manager.measures import Measures
-from application_manager.workers.jobs import DetectorJob, RuleContext, RuleJob, TemplateJob
+from application_manager.workers.jobs import RuleContext, judge_detector
 from application_manager.workers.pool import ExceededError, Runs
 from application_manager.workers.process import Job
 from wayside.api import ApplicationTemplate, Detector, EventRule
@@ -107,7 +109,7 @@ class Admission:
             return Findings((str(error),))
         match model:
             case ApplicationTemplate():
-                return await self._run(request.namespace, TemplateJob(model, self.cache.policy))
+                return await self._run(request.namespace, partial(template_findings, model, self.cache.policy))
             case EventRule():
                 return await self._of_rule(model)
             case Detector():
@@ -118,7 +120,7 @@ class Admission:
         findings = await self._judged(rule)
         if not findings.all:
             return findings
-        if (await self._run(rule.namespace, RuleJob(rule, RuleContext()))).problems:
+        if (await self._run(rule.namespace, partial(RuleContext().findings, rule))).problems:
             return findings  # it has them by itself
         try:
             async with asyncio.timeout(LOOKING_UP):
@@ -134,7 +136,7 @@ class Admission:
         return await self._judged(rule)
 
     async def _judged(self, rule: EventRule) -> Findings:
-        return await self._run(rule.namespace, RuleJob(rule, surroundings(self.cache, rule)))
+        return await self._run(rule.namespace, partial(surroundings(self.cache, rule).findings, rule))
 
     async def _run(self, namespace: str, job: Job[Findings]) -> Findings:
         """What a worker process finds; that it takes too much is a problem as well."""
@@ -150,7 +152,7 @@ class Admission:
     async def _of_detector(self, detector: Detector, old: Kind | None) -> Findings:
         """What is wrong with the detector; that rules of it no longer compile is a remark, since they may follow."""
         before = old if isinstance(old, Detector) else None
-        findings = await self._run(detector.namespace, DetectorJob(detector))
+        findings = await self._run(detector.namespace, partial(judge_detector, detector))
         if not findings.problems and (problem := await self._pod_problem(detector, before)):
             return replace(findings, problems=(problem,))
         remarks: list[Finding] = []
@@ -158,7 +160,7 @@ class Admission:
         rules = self.cache.models(EVENT_RULE, EventRule, detector.namespace)
         for first in range(0, len(rules), _RULES_AT_ONCE):
             some = rules[first : first + _RULES_AT_ONCE]
-            remarks += (await self._run(detector.namespace, DetectorJob(detector, before, some))).remarks
+            remarks += (await self._run(detector.namespace, partial(judge_detector, detector, before, some))).remarks
             if time.monotonic() > until and first + _RULES_AT_ONCE < len(rules):
                 unseen = "not all of its rules were reviewed: see their statuses"
                 remarks.append(Finding(BROKEN_RULE.name, unseen))

@@ -2,7 +2,8 @@
 
 All managers of a release share the Secret. A manager that finds its certificate missing or due writes a new one; the
 resourceVersion decides between two. The previous authority stays in `ca.crt` beside the new one, and the API server
-trusts both before any manager shows the new certificate, so no question fails while they change.
+trusts both before any manager shows the new certificate, so no question fails while they change. A new
+authority signs one certificate and is forgotten: its key is kept nowhere, so nothing else can be signed with it.
 """
 
 from __future__ import annotations
@@ -10,17 +11,20 @@ from __future__ import annotations
 import asyncio
 import base64
 import datetime
+import ipaddress
 import logging
-from collections.abc import AsyncIterator
+import secrets
+from collections.abc import AsyncIterator, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from cryptography import x509
-from cryptography.hazmat.primitives.serialization import Encoding
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from application_manager.admission.authority import AUTHORITY, VALID, issued, write_whole
 from application_manager.admission.reviewing import Serving
 from application_manager.core.findings.webhooks import WebhookClientConfig
 from wayside.kubernetes.client import Client
@@ -32,6 +36,10 @@ from wayside.process.servingcertificate import CERTIFICATE, KEY
 
 EVERY = 10.0  # s between two looks at the Secret
 _RENEWED_AT = 1 / 3  # of its life that is left
+
+AUTHORITY = "ca.crt"
+VALID = datetime.timedelta(days=365)
+_CLOCKS = datetime.timedelta(hours=1)  # that the clocks of two machines may differ
 
 _SECRETS = Resource("v1", "Secret", "secrets")
 _GROUP = "admissionregistration.k8s.io/v1"
@@ -128,7 +136,7 @@ def _trusted(secret: Object, now: datetime.datetime) -> bytes:
         newest = x509.load_pem_x509_certificates(bundle)[0]
     except (ValueError, IndexError):
         return b""
-    return newest.public_bytes(Encoding.PEM) if newest.not_valid_after_utc > now else b""
+    return newest.public_bytes(serialization.Encoding.PEM) if newest.not_valid_after_utc > now else b""
 
 
 @asynccontextmanager
@@ -145,3 +153,80 @@ async def issuing(client: Client, serving: Serving | None) -> AsyncIterator[None
     finally:
         following.cancel()
         await asyncio.gather(following, return_exceptions=True)
+
+
+def make_certificates(folder: Path, hosts: Sequence[str]) -> bytes:
+    """Write ca.crt, tls.crt and tls.key for the hosts, names or addresses, into the folder; the first one's content.
+
+    Raises ConfigurationError where the folder cannot be written to.
+    """
+    files = issued(hosts)
+    write_whole(folder, files)
+    return files[AUTHORITY]
+
+
+def write_whole(folder: Path, files: Mapping[str, bytes]) -> None:
+    """Write the files whole or not at all. Raises ConfigurationError where the folder cannot be written to."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, content in files.items():
+            if (folder / name).is_file() and (folder / name).read_bytes() == content:
+                continue
+            new = folder / f".{name}"
+            new.unlink(missing_ok=True)
+            new.touch(mode=0o600)
+            new.write_bytes(content)
+            new.replace(folder / name)
+    except OSError as error:
+        reason = error.strerror or error
+        raise ConfigurationError(f"{folder}: {reason}: give a writable folder") from error
+
+
+def issued(hosts: Sequence[str], valid: datetime.timedelta = VALID) -> dict[str, bytes]:
+    """A new authority's certificate, and one that it signed for the hosts, with its key: contents, by file name."""
+    authority, key = ec.generate_private_key(ec.SECP256R1()), ec.generate_private_key(ec.SECP256R1())
+    # Of two authorities with the same name, OpenSSL tries one alone.
+    issuer = _named(f"wayside-admission-authority-{secrets.token_hex(4)}")
+    root = (
+        _begun(issuer, authority.public_key(), issuer, valid)
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .sign(authority, hashes.SHA256())
+    )
+    certificate = (
+        _begun(_named("wayside-admission"), key.public_key(), issuer, valid)
+        .add_extension(x509.SubjectAlternativeName([_host(each) for each in hosts]), critical=False)
+        .add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH]), critical=False)
+        .sign(authority, hashes.SHA256())
+    )
+    pem = serialization.Encoding.PEM
+    return {
+        AUTHORITY: root.public_bytes(pem),
+        CERTIFICATE: certificate.public_bytes(pem),
+        KEY: key.private_bytes(pem, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()),
+    }
+
+
+def _begun(
+    subject: x509.Name, key: ec.EllipticCurvePublicKey, issuer: x509.Name, valid: datetime.timedelta
+) -> x509.CertificateBuilder:
+    now = datetime.datetime.now(datetime.UTC)
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(key)
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - _CLOCKS)
+        .not_valid_after(now + valid)
+    )
+
+
+def _named(name: str) -> x509.Name:
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+
+
+def _host(name: str) -> x509.GeneralName:
+    try:
+        return x509.IPAddress(ipaddress.ip_address(name))
+    except ValueError:
+        return x509.DNSName(name)

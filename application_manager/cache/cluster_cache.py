@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import InitVar, dataclass, field, replace
-from typing import Any, Final, TypeVar
+from typing import Final, TypeVar
 
 from application_manager.cache.claim_index import ClaimIndex
 from application_manager.cache.fallback_index import FallbackIndex
@@ -32,6 +32,7 @@ from application_manager.core.holders.leases import HealthyTime, LeaseIndex, Lea
 from application_manager.core.holders.policies import TaskPolicy
 from application_manager.core.objects.ownership import Applied
 from application_manager.core.objects.policy import KindKey, Name, Policy
+from application_manager.core.objects.trimming import without_objects
 from application_manager.core.statuses.status import Service
 from application_manager.workers.jobs import RuleContext
 from wayside.api import (
@@ -339,16 +340,11 @@ def surroundings(cache: ClusterCache, rule: EventRule) -> RuleContext:
     """As far as they matter to the rule: other rules where it names any, templates where it deploys."""
     namespace = rule.namespace
     deploys = any(each.deploy is not None for each in rule.spec.actions)
+    templates = cache.models(TEMPLATE, ApplicationTemplate, namespace) if deploys else []
     return RuleContext(
         detectors=cache.models(DETECTOR, Detector, namespace),
         invalid_detectors=cache.invalid(DETECTOR, namespace),
         rules=cache.models(EVENT_RULE, EventRule, namespace) if depends(rule) else [],
-        templates=[_bare(each) for each in cache.models(TEMPLATE, ApplicationTemplate, namespace)] if deploys else [],
+        templates=[without_objects(each) for each in templates],
         invalid_templates=cache.invalid(TEMPLATE, namespace) if deploys else [],
     )
-
-
-def _bare(template: ApplicationTemplate) -> ApplicationTemplate:
-    """The template without its objects, which may be large: a rule gives parameters alone."""
-    less: dict[str, Any] = {"manifests": [], "configuration": {}, "helm": None}
-    return template.model_copy(update={"spec": template.spec.model_copy(update=less), "status": None})

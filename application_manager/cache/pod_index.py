@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from application_manager.cache.store import name_of
 from application_manager.core.health.pods import Trouble, summary, trouble
-from application_manager.core.objects.labelling import INSTANCE_LABEL
+from application_manager.core.objects.ownership import INSTANCE_LABEL
 from application_manager.core.objects.policy import Name
 from wayside.kubernetes.resources import Object
 

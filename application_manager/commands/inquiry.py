@@ -11,7 +11,7 @@ from kubernetes.aio.config import ConfigException, list_kube_config_contexts
 
 from application_manager.cluster.client import manager_client
 from application_manager.core.claims.claims import InvalidTemplate
-from application_manager.core.objects.labelling import INSTANCE_LABEL
+from application_manager.core.objects.ownership import INSTANCE_LABEL
 from application_manager.core.statuses.explaining import Found, explanation_of, serving
 from application_manager.core.statuses.explanation import Explanation
 from wayside.api import API_VERSION, ApplicationInstance, ApplicationTask, ApplicationTemplate, Kind

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from application_manager.charts.chartcache import ChartCache, default_folder
+from application_manager.charts.chartrenderer import rendered_at_once
 from application_manager.charts.helm import HelmRunner
-from application_manager.charts.rendering import rendered_at_once
 from application_manager.core.claims.operations import Standing
 from application_manager.core.demand import drafting
 from application_manager.core.demand.decisions import Decision

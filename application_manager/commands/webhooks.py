@@ -59,7 +59,7 @@ def print_webhooks(
 
 def _authority(given: Path | None, folder: Path | None, place: WebhookClientConfig) -> bytes | None:
     if folder is not None:
-        from application_manager.admission.authority import make_certificates  # noqa: PLC0415  hardly ever needed
+        from application_manager.admission.issuing import make_certificates  # noqa: PLC0415  hardly ever needed
 
         return make_certificates(folder, place.hosts)
     if given is None:

@@ -24,14 +24,13 @@ from application_manager.running.options import Options
 from application_manager.watching.router import Router
 from application_manager.work.applying import Applier
 from application_manager.work.configurations import ConfigurationWork
-from application_manager.work.detectors import DetectorWork
+from application_manager.work.detectors import DetectorWork, SidecarEvents
 from application_manager.work.instances import InstanceWork
 from application_manager.work.instancestatus import InstanceStatusWork
 from application_manager.work.publishing import Publisher
 from application_manager.work.recorder import Recorder
 from application_manager.work.rendering import Renderings
 from application_manager.work.rulework import RuleKey, RuleWork
-from application_manager.work.sidecars import SidecarEvents
 from application_manager.work.statuses import StatusWriter
 from application_manager.work.suspending import Suspending
 from application_manager.work.tasks import TaskWork

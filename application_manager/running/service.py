@@ -23,7 +23,7 @@ from application_manager.admission.issuing import issuing
 from application_manager.admission.reviewing import ReviewHandler, webhook
 from application_manager.cache.cluster_cache import DETECTOR, OWN_KINDS, POD
 from application_manager.cluster.client import manager_client
-from application_manager.cluster.grants import Grants
+from application_manager.cluster.entitlement import Grants
 from application_manager.cluster.leadership import RENEWAL_TIMEOUT, Leadership
 from application_manager.core.findings.webhooks import INJECTION_PATH, PATH
 from application_manager.measures import Measures

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from application_manager.cache.cluster_cache import ClusterCache
 from application_manager.cache.store import name_of
-from application_manager.core.objects.labelling import INSTANCE_LABEL
+from application_manager.core.objects.ownership import INSTANCE_LABEL
 from application_manager.core.objects.policy import Name
 from application_manager.measures import Measures
 from application_manager.watching.router import Router

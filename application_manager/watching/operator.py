@@ -20,7 +20,7 @@ from typing import Any
 import kopf
 from kopf._cogs.clients import fetching, watching
 
-from application_manager.core.objects.labelling import INSTANCE_LABEL
+from application_manager.core.objects.ownership import INSTANCE_LABEL
 from application_manager.watching.pulse import NEVER, Pulse, pulsing
 from wayside.kubernetes.errors import RequestError
 from wayside.kubernetes.leases import HOLDER_LEASE_LABEL

@@ -23,7 +23,7 @@ from application_manager.cache.cluster_cache import (
 from application_manager.cache.store import Entry, kind_of, name_of
 from application_manager.core.health.readiness import not_ready
 from application_manager.core.objects.configuration import CONFIG_MAP, config_map_name
-from application_manager.core.objects.labelling import INSTANCE_LABEL
+from application_manager.core.objects.ownership import INSTANCE_LABEL
 from application_manager.core.objects.policy import Name
 from application_manager.core.objects.suspension import pods_left
 from application_manager.work.applying import Applier

@@ -10,8 +10,14 @@ import logging
 from dataclasses import dataclass
 
 from application_manager.cache.cluster_cache import ClusterCache
-from application_manager.core.objects import following
-from application_manager.core.objects.configuration import CONFIG_MAP, config_map_name
+from application_manager.core.objects.configuration import (
+    ANNOTATION,
+    CONFIG_MAP,
+    behind,
+    config_map_name,
+    fingerprint,
+    selectors,
+)
 from application_manager.core.objects.ownership import controller_uid
 from application_manager.core.objects.policy import Name
 from application_manager.work.applying import Applier
@@ -48,7 +54,7 @@ class ConfigurationWork:
         files = live.get("data") or {}
         self.publisher.publish(name, files)
         try:
-            count = await self._announce(name, instance, following.fingerprint(files))
+            count = await self._announce(name, instance, fingerprint(files))
         except ApiError as error:
             if not error.permanent and not error.terminating:
                 raise
@@ -59,13 +65,13 @@ class ConfigurationWork:
 
     async def _announce(self, name: Name, instance: ApplicationInstance, content: str) -> int:
         pods: dict[str, Object] = {}
-        for selector in following.selectors(self._workloads(name, instance)):
+        for selector in selectors(self._workloads(name, instance)):
             listed, _ = await self.client.list(PODS, name[0], labels=selector)
             pods |= {each["metadata"]["uid"]: each for each in listed}
         count = 0
-        for pod, uid in following.behind(pods.values(), name[1], content):
+        for pod, uid in behind(pods.values(), name[1], content):
             try:
-                await self.client.annotate(PODS, name[0], pod, uid, {following.ANNOTATION: content})
+                await self.client.annotate(PODS, name[0], pod, uid, {ANNOTATION: content})
             except ApiError as error:
                 if error.code not in (404, 409):  # gone, or another pod of that name
                     raise

@@ -2,6 +2,9 @@
 
 What is not the Detector's own is left alone: an object of the same name that it does not control. What it owns goes
 with it, by Kubernetes' garbage collection, and without its mode by us.
+
+A pod that requested a sidecar and was created without it gets an Event: the API server's review comes before there is a
+pod, or not at all where no manager is there. So the pods are looked at afterwards, within an hour after they were made.
 """
 
 from __future__ import annotations
@@ -9,30 +12,80 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-from collections.abc import Callable, Iterable
+import time
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 from application_manager.cache.cluster_cache import DETECTOR, ClusterCache
 from application_manager.cache.detector_index import DetectorIndex
 from application_manager.core.conditions import Aspect
+from application_manager.core.findings.injections import injection
 from application_manager.core.findings.rulefindings import detector_findings
 from application_manager.core.objects.detectors import KINDS, Manifest, detector_objects
 from application_manager.core.objects.ownership import Obstacle, controller_uid, our_fields
 from application_manager.core.objects.poddefaults import PodDefaults
 from application_manager.core.objects.policy import Name
 from application_manager.core.objects.sidecars import has_sidecar
-from application_manager.core.statuses.running import NOT_ACCEPTED, NOT_RUN, RUNNING, carried, running
+from application_manager.core.statuses.rulestatus import NOT_ACCEPTED, NOT_RUN, RUNNING, carried, running
 from application_manager.work.applying import apply_owned
-from application_manager.work.sidecars import SidecarEvents
+from application_manager.work.recorder import EventReason, Recorder
 from wayside.api import Detector
+from wayside.api.base import Kind, Metadata
 from wayside.api.pod import DetectorMode
 from wayside.kubernetes.client import Client
 from wayside.kubernetes.errors import ApiError
 from wayside.kubernetes.resources import Resource
+from wayside.times import parse_seconds
 
 _RESOURCES = {each[1]: Resource(*each) for each in KINDS}
 
+NEW = 3600.0  # s after its making in which a pod has its Event; as long as Kubernetes keeps Events, so none comes again
+_NOBODY = "it was created before its Detector, or while no webhook was available"
+
 log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class _Posted:
+    """The Event of a pod, and the version of its Detector."""
+
+    version: int
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class SidecarEvents:
+    """Posts them, once a pod and cause."""
+
+    cache: ClusterCache
+    index: DetectorIndex
+    recorder: Recorder
+    _posted: dict[Name, dict[str, _Posted]] = field(default_factory=dict)  # by Detector, then the pod's uid
+
+    def report(self, name: Name) -> None:
+        """Post Events about the pods that request the Detector of this namespace and name."""
+        entry = self.cache.store.get(DETECTOR, name)
+        detector = entry.model if entry is not None and isinstance(entry.model, Detector) else None
+        version = entry.version if entry is not None else 0
+        before, posted, now = self._posted.pop(name, {}), dict[str, _Posted](), time.time()
+        for pod in self.index.requesting.get(name, []):
+            metadata, spec = pod["metadata"], pod["spec"]
+            if has_sidecar(spec) or metadata.get("deletionTimestamp") or not _is_new(metadata, now):
+                continue
+            uid, last = metadata["uid"], before.get(metadata["uid"])
+            if last is not None and last.version == version:
+                posted[uid] = last
+                continue
+            why = injection(metadata, spec, name[0], detector, self.index.defaults).why_not or _NOBODY
+            posted[uid] = _Posted(version, why)
+            if last is None or last.why != why:
+                about = Metadata(name=metadata["name"], namespace=name[0], uid=uid)
+                note = f"it runs without a detector: {why}. Recreate the pod once this is corrected"
+                regarding = Kind(api_version="v1", kind="Pod", metadata=about)
+                self.recorder.event(regarding, EventReason.NOT_INJECTED, note, now, once=True)
+        if posted:
+            self._posted[name] = posted
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,3 +196,7 @@ class DetectorWork:
             self.index.owned(uid).pop(kind, None)
             self._applied.pop(raw["metadata"]["uid"], None)
             log.info("detector %s/%s: removed %s %s", *name, kind, raw["metadata"]["name"])
+
+
+def _is_new(metadata: Mapping[str, Any], now: float) -> bool:
+    return now - parse_seconds(metadata["creationTimestamp"]) < NEW

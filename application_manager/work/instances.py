@@ -25,7 +25,6 @@ from application_manager.core.objects.ownership import Applied, Known, ObjectKey
 from application_manager.core.objects.policy import Name
 from application_manager.core.objects.rendering import Rendering, object_key
 from application_manager.work.applying import Applier
-from application_manager.work.attempts import Attempts
 from application_manager.work.recorder import EventReason, Recorder
 from application_manager.work.suspending import Suspending
 from wayside.api import ApplicationInstance
@@ -33,10 +32,13 @@ from wayside.api.documents import parse_object
 from wayside.kubernetes.client import Client
 from wayside.kubernetes.errors import ApiError
 from wayside.kubernetes.resources import Object, Resource
+from wayside.process.backoff import pause_after
 
 log = logging.getLogger(__name__)
 
 _LOOK_AGAIN = 1.0  # s until an object that is on its way out is looked for again, should its watch event not come
+FIRST_PAUSE = 1.0  # s until what was refused is tried again, doubled with every refusal of the same
+LONGEST_PAUSE = 30.0  # s
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +73,30 @@ class _Start:
             return record.applied.aspect if record.applied.aspect.holds else None
         kept = find(instance.status.conditions, "Applied") if instance.status else None
         return Aspect("Applied", True, kept.reason, kept.message) if kept and kept.status == "True" else None
+
+
+class Attempts:
+    """When a refused apply is retried, by instance: with backoff, and at once when something else is applied."""
+
+    def __init__(self) -> None:
+        self._refused: dict[Name, tuple[object, int, float]] = {}  # what, how often, and until when
+
+    def waits_until(self, name: Name, what: object, now: float) -> float | None:
+        """Until when the same is not tried again, in seconds since 1970; None: it may be tried."""
+        known, _, until = self._refused.get(name, (None, 0, 0.0))
+        return until if known == what and now < until else None
+
+    def refused(self, name: Name, what: object, now: float) -> float:
+        """Note that it was refused; when it is to be tried again, in seconds since 1970."""
+        known, times, _ = self._refused.get(name, (None, 0, 0.0))
+        times = times + 1 if known == what else 1
+        until = now + pause_after(times, FIRST_PAUSE, LONGEST_PAUSE)
+        self._refused[name] = (what, times, until)
+        return until
+
+    def forget(self, name: Name) -> None:
+        """Note that nothing is refused, or that the instance is gone."""
+        self._refused.pop(name, None)
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from application_manager.cache.cluster_cache import ClusterCache, Served, WorkRecord
 from application_manager.cluster.looks import FailedPodsLook, NodeLook
 from application_manager.core.conditions import Aspect
-from application_manager.core.demand.byhand import PAUSE_ANNOTATION
 from application_manager.core.demand.decisions import Decision
 from application_manager.core.demand.fallback import READY_TIMEOUT
+from application_manager.core.demand.lingering import PAUSE_ANNOTATION
 from application_manager.core.health.placement import is_placed, misplaced
 from application_manager.core.health.pods import Trouble, summary
 from application_manager.core.health.readiness import is_unseen, not_ready

@@ -19,8 +19,8 @@ from application_manager.core.objects.charts import ChartFailure, ChartOutcome, 
 from application_manager.core.objects.policy import Name
 from application_manager.core.objects.rendering import Rendering
 from application_manager.workers.answers import AnswerCache, Exceeded
-from application_manager.workers.jobs import RenderJob, RenderProblem
-from application_manager.workers.plain import objects_are_plain, values_are_small
+from application_manager.workers.jobs import RenderProblem, objects_are_plain, render, values_are_small
+from application_manager.workers.process import Job
 from wayside.api import ApplicationInstance, ApplicationTemplate
 
 _PICKLED = 64  # templates that are kept as bytes
@@ -93,11 +93,11 @@ class Renderings:
         metadata = template.metadata
         bare = wanted.model_copy(update={"status": None})
 
-        def job() -> RenderJob:
-            return RenderJob(metadata.uid, metadata.generation, self._bytes(template), self._cache.policy, bare, chart)
+        def job() -> Job[object]:
+            return partial(render, self._bytes(template), self._cache.policy, bare, chart)
 
         if self._is_plain(template) and values_are_small(bare):
-            return job().run()
+            return job()()
         return self._answers.answer(
             key=(kind, *name),
             question=(metadata.uid, metadata.generation, wanted.spec, chart),

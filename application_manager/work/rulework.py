@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field
+from functools import partial
 
 from application_manager.cache.cluster_cache import EVENT_RULE, ClusterCache, surroundings
 from application_manager.cache.detector_index import DetectorIndex
 from application_manager.cache.store import Entry
 from application_manager.core.objects.policy import KindKey, Name
-from application_manager.core.statuses.rulestatus import DETECTOR_INVALID, RULE_INVALID, unreadable_status
+from application_manager.core.statuses.rulestatus import (
+    DETECTOR_INVALID,
+    RULE_INVALID,
+    detector_status,
+    unreadable_status,
+)
 from application_manager.work.statuses import StatusWriter
-from application_manager.workers.jobs import DetectorStatusJob, RuleJob, RuleStatusJob
 from application_manager.workers.pool import ExceededError, Runs
 from wayside.api import Detector, EventRule
 from wayside.api.base import Kind, Metadata
@@ -66,7 +71,7 @@ class RuleWork:
             old, judged = EventRuleStatus.model_validate(written), entry.model
             if not isinstance(judged, EventRule):
                 return old, unreadable_status(old, RULE_INVALID, entry.problem, generation, now)
-            job = RuleStatusJob(RuleJob(judged, surroundings(self.cache, judged)), now)
+            job = partial(surroundings(self.cache, judged).status, judged, now)
             try:
                 return old, await self.pool.run(namespace, job)
             except ExceededError as error:
@@ -76,7 +81,7 @@ class RuleWork:
             return old, unreadable_status(old, DETECTOR_INVALID, entry.problem, generation, now)
         rules, running = self.cache.models(EVENT_RULE, EventRule, namespace), self.detectors.running.get(name)
         try:
-            return old, await self.pool.run(namespace, DetectorStatusJob(judged, rules, now, running))
+            return old, await self.pool.run(namespace, partial(detector_status, judged, rules, now, running))
         except ExceededError as error:
             problem = f"spec: compiling the detector {error}"
             return old, unreadable_status(old, DETECTOR_INVALID, problem, generation, now)

@@ -5,16 +5,17 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 from application_manager.cache.cluster_cache import TEMPLATE, ClusterCache
 from application_manager.cache.overlap_index import Turn
 from application_manager.core.claims.claims import InvalidTemplate
 from application_manager.core.findings.findings import Findings
+from application_manager.core.findings.templatefindings import template_findings
 from application_manager.core.objects.policy import Name
 from application_manager.core.statuses.status import template_status
 from application_manager.work.recorder import EventReason
 from application_manager.work.statuses import StatusWriter
-from application_manager.workers.jobs import TemplateJob
 from application_manager.workers.pool import ExceededError, Runs
 from wayside.api.applicationtemplate import ApplicationTemplateStatus, TemplateManager
 from wayside.api.base import Kind, Metadata
@@ -78,7 +79,7 @@ class TemplateWork:
         found = self.cache.known_findings(template)
         if found is None:
             try:
-                found = await self.pool.run(name[0], TemplateJob(template, self.cache.policy))
+                found = await self.pool.run(name[0], partial(template_findings, template, self.cache.policy))
             except ExceededError as error:
                 found = Findings((f"spec: rendering the template {error}",))
             self.cache.note_findings(template, found)

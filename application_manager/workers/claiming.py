@@ -9,15 +9,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
-from application_manager.core.claims.claims import Claim, InvalidTemplate, Refusal, Refused
+from application_manager.core.claims.claims import Claim, InvalidTemplate, Refusal, Refused, claim
 from application_manager.core.claims.operations import Standing, Verdict
 from application_manager.core.demand.demand import claim_or_verdict, finished, refused
 from application_manager.core.objects.policy import Name
+from application_manager.core.objects.trimming import without_objects
 from application_manager.workers.answers import AnswerCache, Exceeded
-from application_manager.workers.jobs import ClaimJob
-from application_manager.workers.plain import claims_are_plain
+from application_manager.workers.jobs import claims_are_plain
 from wayside.api import ApplicationTask, ApplicationTemplate
 
 
@@ -44,7 +43,7 @@ class Claiming:
             key=("claim", *name),
             question=(metadata.uid, metadata.generation, task.metadata.uid, spec.operation, spec.parameters),
             namespace=task.namespace,
-            job=lambda: ClaimJob(_without_objects(template), task),
+            job=lambda: partial(claim, without_objects(template), task),
             done=partial(self._done, name),
         )
         match found:
@@ -60,9 +59,3 @@ class Claiming:
     def forget(self, name: Name) -> None:
         """Drop what is known of a task that is deleted."""
         self._answers.forget(("claim", *name))
-
-
-def _without_objects(template: ApplicationTemplate) -> ApplicationTemplate:
-    """The template without what plays no part in claims, and may be large."""
-    less: dict[str, Any] = {"manifests": [], "configuration": {}, "helm": None}
-    return template.model_copy(update={"spec": template.spec.model_copy(update=less)})

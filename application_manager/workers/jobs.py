@@ -1,34 +1,36 @@
-"""The jobs of the worker processes: everything that compiles or evaluates expressions of users.
+"""The jobs of the worker processes, for all that compiles or evaluates expressions of users.
 
-Each job is data, and its result follows from it alone. A template travels as bytes, since a process that has compiled
-it before need not read it again.
+A job is a function and its arguments, and its result follows from them alone. A template travels as bytes, since a
+process that has compiled it before need not read it again. The manager itself evaluates only small templates whose
+expressions just read: `${parameters.region}` costs no more than to write it down, and two switches between processes
+cost more than the work.
 """
 
 from __future__ import annotations
 
+import json
 import pickle
-from collections import OrderedDict
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
 
-from application_manager.core.claims.claims import Claim, Refusal, claim
-from application_manager.core.conditions import Aspect
 from application_manager.core.findings.demanding import deploy_remarks
 from application_manager.core.findings.findings import Findings
 from application_manager.core.findings.rulefindings import detector_findings, newly_wrong, rule_findings
-from application_manager.core.findings.templatefindings import template_findings
 from application_manager.core.objects.charts import ChartOutcome, ChartRequest
 from application_manager.core.objects.policy import Policy
-from application_manager.core.objects.rendering import Renderer, RenderError, Rendering
-from application_manager.core.statuses.rulestatus import detector_status, rule_status
-from wayside.api import ApplicationInstance, ApplicationTask, ApplicationTemplate, Detector, EventRule
-from wayside.api.detector import DetectorStatus
+from application_manager.core.objects.rendering import ChartPending, Renderer, RenderError, Rendering
+from application_manager.core.statuses.rulestatus import rule_status
+from wayside.api import ApplicationInstance, ApplicationTemplate, Detector, EventRule
 from wayside.api.eventrule import EventRuleStatus
-from wayside.findings import Finding
 
 _COMPILED = 64  # templates that a process keeps compiled
-
-_renderers: OrderedDict[tuple[str, int], Renderer | RenderError] = OrderedDict()
+_READ = re.compile(r"\$\{\s*(?:parameters|instance)(?:\.[A-Za-z_]\w*)+\s*\}")
+_LARGEST = 32 * 1024  # characters of the objects and files of a small template
+_MOST = 256  # expressions in them
+_VALUES = 16 * 1024  # characters of the values: with the above, of 4 MB at most
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,85 +41,30 @@ class RenderProblem:
     message: str
 
 
-@dataclass(frozen=True, slots=True)
-class RenderJob:
-    """An instance's objects.
+def render(
+    template: bytes, policy: Policy, instance: ApplicationInstance, chart: ChartOutcome | None = None
+) -> Rendering | RenderProblem | ChartRequest:
+    """An instance's objects, or why there are none, or the chart that is to be rendered first.
 
-    Attributes:
-        uid, generation: the template's.
-        template: the template, pickled.
-        chart: what became of the instance's chart, where that was requested.
+    `template` is pickled; `chart` is what became of the instance's chart, where that was requested.
     """
-
-    uid: str
-    generation: int
-    template: bytes
-    policy: Policy
-    instance: ApplicationInstance
-    chart: ChartOutcome | None = None
-
-    def run(self) -> Rendering | RenderProblem | ChartRequest:
-        """The objects, or why there are none, or the chart that is to be rendered first."""
-        requested: list[ChartRequest] = []
-
-        def charts(request: ChartRequest) -> ChartOutcome:
-            requested.append(request)
-            if self.chart is None:
-                raise _ChartWantedError
-            return self.chart
-
-        try:
-            return self._renderer().render(self.instance, charts)
-        except _ChartWantedError:
-            return requested[0]
-        except RenderError as error:
-            return RenderProblem(error.reason, str(error))
-
-    def _renderer(self) -> Renderer:
-        # The policy is the same for all jobs of a manager.
-        key = (self.uid, self.generation)
-        known = _renderers.get(key)
-        if known is None:
-            template: ApplicationTemplate = pickle.loads(self.template)  # noqa: S301  from the manager
-            try:
-                known = Renderer(template, self.policy)
-            except RenderError as error:
-                known = error
-            _renderers[key] = known
-            while len(_renderers) > _COMPILED:
-                _renderers.popitem(last=False)
-        _renderers.move_to_end(key)
-        if isinstance(known, RenderError):
-            raise known
-        return known
+    compiled = _compiled(template, policy)
+    if isinstance(compiled, RenderProblem):
+        return compiled
+    try:
+        return compiled.render(instance, lambda _: chart)
+    except ChartPending as pending:
+        return pending.request
+    except RenderError as error:
+        return RenderProblem(error.reason, str(error))
 
 
-class _ChartWantedError(Exception):
-    """The chart's objects are wanted, and not there yet."""
-
-
-@dataclass(frozen=True, slots=True)
-class ClaimJob:
-    """What a task requests of its template."""
-
-    template: ApplicationTemplate
-    task: ApplicationTask
-
-    def run(self) -> Claim | Refusal:
-        """The claim, or why the task cannot be served."""
-        return claim(self.template, self.task)
-
-
-@dataclass(frozen=True, slots=True)
-class TemplateJob:
-    """What is wrong with a template."""
-
-    template: ApplicationTemplate
-    policy: Policy
-
-    def run(self) -> Findings:
-        """The findings."""
-        return template_findings(self.template, self.policy)
+@lru_cache(maxsize=_COMPILED)
+def _compiled(template: bytes, policy: Policy) -> Renderer | RenderProblem:
+    try:
+        return Renderer(pickle.loads(template), policy)  # noqa: S301  from the manager
+    except RenderError as error:
+        return RenderProblem(error.reason, str(error))
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,61 +77,46 @@ class RuleContext:
     templates: Sequence[ApplicationTemplate] = ()
     invalid_templates: Sequence[str] = ()
 
+    def findings(self, rule: EventRule) -> Findings:
+        """What is wrong with the rule, and what its tasks would be refused for."""
+        found = rule_findings(rule, self.detectors, self.invalid_detectors, self.rules)
+        return replace(found, remarks=tuple(deploy_remarks(rule, self.templates, self.invalid_templates)))
 
-@dataclass(frozen=True, slots=True)
-class RuleJob:
-    """What is wrong with a rule."""
-
-    rule: EventRule
-    among: RuleContext
-
-    def run(self) -> Findings:
-        """The findings."""
-        found = rule_findings(self.rule, self.among.detectors, self.among.invalid_detectors, self.among.rules)
-        return replace(found, remarks=tuple(self.remarks()))
-
-    def remarks(self) -> list[Finding]:
-        """What the rule's tasks would be refused for."""
-        return deploy_remarks(self.rule, self.among.templates, self.among.invalid_templates)
+    def status(self, rule: EventRule, now: float) -> EventRuleStatus:
+        """The rule's status as of `now`, in seconds since 1970."""
+        remarks = deploy_remarks(rule, self.templates, self.invalid_templates)
+        return rule_status(rule, self.detectors, now, self.invalid_detectors, self.rules, remarks)
 
 
-@dataclass(frozen=True, slots=True)
-class RuleStatusJob:
-    """A rule's status as of `now`, in seconds since 1970."""
-
-    judged: RuleJob
-    now: float
-
-    def run(self) -> EventRuleStatus:
-        """The status."""
-        among, remarks = self.judged.among, self.judged.remarks()
-        rule = self.judged.rule
-        return rule_status(rule, among.detectors, self.now, among.invalid_detectors, among.rules, remarks)
+def judge_detector(detector: Detector, old: Detector | None = None, rules: Sequence[EventRule] = ()) -> Findings:
+    """What is wrong with a detector; what is newly wrong with these rules is a remark, since they may follow."""
+    remarks = [each for rule in rules for each in newly_wrong(rule, detector, old)]
+    return replace(detector_findings(detector), remarks=tuple(remarks))
 
 
-@dataclass(frozen=True, slots=True)
-class DetectorJob:
-    """What is wrong with a detector; and what is newly wrong with its rules, where there are any to look at."""
-
-    detector: Detector
-    old: Detector | None = None
-    rules: Sequence[EventRule] = ()
-
-    def run(self) -> Findings:
-        """The findings; what is wrong with rules is a remark, since they may follow."""
-        remarks = [each for rule in self.rules for each in newly_wrong(rule, self.detector, self.old)]
-        return replace(detector_findings(self.detector), remarks=tuple(remarks))
+def claims_are_plain(template: ApplicationTemplate) -> bool:
+    """Whether what a task of the template claims takes no expression but plain reads of parameters."""
+    patterns = (each.pattern for each in template.spec.parameters.values())
+    return _reads_alone(template.spec.key or "") and all(each is None for each in patterns)
 
 
-@dataclass(frozen=True, slots=True)
-class DetectorStatusJob:
-    """A detector's status as of `now`, in seconds since 1970."""
+def objects_are_plain(template: ApplicationTemplate) -> bool:
+    """Whether the objects of the template's instances take none but such reads, and few of them."""
+    if template.spec.helm is not None:
+        return False
+    text = _text([template.spec.manifests, template.spec.configuration])
+    return len(text) <= _LARGEST and text.count("${") <= _MOST and _reads_alone(text)
 
-    detector: Detector
-    rules: Sequence[EventRule]
-    now: float
-    running: Aspect | None
 
-    def run(self) -> DetectorStatus:
-        """The status."""
-        return detector_status(self.detector, self.rules, self.now, self.running)
+def values_are_small(instance: ApplicationInstance) -> bool:
+    """Whether the instance's values are too small to make much of, however often they are read."""
+    return len(_text(instance.spec.parameters)) <= _VALUES
+
+
+def _reads_alone(text: str) -> bool:
+    """Whether all expressions in the text only read a parameter or a field of the instance."""
+    return "${" not in _READ.sub("", text)
+
+
+def _text(value: Any) -> str:
+    return json.dumps(value, ensure_ascii=False, default=str)

@@ -14,11 +14,11 @@ import pickle
 import time
 from collections import Counter, deque
 from dataclasses import dataclass
-from typing import Protocol, TypeVar, cast
+from typing import Protocol, cast
 
 from application_manager.measures import Measures
 from application_manager.workers.child import Child, EndedError, pickled
-from application_manager.workers.process import FAILED, Job
+from application_manager.workers.process import FAILED, Job, Result
 
 PROCESSES = 2
 CPU_TIME = 3.0
@@ -26,8 +26,6 @@ CPU_TIME = 3.0
 
 _ATTEMPTS = 2  # at a job whose process ended for another reason than its CPU time
 _FORGETTING = 30.0  # s in which the CPU time that a namespace has used counts half
-
-Result = TypeVar("Result")
 
 log = logging.getLogger(__name__)
 
@@ -75,7 +73,7 @@ class Pool:
         self._closed = False
 
     async def run(self, namespace: str, job: Job[Result]) -> Result:
-        """What `job.run()` gives, in another process.
+        """What the job gives, in another process.
 
         Raises ExceededError where the job was ended for what it takes, and JobError where it raised an error.
         """

@@ -16,8 +16,9 @@ import signal
 import struct
 import sys
 import time
+from collections.abc import Callable
 from contextlib import suppress
-from typing import Any, BinaryIO, Protocol, TypeVar
+from typing import Any, BinaryIO, TypeVar
 
 LENGTH = struct.Struct("<I")
 
@@ -26,16 +27,9 @@ MEMORY = 256 * 1024 * 1024
 
 _NICENESS = 10  # where there is no idle class
 
-
-Result_co = TypeVar("Result_co", covariant=True)
-
-
-class Job(Protocol[Result_co]):
-    """Something to work out that follows from its own content alone."""
-
-    def run(self) -> Result_co:
-        """The result."""
-
+Result = TypeVar("Result")
+Job = Callable[[], Result]
+"""Something to work out that follows from its own content alone, and that can be pickled."""
 
 FAILED = -1.0
 """In place of the CPU time: the job raised an error, a defect of ours, and the answer is its text."""
@@ -59,7 +53,9 @@ def main() -> None:
     resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # of a terminal: the manager ends us
-    import application_manager.workers.jobs  # noqa: F401, PLC0415  before the first job, which is to be fast
+    # Before the first job, which is to be fast.
+    import application_manager.core.findings.templatefindings  # noqa: PLC0415
+    import application_manager.workers.jobs  # noqa: F401, PLC0415
 
     _yield_to_others()  # after the imports: on a busy machine, they would take many seconds in the idle class
     questions = sys.stdin.buffer
@@ -82,7 +78,7 @@ def main() -> None:
 def _answer(frame: bytes) -> tuple[bytes, bool]:
     try:
         job: Job[Any] = pickle.loads(frame)  # noqa: S301  from the manager, which started us
-        return pickle.dumps(job.run(), pickle.HIGHEST_PROTOCOL), True
+        return pickle.dumps(job(), pickle.HIGHEST_PROTOCOL), True
     except MemoryError:  # as CEL does in C++: the expression takes more than there is
         os.abort()
     except Exception as error:  # noqa: BLE001  a defect in one job must not end the others

@@ -16,9 +16,9 @@ from pydantic import ValidationError
 
 from application_manager.core.claims.claims import InvalidTemplate
 from application_manager.core.claims.operations import Standing
-from application_manager.core.demand.byhand import is_held
 from application_manager.core.demand.decisions import is_managed
 from application_manager.core.demand.demand import NamespaceOutcome, demand
+from application_manager.core.demand.lingering import is_held
 from application_manager.core.holders.leases import LeaseView
 from application_manager.core.objects.policy import Policy
 from application_manager.core.objects.rendering import Renderer, RenderError

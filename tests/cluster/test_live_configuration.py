@@ -14,7 +14,7 @@ import pytest
 import yaml
 import zenoh
 
-from application_manager.core.objects.following import ANNOTATION, fingerprint
+from application_manager.core.objects.configuration import ANNOTATION, fingerprint
 from tests.cluster.api import Api, Object
 from tests.cluster.managed_world import end, start_manager, task, wait_settled
 from tests.cluster.processes import Process, Processes

@@ -13,7 +13,7 @@ from typing import Any
 
 import yaml
 
-from application_manager.admission.authority import make_certificates
+from application_manager.admission.issuing import make_certificates
 from application_manager.core.findings.webhooks import (
     WebhookClientConfig,
     injection_configuration,

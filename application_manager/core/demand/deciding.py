@@ -16,14 +16,12 @@ from application_manager.core.claims.claims import Claim, InvalidTemplate, Refus
 from application_manager.core.claims.operations import Standing, Verdict, settle, waiting_for_any
 from application_manager.core.claims.parameters import baseline
 from application_manager.core.conditions import find, holds
-from application_manager.core.demand import byhand
 from application_manager.core.demand.decisions import Decision, is_managed
 from application_manager.core.demand.fallback import Fallback, fallback, fallback_of, overdue
-from application_manager.core.demand.lingering import linger_of, protected_until
+from application_manager.core.demand.lingering import is_held, is_paused, linger_of, protected_until
 from application_manager.core.demand.places import BASELINE_RANK, Placement, PlaceRequest
 from application_manager.core.demand.placing import PREEMPTED, candidate, placed
-from application_manager.core.holders.lapses import live_claims
-from application_manager.core.holders.leases import LeaseView
+from application_manager.core.holders.leases import LeaseView, live_claims
 from wayside.api import ApplicationInstance, ApplicationTask, ApplicationTemplate
 
 
@@ -143,7 +141,7 @@ def _decide_one(name: str, template_name: str, claims: Iterable[Claim], indexes:
     """What should become of an instance, given the tasks that claim it."""
     ordered = sorted(claims, key=lambda each: precedence(each.task))
     template, instance = indexes.template(template_name), indexes.instance(name)
-    paused = instance is not None and byhand.is_paused(instance)
+    paused = instance is not None and is_paused(instance)
     if instance is not None and not is_managed(instance):
         return _left_alone(instance, ordered)
     if isinstance(template, InvalidTemplate):  # its tasks are refused, and what runs stays until it is corrected
@@ -156,7 +154,7 @@ def _decide_one(name: str, template_name: str, claims: Iterable[Claim], indexes:
     wanted = settled.parameters is not None
     suspended: bool | None = settled.suspender is not None
     release_time = None
-    if not wanted and instance is not None and not paused and not byhand.is_held(instance):
+    if not wanted and instance is not None and not paused and not is_held(instance):
         linger = linger_of(instance, template).seconds  # from when we see that no demand is left
         deadline = indexes.deadline(instance)  # of a linger that continues; it restarts after a demand
         release_time = max(now + linger if deadline is None else deadline, protected_until(instance, template))
@@ -245,5 +243,5 @@ def _left_alone(instance: ApplicationInstance, claims: list[Claim]) -> Decision:
     refused = Verdict(Standing.REFUSED, Refused.INSTANCE_NOT_MANAGED, message)
     verdicts = {each.task.name: refused for each in claims}
     spec = instance.spec
-    paused = byhand.is_paused(instance)
+    paused = is_paused(instance)
     return Decision(instance.name, spec.template_name, spec.key, None, (), verdicts, None, None, paused)

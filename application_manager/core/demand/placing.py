@@ -7,9 +7,8 @@ from dataclasses import replace
 
 from application_manager.core.claims.claims import InvalidTemplate
 from application_manager.core.claims.operations import NOTHING_RUNS, Standing, Verdict
-from application_manager.core.demand import byhand
 from application_manager.core.demand.decisions import Decision, is_managed
-from application_manager.core.demand.lingering import protected_until
+from application_manager.core.demand.lingering import is_held, protected_until
 from application_manager.core.demand.places import GrantedPlace, Limits, PlaceCandidate
 from wayside.api import ApplicationInstance, ApplicationTemplate
 from wayside.times import format_seconds
@@ -44,7 +43,7 @@ def candidate(
     if instance is None and decision.rank is None:
         return None
     kept = instance is not None and (
-        decision.paused or byhand.is_held(instance) or (not decision.wanted and decision.release_time is None)
+        decision.paused or is_held(instance) or (not decision.wanted and decision.release_time is None)
     )
     return PlaceCandidate(
         name=decision.name,

@@ -2,18 +2,19 @@
 
 It is compiled, its expressions are checked for the types of the parameters they read, and it is rendered on examples.
 What fails on an example counts against the template only if no value of a task could change it; else it is a remark,
-and where the example proves nothing, it is nothing.
+and where the example proves nothing, it is nothing. A default, a member of an enum and both booleans are values that
+will come; all others are made up.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 from application_manager.core.claims import claims, parameters
 from application_manager.core.findings.checks import FAILING_EXAMPLE
-from application_manager.core.findings.examples import Example, examples, is_open
 from application_manager.core.findings.findings import Findings, field_of
 from application_manager.core.objects.charts import ChartObjects, ChartOutcome, ChartRequest
 from application_manager.core.objects.policy import Policy
@@ -36,8 +37,25 @@ _KINDS: Mapping[ParameterType, CelType] = {
 _VARIABLES = {"parameters": CelType.MAP, "instance": CelType.MAP}
 _NAMES = "metadata.name"
 
+_ITEMS: Mapping[str, Any] = {"string": "example", "number": 1, "integer": 1, "boolean": True}
+
 Reads = Iterable[tuple[str, frozenset[Path]]]
 """Fields, each with what an expression in it reads."""
+
+
+@dataclass(frozen=True, slots=True)
+class Example:
+    """Parameters of one instance.
+
+    Attributes:
+        given: those that tasks give; defaults come in besides.
+        made_up: the names of those whose value is no task's, nor the template's.
+        phrase: when it is so, to end a sentence.
+    """
+
+    given: Mapping[str, Any]
+    made_up: frozenset[str]
+    phrase: str
 
 
 def template_findings(template: ApplicationTemplate, policy: Policy) -> Findings:
@@ -166,3 +184,55 @@ def _parameters(every: frozenset[str], paths: frozenset[Path]) -> frozenset[str]
 def _within(field: str, other: str) -> bool:
     """Whether the field is the other, or a part of it."""
     return field == other or (field.startswith(other) and field[len(other)] in ".[")
+
+
+def examples(template: ApplicationTemplate) -> tuple[Example, ...]:
+    """The baseline where there is one, the least that a task may give, and all that it can."""
+    baseline = template.spec.baseline
+    if baseline is None:
+        return _of_tasks(template.spec.parameters)
+    given = {name: each for name, each in baseline.parameters.items() if each is not None}
+    return (Example(given, frozenset(), "for the baseline"), *_of_tasks(template.spec.parameters))
+
+
+def _of_tasks(declared: Mapping[str, Parameter]) -> tuple[Example, ...]:
+    optional = frozenset(name for name, each in declared.items() if not each.required and each.default is None)
+    required = {name: example_of(each) for name, each in declared.items() if each.required}
+    made_up = frozenset(name for name in required if not _is_real(declared[name]))
+    given = f"only {', '.join(sorted(required))}" if required else "no parameters"
+    least = Example(required, made_up | optional, f"when tasks give {given}")
+    if not optional:
+        return (least,)
+    every = {name: example_of(each) for name, each in declared.items() if each.default is None}
+    made_up = frozenset(name for name in every if not _is_real(declared[name]))
+    return (least, Example(every, made_up, "when tasks give all parameters"))
+
+
+def example_of(parameter: Parameter) -> Any:
+    """A value within the parameter's bounds; of a pattern it knows nothing."""
+    if parameter.default is not None:
+        return parameter.default
+    if parameter.enum:
+        return parameter.enum[0]
+    match parameter.type:
+        case ParameterType.STRING:
+            return "example"
+        case ParameterType.BOOLEAN:
+            return False
+        case ParameterType.OBJECT:
+            return {}
+        case ParameterType.ARRAY:
+            return [] if parameter.items is None else [_ITEMS[parameter.items]]
+    low = 1.0 if parameter.minimum is None else parameter.minimum
+    within = low if parameter.maximum is None else min(low, parameter.maximum)
+    return within
+
+
+def is_open(parameter: Parameter) -> bool:
+    """Whether values may be of a shape that cannot be guessed, so that an example that fails proves nothing."""
+    shapeless = parameter.type in (ParameterType.OBJECT, ParameterType.ARRAY) or parameter.pattern is not None
+    return shapeless and not _is_real(parameter)
+
+
+def _is_real(parameter: Parameter) -> bool:
+    return parameter.default is not None or bool(parameter.enum) or parameter.type is ParameterType.BOOLEAN

@@ -1,21 +1,33 @@
-"""The objects of an owner, distinguished from those of others by their controller and uid. Pure."""
+"""The objects of an owner, distinguished from those of others by their controller and uid, and their labels. Pure.
+
+Pods have the instance's label alone: it never changes while the instance lives, so it never makes a workload roll out.
+"""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from application_manager.core.conditions import Aspect
-from wayside.api import API_VERSION, Kind
+from application_manager.core.objects.podspecs import with_pod_template
+from wayside.api import API_VERSION, ApplicationInstance, Kind
 from wayside.api.applicationinstance import ObjectReference
+from wayside.api.base import MANAGED_BY, MANAGED_BY_LABEL
 
 FIELD_MANAGER = "wayside"
 """The manager's name in server-side apply."""
 
+INSTANCE_LABEL = "wayside.dev/instance"
+TEMPLATE_LABEL = "wayside.dev/template"
+
 ObjectKey = tuple[str, str, str]
 """apiVersion, kind and name."""
+
+
+Manifest = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,3 +121,29 @@ def our_fields(raw: Mapping[str, Any]) -> str:
         if each.get("manager") == FIELD_MANAGER and each.get("operation") == "Apply" and not each.get("subresource"):
             return json.dumps(each.get("fieldsV1"), sort_keys=True)
     return ""
+
+
+def labelled(manifest: Manifest, instance: ApplicationInstance) -> Manifest:
+    """The manifest in the instance's namespace and with its labels, and its pod template with the instance's."""
+    metadata = manifest["metadata"]
+    own = {
+        MANAGED_BY_LABEL: MANAGED_BY,
+        INSTANCE_LABEL: instance.name,
+        TEMPLATE_LABEL: instance.spec.template_name,
+    }
+    made = (
+        manifest if manifest["kind"] == "Pod" else with_pod_template(manifest, partial(_labelled_pods, instance.name))
+    )
+    return {
+        **made,
+        "metadata": {**metadata, "namespace": instance.namespace, "labels": {**(metadata.get("labels") or {}), **own}},
+    }
+
+
+def _labelled_pods(instance: str, template: Manifest) -> Manifest:
+    """The pod template with the instance's label; one of a wrong shape is unchanged, and the API server rejects it."""
+    metadata = template.get("metadata") or {}
+    labels = (metadata.get("labels") or {}) if isinstance(metadata, dict) else None
+    if not isinstance(labels, dict):
+        return template
+    return {**template, "metadata": {**metadata, "labels": {**labels, INSTANCE_LABEL: instance}}}

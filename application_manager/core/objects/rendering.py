@@ -19,7 +19,7 @@ from application_manager.core.claims import parameters, values
 from application_manager.core.claims.claims import unknown_members
 from application_manager.core.objects.charts import ChartFailure, ChartRequest, Charts, ChartSource, no_charts
 from application_manager.core.objects.configuration import CONFIG_MAP, Configuration, config_map, config_map_name
-from application_manager.core.objects.labelling import labelled
+from application_manager.core.objects.ownership import labelled
 from application_manager.core.objects.policy import Policy
 from application_manager.core.objects.suspension import stated_replicas, stopped, yielded
 from wayside.api import ApplicationInstance, ApplicationTemplate
@@ -54,6 +54,10 @@ class RenderError(Exception):
 
 class ChartPending(Exception):  # noqa: N818  no error: the answer is still to come
     """The instance's chart is being rendered; render again once it is."""
+
+    def __init__(self, request: ChartRequest) -> None:
+        super().__init__(f"chart {request.source} is being rendered")
+        self.request = request
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,7 +199,7 @@ class Renderer:
         request = ChartRequest(ChartSource.of(helm), instance.namespace, instance.name, values.canonical(given or {}))
         outcome = charts(request)
         if outcome is None:
-            raise ChartPending(f"chart {request.source} is being rendered")
+            raise ChartPending(request)
         if isinstance(outcome, ChartFailure):
             raise RenderError([outcome.message], outcome.reason)
         for each in outcome.objects:

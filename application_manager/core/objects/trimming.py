@@ -10,7 +10,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from application_manager.core.objects.configuration import CONFIG_MAP, config_map_name
-from application_manager.core.objects.labelling import INSTANCE_LABEL
+from application_manager.core.objects.ownership import INSTANCE_LABEL
+from wayside.api import ApplicationTemplate
 from wayside.api.base import GROUP
 
 Object = dict[str, Any]
@@ -55,6 +56,12 @@ def others(raw: Object, manager: str) -> Object:
     if "data" in raw and _is_configuration(raw):
         kept["data"] = raw["data"]
     return kept
+
+
+def without_objects(template: ApplicationTemplate) -> ApplicationTemplate:
+    """The template without its objects and status, which may be large, and play no part in claims."""
+    less: dict[str, Any] = {"manifests": [], "configuration": {}, "helm": None}
+    return template.model_copy(update={"spec": template.spec.model_copy(update=less), "status": None})
 
 
 def _is_configuration(raw: Object) -> bool:

@@ -20,8 +20,7 @@ from application_manager.core.demand.demand import NamespaceOutcome, demand
 from application_manager.core.demand.placing import LIMIT_REACHED, PREEMPTED
 from application_manager.core.health.pods import trouble
 from application_manager.core.health.readiness import not_ready
-from application_manager.core.holders.lapses import HOLDER_LOST
-from application_manager.core.holders.leases import LeaseView
+from application_manager.core.holders.leases import HOLDER_LOST, LeaseView
 from application_manager.core.statuses.explanation import (
     ExplainedContribution,
     ExplainedInstance,

@@ -12,8 +12,9 @@ from typing import Any
 
 from application_manager.core.claims.operations import ACCEPTED, Standing, Verdict
 from application_manager.core.conditions import STALLED, Aspect, concluded, find, updated
-from application_manager.core.demand import byhand, fallback
+from application_manager.core.demand import fallback
 from application_manager.core.demand.decisions import Decision
+from application_manager.core.demand.lingering import is_held, manual_aspects
 from application_manager.core.findings.findings import Findings
 from application_manager.core.objects.suspension import autoscalers, pods_left
 from wayside.api import ApplicationInstance, ApplicationTask
@@ -211,7 +212,7 @@ def instance_status(
                     *([suspended] if suspended else []),
                     *_capped(old.conditions, decision),
                     *fallback.aspects(old.conditions, decision.overdue, decision.fallback, decision.stands_in_for),
-                    *byhand.manual_aspects(instance),
+                    *manual_aspects(instance),
                 ),
                 generation,
                 now,
@@ -265,7 +266,7 @@ def _instance_message(instance: ApplicationInstance, decision: Decision, applied
         parts.append(ready.message)
     if decision.release_time is not None:
         parts.append(f"released at {format_seconds(decision.release_time)} unless a demand arrives")
-    elif byhand.is_held(instance) and not decision.wanted:
+    elif is_held(instance) and not decision.wanted:
         parts.append("held without demand")
     parts += decision.capped
     parts += [f"stands in for {each}" for each in decision.stands_in_for]

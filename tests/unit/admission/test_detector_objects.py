@@ -18,8 +18,7 @@ from application_manager.core.objects.detectors import detector_objects, detecto
 from application_manager.core.objects.poddefaults import PodDefaults, parse_user
 from application_manager.core.objects.pullpolicy import PullPolicy
 from application_manager.core.objects.rights import detector_rights, merged_rules, rights
-from application_manager.core.statuses.rulestatus import detector_status
-from application_manager.core.statuses.running import NOT_RUN, running
+from application_manager.core.statuses.rulestatus import NOT_RUN, detector_status, running
 from tests.cluster.manifests import DETECTOR
 from tests.guides import guide, yaml_blocks
 from tests.unit.manager_objects import NOW

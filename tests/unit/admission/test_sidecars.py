@@ -20,7 +20,7 @@ from application_manager.core.findings.reviews import ReviewError
 from application_manager.core.objects.detectors import detector_objects, sidecar_roles
 from application_manager.core.objects.poddefaults import PodDefaults
 from application_manager.core.objects.sidecars import CONTAINER, added, addition, patch, sidecar_pods
-from application_manager.core.statuses.running import carried
+from application_manager.core.statuses.rulestatus import carried
 from tests.cluster.manifests import DETECTOR
 from tests.guides import guide, yaml_blocks
 from tests.unit.admission.test_detector_objects import ON_A_CLAIM

@@ -12,7 +12,7 @@ import aiohttp
 import pytest
 import yaml
 
-from application_manager.admission.authority import make_certificates
+from application_manager.admission.issuing import make_certificates
 from application_manager.admission.reviewing import AT_ONCE, LARGEST, ReviewHandler, Serving, webhook
 from application_manager.cli import EXPECTED, app
 from application_manager.core.findings.reviews import ReviewError

@@ -7,9 +7,15 @@ from typing import Any
 import pytest
 
 from application_manager.core.conditions import Aspect
-from application_manager.core.demand.byhand import HOLD_ANNOTATION, PAUSE_ANNOTATION, is_held, is_paused, manual_aspects
 from application_manager.core.demand.decisions import Decision
 from application_manager.core.demand.demand import Standing, demand
+from application_manager.core.demand.lingering import (
+    HOLD_ANNOTATION,
+    PAUSE_ANNOTATION,
+    is_held,
+    is_paused,
+    manual_aspects,
+)
 from application_manager.core.statuses.status import instance_status
 from tests.unit.manager_objects import NOW, instance, task, template
 from wayside.api import ApplicationInstance

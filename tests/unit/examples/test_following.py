@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from application_manager.core.objects.following import ANNOTATION, behind, fingerprint, selectors
+from application_manager.core.objects.configuration import ANNOTATION, behind, fingerprint, selectors
 from tests.guides import ROOT
 
 FILE = ROOT / "examples" / "live-configuration" / "follow.py"

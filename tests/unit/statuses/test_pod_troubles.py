@@ -8,7 +8,7 @@ import pytest
 
 from application_manager.cache.pod_index import PodIndex
 from application_manager.core.health.pods import Trouble, TroubleReason, summary, trouble
-from application_manager.core.objects.labelling import INSTANCE_LABEL
+from application_manager.core.objects.ownership import INSTANCE_LABEL
 from application_manager.core.objects.policy import Policy
 from application_manager.core.objects.rendering import Renderer
 from tests.unit.manager_objects import DEPLOYMENT, instance, template

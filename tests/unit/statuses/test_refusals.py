@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from application_manager.core.health.refusals import lacks_pods, reason_of, refused_by_events, refused_pods
-from application_manager.work.attempts import FIRST_PAUSE, LONGEST_PAUSE, Attempts
+from application_manager.work.instances import FIRST_PAUSE, LONGEST_PAUSE, Attempts
 from wayside.times import format_time
 
 QUOTA = 'pods "app-6b4-zk5mt" is forbidden: exceeded quota: few, requested: pods=1, used: pods=0, limited: pods=0'
