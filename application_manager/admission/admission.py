@@ -1,8 +1,9 @@
-"""Reviews a template, rule or Detector before the API server stores it, against the manager's cache.
+"""Reviews a template, rule or Detector before the API server stores it, and injects detectors into pods.
 
 The answers are the findings that also make the conditions. What a rule has only with others (its Detectors, the rules
 and templates that it names) is looked up again at the API server before it is reported: a Detector that was applied a
-moment before its rules may not have reached us yet.
+moment before its rules may not have reached us yet. So is a pod's Detector, before the pod goes without. Whatever else
+goes wrong there is no answer, and the pod is made without its detector (failurePolicy Ignore).
 """
 
 from __future__ import annotations
@@ -11,19 +12,33 @@ import asyncio
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
-from application_manager.cache.cluster_cache import DETECTOR, EVENT_RULE, TEMPLATE, ClusterCache, surroundings
+from application_manager.cache.cluster_cache import (
+    DETECTORS,
+    EVENT_RULE,
+    EVENT_RULES,
+    TEMPLATES,
+    ClusterCache,
+    surroundings,
+)
 from application_manager.core.findings.checks import BROKEN_RULE, INVALID_RULE
 from application_manager.core.findings.findings import Findings
+from application_manager.core.findings.injections import (
+    Injection,
+    PodRequest,
+    answer_pod,
+    detector_of,
+    injection,
+    read_pod,
+)
 from application_manager.core.findings.reviews import Request, ReviewError, Weight, answer, read
 from application_manager.core.findings.templatefindings import template_findings
 from application_manager.core.objects.detectors import deployment_to_try
 from application_manager.core.objects.poddefaults import PodDefaults
-from application_manager.core.objects.policy import KindKey
 from application_manager.measures import Measures
 from application_manager.workers.jobs import RuleContext, judge_detector
 from application_manager.workers.pool import ExceededError, Runs
@@ -56,7 +71,6 @@ class Admission:
     """Answers.
 
     Attributes:
-        resources: where EventRules and Detectors live.
         observe: takes an object that was read.
         pool: where objects are checked.
         namespaces: those that are managed; empty: all.
@@ -65,7 +79,6 @@ class Admission:
 
     cache: ClusterCache
     client: Client
-    resources: Mapping[KindKey, Resource]
     observe: Callable[[Object], None]
     measures: Measures
     pool: Runs
@@ -124,11 +137,11 @@ class Admission:
             return findings  # it has them by itself
         try:
             async with asyncio.timeout(LOOKING_UP):
-                await self._look_up(DETECTOR, rule.namespace)
+                await self._look_up(DETECTORS, rule.namespace)
                 if depends(rule):
-                    await self._look_up(EVENT_RULE, rule.namespace)
+                    await self._look_up(EVENT_RULES, rule.namespace)
                 if findings.remarks:
-                    await self._look_up(TEMPLATE, rule.namespace)
+                    await self._look_up(TEMPLATES, rule.namespace)
         except (ApiError, Unreachable, TimeoutError) as error:
             log.warning("EventRule %s/%s: reviewed against the cache only: %s", rule.namespace, rule.name, error)
             problems = (Finding(INVALID_RULE.name, each, rule.name) for each in findings.problems)
@@ -145,8 +158,8 @@ class Admission:
         except ExceededError as error:
             return Findings((f"spec: its review {error}",))
 
-    async def _look_up(self, kind: KindKey, namespace: str) -> None:
-        for raw in (await self.client.list(self.resources[kind], namespace))[0]:
+    async def _look_up(self, resource: Resource, namespace: str, fields: str = "") -> None:
+        for raw in (await self.client.list(resource, namespace, fields=fields))[0]:
             self.observe(raw)
 
     async def _of_detector(self, detector: Detector, old: Kind | None) -> Findings:
@@ -185,6 +198,29 @@ class Admission:
                 "Detector %s/%s: cannot check its pod by a dry run: %s", detector.namespace, detector.name, error
             )
         return problem
+
+    async def inject(self, review: Any) -> Object:
+        """The answer to an AdmissionReview about a pod. Raises ReviewError where it is none."""
+        request = read_pod(review)
+        name = detector_of(request.pod.get("metadata"))
+        if name is None:
+            return answer_pod(request, Injection())
+        found = await self._injection(request, name)
+        if found.why_not is not None:
+            try:
+                async with asyncio.timeout(LOOKING_UP):
+                    await self._look_up(DETECTORS, request.namespace, f"metadata.name={name}")
+            except (ApiError, Unreachable, TimeoutError) as error:
+                log.warning("cannot look up Detector %s/%s, which a pod requests: %s", request.namespace, name, error)
+            found = await self._injection(request, name)
+        self.measures.reviewed("Pod", "allowed" if found.why_not is None else "warned")
+        return answer_pod(request, found)
+
+    async def _injection(self, request: PodRequest, name: str) -> Injection:
+        detector = self.cache.detector((request.namespace, name))
+        metadata, spec = request.pod["metadata"], request.pod["spec"]
+        # Beside the event loop: whether the Detector is accepted is found by compiling its expressions.
+        return await asyncio.to_thread(injection, metadata, spec, request.namespace, detector, self.defaults)
 
 
 def _parsed(raw: Object | None) -> Kind | None:

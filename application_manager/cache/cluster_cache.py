@@ -45,6 +45,7 @@ from wayside.api import (
     Kind,
 )
 from wayside.findings import ignored_by
+from wayside.kubernetes.resources import Resource
 from wayside.rules import depends
 
 Model = TypeVar("Model", bound=Kind)
@@ -54,7 +55,14 @@ TASK: Final[KindKey] = (API_VERSION, "ApplicationTask")
 INSTANCE: Final[KindKey] = (API_VERSION, "ApplicationInstance")
 EVENT_RULE: Final[KindKey] = (API_VERSION, "EventRule")
 DETECTOR: Final[KindKey] = (API_VERSION, "Detector")
-OWN_KINDS: Final = (TEMPLATE, INSTANCE, TASK, DETECTOR, EVENT_RULE)
+TEMPLATES: Final = Resource(*TEMPLATE, ApplicationTemplate.plural)
+TASKS: Final = Resource(*TASK, ApplicationTask.plural)
+INSTANCES: Final = Resource(*INSTANCE, ApplicationInstance.plural)
+EVENT_RULES: Final = Resource(*EVENT_RULE, EventRule.plural)
+DETECTORS: Final = Resource(*DETECTOR, Detector.plural)
+OWN: Final = {TEMPLATE: TEMPLATES, INSTANCE: INSTANCES, TASK: TASKS, DETECTOR: DETECTORS, EVENT_RULE: EVENT_RULES}
+"""Our own kinds and where they live, those that others depend on first."""
+
 POD: Final[KindKey] = ("v1", "Pod")
 LEASE: Final[KindKey] = ("coordination.k8s.io/v1", "Lease")
 
@@ -126,7 +134,7 @@ class ClusterCache:
     _findings: dict[Name, tuple[_Version, Findings]] = field(default_factory=dict)
 
     def __post_init__(self, full: Callable[[], bool], tasks: TaskPolicy | None) -> None:
-        self.store = Store(OWN_KINDS, full)
+        self.store = Store(OWN, full)
         self.claims = ClaimIndex(policy=tasks or TaskPolicy())
 
     def template(self, name: Name) -> ApplicationTemplate | InvalidTemplate | None:
@@ -137,14 +145,20 @@ class ClusterCache:
         return entry.model if isinstance(entry.model, ApplicationTemplate) else InvalidTemplate(name[1], entry.problem)
 
     def instance(self, name: Name) -> ApplicationInstance | None:
-        """The instance, or None."""
-        entry = self.store.get(INSTANCE, name)
-        return entry.model if entry is not None and isinstance(entry.model, ApplicationInstance) else None
+        """The instance; None where there is none that is valid, as for tasks and Detectors."""
+        return self._model(INSTANCE, ApplicationInstance, name)
 
     def task(self, name: Name) -> ApplicationTask | None:
-        """The task, or None where there is none, or none that is valid."""
-        entry = self.store.get(TASK, name)
-        return entry.model if entry is not None and isinstance(entry.model, ApplicationTask) else None
+        """The task."""
+        return self._model(TASK, ApplicationTask, name)
+
+    def detector(self, name: Name) -> Detector | None:
+        """The Detector."""
+        return self._model(DETECTOR, Detector, name)
+
+    def _model(self, kind: KindKey, model: type[Model], name: Name) -> Model | None:
+        entry = self.store.get(kind, name)
+        return entry.model if entry is not None and isinstance(entry.model, model) else None
 
     def models(self, kind: KindKey, model: type[Model], namespace: str) -> list[Model]:
         """The objects of a kind in a namespace, as far as they are valid."""

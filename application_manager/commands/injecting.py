@@ -12,20 +12,19 @@ from typing import Any
 import typer
 import yaml
 
+from application_manager.cache.cluster_cache import DETECTOR, DETECTORS
 from application_manager.cluster.client import manager_client
 from application_manager.core.findings.injections import detector_of, injection
 from application_manager.core.objects.poddefaults import PodDefaults
 from application_manager.core.objects.podspecs import POD_TEMPLATES, pod_template, with_pod_template
 from application_manager.core.objects.sidecars import added, has_sidecar
-from wayside.api import API_VERSION, Detector
+from wayside.api import Detector
 from wayside.api.documents import parse_object
 from wayside.kubernetes.connection import ConfigurationError, load_configuration
 from wayside.kubernetes.errors import RequestError
-from wayside.kubernetes.resources import Resource
 from wayside.manifests import to_yaml
 from wayside.process import commandline
 
-_DETECTORS = Resource(API_VERSION, "Detector", Detector.plural)
 _NO_IMAGE = "Detector {} has no image: give --detector-image, or set its spec.pod.image"
 
 Manifest = dict[str, Any]
@@ -112,7 +111,7 @@ async def _looked_up(documents: list[Manifest], known: _Known) -> _Known:
         ) from error
     try:
         for namespace, name in sorted(wanted):
-            raw = await client.get(_DETECTORS, namespace, name)
+            raw = await client.get(DETECTORS, namespace, name)
             if raw is not None and (found := _detector(raw)) is not None:
                 known.found[namespace, name] = found
     except RequestError as error:
@@ -139,7 +138,7 @@ def _namespace(raw: Mapping[str, Any], default: str) -> str:
 
 
 def _is_detector(raw: Mapping[str, Any]) -> bool:
-    return (raw.get("apiVersion"), raw.get("kind")) == (API_VERSION, "Detector")
+    return (raw.get("apiVersion"), raw.get("kind")) == DETECTOR
 
 
 def _detector(raw: Manifest) -> Detector | None:

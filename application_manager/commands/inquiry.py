@@ -9,12 +9,13 @@ from typing import Any, TypeVar
 
 from kubernetes.aio.config import ConfigException, list_kube_config_contexts
 
+from application_manager.cache.cluster_cache import INSTANCES, TASKS, TEMPLATES
 from application_manager.cluster.client import manager_client
 from application_manager.core.claims.claims import InvalidTemplate
 from application_manager.core.objects.ownership import INSTANCE_LABEL
 from application_manager.core.statuses.explaining import Found, explanation_of, serving
 from application_manager.core.statuses.explanation import Explanation
-from wayside.api import API_VERSION, ApplicationInstance, ApplicationTask, ApplicationTemplate, Kind
+from wayside.api import ApplicationInstance, ApplicationTask, ApplicationTemplate, Kind
 from wayside.api.documents import parse_object
 from wayside.inputerror import InputError
 from wayside.kubernetes.client import Client
@@ -27,9 +28,6 @@ Model = TypeVar("Model", bound=Kind)
 
 _contexts: Any = list_kube_config_contexts  # the package claims to be typed, yet this function is not
 
-_TASKS = Resource(API_VERSION, "ApplicationTask", "applicationtasks")
-_INSTANCES = Resource(API_VERSION, "ApplicationInstance", "applicationinstances")
-_TEMPLATES = Resource(API_VERSION, "ApplicationTemplate", "applicationtemplates")
 _PODS = Resource("v1", "Pod", "pods")
 
 _TASK_WORDS = frozenset({"task", "apptask", "applicationtask", "applicationtasks"})
@@ -70,8 +68,8 @@ def _namespace_of_context() -> str:
 
 async def _inquire(client: Client, subject: str, namespace: str) -> Explanation:
     kind, _, name = subject.rpartition("/")
-    task = await _read(client, _TASKS, ApplicationTask, namespace, name, kind, _TASK_WORDS)
-    existing = await _read(client, _INSTANCES, ApplicationInstance, namespace, name, kind, _INSTANCE_WORDS)
+    task = await _read(client, TASKS, ApplicationTask, namespace, name, kind, _TASK_WORDS)
+    existing = await _read(client, INSTANCES, ApplicationInstance, namespace, name, kind, _INSTANCE_WORDS)
     if kind and kind.lower() not in _TASK_WORDS | _INSTANCE_WORDS:
         raise InquiryError(f"{subject}: {kind} is not a kind: write task/{name} or instance/{name}")
     if task is None and existing is None:
@@ -84,8 +82,8 @@ async def _inquire(client: Client, subject: str, namespace: str) -> Explanation:
         raise InquiryError(f"{name} is the name of a task and of an instance: write task/{name} or instance/{name}")
     found = Found(
         await _templates(client, namespace),
-        await _list(client, _TASKS, ApplicationTask, namespace),
-        await _list(client, _INSTANCES, ApplicationInstance, namespace),
+        await _list(client, TASKS, ApplicationTask, namespace),
+        await _list(client, INSTANCES, ApplicationInstance, namespace),
     )
     now = time.time()
     instance = serving(found, task, now) if task is not None else name
@@ -134,7 +132,7 @@ async def _list(client: Client, resource: Resource, model: type[Model], namespac
 
 async def _templates(client: Client, namespace: str) -> list[ApplicationTemplate | InvalidTemplate]:
     found: list[ApplicationTemplate | InvalidTemplate] = []
-    for raw in (await client.list(_TEMPLATES, namespace))[0]:
+    for raw in (await client.list(TEMPLATES, namespace))[0]:
         try:
             parsed = parse_object(raw)
         except ValueError as error:

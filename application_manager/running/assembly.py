@@ -7,9 +7,9 @@ enqueues what depends on it.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Awaitable, Callable, Iterable
 
-from application_manager.cache.cluster_cache import DETECTOR, INSTANCE, TASK, TEMPLATE, ClusterCache
+from application_manager.cache.cluster_cache import DETECTOR, INSTANCE, ClusterCache
 from application_manager.cache.detector_index import DetectorIndex
 from application_manager.charts.chartcache import ChartCache
 from application_manager.charts.chartrenderer import ChartRenderer
@@ -43,9 +43,7 @@ from wayside.kubernetes.resources import Resource
 from wayside.kubernetes.workqueue import Key, WorkQueue
 from wayside.process.tracing import Tracing
 
-_JUDGING_PAUSE = (
-    0.3  # s from a change of a template, rule or detector to its status: changes that come together are one
-)
+_JUDGING_PAUSE = 0.3  # s from a change of a template, rule or detector to its status: several changes are one
 _INSTANCE_WORKERS = 16
 _INSTANCE_SHARE = 6  # of these for one namespace: more requests at once make each take longer, also those of others
 _CONFIGURATION_WORKERS = 4
@@ -86,30 +84,30 @@ class Assembly:
         self._traces = None if traced is None else TaskTraces(traced, self.cache)
         if traced is not None:
             measures.registry.register(LostSpans(traced))
-        self._client = client
         self.recorder = Recorder(client, measures)
         applier = self.applier = Applier(client, self.cache.store, resources)
-        measure = measures.reconciled
-        self._instances: WorkQueue[Name] = WorkQueue(
-            "instance", self._reconcile_instance, _INSTANCE_WORKERS, measure=measure, share=_INSTANCE_SHARE
+        instances: WorkQueue[Name] = WorkQueue(
+            "instance",
+            self._where_active(self._reconcile_instance),
+            _INSTANCE_WORKERS,
+            measure=measures.reconciled,
+            share=_INSTANCE_SHARE,
         )
-        self._statuses: WorkQueue[Name] = WorkQueue(
-            "instance status",
-            self._reconcile_instance_status,
-            _STATUS_WORKERS,
-            self._instances,
-            measure,
-            share=_STATUS_SHARE,
-        )
-        self._tasks: WorkQueue[Name] = WorkQueue(
-            "task", self._reconcile_task, _STATUS_WORKERS, self._instances, measure, share=_STATUS_SHARE
-        )
-        self._templates: WorkQueue[Name] = WorkQueue(
-            "template", self._reconcile_template, _JUDGING_WORKERS, self._instances, measure, share=1
-        )
-        self._rules: WorkQueue[RuleKey] = WorkQueue(
-            "rule", self._reconcile_rule, _JUDGING_WORKERS, self._instances, measure, share=1
-        )
+
+        def queue(
+            name: str, work: Callable[[Key], Awaitable[None]], workers: int, share: int | None = None
+        ) -> WorkQueue[Key]:
+            return WorkQueue(name, work, workers, instances, measures.reconciled, share)
+
+        def statuses_of(name: str, reconcile: Callable[[Name], Awaitable[None]]) -> WorkQueue[Name]:
+            return queue(name, self._where_active(reconcile), _STATUS_WORKERS, _STATUS_SHARE)
+
+        # The work is made below, since it enqueues.
+        self._instances = instances
+        self._statuses = statuses_of("instance status", self._reconcile_instance_status)
+        self._tasks = statuses_of("task", self._reconcile_task)
+        self._templates: WorkQueue[Name] = queue("template", self._reconcile_template, _JUDGING_WORKERS, 1)
+        self._rules: WorkQueue[RuleKey] = queue("rule", self._reconcile_rule, _JUDGING_WORKERS, 1)
         self.detector_index = DetectorIndex(options.detectors)
         detectors = DetectorWork(
             self.cache,
@@ -118,31 +116,29 @@ class Assembly:
             lambda name: self._rules.add((DETECTOR, name)),
             SidecarEvents(self.cache, self.detector_index, self.recorder),
         )
-        self._detector_work = detectors
-        self.detectors: WorkQueue[Name] = WorkQueue("detector", self._reconcile_detector, 1, self._instances, measure)
-        queues = (self._instances, self._statuses, self._tasks, self._templates, self._rules, self.detectors)
+        self.detectors = queue("detector", self._where_active(detectors.reconcile), 1)
+        queues = (instances, self._statuses, self._tasks, self._templates, self._rules, self.detectors)
         measures.registry.register(Overview(self.cache, lambda: [(each.name, *each.depth) for each in queues]))
         self.publisher = Publisher(options.zenoh)
         self._configurations: WorkQueue[Name] = WorkQueue(
             "configuration",
             ConfigurationWork(self.cache, client, applier, self.publisher).reconcile,
             _CONFIGURATION_WORKERS,
-            measure=measure,
+            measure=measures.reconciled,
         )
         self.queues = (*queues, self._configurations)
         self.pool = Pool(measures, options.cpu_time)
         self._answers = AnswerCache(self.pool)
-        self._claiming = Claiming(self._answers, self._claimed)
-        self.cache.claims.claim_of = self._claiming
         self.router = Router(
             self.cache,
             applier,
-            self._instances.add,
+            instances.add,
             self._tasks.add,
-            _soon(self._templates),
+            lambda name: self._templates.add_at(name, time.time() + _JUDGING_PAUSE),
             self._judge,
             self._configurations.add,
         )
+        self.cache.claims.claim_of = Claiming(self._answers, self.router.claimed)
         self.cache.claims.settled = self.router.settled
         self.cache.claims.moved = self.router.claimed
         self.cache.overlap.every = options.resync
@@ -152,31 +148,24 @@ class Assembly:
             cache=self.cache,
             statuses=statuses,
             applier=applier,
-            instances=resources[INSTANCE],
             task_changed=self._tasks.add,
             nodes=NodeLook(client),
             failed_pods=FailedPodsLook(client),
             again=self._statuses.add_at,
         )
-        cache = ChartCache(options.helm, options.chart_cache, options.chart_folder)
-        self.charts = ChartRenderer(options.helm, cache, self._instances.add_at)
+        charts = ChartCache(options.helm, options.chart_cache, options.chart_folder)
+        self.charts = ChartRenderer(options.helm, charts, instances.add_at)
         self._renderings = Renderings(
-            self.cache,
-            self._answers,
-            self.charts.outcome,
-            lambda name, _: self._instances.add(name),
-            self._templates.add,
+            self.cache, self._answers, self.charts.outcome, instances.add, self._templates.add
         )
         self._instance_work = InstanceWork(
             cache=self.cache,
             client=client,
             applier=applier,
             recorder=self.recorder,
-            suspending=Suspending(client, applier, resources[INSTANCE], self.router.observe),
-            instances=resources[INSTANCE],
-            tasks=resources[TASK],
-            again=self._instances.add_at,
-            enqueue=self._instances.add,
+            suspending=Suspending(client, applier, self.router.observe),
+            again=instances.add_at,
+            enqueue=instances.add,
             done=self._statuses.add,
             absent=self._absent,
             not_made=self._status_work.report_not_made,
@@ -188,28 +177,14 @@ class Assembly:
             cache=self.cache,
             client=client,
             statuses=statuses,
-            tasks=resources[TASK],
-            templates=resources[TEMPLATE],
             ttl=options.ttl_after_finished,
             again=self._tasks.add_at,
             observe=self.router.observe,
             measures=measures,
             traces=self._traces,
         )
-        self._template_work = TemplateWork(
-            cache=self.cache,
-            statuses=statuses,
-            templates=resources[TEMPLATE],
-            pool=self.pool,
-            again=self._templates.add_at,
-        )
-        self._rule_work = RuleWork(
-            cache=self.cache,
-            statuses=statuses,
-            resources=resources,
-            pool=self.pool,
-            detectors=self.detector_index,
-        )
+        self._template_work = TemplateWork(self.cache, statuses, self.pool, self._templates.add_at)
+        self._rule_work = RuleWork(self.cache, statuses, self.pool, self.detector_index)
 
     async def close(self) -> None:
         """End what works in the background."""
@@ -220,9 +195,6 @@ class Assembly:
     def _absent(self, name: Name, decision: Decision | None) -> None:
         self._renderings.forget(name)
         self._status_work.report(name, decision, None)
-
-    def _claimed(self, name: Name) -> None:
-        self.router.claimed(name)
 
     def begin_term(self, children: Iterable[Resource]) -> None:
         """Begin a term as the active manager: forget what this one did, since others may have acted meanwhile.
@@ -242,32 +214,33 @@ class Assembly:
 
     async def _looks_after(self, namespace: str) -> bool:
         """Whether this manager works in the namespace, and no older one does. Raises NotGranted if it may not write."""
-        await self._client.check_granted(namespace)  # before any read: otherwise each object there would cost one
+        await self.client.check_granted(namespace)  # before any read: otherwise each object there would cost one
         return not self.cache.overlap.yields(namespace)
 
+    def _where_active(self, reconcile: Callable[[Name], Awaitable[None]]) -> Callable[[Name], Awaitable[None]]:
+        """The same work, in namespaces that this manager looks after."""
+
+        async def work(name: Name) -> None:
+            if await self._looks_after(name[0]):
+                await reconcile(name)
+
+        return work
+
     async def _reconcile_instance(self, name: Name) -> None:
-        if not await self._looks_after(name[0]):
-            return
         if self._traces is None:
             await self._instance_work.reconcile(name)
         else:
             await self._traces.reconciling(name, self._instance_work.reconcile)
 
     async def _reconcile_instance_status(self, name: Name) -> None:
-        if await self._looks_after(name[0]):
-            await self._status_work.reconcile(name)
+        await self._status_work.reconcile(name)
 
     async def _reconcile_task(self, name: Name) -> None:
-        if await self._looks_after(name[0]):
-            await self._task_work.reconcile(name)
+        await self._task_work.reconcile(name)
 
     async def _reconcile_template(self, name: Name) -> None:
-        await self._client.check_granted(name[0])
+        await self.client.check_granted(name[0])
         await self._template_work.reconcile(name)
-
-    async def _reconcile_detector(self, name: Name) -> None:
-        if await self._looks_after(name[0]):
-            await self._detector_work.reconcile(name)
 
     async def _reconcile_rule(self, key: RuleKey) -> None:
         if await self._looks_after(key[1][0]):
@@ -278,7 +251,3 @@ class Assembly:
         self._rules.add_at(key, time.time() + _JUDGING_PAUSE)
         if key[0] == DETECTOR:
             self.detectors.add(key[1])
-
-
-def _soon(queue: WorkQueue[Key]) -> Callable[[Key], None]:
-    return lambda key: queue.add_at(key, time.time() + _JUDGING_PAUSE)

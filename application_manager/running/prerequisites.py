@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping
 from functools import partial
 
-from application_manager.cache.cluster_cache import OWN_KINDS, POD, TASK
+from application_manager.cache.cluster_cache import OWN, POD, TASKS
 from application_manager.cluster.entitlement import missing_rights, report_missing
 from application_manager.cluster.leadership import LeaseKey
 from application_manager.core.objects.policy import KindKey, Policy, kind_text
@@ -38,14 +38,14 @@ async def recent_enough(client: Client) -> str:
     return version
 
 
-async def selectable(client: Client, resources: Mapping[KindKey, Resource], namespaces: tuple[str, ...]) -> None:
+async def selectable(client: Client, namespaces: tuple[str, ...]) -> None:
     """Look whether tasks can be listed by their template: CRDs of an older release, or a proxy, may not have it.
 
     Raises ConfigurationError where not.
     """
     namespace = next(iter(sorted(namespaces)), None)
     try:
-        await until_answered(partial(client.list, resources[TASK], namespace, fields="spec.templateName=none"))
+        await until_answered(partial(client.list, TASKS, namespace, fields="spec.templateName=none"))
     except ApiError as error:
         if error.code != 400:
             raise
@@ -61,9 +61,9 @@ async def discovered(client: Client, policy: Policy) -> dict[KindKey, Resource]:
     Raises ConfigurationError where one of our own lacks, or one that is allowed is not namespaced.
     """
     found: dict[KindKey, Resource] = {}
-    for version in sorted({each[0] for each in (*OWN_KINDS, POD, *policy.kinds)}):
+    for version in sorted({each[0] for each in (*OWN, POD, *policy.kinds)}):
         found |= await until_answered(partial(client.discover, version))
-    missing = [kind_text(kind) for kind in OWN_KINDS if kind not in found]
+    missing = [kind_text(kind) for kind in OWN if kind not in found]
     if missing:
         raise ConfigurationError(f"the cluster has no kind {', '.join(missing)}: run kubectl apply -f crds/")
     for kind in sorted(policy.kinds):

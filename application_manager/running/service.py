@@ -18,10 +18,9 @@ from typing import Any
 import kopf
 
 from application_manager.admission.admission import Admission
-from application_manager.admission.injecting import Injecting
 from application_manager.admission.issuing import issuing
 from application_manager.admission.reviewing import ReviewHandler, webhook
-from application_manager.cache.cluster_cache import DETECTOR, OWN_KINDS, POD
+from application_manager.cache.cluster_cache import POD, TEMPLATES
 from application_manager.cluster.client import manager_client
 from application_manager.cluster.entitlement import Grants
 from application_manager.cluster.leadership import RENEWAL_TIMEOUT, Leadership
@@ -66,7 +65,7 @@ async def serve(options: Options) -> None:
         resources = await discovered(client, options.policy)
         runs = options.detectors is not None
         await entitled(client, options.policy, resources, options.namespaces, options.lease, detectors=runs)
-        await selectable(client, resources, options.namespaces)
+        await selectable(client, options.namespaces)
         helm = replace(options.helm, kube_version=version)
         async with issuing(renewals, options.admission):
             work = Assembly(client, replace(options, helm=helm), resources, measures, traced)
@@ -90,14 +89,12 @@ class Manager:
         self._work = work
         self._leadership = leadership
         client, options, resources, measures = work.client, work.options, work.resources, work.measures
-        own = [resources[kind] for kind in OWN_KINDS]
         # Pods always: those of workloads show why they do not run.
         children = [resources[kind] for kind in sorted({*options.policy.kinds, POD}) if kind in resources]
         self._listing = Listing(
             cache=work.cache,
             client=client,
             router=work.router,
-            own=own,
             children=children,
             namespaces=options.namespaces,
             every=options.resync,
@@ -112,23 +109,14 @@ class Manager:
         self._grants = Grants(client, work.router.everything)
         if not options.namespaces:
             client.may_write = self._grants.may_write
-        self._leases = LeaseWatch(work.cache, client, own[0], options.namespaces, work.router.look_at)
+        self._leases = LeaseWatch(work.cache, client, TEMPLATES, options.namespaces, work.router.look_at)
         self._admission = Admission(
             cache=work.cache,
             client=client,
-            resources=resources,
             observe=work.router.observe,
             measures=measures,
             pool=work.pool,
             namespaces=options.namespaces,
-            defaults=options.detectors,
-        )
-        self._injecting = Injecting(
-            cache=work.cache,
-            client=client,
-            detectors=resources[DETECTOR],
-            observe=work.router.observe,
-            measures=measures,
             defaults=options.detectors,
         )
 
@@ -138,7 +126,7 @@ class Manager:
         watching = asyncio.Event()
         review_handlers = {
             path: ReviewHandler(review, watching.is_set, self._work.measures)
-            for path, review in ((PATH, self._admission.review), (INJECTION_PATH, self._injecting.review))
+            for path, review in ((PATH, self._admission.review), (INJECTION_PATH, self._admission.inject))
         }
         _on_signals(stop)
         limit = self._work.options.stalled_after
@@ -229,7 +217,6 @@ class Manager:
 
     async def _watch(self, watching: asyncio.Event) -> None:
         await watch(
-            self._listing.own,
             self._listing.children,
             observe=self._work.router.observe,
             vanished=self._work.router.vanished,

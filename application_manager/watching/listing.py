@@ -8,7 +8,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from application_manager.cache.cluster_cache import ClusterCache
+from application_manager.cache.cluster_cache import OWN, ClusterCache
 from application_manager.cache.store import name_of
 from application_manager.core.objects.ownership import INSTANCE_LABEL
 from application_manager.core.objects.policy import Name
@@ -27,7 +27,6 @@ class Listing:
     """Lists what the manager looks at.
 
     Attributes:
-        own: our own kinds, those that others depend on first.
         children: the kinds of instances' objects.
         namespaces: where; empty: everywhere.
         every: seconds between two resyncs.
@@ -37,7 +36,6 @@ class Listing:
     cache: ClusterCache
     client: Client
     router: Router
-    own: Sequence[Resource]
     children: Sequence[Resource]
     namespaces: tuple[str, ...]
     every: float
@@ -72,12 +70,12 @@ class Listing:
 
         Raises ApiError or Unreachable.
         """
-        for resource in (LEASES, *self.own, *self.children):
+        for resource in (LEASES, *OWN.values(), *self.children):
             if (resource.group, resource.plural) == (group, plural):
                 await self._list(resource, labels, (namespace,))
 
     async def _everything(self) -> None:
-        for resource in self.own:
+        for resource in OWN.values():
             await self._list(resource, "", self.namespaces)
         await asyncio.gather(*(self._list(resource, INSTANCE_LABEL, self.namespaces) for resource in self.children))
         self.router.everything()

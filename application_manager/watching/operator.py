@@ -20,6 +20,7 @@ from typing import Any
 import kopf
 from kopf._cogs.clients import fetching, watching
 
+from application_manager.cache.cluster_cache import OWN
 from application_manager.core.objects.ownership import INSTANCE_LABEL
 from application_manager.watching.pulse import NEVER, Pulse, pulsing
 from wayside.kubernetes.errors import RequestError
@@ -47,7 +48,6 @@ class _Pauses:
 
 
 async def watch(
-    own: Collection[Resource],
     children: Collection[Resource],
     *,
     observe: Handler,
@@ -85,7 +85,7 @@ async def watch(
         """Make kopf watch a kind; the relay handles the events."""
 
     kopf.on.login(registry=registry)(login)
-    for resource in own:
+    for resource in OWN.values():
         kopf.on.event(resource.group, resource.version, resource.plural, registry=registry)(handled)
     for resource, label in ((LEASES, HOLDER_LEASE_LABEL), *((each, INSTANCE_LABEL) for each in children)):
         kopf.on.event(resource.group, resource.version, resource.plural, registry=registry)(handled)

@@ -65,8 +65,7 @@ class SidecarEvents:
 
     def report(self, name: Name) -> None:
         """Post Events about the pods that request the Detector of this namespace and name."""
-        entry = self.cache.store.get(DETECTOR, name)
-        detector = entry.model if entry is not None and isinstance(entry.model, Detector) else None
+        entry, detector = self.cache.store.get(DETECTOR, name), self.cache.detector(name)
         version = entry.version if entry is not None else 0
         before, posted, now = self._posted.pop(name, {}), dict[str, _Posted](), time.time()
         for pod in self.index.requesting.get(name, []):

@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
-from application_manager.cache.cluster_cache import ClusterCache, WorkRecord
+from application_manager.cache.cluster_cache import INSTANCES, TASKS, ClusterCache, WorkRecord
 from application_manager.core.claims.merging import TOO_LARGE
 from application_manager.core.conditions import Aspect, find
 from application_manager.core.demand import drafting
@@ -31,7 +31,7 @@ from wayside.api import ApplicationInstance
 from wayside.api.documents import parse_object
 from wayside.kubernetes.client import Client
 from wayside.kubernetes.errors import ApiError
-from wayside.kubernetes.resources import Object, Resource
+from wayside.kubernetes.resources import Object
 from wayside.process.backoff import pause_after
 
 log = logging.getLogger(__name__)
@@ -104,8 +104,6 @@ class InstanceWork:
     """Reconciles instances.
 
     Attributes:
-        instances: where ApplicationInstances live.
-        tasks: where ApplicationTasks live.
         again: enqueues an instance at a time, in seconds since 1970.
         enqueue: enqueues an instance.
         done: called when an instance's record is new.
@@ -123,8 +121,6 @@ class InstanceWork:
     applier: Applier
     recorder: Recorder
     suspending: Suspending
-    instances: Resource
-    tasks: Resource
     again: Callable[[Name, float], None]
     enqueue: Callable[[Name], None]
     done: Callable[[Name], None]
@@ -212,7 +208,7 @@ class InstanceWork:
             self.cache.places.being_made.add(start.name)  # it takes its place from here on
         try:
             return await asyncio.gather(
-                self.client.apply(self.instances, manifest), self.applier.look(start.name[0], to_look)
+                self.client.apply(INSTANCES, manifest), self.applier.look(start.name[0], to_look)
             )
         except ApiError as error:
             if start.existing is None and error.permanent and not error.terminating:
@@ -269,7 +265,7 @@ class InstanceWork:
 
     async def _look_whether_it_was_made(self, name: Name) -> None:
         """Look for the instance where an attempt to make it failed, and so may have made it or not."""
-        raw = await self.client.get(self.instances, name[0], name[1])
+        raw = await self.client.get(INSTANCES, name[0], name[1])
         if raw is not None:
             self.observe(raw)
         self.cache.places.being_made.discard(name)
@@ -294,7 +290,7 @@ class InstanceWork:
         announced = references({**dict.fromkeys(rendering.keys()), **known.objects})
         status = {"objects": [each.to_json() for each in announced]}
         namespace, name, uid = instance.namespace, instance.name, instance.metadata.uid
-        self.observe(await self.client.patch_status(self.instances, namespace, name, uid, status))
+        self.observe(await self.client.patch_status(INSTANCES, namespace, name, uid, status))
 
     def _note(self, start: _Start, instance: ApplicationInstance, applied: Applied, digest: str | None) -> None:
         too_large = start.decision.too_large
@@ -323,7 +319,7 @@ class InstanceWork:
     async def _list_tasks(self, name: Name) -> None:
         instance = self.cache.instance(name)
         fields = f"spec.templateName={instance.spec.template_name}" if instance is not None else ""
-        async for page, _ in self.client.pages(self.tasks, name[0], fields=fields):
+        async for page, _ in self.client.pages(TASKS, name[0], fields=fields):
             for raw in page:
                 self.observe(raw)
 
@@ -335,7 +331,7 @@ class InstanceWork:
         if self.cache.claims.pending((name[0], instance.spec.template_name)):
             self.again(name, time.time() + _LOOK_AGAIN)  # one of the tasks that were listed may demand it
             return False
-        await self.client.delete(self.instances, name[0], name[1], instance.metadata.uid)
+        await self.client.delete(INSTANCES, name[0], name[1], instance.metadata.uid)
         why = over.yields or "no demand arrived within its linger"
         self.recorder.event(instance, EventReason.PREEMPTED if over.yields else EventReason.RELEASED, why, time.time())
         log.info("instance %s/%s: released: %s", *name, why)

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from application_manager.cache.cluster_cache import ClusterCache, Served, WorkRecord
+from application_manager.cache.cluster_cache import INSTANCES, ClusterCache, Served, WorkRecord
 from application_manager.cluster.looks import FailedPodsLook, NodeLook
 from application_manager.core.conditions import Aspect
 from application_manager.core.demand.decisions import Decision
@@ -29,7 +29,7 @@ from application_manager.work.recorder import EventReason
 from application_manager.work.statuses import StatusWriter
 from wayside.api import ApplicationInstance
 from wayside.api.applicationinstance import ApplicationInstanceStatus
-from wayside.kubernetes.resources import Object, Resource
+from wayside.kubernetes.resources import Object
 
 _TROUBLES_SHOWN = 3
 _SETTLING = 2.0  # s
@@ -43,7 +43,6 @@ class InstanceStatusWork:
     """Writes statuses of instances.
 
     Attributes:
-        instances: where ApplicationInstances live.
         task_changed: enqueues a task.
         nodes: lists the cluster's nodes.
         failed_pods: finds why pods could not be made.
@@ -53,7 +52,6 @@ class InstanceStatusWork:
     cache: ClusterCache
     statuses: StatusWriter
     applier: Applier
-    instances: Resource
     task_changed: Callable[[Name], None]
     nodes: NodeLook
     failed_pods: FailedPodsLook
@@ -84,7 +82,7 @@ class InstanceStatusWork:
         )
         if until > now and instance.status != new:
             self.again(name, until)
-        elif not await self.statuses.write(self.instances, instance, instance.status, new, now):
+        elif not await self.statuses.write(INSTANCES, instance, instance.status, new, now):
             return
         elif old.release_time is None and new.release_time is not None:
             note = f"no demand is left; the instance is released at {new.release_time} unless a demand arrives"

@@ -7,7 +7,6 @@ problem of its template, whose status gives it; what runs of the instance stays 
 from __future__ import annotations
 
 import pickle
-import time
 from collections import OrderedDict
 from collections.abc import Callable
 from functools import partial
@@ -35,7 +34,7 @@ class Renderings:
         cache: ClusterCache,
         answers: AnswerCache,
         charts: Charts,
-        again: Callable[[Name, float], None],
+        again: Callable[[Name], None],
         template_changed: Callable[[Name], None],
     ) -> None:
         """Make it.
@@ -44,7 +43,7 @@ class Renderings:
             cache: the policy, and what exceeded.
             answers: computes the renderings.
             charts: knows what became of a chart.
-            again: enqueues an instance at a time, in seconds since 1970.
+            again: enqueues an instance.
             template_changed: enqueues a template whose renderings exceed the limit, or do so no more.
         """
         self._cache = cache
@@ -103,7 +102,7 @@ class Renderings:
             question=(metadata.uid, metadata.generation, wanted.spec, chart),
             namespace=wanted.namespace,
             job=job,
-            done=partial(self._done, name),
+            done=partial(self._again, name),
         )
 
     def _is_plain(self, template: ApplicationTemplate) -> bool:
@@ -113,9 +112,6 @@ class Renderings:
             while len(self._plain) > _JUDGED:
                 self._plain.popitem(last=False)
         return self._plain[key]
-
-    def _done(self, name: Name) -> None:
-        self._again(name, time.time())
 
     def _bytes(self, template: ApplicationTemplate) -> bytes:
         key = (template.metadata.uid, template.metadata.generation)

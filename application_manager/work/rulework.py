@@ -6,7 +6,7 @@ import time
 from dataclasses import dataclass, field
 from functools import partial
 
-from application_manager.cache.cluster_cache import EVENT_RULE, ClusterCache, surroundings
+from application_manager.cache.cluster_cache import EVENT_RULE, OWN, ClusterCache, surroundings
 from application_manager.cache.detector_index import DetectorIndex
 from application_manager.cache.store import Entry
 from application_manager.core.objects.policy import KindKey, Name
@@ -22,7 +22,6 @@ from wayside.api import Detector, EventRule
 from wayside.api.base import Kind, Metadata
 from wayside.api.detector import DetectorStatus
 from wayside.api.eventrule import EventRuleStatus
-from wayside.kubernetes.resources import Resource
 
 RuleKey = tuple[KindKey, Name]
 """An EventRule or a Detector."""
@@ -35,14 +34,12 @@ class RuleWork:
     """Writes the statuses of rules and detectors.
 
     Attributes:
-        resources: where EventRules and Detectors live.
         pool: where they are checked.
         detectors: what is known of those that the manager runs.
     """
 
     cache: ClusterCache
     statuses: StatusWriter
-    resources: dict[KindKey, Resource]
     pool: Runs
     detectors: DetectorIndex = field(default_factory=DetectorIndex)
 
@@ -58,8 +55,8 @@ class RuleWork:
         now = time.time()
         metadata = Metadata.model_validate(entry.raw["metadata"])
         old, new = await self._judged(kind, name, entry, now)
-        regarding = Kind(kind=self.resources[kind].kind, metadata=metadata)
-        await self.statuses.write(self.resources[kind], regarding, old if entry.raw.get("status") else None, new, now)
+        regarding = Kind(kind=OWN[kind].kind, metadata=metadata)
+        await self.statuses.write(OWN[kind], regarding, old if entry.raw.get("status") else None, new, now)
 
     async def _judged(self, kind: KindKey, name: Name, entry: Entry, now: float) -> tuple[Status, Status]:
         """The status as it is and as it should be."""

@@ -10,6 +10,7 @@ import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from application_manager.cache.cluster_cache import INSTANCES
 from application_manager.core.objects.ownership import controller_uid
 from application_manager.core.objects.rendering import Rendering
 from application_manager.core.objects.suspension import ObjectKey
@@ -18,7 +19,7 @@ from wayside.api import ApplicationInstance
 from wayside.api.applicationinstance import SuspendedReplicas
 from wayside.kubernetes.client import Client
 from wayside.kubernetes.errors import ApiError
-from wayside.kubernetes.resources import Object, Resource
+from wayside.kubernetes.resources import Object
 
 _ATTEMPTS = 5  # at a scale, where somebody else keeps changing the object
 
@@ -30,13 +31,11 @@ class Suspending:
     """Scales the workloads of instances.
 
     Attributes:
-        instances: where ApplicationInstances live.
         observe: takes an object that was read.
     """
 
     client: Client
     applier: Applier
-    instances: Resource
     observe: Callable[[Object], None]
 
     async def settle(self, instance: ApplicationInstance, rendering: Rendering) -> None:
@@ -112,7 +111,7 @@ class Suspending:
         ]
         status = {"suspendedReplicas": noted}
         uid = instance.metadata.uid
-        self.observe(await self.client.patch_status(self.instances, *_name(instance), uid, status))
+        self.observe(await self.client.patch_status(INSTANCES, *_name(instance), uid, status))
 
 
 def _name(instance: ApplicationInstance) -> tuple[str, str]:

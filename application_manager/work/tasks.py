@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-from application_manager.cache.cluster_cache import ClusterCache
+from application_manager.cache.cluster_cache import TASKS, TEMPLATES, ClusterCache
 from application_manager.core.claims.claims import Claim, Refused
 from application_manager.core.claims.operations import Standing, Verdict
 from application_manager.core.conditions import changed
@@ -23,7 +23,7 @@ from wayside.api.applicationtask import ApplicationTaskStatus
 from wayside.api.documents import parse_object
 from wayside.kubernetes.client import Client
 from wayside.kubernetes.errors import ApiError
-from wayside.kubernetes.resources import Object, Resource
+from wayside.kubernetes.resources import Object
 from wayside.times import parse_seconds
 
 _SHED = Verdict(
@@ -42,8 +42,6 @@ class TaskWork:
     """Writes the statuses of tasks.
 
     Attributes:
-        tasks: where ApplicationTasks live.
-        templates: where ApplicationTemplates live.
         ttl: seconds that a finished task is kept.
         again: enqueues a task at a time, in seconds since 1970.
         observe: takes an object that was read.
@@ -54,8 +52,6 @@ class TaskWork:
     cache: ClusterCache
     client: Client
     statuses: StatusWriter
-    tasks: Resource
-    templates: Resource
     ttl: float
     again: Callable[[Name, float], None]
     observe: Callable[[Object], None]
@@ -81,7 +77,7 @@ class TaskWork:
 
     async def _write_shed(self, name: Name) -> None:
         """Write that a task is not taken in; it is read for that alone."""
-        raw = await self.client.get(self.tasks, *name)
+        raw = await self.client.get(TASKS, *name)
         try:
             task = parse_object(trimming.own(raw)) if raw is not None else None
         except ValueError:
@@ -94,7 +90,7 @@ class TaskWork:
         old = task.status or ApplicationTaskStatus()
         new = task_status(task, verdict, service, now)
         try:
-            if not await self.statuses.write(self.tasks, task, task.status, new, now, _OWN_CONDITIONS):
+            if not await self.statuses.write(TASKS, task, task.status, new, now, _OWN_CONDITIONS):
                 return
             self._measure(task, old, new, now)
             if self.traces is not None:
@@ -121,7 +117,7 @@ class TaskWork:
             self.measures.ready(since_start)
 
     async def _has_template(self, namespace: str, template: str) -> bool:
-        found = await self.client.get(self.templates, namespace, template)
+        found = await self.client.get(TEMPLATES, namespace, template)
         if found is not None:
             self.observe(found)
         return found is not None
@@ -158,5 +154,5 @@ class TaskWork:
         if time.time() < since + self.ttl:
             self.again(name, since + self.ttl)
             return
-        await self.client.delete(self.tasks, name[0], name[1], task.metadata.uid)
+        await self.client.delete(TASKS, name[0], name[1], task.metadata.uid)
         log.info("task %s/%s: deleted %g s after it finished", *name, self.ttl)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
-from application_manager.cache.cluster_cache import TEMPLATE, ClusterCache
+from application_manager.cache.cluster_cache import TEMPLATE, TEMPLATES, ClusterCache
 from application_manager.cache.overlap_index import Turn
 from application_manager.core.claims.claims import InvalidTemplate
 from application_manager.core.findings.findings import Findings
@@ -19,7 +19,6 @@ from application_manager.work.statuses import StatusWriter
 from application_manager.workers.pool import ExceededError, Runs
 from wayside.api.applicationtemplate import ApplicationTemplateStatus, TemplateManager
 from wayside.api.base import Kind, Metadata
-from wayside.kubernetes.resources import Resource
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,14 +26,12 @@ class TemplateWork:
     """Writes the statuses of templates.
 
     Attributes:
-        templates: where ApplicationTemplates live.
         pool: where templates are checked.
         again: enqueues a template at a time, in seconds since 1970.
     """
 
     cache: ClusterCache
     statuses: StatusWriter
-    templates: Resource
     pool: Runs
     again: Callable[[Name, float], None]
 
@@ -47,7 +44,7 @@ class TemplateWork:
         if entry is None:
             return
         metadata = Metadata.model_validate(entry.raw["metadata"])
-        regarding = Kind(kind=self.templates.kind, metadata=metadata)
+        regarding = Kind(kind=TEMPLATES.kind, metadata=metadata)
         now = time.time()
         old = ApplicationTemplateStatus.model_validate(entry.raw.get("status") or {})
         own = self.cache.overlap.own()
@@ -59,7 +56,7 @@ class TemplateWork:
             return
         findings = await self._findings(name)
         new = template_status(old, metadata.generation, findings, len(self.cache.instances_of(name)), now, own)
-        await self.statuses.write(self.templates, regarding, old if entry.raw.get("status") else None, new, now)
+        await self.statuses.write(TEMPLATES, regarding, old if entry.raw.get("status") else None, new, now)
 
     async def _challenge(self, regarding: Kind, own: TemplateManager, now: float) -> None:
         """Find out by the template's status whether the other manager of the namespace is alive."""
@@ -68,7 +65,7 @@ class TemplateWork:
             f"this namespace is managed by the managers of the Leases {other} and {own.lease}: the second one stands by"
         )
         self.statuses.recorder.event(regarding, EventReason.MANAGERS_OVERLAP, note, now, once=True)
-        await self.statuses.merge(self.templates, regarding, {"manager": own.to_json()})
+        await self.statuses.merge(TEMPLATES, regarding, {"manager": own.to_json()})
 
     async def _findings(self, name: Name) -> Findings:
         template = self.cache.template(name)

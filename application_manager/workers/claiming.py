@@ -55,7 +55,3 @@ class Claiming:
                 what = f"spec.parameters: checking them against template {template.name}"
                 return Verdict(Standing.REFUSED, Refused.EXPRESSION_LIMIT, f"{what} {message}")
         return None
-
-    def forget(self, name: Name) -> None:
-        """Drop what is known of a task that is deleted."""
-        self._answers.forget(("claim", *name))

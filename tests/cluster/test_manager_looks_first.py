@@ -28,8 +28,6 @@ from wayside.kubernetes.client import Client
 from wayside.kubernetes.connection import load_configuration
 from wayside.kubernetes.resources import Object, Resource
 
-INSTANCES = Resource(API_VERSION, "ApplicationInstance", "applicationinstances")
-TASKS = Resource(API_VERSION, "ApplicationTask", "applicationtasks")
 LINGERING = {"phase": "Lingering", "releaseTime": "2020-01-01T00:00:00Z"}
 NORTH = instance_name("app", "north")
 
@@ -48,9 +46,7 @@ def work_on(cache: ClusterCache, client: Client) -> tuple[Router, InstanceWork]:
         client=client,
         applier=applier,
         recorder=Recorder(client),
-        suspending=Suspending(client, applier, INSTANCES, router.observe),
-        instances=INSTANCES,
-        tasks=TASKS,
+        suspending=Suspending(client, applier, router.observe),
         again=ignore,
         enqueue=ignore,
         done=ignore,

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from kubernetes.aio.client import Configuration
 
 from application_manager.admission.admission import Admission
-from application_manager.cache.cluster_cache import DETECTOR, EVENT_RULE, TEMPLATE, ClusterCache
+from application_manager.cache.cluster_cache import ClusterCache
 from application_manager.core.findings.findings import Findings
 from application_manager.core.findings.reviews import LONGEST, MOST_REPORTED, ReviewError, answer, read
 from application_manager.core.findings.webhooks import WebhookClientConfig, webhook_configuration
@@ -20,7 +20,7 @@ from application_manager.measures import Measures
 from tests.inprocess import InProcess
 from tests.unit.manager_objects import template
 from tests.unit.templates.test_findings import counting, deploying, detector, rule
-from wayside.api import API_VERSION, Kind
+from wayside.api import Kind
 from wayside.kubernetes.client import Client
 from wayside.kubernetes.errors import ApiError
 from wayside.kubernetes.resources import Resource
@@ -177,11 +177,8 @@ def reviewed(
         cache = ClusterCache(Policy())
         for each in known:
             cache.store.put(raw(each, 1))
-        resources = {
-            kind: Resource(API_VERSION, kind[1], f"{kind[1].lower()}s") for kind in (DETECTOR, EVENT_RULE, TEMPLATE)
-        }
         client = Cluster(*live)
-        admission = Admission(cache, client, resources, cache.store.put, Measures(), InProcess(), namespaces)
+        admission = Admission(cache, client, cache.store.put, Measures(), InProcess(), namespaces)
         requested = question("CREATE" if old is None else "UPDATE", new.to_json(), old and old.to_json(), new.kind)
         try:
             return await admission.review(requested)

@@ -21,8 +21,6 @@ from wayside.kubernetes.errors import ApiError
 from wayside.kubernetes.resources import Object, Resource
 
 CONFIG_MAPS = Resource("v1", "ConfigMap", "configmaps")
-INSTANCES = Resource(API_VERSION, "ApplicationInstance", "applicationinstances")
-TASKS = Resource(API_VERSION, "ApplicationTask", "applicationtasks")
 
 
 class MemoryServer:
@@ -89,9 +87,7 @@ def work_on(cache: ClusterCache, server: object, absent: list[Name]) -> Instance
         client=client,
         applier=applier,
         recorder=Recorder(client),
-        suspending=Suspending(client, applier, INSTANCES, cache.store.put),
-        instances=INSTANCES,
-        tasks=TASKS,
+        suspending=Suspending(client, applier, cache.store.put),
         again=lambda name, at: None,
         enqueue=lambda name: None,
         done=lambda name: None,

@@ -16,7 +16,7 @@ from application_manager.work.recorder import Recorder
 from application_manager.work.statuses import StatusWriter
 from application_manager.work.tasks import TaskWork
 from tests.otlp import Received, Receiver
-from tests.unit.manager.memory_server import CONFIG_MAPS, TASKS, MemoryServer, a_world, raw, work_on
+from tests.unit.manager.memory_server import CONFIG_MAPS, MemoryServer, a_world, raw, work_on
 from tests.unit.manager_objects import task, template
 from wayside.api import ApplicationTask
 from wayside.kubernetes.client import Client
@@ -69,8 +69,6 @@ def spans(monkeypatch: pytest.MonkeyPatch, run: Run) -> dict[str, Received]:
                 cache=cache,
                 client=client,
                 statuses=StatusWriter(client, Recorder(client), cache.store.put),
-                tasks=TASKS,
-                templates=TASKS,
                 ttl=60,
                 again=lambda name, at: None,
                 observe=cache.store.put,

@@ -147,8 +147,7 @@ def test_what_passed_the_api_server_and_is_invalid_is_reported_in_its_status(kin
 
     async def reconcile_twice() -> None:
         client = Accepting(Configuration(), "test", field_manager="test")
-        resources = {(API_VERSION, kind): Resource(API_VERSION, kind, f"{kind.lower()}s")}
-        work = RuleWork(cache, StatusWriter(client, Recorder(client), observe), resources, InProcess())
+        work = RuleWork(cache, StatusWriter(client, Recorder(client), observe), InProcess())
         await work.reconcile(((API_VERSION, kind), ("site", "odd")))
         await work.reconcile(((API_VERSION, kind), ("site", "odd")))
         await client.close()
