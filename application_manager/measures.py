@@ -6,13 +6,28 @@ Labels are queues, reasons, phases and codes, never names of objects: there may 
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector, generate_latest
+from prometheus_client.core import GaugeMetricFamily, Metric
 
 PREFIX = "wayside_manager_"
 
 _SERVICE = (0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 60, 120, 300, 600)  # s from an event to what follows
 _WORK = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 15)  # s of a request or a reconciliation
+
+
+def gauge(name: str, text: str, value: float) -> Metric:
+    """A number as of now, for a collector."""
+    return GaugeMetricFamily(f"{PREFIX}{name}", text, value)
+
+
+def gauges(name: str, text: str, label: str, values: Iterable[tuple[str, float]]) -> Metric:
+    """A number for each value of a label, as of now."""
+    family = GaugeMetricFamily(f"{PREFIX}{name}", text, labels=(label,))
+    for of, value in values:
+        family.add_metric((of,), value)
+    return family
 
 
 class Measures:

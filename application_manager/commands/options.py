@@ -5,6 +5,8 @@ What is read into is imported when it is read, as all that a command runs.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,47 +23,48 @@ if TYPE_CHECKING:
     from application_manager.core.objects.policy import Policy
 
 
+@contextmanager
+def checking(option: str) -> Iterator[None]:
+    """Report a ValueError of the block as one of this option's value."""
+    try:
+        yield
+    except ValueError as error:
+        raise typer.BadParameter(str(error), param_hint=option) from None
+
+
 def seconds_of(option: str, written: str) -> float:
     """The duration of an option, in seconds."""
     from wayside.api.base import Duration
 
-    try:
+    with checking(option):
         return Duration.parse(written).seconds
-    except ValueError as error:
-        raise typer.BadParameter(str(error), param_hint=option) from None
 
 
 def option_bytes(option: str, written: str) -> int:
     """The quantity of an option, in bytes."""
     from wayside.api.base import PositiveQuantity
 
-    try:
+    with checking(option):
         return PositiveQuantity.parse(written).bytes
-    except ValueError as error:
-        raise typer.BadParameter(str(error), param_hint=option) from None
 
 
 def policy_of(kinds: list[str] | None, accounts: list[str] | None, *, everywhere: bool = False) -> Policy:
     """The policy; `everywhere`: of a manager of all namespaces."""
     from application_manager.core.objects.policy import Policy
 
-    try:
+    with checking("--allowed-kinds"):
         policy = Policy.parse(kinds, accounts)
         if everywhere:
             policy.check_everywhere()
         return policy
-    except ValueError as error:
-        raise typer.BadParameter(str(error), param_hint="--allowed-kinds") from None
 
 
 def tasks_of(most: int | None, holders: list[str] | None) -> TaskPolicy:
     """The bounds of tasks: of `--max-tasks` and `--holder-policy`."""
     from application_manager.core.holders.policies import HolderPolicy, TaskPolicy
 
-    try:
+    with checking("--holder-policy"):
         return TaskPolicy(most, tuple(HolderPolicy.parse(each) for each in holders or ()))
-    except ValueError as error:
-        raise typer.BadParameter(str(error), param_hint="--holder-policy") from None
 
 
 def serving_of(port: int | None, certificates: Path | None, service: str | None, webhooks: str) -> Serving | None:
@@ -75,10 +78,8 @@ def serving_of(port: int | None, certificates: Path | None, service: str | None,
         commandline.refuse(f"give both {PORT_OPTION} and {FOLDER_OPTION}, or neither")
     if service is None:
         return Serving(port, certificates)
-    try:
+    with checking("--admission-service"):
         certificate_secret(service)
-    except ValueError as error:
-        raise typer.BadParameter(str(error), param_hint="--admission-service") from None
     return Serving(port, certificates, service, webhooks)
 
 
@@ -86,10 +87,8 @@ def lease_of(given: str | None, namespaces: tuple[str, ...]) -> LeaseKey:
     """The Lease of the managers."""
     from application_manager.cluster.leadership import lease_key
 
-    try:
+    with checking("--lease"):
         return lease_key(given, namespaces)
-    except ValueError as error:
-        raise typer.BadParameter(str(error), param_hint="--lease") from None
 
 
 def detectors_of(
@@ -103,13 +102,10 @@ def detectors_of(
     """What holds for the pods of detectors; None: no detector is run."""
     from application_manager.core.objects.poddefaults import USER, PodDefaults, parse_environment, parse_user
 
-    option = "--detector-env"
-    try:
+    with checking("--detector-env"):
         environment = parse_environment(variables or ())
-        option = "--detector-user"
+    with checking("--detector-user"):
         number = USER if user is None else parse_user(user)
-    except ValueError as error:
-        raise typer.BadParameter(str(error), param_hint=option) from None
     if image:
         return PodDefaults(image, policy, tuple(secrets or ()), environment, number, metrics_secret)
     if policy or secrets or environment or user or metrics_secret:

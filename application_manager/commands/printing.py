@@ -5,11 +5,15 @@ Declared here; what a command runs is imported when it runs, so that `--help` ne
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from application_manager.commands.options import checking, lease_of, policy_of
+from wayside.process import commandline
 from wayside.process.beginning import importing
 
 
@@ -55,9 +59,43 @@ def webhooks(
 ) -> None:
     """Print the webhook configurations for a manager with --admission-port."""
     with importing():
-        from application_manager.commands.webhooks import print_webhooks
+        from application_manager.core.findings.webhooks import (
+            WebhookClientConfig,
+            injection_configuration,
+            webhook_configuration,
+        )
+        from wayside.manifests import to_yaml
 
-    print_webhooks(service, url, ca_bundle, make_certificates, namespace or (), name, detectors=detectors)
+    if (service is None) == (url is None):
+        commandline.refuse("give either --service NAMESPACE/NAME or --url https://HOST:PORT")
+    if ca_bundle is not None and make_certificates is not None:
+        commandline.refuse("give either --ca-bundle or --make-certificates")
+    with checking("--url" if service is None else "--service"):
+        place = (
+            WebhookClientConfig.of_service(service) if service is not None else WebhookClientConfig.of_url(url or "")
+        )
+    bundle = _authority(ca_bundle, make_certificates, place.hosts)
+    made = [webhook_configuration, *([injection_configuration] if detectors else [])]
+    sys.stdout.write(to_yaml([each(place, bundle, namespace or (), name) for each in made]))
+
+
+def _authority(given: Path | None, folder: Path | None, hosts: Sequence[str]) -> bytes | None:
+    """The certificate of the CA, in the file or made in the folder. Raises ConfigurationError."""
+    if folder is not None:
+        from application_manager.admission.issuing import make_certificates
+
+        return make_certificates(folder, hosts)
+    if given is None:
+        return None
+    from wayside.kubernetes.connection import ConfigurationError
+
+    try:
+        content = given.read_bytes()
+    except OSError as error:
+        raise ConfigurationError(f"--ca-bundle {given}: {error.strerror or error}: give a readable file") from error
+    if b"-----BEGIN CERTIFICATE-----" not in content:
+        raise ConfigurationError(f"--ca-bundle {given}: contains no certificate: give the CA's PEM file")
+    return content
 
 
 def rbac(
@@ -102,19 +140,34 @@ def rbac(
     Kinds other than the default ones are looked up in the cluster of the current kubeconfig.
     """
     with importing():
-        from application_manager.commands.rbac import print_rbac
+        from application_manager.cluster.leadership import LEASE_NAME
+        from application_manager.commands.plurals import plurals
+        from application_manager.core.findings.webhooks import certificate_secret
+        from application_manager.core.objects.rights import roles
+        from wayside.manifests import to_yaml
 
-    print_rbac(
-        allowed_kinds,
+    where, _, who = account.partition("/")
+    if not where or not who:
+        raise typer.BadParameter(f"{account!r} is not a service account: write NAMESPACE/NAME", param_hint="--account")
+    if grant and namespace:
+        raise typer.BadParameter("remove it, or --namespace, whose Roles already permit writing", param_hint="--grant")
+    policy = policy_of(allowed_kinds, None, everywhere=not namespace)
+    key = lease_of(lease if lease and "/" in lease else f"{where}/{lease or LEASE_NAME}", ())
+    certificates = None
+    if admission_service:
+        with checking("--admission-service"):
+            certificates = certificate_secret(admission_service), admission_webhooks
+    made = roles(
+        plurals(policy),
         namespace or (),
-        account,
-        lease,
+        (key.namespace, key.name),
+        (where, who),
         name,
         detectors=detectors,
-        grant=grant or (),
-        service=admission_service,
-        webhooks=admission_webhooks,
+        granted=grant or (),
+        certificates=certificates,
     )
+    sys.stdout.write(to_yaml(made))
 
 
 def detector_rbac(
@@ -129,9 +182,27 @@ def detector_rbac(
 ) -> None:
     """Print the service account and the minimal roles of a detector that you run yourself."""
     with importing():
-        from application_manager.commands.rbac import print_detector_rbac
+        from application_manager.core.objects.detectors import detector_roles, sidecar_roles
+        from wayside.manifests import to_yaml
 
-    print_detector_rbac(name, namespace, pod_account or ())
+    _check_name(name, "Detector", "NAME")
+    for account in pod_account or ():
+        _check_name(account, "service account", "--pod-account")
+    made = sidecar_roles(namespace, name, pod_account) if pod_account else detector_roles(namespace, name)
+    sys.stdout.write(to_yaml(made))
+
+
+def _check_name(name: str, what: str, option: str) -> None:
+    from pydantic import TypeAdapter, ValidationError
+
+    from wayside.api.base import ObjectName
+
+    try:
+        TypeAdapter(ObjectName).validate_python(name)
+    except ValidationError:
+        raise typer.BadParameter(
+            f"{name!r} is not a {what} name: use at most 63 lower-case letters, digits and -", param_hint=option
+        ) from None
 
 
 def inject(

@@ -38,7 +38,7 @@ def updated(
     now: float,
     *,
     only_while: Iterable[str] = (),
-) -> tuple[Condition, ...]:
+) -> list[Condition]:
     """The conditions that the aspects make; one keeps its time of transition while its status stays.
 
     Conditions of other types are kept, but for those of the types `only_while`. `now` is in seconds since 1970.
@@ -53,11 +53,11 @@ def updated(
             type=aspect.type,
             status=aspect.status,
             reason=aspect.reason,
-            message=_cut(aspect.message),
+            message=cut(aspect.message),
             observed_generation=generation,
             last_transition_time=old.last_transition_time if old is not None and kept else format_seconds(now),
         )
-    return tuple(by_type.values())
+    return list(by_type.values())
 
 
 def find(conditions: Iterable[Condition], type_: str) -> Condition | None:
@@ -77,8 +77,9 @@ def changed(old: Iterable[Condition], new: Iterable[Condition]) -> list[Conditio
     return [each for each in new if before.get(each.type) != (each.status, each.reason)]
 
 
-def _cut(message: str) -> str:
-    return message if len(message) <= MAXIMUM_MESSAGE else message[: MAXIMUM_MESSAGE - 1] + "…"
+def cut(message: str, longest: int = MAXIMUM_MESSAGE) -> str:
+    """The message, of at most so many characters."""
+    return message if len(message) <= longest else f"{message[: longest - 1]}…"
 
 
 READY = "Ready"
@@ -87,7 +88,7 @@ STALLED = "Stalled"
 
 def concluded(
     known: Sequence[Condition], aspects: Sequence[Aspect], generation: int, now: float, *, stalled: Collection[str]
-) -> tuple[Condition, ...]:
+) -> list[Condition]:
     """The conditions that the aspects make, with Ready and Stalled as follows from them.
 
     Args:

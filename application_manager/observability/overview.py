@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 
-from prometheus_client.core import GaugeMetricFamily, Metric
+from prometheus_client.core import Metric
 from prometheus_client.registry import Collector
 
 from application_manager.cache.cluster_cache import INSTANCE, TASK, TEMPLATE, ClusterCache
-from application_manager.measures import PREFIX
+from application_manager.core.objects.policy import KindKey
+from application_manager.measures import gauge, gauges
 from wayside.api.applicationinstance import InstancePhase
 from wayside.api.applicationtask import TaskPhase
 
@@ -30,54 +31,31 @@ class Overview(Collector):
 
     def collect(self) -> Iterator[Metric]:
         """The metrics as of now."""
-        yield self._phases("tasks", "ApplicationTasks by phase", TASK, [each.value for each in TaskPhase])
-        yield self._phases(
-            "instances", "ApplicationInstances by phase", INSTANCE, [each.value for each in InstancePhase]
-        )
-        yield self._templates()
-        depth = GaugeMetricFamily(f"{PREFIX}queue_depth", "Keys that wait for a worker", labels=("queue",))
-        later = GaugeMetricFamily(f"{PREFIX}queue_later", "Keys that wait for a time or a retry", labels=("queue",))
-        for name, waiting, timed in self._queues():
-            depth.add_metric((name,), waiting)
-            later.add_metric((name,), timed)
-        yield from (depth, later)
-        yield self._leases()
-        shed = GaugeMetricFamily(f"{PREFIX}tasks_shed", "ApplicationTasks that wait because memory is short")
-        shed.add_metric((), len(self._cache.store.shed))
-        yield shed
-        yielded = GaugeMetricFamily(f"{PREFIX}namespaces_yielded", "Namespaces in which an older manager is active")
-        yielded.add_metric((), self._cache.overlap.count)
-        yield yielded
-        reached = GaugeMetricFamily(f"{PREFIX}api_reached", "1 while the API server responds")
-        reached.add_metric((), float(self._cache.healthy.reached))
-        yield reached
-
-    def _phases(self, name: str, text: str, kind: tuple[str, str], phases: Sequence[str]) -> Metric:
-        family = GaugeMetricFamily(f"{PREFIX}{name}", text, labels=("phase",))
-        found = Counter(
-            (entry.raw.get("status") or {}).get("phase") or NO_PHASE for _, entry in self._cache.store.all(kind)
-        )
-        for phase in (*phases, NO_PHASE):
-            family.add_metric((phase,), found[phase])
-        return family
-
-    def _templates(self) -> Metric:
-        family = GaugeMetricFamily(f"{PREFIX}templates", "ApplicationTemplates by Accepted", labels=("accepted",))
-        found = Counter(_accepted(entry.raw) for _, entry in self._cache.store.all(TEMPLATE))
-        for status in ("True", "False", "Unknown"):
-            family.add_metric((status,), found[status])
-        return family
-
-    def _leases(self) -> Metric:
-        family = GaugeMetricFamily(
-            f"{PREFIX}leases", "Holders of demands by the state of their Lease", labels=("state",)
-        )
+        yield self._phases("tasks", "ApplicationTasks by phase", TASK, TaskPhase)
+        yield self._phases("instances", "ApplicationInstances by phase", INSTANCE, InstancePhase)
+        accepted = Counter(_accepted(entry.raw) for _, entry in self._cache.store.all(TEMPLATE))
+        by_status = [(each, accepted[each]) for each in ("True", "False", "Unknown")]
+        yield gauges("templates", "ApplicationTemplates by Accepted", "accepted", by_status)
+        queues = list(self._queues())
+        depth = [(name, waiting) for name, waiting, _ in queues]
+        yield gauges("queue_depth", "Keys that wait for a worker", "queue", depth)
+        later = [(name, timed) for name, _, timed in queues]
+        yield gauges("queue_later", "Keys that wait for a time or a retry", "queue", later)
         at = self._cache.healthy.elapsed
         views = [self._cache.leases.view(key, at) for key in self._cache.claims.holders()]
         overdue = sum(view.unchanged >= view.duration for view in views)
-        family.add_metric(("renewed",), len(views) - overdue)
-        family.add_metric(("overdue",), overdue)
-        return family
+        states = [("renewed", len(views) - overdue), ("overdue", overdue)]
+        yield gauges("leases", "Holders of demands by the state of their Lease", "state", states)
+        shed = len(self._cache.store.shed)
+        yield gauge("tasks_shed", "ApplicationTasks that wait because memory is short", shed)
+        yielded = self._cache.overlap.count
+        yield gauge("namespaces_yielded", "Namespaces in which an older manager is active", yielded)
+        yield gauge("api_reached", "1 while the API server responds", self._cache.healthy.reached)
+
+    def _phases(self, name: str, text: str, kind: KindKey, phases: Iterable[str]) -> Metric:
+        stored = (entry.raw.get("status") or {} for _, entry in self._cache.store.all(kind))
+        found = Counter(each.get("phase") or NO_PHASE for each in stored)
+        return gauges(name, text, "phase", [(each, found[each]) for each in (*phases, NO_PHASE)])
 
 
 def _accepted(raw: dict[str, object]) -> str:

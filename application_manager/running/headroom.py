@@ -13,10 +13,10 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from prometheus_client.core import GaugeMetricFamily, Metric
+from prometheus_client.core import Metric
 from prometheus_client.registry import Collector
 
-from application_manager.measures import PREFIX
+from application_manager.measures import gauge
 
 _FULL, _ROOM = 0.85, 0.75  # of the limit: beyond the first it is tight, until it is below the second
 _LOOK_EVERY = 0.5  # s
@@ -56,17 +56,11 @@ class Headroom(Collector):
 
     def collect(self) -> Iterator[Metric]:
         """The metrics as of now."""
-        used = GaugeMetricFamily(f"{PREFIX}memory_bytes", "Resident memory of the manager and its worker processes")
-        used.add_metric((), _resident())
-        tight = GaugeMetricFamily(f"{PREFIX}memory_tight", "1 while memory is short and no new tasks are accepted")
-        tight.add_metric((), float(self.tight()))
-        yield from (used, tight)
+        what = "of the manager and its worker processes"
+        yield gauge("memory_bytes", f"Resident memory {what}", _resident())
+        yield gauge("memory_tight", "1 while memory is short and no new tasks are accepted", self.tight())
         if self.limit is not None:
-            limit = GaugeMetricFamily(
-                f"{PREFIX}memory_limit_bytes", "Memory limit of the manager and its worker processes"
-            )
-            limit.add_metric((), self.limit)
-            yield limit
+            yield gauge("memory_limit_bytes", f"Memory limit {what}", self.limit)
 
     def _look(self, limit: int) -> None:
         used = _resident()

@@ -16,10 +16,10 @@ from contextlib import contextmanager
 from typing import Any
 
 from kopf._cogs.clients import errors, watching
-from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.core import CounterMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from application_manager.measures import PREFIX
+from application_manager.measures import PREFIX, gauges
 
 WATCH_TIMEOUT = 90.0
 """Seconds without an event or a bookmark after which a watch is restarted: the API server sends one a minute."""
@@ -85,19 +85,10 @@ class Pulse(Collector):
         now, ages = time.monotonic(), dict[str, float]()
         for (resource, _), (since, _) in self._beats.copy().items():
             ages[resource] = max(ages.get(resource, 0.0), now - since)
-        family = GaugeMetricFamily(
-            f"{PREFIX}watch_age_seconds",
-            "Seconds since the last event or bookmark of the quietest watch",
-            labels=("resource",),
-        )
-        for resource, age in sorted(ages.items()):
-            family.add_metric((resource,), age)
-        yield family
-        restarts = CounterMetricFamily(
-            f"{PREFIX}watch_restarts", "Watches that were restarted because they were silent"
-        )
-        restarts.add_metric((), self._restarts)
-        yield restarts
+        text = "Seconds since the last event or bookmark of the quietest watch"
+        yield gauges("watch_age_seconds", text, "resource", sorted(ages.items()))
+        text = "Watches that were restarted because they were silent"
+        yield CounterMetricFamily(f"{PREFIX}watch_restarts", text, self._restarts)
 
 
 @contextmanager

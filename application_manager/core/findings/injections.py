@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from application_manager.core.findings.reviews import REVIEW_VERSION, Json, ReviewError, shortened
+from application_manager.core.findings.reviews import REVIEW_VERSION, Json, request_in, shortened
 from application_manager.core.findings.rulefindings import detector_findings
 from application_manager.core.objects.poddefaults import PodDefaults
 from application_manager.core.objects.sidecars import SIDECAR_LABEL, Addition, SidecarError, addition, patch
@@ -111,11 +111,7 @@ def _why_not(name: str, metadata: Mapping[str, Any], spec: Mapping[str, Any], de
 
 def read_pod(review: Any) -> PodRequest:
     """The question in an AdmissionReview about a pod. Raises ReviewError."""
-    if not isinstance(review, dict) or review.get("apiVersion") != REVIEW_VERSION:
-        raise ReviewError(f"is not an AdmissionReview of {REVIEW_VERSION}: only the API server may call this path")
-    raw = review.get("request")
-    if not isinstance(raw, dict) or not isinstance(raw.get("uid"), str):
-        raise ReviewError("request.uid: is missing: only the API server may call this path")
+    raw = request_in(review)
     pod, kind = raw.get("object"), raw.get("kind")
     made = raw.get("operation") == "CREATE" and not raw.get("subResource")
     ours = isinstance(kind, dict) and (kind.get("group"), kind.get("kind")) == ("", "Pod")

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
+from application_manager.core.conditions import cut
 from application_manager.core.findings.findings import Findings, field_of
 from wayside.api.base import API_VERSION, GROUP
 
@@ -57,13 +58,19 @@ class Request:
     weight: Weight
 
 
-def read(review: Any) -> Request:
-    """The question in an AdmissionReview. Raises ReviewError."""
+def request_in(review: Any) -> Json:
+    """The `request` of an AdmissionReview, which has a uid. Raises ReviewError."""
     if not isinstance(review, dict) or review.get("apiVersion") != REVIEW_VERSION:
         raise ReviewError(f"is not an AdmissionReview of {REVIEW_VERSION}: only the API server may call this path")
     raw = review.get("request")
     if not isinstance(raw, dict) or not isinstance(raw.get("uid"), str):
         raise ReviewError("request.uid: is missing: only the API server may call this path")
+    return raw
+
+
+def read(review: Any) -> Request:
+    """The question in an AdmissionReview. Raises ReviewError."""
+    raw = request_in(review)
     kind, new, old = (raw.get(name) for name in ("kind", "object", "oldObject"))
     kind = kind if isinstance(kind, dict) else {}
     new = dict(new) if isinstance(new, dict) else {}
@@ -131,7 +138,7 @@ def shortened(texts: tuple[str, ...]) -> list[str]:
 
 def _line(text: str) -> str:
     line = " ".join("".join(sign if sign.isprintable() else " " for sign in text).split())
-    return line if len(line) <= LONGEST else f"{line[: LONGEST - 1]}…"
+    return cut(line, LONGEST)
 
 
 def _metadata(raw: Mapping[str, Any]) -> Json:

@@ -88,23 +88,8 @@ def webhook_configuration(
         namespaces: those that are managed; empty: all.
         name: the object's.
     """
-    webhook: dict[str, Any] = {
-        "name": f"admission.{GROUP}",
-        "clientConfig": place.at(PATH, authority),
-        "rules": [
-            {
-                "apiGroups": [GROUP],
-                "apiVersions": [VERSION],
-                "operations": ["CREATE", "UPDATE"],
-                "resources": sorted(REVIEWED.values()),
-                "scope": "Namespaced",
-            }
-        ],
-        "failurePolicy": "Ignore",
-        "timeoutSeconds": TIMEOUT,
-        "sideEffects": "None",
-        "admissionReviewVersions": ["v1"],
-    }
+    rules = _rules(GROUP, VERSION, ["CREATE", "UPDATE"], sorted(REVIEWED.values()))
+    webhook = {"name": f"admission.{GROUP}", "clientConfig": place.at(PATH, authority), "rules": rules}
     return _configuration("ValidatingWebhookConfiguration", name, webhook, namespaces)
 
 
@@ -116,25 +101,31 @@ def injection_configuration(
         "name": f"injection.{GROUP}",
         "clientConfig": place.at(INJECTION_PATH, authority),
         "objectSelector": {"matchExpressions": [{"key": SIDECAR_LABEL, "operator": "Exists"}]},
-        "rules": [
-            {
-                "apiGroups": [""],
-                "apiVersions": ["v1"],
-                "operations": ["CREATE"],
-                "resources": ["pods"],
-                "scope": "Namespaced",
-            }
-        ],
-        "failurePolicy": "Ignore",
-        "timeoutSeconds": TIMEOUT,
-        "sideEffects": "None",
+        "rules": _rules("", "v1", ["CREATE"], ["pods"]),
         "reinvocationPolicy": "IfNeeded",  # another webhook may change the volumes or the account
-        "admissionReviewVersions": ["v1"],
     }
     return _configuration("MutatingWebhookConfiguration", name, webhook, namespaces)
 
 
+def _rules(group: str, version: str, operations: list[str], resources: list[str]) -> list[dict[str, Any]]:
+    return [
+        {
+            "apiGroups": [group],
+            "apiVersions": [version],
+            "operations": operations,
+            "resources": resources,
+            "scope": "Namespaced",
+        }
+    ]
+
+
 def _configuration(kind: str, name: str, webhook: dict[str, Any], namespaces: Sequence[str]) -> dict[str, Any]:
+    webhook |= {
+        "failurePolicy": "Ignore",
+        "timeoutSeconds": TIMEOUT,
+        "sideEffects": "None",
+        "admissionReviewVersions": ["v1"],
+    }
     if namespaces:
         named = {"key": "kubernetes.io/metadata.name", "operator": "In", "values": sorted(namespaces)}
         webhook["namespaceSelector"] = {"matchExpressions": [named]}

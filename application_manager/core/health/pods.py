@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
+from application_manager.core.conditions import cut
+
 _LONGEST = 600  # characters of a message of a kubelet or a scheduler
 
 _IMAGE = frozenset(
@@ -156,4 +158,4 @@ def _pull_cause(message: str) -> str:
 def _plain(message: str) -> str:
     """One line, without the wrapping of gRPC, and not too long."""
     line = " ".join(re.sub(r"rpc error: code = \w+ desc = ", "", str(message)).split())
-    return line if len(line) <= _LONGEST else f"{line[: _LONGEST - 1]}…"
+    return cut(line, _LONGEST)

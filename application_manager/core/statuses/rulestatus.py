@@ -66,18 +66,16 @@ def rule_status(
         others: the rules of its namespace, which its signals may name.
         remarks: what else is worth knowing of it.
     """
-    selected = selecting(rule, detectors)
+    names = [each.name for each in selecting(rule, detectors)]
     findings = replace(rule_findings(rule, detectors, invalid, others), remarks=tuple(remarks))
     old = rule.status or EventRuleStatus()
     generation = rule.metadata.generation
     return EventRuleStatus(
         observed_generation=generation,
-        detectors=[each.name for each in selected],
-        selected_by=_listed([each.name for each in selected]),
-        conditions=list(
-            concluded(
-                old.conditions, [_rule_aspect(findings, bool(selected))], generation, now, stalled=(RULE_INVALID,)
-            )
+        detectors=names,
+        selected_by=_listed(names),
+        conditions=concluded(
+            old.conditions, [_rule_aspect(findings, bool(names))], generation, now, stalled=(RULE_INVALID,)
         ),
     )
 
@@ -106,7 +104,7 @@ def detector_status(
     return DetectorStatus(
         observed_generation=generation,
         rules=sum(1 for each in rules if selects(detector, each)),
-        conditions=list(concluded(kept, aspects, generation, now, stalled=(DETECTOR_INVALID,))),
+        conditions=concluded(kept, aspects, generation, now, stalled=(DETECTOR_INVALID,)),
     )
 
 
@@ -121,7 +119,7 @@ def unreadable_status(status: Status, reason: str, problem: str, generation: int
         now: seconds since 1970.
     """
     aspect = Aspect("Accepted", False, reason, problem)
-    conditions = list(concluded(status.conditions, [aspect], generation, now, stalled=(reason,)))
+    conditions = concluded(status.conditions, [aspect], generation, now, stalled=(reason,))
     return status.model_copy(update={"observed_generation": generation, "conditions": conditions})
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from application_manager.core.claims.operations import ACCEPTED, Standing, Verdict
-from application_manager.core.conditions import STALLED, Aspect, concluded, find, updated
+from application_manager.core.conditions import STALLED, Aspect, concluded, cut, find, updated
 from application_manager.core.demand import fallback
 from application_manager.core.demand.decisions import Decision
 from application_manager.core.demand.lingering import is_held, manual_aspects
@@ -115,7 +115,7 @@ def task_status(task: ApplicationTask, verdict: Verdict, service: Service | None
         observed_generation=task.metadata.generation,
         applied_time=applied_time,
         ready_time=ready_time,
-        conditions=list(conditions),
+        conditions=conditions,
     )
 
 
@@ -193,6 +193,15 @@ def instance_status(
     else:
         phase = InstancePhase.READY if ready.holds else InstancePhase.APPLIED
     generation = instance.metadata.generation
+    aspects = (
+        applied,
+        ready,
+        *_stalled(phase, applied, ready, decision),
+        *([suspended] if suspended else []),
+        *_capped(old.conditions, decision),
+        *fallback.aspects(old.conditions, decision.overdue, decision.fallback, decision.stands_in_for),
+        *manual_aspects(instance),
+    )
     return ApplicationInstanceStatus(
         phase=phase,
         message=_instance_message(instance, decision, applied, ready),
@@ -202,23 +211,7 @@ def instance_status(
         objects=list(objects),
         suspended_replicas=old.suspended_replicas,
         demands=demands(decision),
-        conditions=list(
-            updated(
-                old.conditions,
-                (
-                    applied,
-                    ready,
-                    *_stalled(phase, applied, ready, decision),
-                    *([suspended] if suspended else []),
-                    *_capped(old.conditions, decision),
-                    *fallback.aspects(old.conditions, decision.overdue, decision.fallback, decision.stands_in_for),
-                    *manual_aspects(instance),
-                ),
-                generation,
-                now,
-                only_while=(STALLED,),
-            )
-        ),
+        conditions=updated(old.conditions, aspects, generation, now, only_while=(STALLED,)),
     )
 
 
@@ -275,8 +268,7 @@ def _instance_message(instance: ApplicationInstance, decision: Decision, applied
 
 def _short(message: str) -> str | None:
     """The message as a column shows it; None where it is empty."""
-    longest = 512
-    return (message if len(message) <= longest else f"{message[: longest - 1]}…") or None
+    return cut(message, 512) or None
 
 
 def demands(decision: Decision) -> Demands:
@@ -302,7 +294,7 @@ def template_status(
         observed_generation=generation,
         instances=instances,
         manager=manager,
-        conditions=list(concluded(old.conditions, [accepted], generation, now, stalled=(TEMPLATE_INVALID,))),
+        conditions=concluded(old.conditions, [accepted], generation, now, stalled=(TEMPLATE_INVALID,)),
     )
 
 

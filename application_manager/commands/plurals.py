@@ -1,0 +1,46 @@
+"""The plurals by which roles call kinds: those known without a cluster, else as the cluster has them."""
+
+from __future__ import annotations
+
+import asyncio
+
+from application_manager.cluster.client import manager_client
+from application_manager.core.objects.policy import PLURALS, KindKey, Policy, kind_text
+from wayside.kubernetes.connection import ConfigurationError, load_configuration
+from wayside.kubernetes.errors import RequestError
+
+
+def plurals(policy: Policy) -> dict[KindKey, str]:
+    """What roles call the kinds of the policy. Raises ConfigurationError for one that nobody knows."""
+    known = {kind: PLURALS[kind] for kind in policy.kinds if kind in PLURALS}
+    others = sorted(policy.kinds - known.keys())
+    return known | (asyncio.run(_looked_up(others)) if others else {})
+
+
+async def _looked_up(kinds: list[KindKey]) -> dict[KindKey, str]:
+    listed = ", ".join(map(kind_text, kinds))
+    remedy = "use the kubeconfig of a cluster that has this kind"
+    try:
+        client = manager_client(await load_configuration())
+    except ConfigurationError as error:
+        raise ConfigurationError(
+            f"cannot look up the plural of {listed}, which roles need, without a cluster: {error}"
+        ) from error
+    try:
+        found = {}
+        for kind in kinds:
+            resource = (await client.discover(kind[0])).get(kind)
+            if resource is None:
+                raise ConfigurationError(
+                    f"the cluster has no kind {kind_text(kind)}: {remedy}, or correct --allowed-kinds"
+                )
+            if not resource.namespaced:
+                raise ConfigurationError(f"{kind_text(kind)} is not namespaced and can never be allowed")
+            found[kind] = resource.plural
+        return found
+    except RequestError as error:
+        raise ConfigurationError(
+            f"cannot look up the plural of {listed}, which roles need, in the cluster: {error}: {remedy}"
+        ) from error
+    finally:
+        await client.close()
