@@ -78,7 +78,7 @@ def changed(old: Iterable[Condition], new: Iterable[Condition]) -> list[Conditio
 
 
 def cut(message: str, longest: int = MAXIMUM_MESSAGE) -> str:
-    """The message, of at most so many characters."""
+    """The message, cut to this number of characters where it is longer."""
     return message if len(message) <= longest else f"{message[: longest - 1]}…"
 
 

@@ -13,7 +13,6 @@ from detector.engine.scoping.positions import Point
 from wayside.expressions.columns.values import Doubles
 from wayside.rules import PairSubject
 
-
 _MANY = 1 << 17
 """Up to this number of possible pairs, they are created without being counted first."""
 
@@ -93,7 +92,7 @@ def _most(points: Doubles, radius: float) -> int:
     buckets = 1 << (len(points).bit_length() + 3)
     cells = np.floor(points / radius).astype(np.int64) @ _HASHES[:axes] & (buckets - 1)
     counts = np.bincount(cells)
-    return 3**axes * int(counts @ counts)
+    return int(3**axes * (counts @ counts))
 
 
 def _crowded(crowd: Crowd, subject: PairSubject, first: Integers, second: Integers) -> Nearby:
