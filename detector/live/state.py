@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import threading
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,6 +18,7 @@ from detector.engine.episodes.open_episodes import OpenEpisode, from_document
 from wayside.api import Detector
 from wayside.names import encode
 from wayside.process.backoff import Backoff, retry
+from wayside.process.files import replace_file, sync_folder
 
 _log = logging.getLogger(__name__)
 
@@ -168,13 +168,5 @@ class StateFile:
         }
         # Not json.dump: each call leaves some thirty objects in cycles, which are rarely collected here.
         text = json.dumps(document, separators=(",", ":"), allow_nan=False)
-        with self._draft.open("w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        self._draft.replace(self.path)
-        folder = os.open(self.path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)  # otherwise the old name might come back after a loss of power
-        finally:
-            os.close(folder)
+        replace_file(self.path, text, draft=self._draft, durable=True)
+        sync_folder(self.path.parent)

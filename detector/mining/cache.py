@@ -15,6 +15,7 @@ import msgspec
 
 from detector.mining.sources import InputRecording, RecordingPreview
 from detector.mining.work import Mined, decode_mined
+from wayside.process.files import replace_file
 
 
 class CacheEntry(msgspec.Struct):
@@ -98,7 +99,4 @@ def mined_in(entry: CacheEntry) -> Mined:
 
 
 def _write(path: Path, data: bytes) -> None:
-    """Write atomically."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
-    partial.write_bytes(data)
-    partial.replace(path)
+    replace_file(path, data, draft=path.with_name(f".{path.name}.{os.getpid()}"))

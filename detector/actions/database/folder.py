@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import os
-from contextlib import suppress
 from pathlib import Path
 
 from detector.actions.database.attachments import Attachment
+from wayside.process.files import replace_file
 
 
 class FolderError(Exception):
@@ -26,17 +26,10 @@ class AttachmentFolder:
         target = self.path / attachment.path
         if self._capacity is not None and self._used + len(attachment.content) > self._capacity:
             raise FolderError(f"the folder for files is full ({self._capacity} bytes)")
-        unfinished = target.with_name(f".{target.name}.unfinished")
         try:
             target.parent.mkdir(parents=True, exist_ok=True)
-            with unfinished.open("wb") as file:
-                file.write(attachment.content)
-                file.flush()
-                os.fsync(file.fileno())
-            unfinished.replace(target)
+            replace_file(target, attachment.content, durable=True)
         except OSError as error:
-            with suppress(OSError):
-                unfinished.unlink(missing_ok=True)
             raise FolderError(f"cannot write a file: {error.strerror or type(error).__name__}") from None
         self._used += len(attachment.content)
 

@@ -25,6 +25,7 @@ from detector.actions.deploy.stores import (
 from wayside.api import ApplicationTask
 from wayside.api.base import JsonValue
 from wayside.manifests import to_yaml
+from wayside.process.files import replace_file
 from wayside.times import format_time, parse_time
 
 _log = logging.getLogger(__name__)
@@ -97,7 +98,7 @@ class FileTaskStore:
 def write_tasks_yaml(path: Path, tasks: Iterable[ApplicationTask]) -> None:
     """Write tasks into one file of several documents, in the order of their event's start and name."""
     documents = [task_manifest(_created(task)) for task in sorted(tasks, key=_order)]
-    _replace(path, to_yaml(documents))
+    replace_file(path, to_yaml(documents))
 
 
 class _Read(NamedTuple):
@@ -154,7 +155,7 @@ class _Folder:
 
     def _write(self, task: ApplicationTask) -> StoredTask:
         self.path.mkdir(parents=True, exist_ok=True)
-        _replace(self._file(task.name), to_yaml([task_manifest(task)]))
+        replace_file(self._file(task.name), to_yaml([task_manifest(task)]))
         return StoredTask(task, self._next())
 
     def _read(self, file: Path) -> StoredTask | None:
@@ -185,9 +186,3 @@ def _created(task: ApplicationTask) -> ApplicationTask:
 
 def _order(task: ApplicationTask) -> tuple[int, str]:
     return (parse_time(task.spec.event.start_time) if task.spec.event else 0, task.name)
-
-
-def _replace(path: Path, text: str) -> None:
-    unfinished = path.with_name(f".{path.name}.new")
-    unfinished.write_text(text)
-    unfinished.replace(path)

@@ -17,6 +17,7 @@ from typing import Any
 from detector.actions.record.bag import BagFile, metadata_yaml
 from detector.actions.record.description import DESCRIPTION, as_text
 from detector.actions.record.destination import PARTIAL, Destination, Kept, hidden_path
+from wayside.process.files import replace_file, sync_folder
 
 CUT = "_cut"
 """The suffix of the names of incomplete recordings."""
@@ -87,7 +88,7 @@ class RecordingFolder:
 
     def describe(self, fields: Mapping[str, Any]) -> None:
         """Writes the description. Raises OSError."""
-        _write(self.path / DESCRIPTION, json.dumps(fields, ensure_ascii=False, indent=1))
+        replace_file(self.path / DESCRIPTION, json.dumps(fields, ensure_ascii=False, indent=1), durable=True)
 
     def described(self) -> dict[str, Any] | None:
         """The existing description; None if there is none that can be read."""
@@ -99,12 +100,12 @@ class RecordingFolder:
 
     def publish(self, parts: Sequence[BagFile], fields: Mapping[str, Any]) -> Kept:
         """Renames the folder to its final name, after syncing it to disk. Raises OSError: then it is unchanged."""
-        _write(self.path / "metadata.yaml", metadata_yaml(parts, as_text(fields)))
+        replace_file(self.path / "metadata.yaml", metadata_yaml(parts, as_text(fields)), durable=True)
         self.describe(fields)
         os.fsync(self._lock)
         final = self.path.with_name(self.name + (CUT if "cut" in fields else ""))
         self.path.rename(final)
-        _sync(final.parent)
+        sync_folder(final.parent)
         size = sum(each.stat().st_size for each in final.iterdir())
         kept = Kept(time.time(), final, size, len(parts))
         self._settle(kept)
@@ -136,23 +137,5 @@ def _keep_room(path: Path) -> None:
     fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o644)
     try:
         os.posix_fallocate(fd, 0, _ROOM_BYTES)
-    finally:
-        os.close(fd)
-
-
-def _write(path: Path, text: str) -> None:
-    """Write the whole file or nothing."""
-    beside = path.with_name(f".{path.name}")
-    with beside.open("w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    beside.replace(path)
-
-
-def _sync(folder: Path) -> None:
-    fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        os.fsync(fd)
     finally:
         os.close(fd)
