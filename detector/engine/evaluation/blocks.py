@@ -6,7 +6,7 @@ evaluation could see or change. The number of ticks evaluated together never cha
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from operator import attrgetter
 
 from detector.engine.columns.block import Context
@@ -146,9 +146,7 @@ class Blocks:
         for group in self._depths[0]:
             if group.waiting and not group.may_wait:
                 ticks, group.waiting = group.waiting, []
-                self._ahead += self._noted(
-                    _timed(group, ticks, stopwatch, group.evaluate(ticks, clients, self._floor()))
-                )
+                self._ahead += self._noted(self._evaluated(group, ticks, clients, stopwatch))
 
     def run(self, stopwatch: Callable[[], int]) -> list[Happened]:
         """Evaluate all queued ticks; returns what happened, in order."""
@@ -159,7 +157,7 @@ class Blocks:
             for group in groups:
                 if group.waiting:
                     ticks, group.waiting = group.waiting, []
-                    found += _timed(group, ticks, stopwatch, group.evaluate(ticks, clients, self._floor()))
+                    found += self._evaluated(group, ticks, clients, stopwatch)
             happened += self._noted(found)
         happened.sort(key=_place)
         return happened
@@ -183,16 +181,20 @@ class Blocks:
         """Evaluate the rules that are triggered by the samples of a stream, about these clients; `only` has the
         subjects of each rule."""
         group = self._on_sample[stream]
-        return self._noted(_timed(group, (time,), stopwatch, group.evaluate((time,), clients, self._floor(), only)))
+        return self._noted(self._evaluated(group, (time,), clients, stopwatch, only))
 
-
-def _timed(
-    group: RuleGroup | PairGroup, ticks: Sequence[int], stopwatch: Callable[[], int], happened: Iterator[Happened]
-) -> list[Happened]:
-    """All that happened; the time spent is divided among the rules."""
-    begin = stopwatch()
-    found = [*happened]
-    spent = (stopwatch() - begin) // max(len(group.runs), 1)
-    for run in group.runs:
-        run.counters.timed(ticks[-1], spent, len(ticks))
-    return found
+    def _evaluated(
+        self,
+        group: RuleGroup | PairGroup,
+        ticks: Sequence[int],
+        clients: Sequence[str],
+        stopwatch: Callable[[], int],
+        only: Mapping[str, Only] | None = None,
+    ) -> list[Happened]:
+        """What happens at these ticks; the time spent is divided among the rules."""
+        begin = stopwatch()
+        found = group.evaluate(ticks, clients, self._floor(), only)
+        spent = (stopwatch() - begin) // max(len(group.runs), 1)
+        for run in group.runs:
+            run.counters.timed(ticks[-1], spent, len(ticks))
+        return found

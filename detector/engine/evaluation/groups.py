@@ -5,16 +5,17 @@ from __future__ import annotations
 import itertools
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from detector.engine.columns.block import Block, Context, Track
 from detector.engine.columns.fleets import FleetBlock, FleetGroup
 from detector.engine.columns.group import ClientGroup
 from detector.engine.columns.table import Integers, Truths
 from detector.engine.columns.verdicts import Codes
-from detector.engine.episodes.episodes import NO_WAKE, TRUE, UNSEEN
+from detector.engine.episodes.episodes import NO_WAKE, TRUE, UNSEEN, UNTIL, UNTIL_UNSURE
 from detector.engine.episodes.events import Happened
 from detector.engine.episodes.subjects import Subject
 from detector.engine.evaluation.observing import Observer
@@ -22,6 +23,13 @@ from detector.engine.evaluation.rule import RuleRun
 from detector.engine.scoping.scopes import Candidate
 from detector.engine.timing.schedule import Only
 from wayside.rules import ClientSubject
+
+_NOTHING, _START, _END, _UNSURE_END = range(4)
+_EFFECTS = np.zeros(256, np.uint8)
+"""By observation, its effect on a rule without `for`, `cooldown` and deploy actions."""
+_EFFECTS[TRUE] = _START
+_EFFECTS[UNTIL_UNSURE : UNTIL_UNSURE + 4] = _UNSURE_END
+_EFFECTS[UNTIL:16] = _END
 
 
 class SubjectChanges(NamedTuple):
@@ -70,6 +78,8 @@ class RuleGroup:
         self._measures = any(signal.episode for run in runs for signal in run.rule.derived)
         """Whether some rule has statistics of its episodes."""
         self._deploying = [(row, run) for row, run in enumerate(self._of) if run.has_deploys]
+        self._timed = [run.has_deploys or run.timing.hold > 0 or run.timing.cooldown > 0 for run in self._of]
+        """The tracks for which it matters how long an observation stays the same."""
         self._plain = [isinstance(run.rule.subject, ClientSubject) and not run.rule.has_actions for run in self._of]
         """Rules whose events contain only signals, and that render nothing."""
         self._orders = [orders[run.rule.name] for run in self._of]
@@ -82,11 +92,12 @@ class RuleGroup:
 
     def evaluate(
         self, ticks: Sequence[int], clients: Sequence[str], floor: int | None, only: Mapping[str, Only] | None = None
-    ) -> Iterator[Happened]:
+    ) -> list[Happened]:
         """Evaluate these ticks; returns what happened. `only`: by rule, the subjects to evaluate; the others are
         skipped."""
+        happened: list[Happened] = []
         if not clients and self.columns.needs_clients:
-            return
+            return happened
         looked = None if only is None else self._looked(clients, only)
         block, codes = self.columns.evaluate(ticks, clients, floor, looked)
         if self.observer is not None:
@@ -98,7 +109,7 @@ class RuleGroup:
         numbers: list[int] = block.numbers.tolist()
         states: list[tuple[int, int, bool, int]] = []
         for change in self._changed(block, codes, looked):
-            yield from self._step(block, change, numbers[change.at], states)
+            self._step(block, change, numbers[change.at], states, happened)
         if self._measures and isinstance(block, Block):
             self._measure(block)
         if states:
@@ -108,6 +119,7 @@ class RuleGroup:
         last = ticks[-1]
         for run in self._budgeted:
             run.tidy_starts(last)
+        return happened
 
     def _looked(self, clients: Sequence[str], only: Mapping[str, Only]) -> Truths:
         """Which track evaluates which client."""
@@ -160,7 +172,7 @@ class RuleGroup:
         changed = np.empty(codes.shape, bool)
         np.not_equal(codes[:, :, 0], self._last[:, numbers], out=changed[:, :, 0])
         np.not_equal(codes[:, :, 1:], codes[:, :, :-1], out=changed[:, :, 1:])
-        watched = self._watched[:, numbers]
+        watched, unseen = self._watched[:, numbers], self._last[:, numbers] == UNSEEN
         changed[:, :, 0] |= self._wakes[:, numbers] <= last
         for row, run in self._deploying:
             if run.open_episodes:
@@ -182,28 +194,41 @@ class RuleGroup:
         if not len(flat):
             return
         which, when = np.divmod(flat, len(block.ticks))
-        bounds = [0, *(np.flatnonzero(np.diff(which)) + 1).tolist(), len(flat)]
-        ticks: list[int] = when.tolist()
-        seen: list[int] = codes.ravel()[flat].tolist()
+        seen = codes.ravel()[flat]
+        if not all(self._timed):
+            alert = watched & ((self._wakes[:, numbers] != NO_WAKE) | unseen)
+            timed = np.array(self._timed)[which // len(block.clients)]
+            kept = _with_effect(which, _EFFECTS[seen], timed, watched.ravel()[which], alert.ravel()[which])
+            which, when, seen = which[kept], when[kept], seen[kept]
+            if not len(which):
+                return
+        bounds = [0, *(np.flatnonzero(np.diff(which)) + 1).tolist(), len(which)]
+        ticks, observations = when.tolist(), seen.tolist()
         tracks, subjects = (each.tolist() for each in np.divmod(which[bounds[:-1]], len(block.clients)))
         for row, at, (begin, end) in zip(tracks, subjects, itertools.pairwise(bounds), strict=True):
-            yield SubjectChanges(row, at, ticks[begin:end], seen[begin:end])
+            yield SubjectChanges(row, at, ticks[begin:end], observations[begin:end])
 
     def _step(
-        self, block: Block | FleetBlock, changes: SubjectChanges, number: int, states: list[tuple[int, int, bool, int]]
-    ) -> list[Happened]:
-        """Advance one subject's state over all ticks of the block; notes whether it keeps a state, and when to evaluate
-        it again."""
+        self,
+        block: Block | FleetBlock,
+        changes: SubjectChanges,
+        number: int,
+        states: list[tuple[int, int, bool, int]],
+        happened: list[Happened],
+    ) -> None:
+        """Advance one subject's state over all ticks of the block; notes what happened, whether it keeps a state, and
+        when to evaluate it again."""
         row, at = changes.row, changes.at
         run, track = self._of[row], self.columns.tracks[row]
         subject = track.subject(block.clients[at])
         state = run.state(subject) or run.new_state(subject)
-        happened: list[Happened] = []
         ticks, timing, count = block.ticks, run.timing, len(block.ticks)
-        deploys = run.has_deploys
+        deploys, timed = run.has_deploys, self._timed[row]
         wake: int | None = None
         for code, begin, end in zip(changes.codes, changes.ticks, (*changes.ticks[1:], count), strict=True):
             first = begin
+            if not timed and (code == TRUE or code >= UNTIL):
+                end = begin + 1  # noqa: PLW2901  the later ticks have no effect
             while first < end:
                 one_by_one = deploys and state.is_open and run.needs_every_tick(subject)
                 happened_at, what, wake = state.run(ticks, first, first + 1 if one_by_one else end, timing, code)
@@ -223,7 +248,6 @@ class RuleGroup:
         if idle:
             run.drop_state(subject)
         states.append((row, number, not idle, NO_WAKE if wake is None else wake))
-        return happened
 
     def _candidate(self, block: Block | FleetBlock, track: Track, subject: Subject, point: int) -> Candidate:
         if not isinstance(block, Block):
@@ -252,3 +276,24 @@ class RuleGroup:
             point = at * len(block.ticks) + tick
             if looked is None or looked[point]:
                 statistics.take(block.ticks[tick], block.measured_at(row, point), run.counters)
+
+
+def _with_effect(subjects: Integers, effects: Codes, timed: Truths, watched: Truths, alert: Truths) -> Integers:
+    """The indices of the changes that may have an effect, of all changes by subject and tick; shapes (changes,).
+
+    `timed`: all changes of the rule matter. `watched`: the subject has a state. `alert`: its first change matters.
+    """
+    before = _shifted(subjects, effects, np.where(alert, _UNSURE_END, _NOTHING))
+    kept = np.flatnonzero(timed | (effects != _NOTHING) | (before == _UNSURE_END))
+    # Of starts (or ends) in a row only the first has an effect. A subject without a state needs no end.
+    effects = effects[kept]
+    before = _shifted(subjects[kept], effects, np.where(watched[kept], _NOTHING, _END))
+    repeated = (before == effects) & ((effects == _START) | (effects == _END))
+    found: Integers = kept[timed[kept] | ~repeated]
+    return found
+
+
+def _shifted(subjects: Integers, effects: Codes, first: NDArray[Any]) -> NDArray[Any]:
+    """The effect before each one of the same subject; `first` where it is the subject's first."""
+    begins = np.concatenate(([True], subjects[1:] != subjects[:-1]))
+    return np.where(begins, first, np.roll(effects, 1))

@@ -79,12 +79,12 @@ class PairGroup:
 
     def evaluate(
         self, ticks: Sequence[int], clients: Sequence[str], floor: int | None, only: Mapping[str, Only] | None = None
-    ) -> Iterator[Happened]:
+    ) -> list[Happened]:
         """Evaluate these ticks; returns what happened. Such a rule evaluates all pairs."""
         assert only is None  # noqa: S101  it is not evaluated with samples
-        for tick in ticks:
-            yield from self._tick(tick, clients, floor)
+        happened = [each for tick in ticks for each in self._tick(tick, clients, floor)]
         self._run.tidy_starts(ticks[-1])
+        return happened
 
     def _tick(self, tick: int, clients: Sequence[str], floor: int | None) -> Iterator[Happened]:
         block = self._block(tick, clients)
