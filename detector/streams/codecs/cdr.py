@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from operator import attrgetter
 from typing import Any
 
@@ -37,10 +37,12 @@ class CdrDecoder:
             raise UnknownTypeError(type_name, types)
         self.type_name = type_name
         self._types = types
-        self._convert = _converter(types, type_name)
-        self._read = types.store.deserialize_cdr
         self._stamp_first = types.stamp_first(type_name)
         self._has_header = types.has_header(type_name)
+
+    @cached_property
+    def _convert(self) -> Convert:
+        return _converter(self._types, self.type_name)
 
     def decode(self, payload: bytes) -> Any:
         """The message as a map; arrays of octets (uint8, char, byte) are bytes, all others lists.
@@ -49,7 +51,9 @@ class CdrDecoder:
         bytes before it allocates, and raises SerdeError for errors (too short, no UTF-8, no terminator).
         """
         try:
-            message = self._read(payload if len(payload) < _LARGE else memoryview(payload), self.type_name)
+            message = self._types.store.deserialize_cdr(
+                payload if len(payload) < _LARGE else memoryview(payload), self.type_name
+            )
         except SerdeError as error:
             raise DecodeError(f"not CDR of {self.type_name} ({len(payload)} bytes): {error}") from None
         return self._convert(message)
@@ -68,7 +72,10 @@ class CdrDecoder:
 
     def field_reader(self, paths: Sequence[Path]) -> FieldReader | None:
         """A reader of only these paths; None for types with wide texts, empty arrays or an unusual size."""
-        return cdr_fields(self._types, self.type_name, paths, self.decode)
+        reader = cdr_fields(self._types, self.type_name, paths, self.decode)
+        if reader is None:
+            _ = self._convert  # made now and not with the first message
+        return reader
 
     def _stamp_inside(self, payload: bytes) -> int:
         """header.stamp if other fields precede the header."""

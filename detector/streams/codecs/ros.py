@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache, cached_property, lru_cache
 
 from rosbags.interfaces.typing import FieldDesc
@@ -13,6 +13,7 @@ from rosbags.typesys.base import TypesysError
 from rosbags.typesys.store import Typestore
 
 from detector.streams.codecs.definitions import Definition, DefinitionsError, check_definitions, merged_types
+from detector.streams.codecs.release import MessageFields, release_fields
 
 HEADER = "std_msgs/msg/Header"
 TIME = "builtin_interfaces/msg/Time"
@@ -26,7 +27,7 @@ class UnknownTypeError(ValueError):
 
     def __init__(self, name: str, types: RosTypes, field: str | None = None) -> None:
         """`field` is the place of the name."""
-        close = difflib.get_close_matches(name, types.store.fielddefs, n=3, cutoff=0.8)
+        close = difflib.get_close_matches(name, types.all_fields, n=3, cutoff=0.8)
         remedy = f"did you mean {' or '.join(close)}? Otherwise give" if close else "give"
         where = f"{field}: " if field else ""
         super().__init__(f"{where}unknown message type {name!r}: {remedy} its definition in spec.messages")
@@ -35,22 +36,35 @@ class UnknownTypeError(ValueError):
 class RosTypes:
     """Message types by their names, e.g. geometry_msgs/msg/PoseStamped."""
 
-    def __init__(self, load: Callable[[], Typestore]) -> None:
-        """`load` returns the types on first use: creating the classes of a release takes 0.1 s."""
+    def __init__(
+        self, load: Callable[[], Typestore], fields: Callable[[], Mapping[str, MessageFields]] | None = None
+    ) -> None:
+        """`load` returns the types on first use: creating the classes of a release takes 0.1 s and 3 MiB.
+
+        `fields` returns the fields of all types without the classes; None: only the types know them.
+        """
         self._load = load
+        self._fields = fields
 
     @cached_property
     def store(self) -> Typestore:
         """The types in rosbags' form."""
         return self._load()
 
+    @cached_property
+    def all_fields(self) -> Mapping[str, MessageFields]:
+        """The fields by type."""
+        if self._fields is not None:
+            return self._fields()
+        return {name: fields for name, (_, fields) in self.store.fielddefs.items()}
+
     def known(self, name: str) -> bool:
         """Whether the type is known."""
-        return name in self.store.fielddefs
+        return name in self.all_fields
 
     def fields(self, name: str) -> Sequence[tuple[str, FieldDesc]]:
         """The fields of a known type, in order."""
-        return self.store.fielddefs[name][1]
+        return self.all_fields[name]
 
     def stamp_first(self, name: str) -> bool:
         """Whether the message begins with a std_msgs/msg/Header, so that its stamp is always at the same position."""
@@ -80,7 +94,7 @@ class RosTypes:
 @cache
 def standard() -> RosTypes:
     """All message types of the newest long-term ROS 2 release."""
-    return RosTypes(lambda: get_typestore(Stores.ROS2_JAZZY))
+    return RosTypes(lambda: get_typestore(Stores.ROS2_JAZZY), release_fields)
 
 
 @lru_cache(maxsize=16)
