@@ -1,9 +1,13 @@
-"""Names inside keys and object names: percent-encoded, and joined so that no two subjects read the same."""
+"""Names inside keys and object names: percent-encoded, and joined so that no two subjects read the same.
+
+And what a misspelt name may stand for.
+"""
 
 from __future__ import annotations
 
+import difflib
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from urllib.parse import unquote_to_bytes
 
 FLEET = "~fleet"
@@ -49,3 +53,9 @@ def parse_subject(text: str) -> tuple[tuple[str, ...], str | None]:
             f"{text!r} is not a subject: write car1, car1+car2 or {FLEET}, with ~element if the rule has each"
         )
     return clients, element
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """The remedy for a name that is not known: a question with the most similar one; empty where none is similar."""
+    close = difflib.get_close_matches(name, list(known), n=1)
+    return f"did you mean {close[0]}?" if close else ""

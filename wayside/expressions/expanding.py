@@ -10,7 +10,6 @@ So what is read is plain paths and numbers, for CEL as for columns, and no field
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple, NoReturn
@@ -18,6 +17,7 @@ from typing import Final, NamedTuple, NoReturn
 from wayside.expressions.errors import ExpressionError, position
 from wayside.expressions.lexer import Token, TokenKind, tokens
 from wayside.geo.geometry import Shape
+from wayside.names import did_you_mean
 
 AT: Final = "at"
 SEEN_FROM: Final = "seenFrom"
@@ -123,7 +123,11 @@ class _Expansion:
             self._refuse(at, f"`{name}` is a value with fields", f"take one, as in {usage}.{next(iter(fields))}")
         chosen = self._text(after + 1)
         if chosen not in fields:
-            self._refuse(after + 1, f"{name} has no field {chosen}", _near(chosen, fields))
+            self._refuse(
+                after + 1,
+                f"{name} has no field {chosen}",
+                did_you_mean(chosen, fields) or f"it has {', '.join(fields)}",
+            )
         if name == SEEN_FROM:
             return self._seen(at, chosen, *map(self._inner, arguments)), after + 2
         return self._at(at, chosen, arguments), after + 2
@@ -138,7 +142,8 @@ class _Expansion:
         if shape is None:
             if not self._places.known:
                 return "(0.0 > 1.0)" if chosen == "inside" else "(0.0 + 0.0)"
-            self._refuse(first, f"there is no place {name}", _near(name, self._places.shapes, "the Detector has none"))
+            known = f"there are {', '.join(self._places.shapes)}" if self._places.shapes else "the Detector has none"
+            self._refuse(first, f"there is no place {name}", did_you_mean(name, self._places.shapes) or known)
         if chosen not in shape.fields:
             what = "an area" if shape.rings else "a line without width"
             self._refuse(at, f"{name} is {what}, which has no {chosen}", f"it has {', '.join(shape.fields)}")
@@ -250,16 +255,3 @@ class _Expansion:
         token: Token = self._tokens[at]
         line, column = position(self._source, token.start)
         raise ExpressionError(message, source=self._source, line=line, column=column, hint=hint)
-
-
-def _near(name: str, known: Mapping[str, object], otherwise: str = "") -> str:
-    close = difflib.get_close_matches(name, known, n=1)
-    if close:
-        return f"did you mean {close[0]}?"
-    return (
-        f"it has {', '.join(known)}"
-        if known and not otherwise
-        else f"there are {', '.join(known)}"
-        if known
-        else otherwise
-    )

@@ -1,6 +1,5 @@
 """Rules, validated and compiled against a Detector: the manager reports the problems, the engine runs the result."""
 
-from wayside.rules.alone import own_problems
 from wayside.rules.compiled import (
     ClientSubject,
     CompiledAction,
@@ -18,7 +17,7 @@ from wayside.rules.compiled import (
     PairSubject,
     episode_stream,
 )
-from wayside.rules.compiling import compile_rule
+from wayside.rules.compiling import compile_rule, own_problems
 from wayside.rules.dependencies import dependency_problems, depends, in_order
 from wayside.rules.fields import BYTES, Fields, ItemFields
 from wayside.rules.parameters import unknown_rules

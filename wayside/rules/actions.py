@@ -3,63 +3,35 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping
-from typing import Protocol
+from collections.abc import Iterable
 
-from wayside.api import Detector
 from wayside.api.actions.action import ActionSpec
 from wayside.api.actions.database import DatabaseAction
 from wayside.api.actions.deploy import Deploy
 from wayside.api.actions.window import Window, WindowClients
-from wayside.api.base import JsonValue
 from wayside.api.detector import DetectorSpec
-from wayside.api.eventrule import EventRuleSpec
 from wayside.api.stream import Stream
 from wayside.api.wording import FieldPath
-from wayside.expressions import CompiledTemplate, Environment, compile_template
+from wayside.expressions import Environment, compile_template
 from wayside.rules.compiled import CompiledAction, CompiledDeploy, CompiledWindow
+from wayside.rules.compiler import Compiler
 
 
-class Compiler(Protocol):
-    """The parts of the rule's compiler that are used here."""
-
-    detector: Detector
-    spec: EventRuleSpec
-
-    def template(
-        self, path: FieldPath, value: Mapping[str, JsonValue], environment: Environment
-    ) -> CompiledTemplate | None:
-        """Texts with ${…}; None where one is wrong."""
-
-    def stream(self, path: FieldPath, name: str) -> Stream | None:
-        """The Detector's stream of that name; None, and a problem, where it has none."""
-
-    def kept_ns(self, stream: Stream) -> int:
-        """How long the Detector keeps the stream's samples, in nanoseconds."""
-
-    def problem(self, path: FieldPath, message: str) -> None:
-        """Report a problem with a field."""
-
-
-def compile_deploys(
-    compiler: Compiler, actions: Iterable[tuple[int, ActionSpec]], environment: Environment
-) -> list[CompiledDeploy]:
-    """The deploy actions among these, which have their places; problems are reported to the compiler."""
+def compile_deploys(compiler: Compiler, environment: Environment) -> list[CompiledDeploy]:
+    """The rule's deploy actions."""
     found = (
         _deploy(compiler, ("spec", "actions", index, "deploy", "parameters"), action.name, action.deploy, environment)
-        for index, action in actions
+        for index, action in enumerate(compiler.spec.actions)
         if action.deploy is not None
     )
     return [each for each in found if each is not None]
 
 
-def compile_actions(
-    compiler: Compiler, actions: Iterable[tuple[int, ActionSpec]], environment: Environment
-) -> list[CompiledAction]:
-    """The actions other than deploy among these, which have their places; problems are reported to the compiler."""
+def compile_actions(compiler: Compiler, environment: Environment) -> list[CompiledAction]:
+    """The rule's actions other than deploy."""
     return [
         _compiled(compiler, ("spec", "actions", index), action, environment)
-        for index, action in actions
+        for index, action in enumerate(compiler.spec.actions)
         if action.deploy is None
     ]
 
@@ -98,8 +70,7 @@ def _compiled(compiler: Compiler, at: FieldPath, action: ActionSpec, environment
         name: compiler.template((*at, *below), {name: value}, environment) for name, value in values.items()
     }  # one by one: what cannot be rendered takes nothing else with it
     if action.database is not None:
-        for path, text in _database_problems(action.database, compiler.detector):
-            compiler.problem((*at, *path), text)
+        _check_database(compiler, (*at, "database"), action.database)
     window = action.window
     return CompiledAction(
         action.name,
@@ -120,15 +91,9 @@ def _window(compiler: Compiler, at: FieldPath, action: ActionSpec, window: Windo
         streams = [stream for stream in named if stream is not None]
     back = window.before.ns + compiler.spec.for_.ns
     for stream in streams:
-        kept = compiler.kept_ns(stream)
-        if window.before.ns and back > kept and not stream.latched:
+        if window.before.ns and back > compiler.kept_ns(stream) and not stream.latched:
             with_for = f" plus the rule's for ({compiler.spec.for_})" if compiler.spec.for_.ns else ""
-            compiler.problem(
-                (*at, "before"),
-                f"{window.before}{with_for} exceeds the {kept / 1e9:g} s that Detector "
-                f"{compiler.detector.name} keeps of stream {stream.name}: shorten it, or raise the stream's "
-                "buffer.duration",
-            )
+            compiler.not_kept((*at, "before"), f"{window.before}{with_for} exceeds", stream)
     everyone = window.clients is WindowClients.ALL or compiler.spec.scope.fleet is not None
     clients = None if everyone else frozenset(window.with_clients)
     return window_of(spec, streams, clients, window.before.ns, window.after.ns)
@@ -153,16 +118,15 @@ def _of_one(stream: Stream) -> bool:
     return stream.client is not None and not stream.names_by_message
 
 
-def _database_problems(action: DatabaseAction, detector: Detector) -> Iterator[tuple[FieldPath, str]]:
-    """The missing fields; the paths begin at the action."""
-    database = detector.spec.database
-    if database is None:
-        yield (
-            ("database",),
-            f"Detector {detector.name} has no spec.database: add it, e.g. {{uriVariable: MONGODB_URI}}",
+def _check_database(compiler: Compiler, at: FieldPath, action: DatabaseAction) -> None:
+    """Report what the Detector lacks."""
+    detector = compiler.detector
+    if detector.spec.database is None:
+        compiler.problem(
+            at, f"Detector {detector.name} has no spec.database: add it, e.g. {{uriVariable: MONGODB_URI}}"
         )
-    elif action.files is not None and database.files is None:
-        yield (
-            ("database", "files"),
+    elif action.files is not None and detector.spec.database.files is None:
+        compiler.problem(
+            (*at, "files"),
             f"Detector {detector.name} has no spec.database.files: add it with a path, or remove files",
         )

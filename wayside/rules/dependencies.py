@@ -6,10 +6,10 @@ on: its depth is 0 where it names none, else one more than the greatest depth of
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from wayside.api import EventRule
+from wayside.names import did_you_mean
 from wayside.rules.compiled import CompiledRule
 from wayside.rules.problems import RuleProblem
 
@@ -63,8 +63,7 @@ def _named(rule: EventRule) -> Iterator[tuple[int, str]]:
 
 
 def _unknown(name: str, others: Sequence[str]) -> str:
-    close = difflib.get_close_matches(name, others, n=1)
-    hint = f"did you mean {close[0]}?" if close else f"the others are {', '.join(sorted(others)) or 'none'}"
+    hint = did_you_mean(name, others) or f"the others are {', '.join(sorted(others)) or 'none'}"
     return f"there is no rule {name} that the same Detector selects; {hint}"
 
 

@@ -3,32 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Protocol
 
-from wayside.api import Detector, EventRule
 from wayside.api.documents import FieldPath
 from wayside.api.eventrule import Aggregate, Signal
 from wayside.expressions import CelType, Environment, Expression
 from wayside.rules.compiled import CompiledDerived
+from wayside.rules.compiler import Compiler
 from wayside.rules.margins import MARGIN, MarginError, margin_of
 
 
-class _Compiler(Protocol):
-    """The rule that is being compiled, and the receiver of its problems."""
-
-    rule: EventRule
-    detector: Detector
-
-    def condition(
-        self, path: FieldPath, source: str | None, environment: Environment, kind: CelType
-    ) -> Expression | None:
-        """An expression over what conditions see; None where there is none, or it is wrong."""
-
-    def problem(self, path: FieldPath, message: str) -> None:
-        """Report a problem with a field."""
-
-
-def compile_derived(compiler: _Compiler, environment: Environment) -> tuple[CompiledDerived, ...]:
+def compile_derived(compiler: Compiler, environment: Environment) -> tuple[CompiledDerived, ...]:
     """The signals over what conditions see, each after those that it reads."""
     found: dict[str, CompiledDerived] = {}
     places: dict[str, FieldPath] = {}
@@ -53,7 +37,7 @@ def compile_derived(compiler: _Compiler, environment: Environment) -> tuple[Comp
     return tuple(found[name] for name in ordered)
 
 
-def _margin(compiler: _Compiler, environment: Environment) -> Expression | None:
+def _margin(compiler: Compiler, environment: Environment) -> Expression | None:
     """The margin of `when`; None, and problems, where it can have none."""
     spec = compiler.rule.spec
     for index, signal in enumerate(spec.signals):
@@ -73,7 +57,7 @@ def statistics_read(expression: Expression, derived: Iterable[CompiledDerived]) 
         yield f"{name} is known only while an episode is open: use it in actions; conditions and signals cannot read it"
 
 
-def _compiled(compiler: _Compiler, at: FieldPath, signal: Signal, of: Expression | None) -> CompiledDerived:
+def _compiled(compiler: Compiler, at: FieldPath, signal: Signal, of: Expression | None) -> CompiledDerived:
     episode = signal.over is not None and signal.over.is_episode
     kept = compiler.detector.spec.buffer.duration
     lag = 0 if signal.lag is None else signal.lag.ns

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable, Mapping
 
 from wayside.expressions import Path
+from wayside.names import did_you_mean
 
 Fields = Mapping[str, "Fields | None"]
 """The fields of a message by name; None below a field: it has none of its own, or they are not known."""
@@ -54,10 +54,9 @@ def fields_at(path: Path, fields: Fields | None) -> Fields | None:
 
 
 def _message(parent: str, step: str, here: Fields) -> str:
-    close = difflib.get_close_matches(step, here, n=1)
     if here is BYTES:
         return (
             f"{parent} has no field {step}: it is bytes; read it with numberAt or utf8, or give the stream's encoding"
         )
-    hint = f"did you mean {close[0]}?" if close else f"it has {', '.join(sorted(here)) or 'no fields'}"
+    hint = did_you_mean(step, here) or f"it has {', '.join(sorted(here)) or 'no fields'}"
     return f"{parent} has no field {step}; {hint}"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
@@ -10,6 +9,7 @@ from typing import Any, Final
 from wayside.api import Detector, EventRule
 from wayside.api.documents import FieldPath
 from wayside.expressions import CelType, normalise
+from wayside.names import did_you_mean
 
 Values = Mapping[str, Any]
 """Parameters by name, as expressions take them."""
@@ -67,7 +67,8 @@ def override_problems(rule: EventRule, detector: Detector) -> Iterator[tuple[Fie
             if name in own:
                 yield from ((path, text) for text in _misfits(name, own[name], value, rule.name))
             else:
-                yield path, f"EventRule {rule.name} has no parameter {name}; {_known(name, own)}"
+                hint = did_you_mean(name, own) or f"it has {', '.join(sorted(own)) or 'none'}"
+                yield path, f"EventRule {rule.name} has no parameter {name}; {hint}"
 
 
 def unknown_rules(detector: Detector, rules: Iterable[str]) -> Iterator[tuple[FieldPath, str]]:
@@ -76,8 +77,7 @@ def unknown_rules(detector: Detector, rules: Iterable[str]) -> Iterator[tuple[Fi
     for index, client in enumerate(detector.spec.clients):
         for rule in client.parameters:
             if rule not in names:
-                close = difflib.get_close_matches(rule, names, n=1)
-                hint = f"did you mean {close[0]}?" if close else "give its file as well, or remove the parameters"
+                hint = did_you_mean(rule, names) or "give its file as well, or remove the parameters"
                 yield ("spec", "clients", index, "parameters", rule), f"there is no EventRule {rule} here; {hint}"
 
 
@@ -106,11 +106,6 @@ _KINDS: Final = {
 def _kind(value: object) -> str:
     kinds = {bool: "boolean", int: "number", float: "number", str: "text", list: "list", dict: "map"}
     return kinds.get(type(value), type(value).__name__)
-
-
-def _known(name: str, own: Values) -> str:
-    close = difflib.get_close_matches(name, own, n=1)
-    return f"did you mean {close[0]}?" if close else f"it has {', '.join(sorted(own)) or 'none'}"
 
 
 def _values(constants: Mapping[str, Any]) -> Values:

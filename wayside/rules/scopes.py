@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import Any, Protocol
 
-from wayside.api import EventRule
 from wayside.api.documents import FieldPath
-from wayside.api.eventrule import EventRuleSpec
 from wayside.api.scopes import Each, PairsScope
-from wayside.api.stream import Stream
-from wayside.expressions import CelType, Environment, Expression
+from wayside.expressions import CelType, Expression
 from wayside.rules.compiled import (
     ClientSubject,
     CompiledElement,
@@ -22,14 +18,11 @@ from wayside.rules.compiled import (
     FleetSubject,
     PairSubject,
 )
-from wayside.rules.fields import Fields
-from wayside.rules.naming import element_name_problem
-from wayside.rules.parameters import Parameters
+from wayside.rules.compiler import Compiler
 from wayside.rules.variables import (
-    MEMBER_OF_CLIENT,
     client_environment,
+    element_name_problem,
     element_of,
-    of_the_subject,
     pairs_environment,
     signal_names,
 )
@@ -38,29 +31,7 @@ CLOSING_NS = 1_000_000_000
 """The time over which the closing speed is measured, in nanoseconds."""
 
 
-class Expressions(Protocol):
-    """Compiles a rule's expressions, and collects what is wrong with them."""
-
-    rule: EventRule
-    parameters: Parameters
-
-    def condition(self, path: FieldPath, source: str | None, environment: Environment) -> Expression | None:
-        """A boolean expression; None where there is none, or it is wrong."""
-
-    def sample(self, path: FieldPath, source: str | None, stream: Stream | None, kind: CelType) -> Expression | None:
-        """An expression over one sample; None where there is none, or it is wrong."""
-
-    def stream(self, path: FieldPath, name: str) -> Stream | None:
-        """The Detector's stream of that name; None where it has none."""
-
-    def problem(self, path: FieldPath, message: str) -> None:
-        """Report a problem with a field."""
-
-    def kept_ns(self, stream: Stream) -> int:
-        """How long the Detector keeps the stream's samples, in nanoseconds."""
-
-
-def compile_subject(compiler: Expressions) -> CompiledSubject | None:
+def compile_subject(compiler: Compiler) -> CompiledSubject | None:
     """The scope; None where problems forbid it. Whether `closingSpeed` is used is not known yet."""
     spec = compiler.rule.spec
     element = element_of(spec)
@@ -81,7 +52,7 @@ def compile_subject(compiler: Expressions) -> CompiledSubject | None:
     )
 
 
-def _pairs(compiler: Expressions, pairs: PairsScope, element: str | None) -> PairSubject | None:
+def _pairs(compiler: Compiler, pairs: PairsScope, element: str | None) -> PairSubject | None:
     at: FieldPath = ("spec", "scope", "pairs")
     position = pairs.position
     stream = compiler.stream((*at, "position", "stream"), position.stream)
@@ -118,7 +89,7 @@ def _pairs(compiler: Expressions, pairs: PairsScope, element: str | None) -> Pai
     )
 
 
-def compile_elements(compiler: Expressions, each: Each | None) -> tuple[CompiledElement, ...]:
+def compile_elements(compiler: Compiler, each: Each | None) -> tuple[CompiledElement, ...]:
     """The elements that the rule is evaluated for, in order of their names; one without a name where it has no each."""
     if each is None:
         return (CompiledElement(),)
@@ -142,10 +113,8 @@ def with_signals(
     )
 
 
-def element_problems(
-    elements: Sequence[CompiledElement], models: Sequence[CompiledModel]
-) -> Iterator[tuple[FieldPath, str]]:
-    """Models that would have to be run for each element: they are run once for a client."""
+def check_models(compiler: Compiler, elements: Sequence[CompiledElement], models: Sequence[CompiledModel]) -> None:
+    """Report models that would have to be run for each element: they are run once for a client."""
     own = {signal.name for signal in elements[0].signals}
     for model in models:
         for index, given in enumerate(model.source.inputs):
@@ -153,36 +122,28 @@ def element_problems(
             for name in names or ():
                 if name in own:
                     path: FieldPath = ("spec", "signals", model.index, "model", "inputs", index)
-                    yield path, f"{name} reads the element of each, but a model runs once per client: remove it"
+                    compiler.problem(
+                        path, f"{name} reads the element of each, but a model runs once per client: remove it"
+                    )
 
 
 def _reads(signal: CompiledSignal, variable: str) -> bool:
     return any(variable in each.names for each in (signal.value, signal.where) if each is not None)
 
 
-def known_members(spec: EventRuleSpec) -> Iterator[tuple[str, Fields]]:
-    """The maps among the variables whose fields are known, and these: CEL itself does not know what is in them."""
-    yield "parameters", dict.fromkeys(spec.parameters)
-    if spec.scope.pairs is not None:
-        whole = of_the_subject(spec)
-        signals = (signal.name for signal in spec.signals if signal.name not in whole)
-        member: dict[str, Any] = dict.fromkeys((*MEMBER_OF_CLIENT, *signals))
-        position = spec.scope.pairs.position
-        axes = ("latitude", "longitude") if position.latitude is not None else ("x", "y", "z")
-        member["parameters"] = dict.fromkeys(spec.parameters)
-        member["position"] = dict.fromkeys(axes) if position.x or position.latitude else None
-        yield "a", member
-        yield "b", member
-    if spec.each is not None:
-        # A field that only some elements have is unknown for the others.
-        yield spec.each.as_, dict.fromkeys(name for element in spec.each.of for name in element.to_json())
-
-
-def closing_speed_problem(stream: Stream | None, kept: int) -> str | None:
-    """Why the closing speed cannot be had of this stream, if so."""
-    if stream is None or kept > CLOSING_NS:
-        return None
-    return (
-        f"closingSpeed needs samples of the last second, but stream {stream.name} is kept for {kept / 1e9:g} s only: "
-        "raise the stream's buffer.duration to 2s or more"
-    )
+def with_closing_speed(
+    compiler: Compiler, subject: CompiledSubject, conditions: Iterable[Expression | None]
+) -> CompiledSubject:
+    """The subject, with the closing speed if any expression uses it."""
+    if not isinstance(subject, PairSubject):
+        return subject
+    if not any("closingSpeed" in each.names for each in (*conditions, subject.where) if each is not None):
+        return subject
+    stream = compiler.detector.spec.stream(subject.position.stream)
+    if stream is not None and (kept := compiler.kept_ns(stream)) <= CLOSING_NS:
+        compiler.problem(
+            ("spec", "scope", "pairs", "position", "stream"),
+            f"closingSpeed needs samples of the last second, but stream {stream.name} is kept for {kept / 1e9:g} s "
+            "only: raise the stream's buffer.duration to 2s or more",
+        )
+    return replace(subject, closing_speed=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable, Iterator
 
 from wayside.api import Detector
@@ -11,6 +10,7 @@ from wayside.api.stream import Stream
 from wayside.api.wording import FieldPath
 from wayside.expressions import CelType, ExpressionError, InterpolationError, compile_template
 from wayside.keys import KeyPattern, KeyPatternError
+from wayside.names import did_you_mean
 from wayside.rules.compiled import CompiledStream
 from wayside.rules.fields import Fields, ItemFields, fields_at, unknown_fields
 from wayside.rules.problems import RuleError, RuleProblem
@@ -141,8 +141,7 @@ def source_problems(detector: Detector) -> Iterator[RuleProblem]:
                     f"is valid only for streams over Zenoh, not for source {stream.source}: remove it",
                 )
             continue
-        close = difflib.get_close_matches(stream.source, names, n=1)
-        hint = f"did you mean {close[0]}?" if close else f"there are {', '.join([ZENOH, *names])}"
+        hint = did_you_mean(stream.source, names) or f"there are {', '.join([ZENOH, *names])}"
         yield RuleProblem(
             ("spec", "streams", index, "source"), f"Detector {detector.name} has no source {stream.source}; {hint}"
         )
