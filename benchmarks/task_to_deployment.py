@@ -30,8 +30,9 @@ import aiohttp
 
 from application_manager.cluster.client import manager_client
 from application_manager.core.claims.claims import instance_name
+from application_manager.core.objects.ownership import owned
 from application_manager.core.objects.policy import Policy
-from application_manager.core.objects.rendering import Renderer, owned
+from application_manager.core.objects.rendering import Renderer
 from tests.cluster.controlplane import ControlPlane
 from tests.cluster.crds import CRDS
 from wayside.api import API_VERSION, ApplicationInstance, ApplicationTemplate

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 from typing import TypeVar
 
+from application_manager.core.claims.claims import TemplateState
 from application_manager.core.conditions import Aspect
 from application_manager.core.demand import drafting
 from application_manager.core.objects.policy import Policy
@@ -24,7 +25,7 @@ class InProcess:
         return job()
 
 
-def objects(wanted: ApplicationInstance, template: drafting.TemplateState) -> Rendering | Aspect | None:
+def objects(wanted: ApplicationInstance, template: TemplateState) -> Rendering | Aspect | None:
     """The instance's objects, or why it has none."""
     if not isinstance(template, ApplicationTemplate):
         return drafting.without_template(wanted, template)

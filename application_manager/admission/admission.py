@@ -68,13 +68,8 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Admission:
-    """Answers.
-
-    Attributes:
-        observe: takes an object that was read.
-        pool: where objects are checked.
-        namespaces: those that are managed; empty: all.
-        defaults: what holds for all detectors; None where the manager runs none.
+    """Answers. `namespaces`: those that are managed, empty for all; `defaults`: None where the manager runs no
+    detectors.
     """
 
     cache: ClusterCache

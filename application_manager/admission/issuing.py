@@ -53,14 +53,9 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Issuing:
-    """Keeps the certificate valid, the files as in the Secret, and the webhooks' authority as in it.
+    """Keeps the certificate valid, the files in `folder` as in the Secret, and the webhooks' authority as in it.
 
-    Attributes:
-        client: writes also while this manager is not the active one.
-        service: of the webhook, as NAMESPACE/NAME.
-        secret: namespace and name of the Secret, which exists.
-        webhooks: the name of the webhook configurations.
-        folder: for the files.
+    `client` writes also while this manager is not the active one; `secret`: namespace and name of a Secret that exists.
     """
 
     client: Client

@@ -10,15 +10,21 @@ from dataclasses import replace
 
 from application_manager.cache.budget_index import BudgetIndex
 from application_manager.cache.store import Entry
-from application_manager.core.claims.claims import Claim, InvalidTemplate, Refused, all_instances, template_of_all
+from application_manager.core.claims.claims import (
+    Claim,
+    Refused,
+    TemplateState,
+    all_instances,
+    template_of_all,
+)
 from application_manager.core.claims.operations import Standing, Verdict
 from application_manager.core.demand.demand import claim_or_verdict, finished
 from application_manager.core.holders.leases import HolderKey
 from application_manager.core.holders.policies import TaskPolicy
 from application_manager.core.objects.policy import Name
-from wayside.api import ApplicationTask, ApplicationTemplate
+from wayside.api import ApplicationTask
 
-Claims = Callable[[ApplicationTemplate | InvalidTemplate | None, ApplicationTask], Claim | Verdict | None]
+Claims = Callable[[TemplateState, ApplicationTask], Claim | Verdict | None]
 """What a task claims of a template, or its verdict; None while that is being computed."""
 
 
@@ -52,7 +58,7 @@ class ClaimIndex:
         self._by_template: dict[Name, dict[Name, ApplicationTask]] = {}
         self._templates: dict[Name, Name] = {}  # task → template
 
-    def note(self, name: Name, entry: Entry, template: ApplicationTemplate | InvalidTemplate | None) -> set[Name]:
+    def note(self, name: Name, entry: Entry, template: TemplateState) -> set[Name]:
         """Note a task as it is now; returns the instances that it claimed or claims, none while that is computed."""
         task = entry.model
         if isinstance(task, ApplicationTask) and finished(task) is None and self._policy.refusal(task) is None:
@@ -64,7 +70,7 @@ class ClaimIndex:
             self.moved(each)
         return touched
 
-    def _note(self, name: Name, entry: Entry, template: ApplicationTemplate | InvalidTemplate | None) -> set[Name]:
+    def _note(self, name: Name, entry: Entry, template: TemplateState) -> set[Name]:
         before = self._claims.get(name)
         task = entry.model
         claimed: Claim | Verdict | None = None

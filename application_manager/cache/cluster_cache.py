@@ -12,7 +12,7 @@ from application_manager.cache.overlap_index import OverlapIndex
 from application_manager.cache.place_index import PlaceIndex
 from application_manager.cache.pod_index import PodIndex
 from application_manager.cache.store import Store
-from application_manager.core.claims.claims import Claim, InvalidTemplate, template_of_all
+from application_manager.core.claims.claims import Claim, InvalidTemplate, TemplateState, template_of_all
 from application_manager.core.claims.operations import Verdict
 from application_manager.core.demand.deciding import (
     Decided,
@@ -86,8 +86,6 @@ class WorkRecord:
 
     Attributes:
         uid: the instance's; a record of a namesake is worth nothing.
-        decision: what was wanted.
-        applied: what came of it.
         digest: of the rendering that was last applied in full.
         since: when the instance was first worked on by this process, in seconds since 1970.
     """
@@ -137,7 +135,7 @@ class ClusterCache:
         self.store = Store(OWN, full)
         self.claims = ClaimIndex(policy=tasks or TaskPolicy())
 
-    def template(self, name: Name) -> ApplicationTemplate | InvalidTemplate | None:
+    def template(self, name: Name) -> TemplateState:
         """The template, also where it is not valid; None where there is none."""
         entry = self.store.get(TEMPLATE, name)
         if entry is None:
@@ -301,7 +299,7 @@ class _NamespaceIndexes:
     cache: ClusterCache
     namespace: str
 
-    def template(self, name: str) -> ApplicationTemplate | InvalidTemplate | None:
+    def template(self, name: str) -> TemplateState:
         return self.cache.template((self.namespace, name))
 
     def instance(self, name: str) -> ApplicationInstance | None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from application_manager.core.conditions import Aspect
 from application_manager.core.health.pods import Trouble, summary, trouble
 from application_manager.core.objects.detectors import DETECTOR_LABEL
+from application_manager.core.objects.ownership import controller_of
 from application_manager.core.objects.poddefaults import PodDefaults
 from application_manager.core.objects.policy import Name
 from application_manager.core.objects.sidecars import SIDECAR_LABEL
@@ -16,14 +17,13 @@ from wayside.kubernetes.resources import Object
 
 @dataclass
 class DetectorIndex:
-    """By the Detector's namespace and name, and its objects by the uid of the Detector that controls them.
+    """By the Detector's namespace and name, and its objects by the uid of the Detector that controls them, and by kind.
 
     Labels find what may be a Detector's; anybody can copy them. So an object counts by its controller, and a pod by the
     ReplicaSet of the Deployment that does.
 
     Attributes:
         defaults: what holds for all pods; None: no detector is run.
-        objects: by the uid of their Detector, and by kind.
         running: the condition Running.
         requesting: the pods that request it as a sidecar.
     """
@@ -39,7 +39,7 @@ class DetectorIndex:
         self.objects = {}
         deployments: set[tuple[str, str]] = set()
         for raw in objects:
-            controller = _controller(raw)
+            controller = controller_of(raw)
             if controller.get("kind") == "Detector":
                 self.objects.setdefault(str(controller["uid"]), {})[raw["kind"]] = raw
                 if raw["kind"] == "Deployment":
@@ -63,14 +63,9 @@ class DetectorIndex:
         return self._troubles.get(name, [])
 
 
-def _controller(raw: Object) -> Object:
-    owners: list[Object] = raw["metadata"].get("ownerReferences") or []
-    return next((each for each in owners if each.get("controller")), {})
-
-
 def _deployment_of(pod: Object) -> tuple[str, str] | None:
     """The Deployment whose ReplicaSet controls the pod: that one's name is the Deployment's with the pod's hash."""
-    metadata, controller = pod["metadata"], _controller(pod)
+    metadata, controller = pod["metadata"], controller_of(pod)
     ending = f"-{metadata['labels'].get('pod-template-hash', '')}"
     if controller.get("kind") != "ReplicaSet" or not str(controller["name"]).endswith(ending):
         return None

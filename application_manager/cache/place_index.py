@@ -14,8 +14,7 @@ from application_manager.core.objects.policy import Name
 class PlaceIndex:
     """The placement of each namespace that has limits, and the instances that changed since.
 
-    Attributes:
-        being_made: instances that were requested from the API server, which may or may not have them.
+    `being_made`: instances that were requested from the API server, which may or may not have them.
     """
 
     def __init__(self) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from application_manager.cache.store import name_of
 from application_manager.core.health.pods import Trouble, summary, trouble
-from application_manager.core.objects.ownership import INSTANCE_LABEL
+from application_manager.core.objects.ownership import instance_of
 from application_manager.core.objects.policy import Name
 from wayside.kubernetes.resources import Object
 
@@ -21,7 +21,7 @@ class PodIndex:
 
     def note(self, pod: Object) -> bool:
         """Note a pod as it is now; whether that changes the `troubles` of its instance."""
-        instance = _instance_of(pod)
+        instance = instance_of(pod)
         if instance is None:
             return False
         before = self.troubles(instance)
@@ -34,7 +34,7 @@ class PodIndex:
 
     def forget(self, pod: Object) -> bool:
         """Forget a pod that is deleted; whether that changes the `troubles` of its instance."""
-        instance = _instance_of(pod)
+        instance = instance_of(pod)
         if instance is None:
             return False
         before = self.troubles(instance)
@@ -52,8 +52,3 @@ class PodIndex:
             members.pop(pod, None)
             if not members:
                 del self._troubles[instance]
-
-
-def _instance_of(pod: Object) -> Name | None:
-    instance = (pod["metadata"].get("labels") or {}).get(INSTANCE_LABEL)
-    return (pod["metadata"]["namespace"], instance) if instance else None

@@ -26,8 +26,7 @@ _TOMBSTONES = 10_000  # uids of deleted objects that are remembered; the oldest 
 class Entry:
     """An object as it was seen, without what nobody reads (see `trimming`): raw, and for our own kinds as a model.
 
-    Attributes:
-        problem: why it is no model, or has a part that is too large: then the model is without that part.
+    `problem`: why it is no model, or has a part that is too large: then the model is without that part.
     """
 
     raw: Object
@@ -46,18 +45,12 @@ class Entry:
 
 
 class Store:
-    """Objects by kind, then by namespace and name.
-
-    Attributes:
-        shed: the uids of tasks that were not taken in for want of memory.
-    """
+    """Objects by kind, then by namespace and name. `shed`: the uids of tasks not taken in for want of memory."""
 
     def __init__(self, modelled: Iterable[KindKey], full: Callable[[], bool] = lambda: False) -> None:
-        """Make an empty one.
+        """Make an empty one, with models of the kinds `modelled`.
 
-        Args:
-            modelled: the kinds that are ours and have a model.
-            full: whether there is no memory for further tasks; those that were served before are always taken in.
+        `full`: whether there is no memory for further tasks; those that were served before are always taken in.
         """
         self._modelled = frozenset(modelled)
         self._full = full

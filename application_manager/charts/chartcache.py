@@ -24,11 +24,9 @@ KEPT = 64  # archives
 
 @dataclass(frozen=True, slots=True)
 class ChartCache:
-    """Gives charts as paths.
+    """Gives charts as paths. `folder`: of the cache, made where it is missing.
 
-    Attributes:
-        folder: of the cache; made where it is missing.
-        local: the folder with the charts of the image, in which all that templates name by a path must be.
+    `local`: the folder with the charts of the image, in which all that templates name by a path must be.
     """
 
     helm: HelmRunner

@@ -157,12 +157,9 @@ class ChartRenderer:
 
 
 async def rendered(helm: HelmRunner, request: ChartRequest, path: Path) -> ChartOutcome:
-    """The objects of the chart at the path, or why they cannot be used.
+    """The objects of the chart at the path, or why they cannot be used. Raises HelmError.
 
     It is rendered twice: what differs each time would be applied again and again.
-
-    Raises:
-        HelmError: Helm cannot render it.
     """
     text = await helm.template(request, path)
     if text != await helm.template(request, path):

@@ -83,12 +83,7 @@ class Grants:
     """Queries the API server once for each namespace, and again while the answer is no."""
 
     def __init__(self, client: Client, changed: Callable[[], None]) -> None:
-        """Prepare.
-
-        Args:
-            client: for the API server.
-            changed: called when the account may write in a namespace in which it was not allowed to before.
-        """
+        """`changed` is called when the account may write in a namespace in which it was not allowed to before."""
         self._client = client
         self._changed = changed
         self._granted: set[str] = set()

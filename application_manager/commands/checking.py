@@ -26,13 +26,7 @@ _INVALID: Mapping[type[Kind], Check] = {
 
 @dataclass(frozen=True, slots=True)
 class Checked:
-    """What was found.
-
-    Attributes:
-        problems: what would be refused, a line each.
-        warnings: what would be warned of, a line each.
-        looked_at: how many objects.
-    """
+    """What would be refused and what would be warned of, a line each, and the number of objects that were looked at."""
 
     problems: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)

@@ -33,13 +33,8 @@ Manifest = dict[str, Any]
 def print_injected(files: Sequence[str], namespace: str, detector_image: str | None) -> None:
     """Print the manifests with their detectors as YAML; exits with 1 where a pod cannot have its detector.
 
-    Args:
-        files: of manifests and Detectors; `-` is stdin.
-        namespace: of manifests that name none.
-        detector_image: of Detectors that name none.
-
-    Raises:
-        ConfigurationError: a file cannot be read, or a Detector not be looked up.
+    `files` of manifests and Detectors, `-` for stdin; `namespace` of manifests, and `detector_image` of Detectors, that
+    name none. Raises ConfigurationError where a file cannot be read, or a Detector not be looked up.
     """
     documents = [each for file in files for each in _read(file)]
     known = _Known({each.name: each for each in map(_detector, documents) if each is not None}, namespace)

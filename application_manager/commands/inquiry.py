@@ -39,15 +39,11 @@ class InquiryError(InputError):
 
 
 async def inquire(subject: str, namespace: str | None) -> Explanation:
-    """The explanation of a task or an instance.
+    """The explanation of a task or an instance: of a name, or `task/<name>`, `instance/<name>` where there is one of
+    each.
 
-    Args:
-        subject: a name, or `task/<name>`, `instance/<name>` where there is one of each.
-        namespace: None for the kubeconfig's, else `default`.
-
-    Raises:
-        InquiryError: there is no such object, or the API server refuses to return it.
-        ConfigurationError: there is no cluster.
+    `namespace` None: the kubeconfig's, else `default`. Raises InquiryError where there is no such object, or the API
+    server refuses to return it, and ConfigurationError where there is no cluster.
     """
     client = manager_client(await load_configuration())
     try:

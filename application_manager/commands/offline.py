@@ -61,12 +61,8 @@ def render_files(
 
 
 def charts_at_once(helm: HelmRunner, cache: Path | None, folder: Path) -> Charts:
-    """Renders charts while the caller waits.
-
-    Args:
-        helm: the program.
-        cache: the folder in which fetched charts are kept; None: the default one.
-        folder: in which all charts are that templates name by a path.
+    """Renders charts while the caller waits. `cache` and `folder`: as the options have them; `cache` None: the default
+    one.
     """
     kept = ChartCache(helm, cache or default_folder(), folder)
     return lambda request: asyncio.run(rendered_at_once(helm, kept, request))
@@ -75,14 +71,9 @@ def charts_at_once(helm: HelmRunner, cache: Path | None, folder: Path) -> Charts
 def render_objects(
     objects: Sequence[Kind], policy: Policy, now: float, limit: int | None = None, charts: Charts = no_charts
 ) -> OfflineResult:
-    """What the templates and tasks make run, namespace by namespace.
+    """What the templates and tasks make run, namespace by namespace; objects of other kinds are passed over.
 
-    Args:
-        objects: those of other kinds are passed over.
-        policy: what templates may create.
-        now: seconds since 1970.
-        limit: how many instances a namespace may have; None: any number.
-        charts: renders charts.
+    `now` in seconds since 1970; `limit`: how many instances a namespace may have, None for any number.
     """
     result = OfflineResult()
     for namespace in sorted({each.namespace for each in objects}):

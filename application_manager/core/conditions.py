@@ -7,8 +7,9 @@ there only while waiting alone helps nothing.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from wayside.api.base import Condition
 from wayside.times import format_seconds
@@ -65,6 +66,12 @@ def find(conditions: Iterable[Condition], type_: str) -> Condition | None:
     return next((each for each in conditions if each.type == type_), None)
 
 
+def find_raw(status: Mapping[str, Any], type_: str) -> Mapping[str, Any]:
+    """The condition of the type in the status of an object as it was read; empty where there is none."""
+    conditions = status.get("conditions") or ()
+    return next((each for each in conditions if isinstance(each, Mapping) and each.get("type") == type_), {})
+
+
 def holds(conditions: Iterable[Condition], type_: str) -> bool:
     """Whether there is a condition of the type and it is True."""
     condition = find(conditions, type_)
@@ -89,14 +96,10 @@ STALLED = "Stalled"
 def concluded(
     known: Sequence[Condition], aspects: Sequence[Aspect], generation: int, now: float, *, stalled: Collection[str]
 ) -> list[Condition]:
-    """The conditions that the aspects make, with Ready and Stalled as follows from them.
+    """The conditions that the aspects, at least one, make, with Ready and Stalled as follows from them.
 
-    Args:
-        known: as they are.
-        aspects: at least one; the object is ready if all of them hold.
-        generation: the object's.
-        now: seconds since 1970.
-        stalled: the reasons that somebody has to correct the object for.
+    The object is ready if all aspects hold. `now` in seconds since 1970; `stalled`: the reasons that somebody has to
+    correct the object for.
     """
     failing = next((each for each in aspects if not each.holds), None)
     if failing is None:

@@ -9,21 +9,19 @@ from prometheus_client.core import Metric
 from prometheus_client.registry import Collector
 
 from application_manager.cache.cluster_cache import INSTANCE, TASK, TEMPLATE, ClusterCache
+from application_manager.core.conditions import find_raw
 from application_manager.core.objects.policy import KindKey
 from application_manager.measures import gauge, gauges
 from wayside.api.applicationinstance import InstancePhase
 from wayside.api.applicationtask import TaskPhase
+from wayside.kubernetes.resources import Object
 
 NO_PHASE = "None"
 """The phase of what the manager has not looked at yet."""
 
 
 class Overview(Collector):
-    """Gauges over the cache.
-
-    Args of the constructor:
-        queues: by name, how many keys wait for a worker, and how many for their time.
-    """
+    """Gauges over the cache and the queues: by name, how many keys wait for a worker, and how many for their time."""
 
     def __init__(self, cache: ClusterCache, queues: Callable[[], Iterable[tuple[str, int, int]]]) -> None:
         self._cache = cache
@@ -58,7 +56,5 @@ class Overview(Collector):
         return gauges(name, text, "phase", [(each, found[each]) for each in (*phases, NO_PHASE)])
 
 
-def _accepted(raw: dict[str, object]) -> str:
-    status = raw.get("status")
-    conditions = status.get("conditions") if isinstance(status, dict) else None
-    return next((str(each["status"]) for each in conditions or () if each["type"] == "Accepted"), "Unknown")
+def _accepted(raw: Object) -> str:
+    return str(find_raw(raw.get("status") or {}, "Accepted").get("status", "Unknown"))

@@ -36,15 +36,10 @@ class _Queue(Protocol):
 
 
 def stalled(measures: Measures, every: float, queues: Sequence[_Queue] = (), least: float = STALLED_AFTER) -> Lack:
-    """Whether work has stalled: no resync has ended, or a worker was at one key, for too long.
+    """Whether work has stalled: no resync has ended, or a worker was at one key, for too long. Any thread may call it.
 
-    A resync that fails, the API server being away, ends as well. Any thread may call it.
-
-    Args:
-        measures: knows when the last resync ended.
-        every: seconds between two resyncs.
-        queues: whose workers are looked at.
-        least: seconds that count as too long, or three times `every` if that is more.
+    A resync that fails, the API server being away, ends as well. `every`: seconds between two resyncs; `least`: seconds
+    that count as too long, or three times `every` if that is more.
     """
     limit = max(least, _RESYNCS * every)
 

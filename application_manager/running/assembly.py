@@ -53,19 +53,11 @@ _STATUS_SHARE = 2  # few: what runs goes before its status
 
 
 class Assembly:
-    """All queues of a manager.
+    """All queues of a manager, and what they share.
 
     Attributes:
-        client, options, resources, measures: as given.
-        cache: the objects of the cluster.
-        detector_index: what is known of Detectors that are run.
-        recorder: posts Events.
-        applier: applies manifests.
-        publisher: publishes configurations.
-        router: takes events.
-        charts: renders charts.
+        detector_index: what is known of Detectors that are run; `detectors`: the queue of these.
         pool: runs users' expressions.
-        detectors: the queue of Detectors that are run.
         queues: all of them.
     """
 

@@ -20,28 +20,14 @@ from application_manager.workers.pool import CPU_TIME
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """The options of the command line.
+    """The options of the command line, which explains them; None means nowhere or no limit.
 
     Attributes:
-        policy: what templates may create.
-        namespaces: those to look at; empty: all.
-        max_instances: how many instances a namespace may have; None: any number.
-        tasks: what limits tasks.
-        resync: seconds between two full resyncs.
-        ttl_after_finished: seconds that finished tasks are kept.
-        metrics_port: where metrics and health are served; None: nowhere.
-        metrics_certificates: the folder with the certificate by which they are served; None: without TLS.
-        zenoh: where configurations are published; None: nowhere.
-        helm: renders charts.
-        chart_cache: the folder in which fetched charts are kept.
-        chart_folder: the folder with the charts of the image.
-        admission: where the API server's questions about objects are answered; None: nowhere.
+        namespaces: empty: all.
+        resync, ttl_after_finished, stalled_after, watch_timeout, cpu_time: seconds.
+        memory_limit: bytes.
         lease: by which one of several managers is active.
-        stalled_after: seconds after which the watchdog ends a manager whose work has stalled.
-        watch_timeout: seconds without an event or a bookmark after which a watch is restarted.
         detectors: what holds for the pods of detectors; None: no detector is run.
-        memory_limit: bytes that the manager and its worker processes may have together; None: any number.
-        cpu_time: seconds of CPU time that one evaluation of a template's or rule's expressions may take.
     """
 
     policy: Policy = field(default_factory=Policy)

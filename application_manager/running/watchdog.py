@@ -44,11 +44,8 @@ async def watchdog(
 ) -> AsyncIterator[None]:
     """Look after the event loop that this is entered in, and after what `stalled` reports, while the block runs.
 
-    Args:
-        stalled: what else may stall than the event loop.
-        silent: seconds after which an event loop without a sign of life hangs.
-        step: seconds between two looks.
-        end: what ends the process.
+    `silent`: seconds after which an event loop without a sign of life hangs; `step`: seconds between two looks; `end`
+    ends the process.
     """
     beats, over = [0], threading.Event()
 

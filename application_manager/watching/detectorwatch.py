@@ -25,12 +25,7 @@ _PODS = Resource("v1", "Pod", "pods")
 
 @dataclass(frozen=True, slots=True)
 class DetectorWatch:
-    """Lists them.
-
-    Attributes:
-        namespaces: where; empty: everywhere.
-        detector: enqueues a Detector.
-    """
+    """Lists them, in these namespaces, everywhere where there are none; `detector` enqueues a Detector."""
 
     cache: ClusterCache
     client: Client

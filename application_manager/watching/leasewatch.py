@@ -26,10 +26,8 @@ log = logging.getLogger(__name__)
 class LeaseWatch:
     """Measures the time in which we reach the API server, on which Leases expire.
 
-    Attributes:
-        probe: what is listed to see whether the API server and its storage answer.
-        namespaces: where; empty: anywhere.
-        instance: enqueues an instance.
+    `probe`: what is listed to see whether the API server and its storage answer, in one of the namespaces, if there are
+    any; `instance` enqueues an instance.
     """
 
     cache: ClusterCache

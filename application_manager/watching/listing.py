@@ -24,13 +24,9 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Listing:
-    """Lists what the manager looks at.
+    """Lists our own kinds and those of instances' objects, in these namespaces, everywhere where there are none.
 
-    Attributes:
-        children: the kinds of instances' objects.
-        namespaces: where; empty: everywhere.
-        every: seconds between two resyncs.
-        measures: counts each resync.
+    `every`: seconds between two resyncs.
     """
 
     cache: ClusterCache

@@ -108,11 +108,8 @@ async def watch(
 def relaying(observe: Handler, vanished: Handler, relist: Relist, failed: Callable[[], None]) -> Iterator[None]:
     """Relay the events of kopf's watches while the block runs.
 
-    Args:
-        observe: handles an object that was added or modified.
-        vanished: handles an object that was deleted.
-        relist: lists a kind and routes all of its objects.
-        failed: counts an object that could not be handled.
+    `observe` and `vanished` handle an object, `failed` counts one that they could not handle, and `relist` lists a
+    kind.
     """
     watch: Any = watching.watch_objs
     fetch = fetching.fetch_objs

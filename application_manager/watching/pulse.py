@@ -39,12 +39,7 @@ class Pulse(Collector):
     """When each watch last gave a sign of life; also as metrics. Any thread may read."""
 
     def __init__(self, limit: float, healthy: Callable[[], float]) -> None:
-        """No watch has any yet.
-
-        Args:
-            limit: seconds after which a watch is restarted.
-            healthy: seconds during which the API server answered.
-        """
+        """`limit`: seconds until a watch is restarted; `healthy`: seconds during which the API server answered."""
         self.limit = limit
         self._healthy = healthy
         self._beats: dict[Watch, tuple[float, float]] = {}  # monotonic and healthy seconds

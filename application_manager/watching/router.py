@@ -22,8 +22,8 @@ from application_manager.cache.cluster_cache import (
 )
 from application_manager.cache.store import Entry, kind_of, name_of
 from application_manager.core.health.readiness import not_ready
-from application_manager.core.objects.configuration import CONFIG_MAP, config_map_name
-from application_manager.core.objects.ownership import INSTANCE_LABEL
+from application_manager.core.objects.configuration import config_map_key
+from application_manager.core.objects.ownership import controller_of, instance_of, object_key
 from application_manager.core.objects.policy import Name
 from application_manager.core.objects.suspension import pods_left
 from application_manager.work.applying import Applier
@@ -42,12 +42,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Router:
-    """Puts events into the cache and enqueues what they concern.
-
-    Attributes:
-        instance, task, template, rule: enqueue one of these; `rule` takes Detectors as well.
-        configuration: enqueues the configuration of an instance.
-    """
+    """Puts events into the cache and enqueues what they concern; `rule` takes Detectors as well."""
 
     cache: ClusterCache
     applier: Applier
@@ -181,13 +176,13 @@ class Router:
         return entry.uid, "deletionTimestamp" in raw["metadata"], not_ready(raw), pods_left(raw) > 0
 
     def _enqueue_owner(self, raw: Object) -> None:
-        owner = _instance_of(raw)
+        owner = instance_of(raw)
         if owner is not None:
             self.instance(owner)
 
     def _enqueue_configuration(self, raw: Object) -> None:
-        owner = _instance_of(raw)
-        if kind_of(raw) == CONFIG_MAP and owner is not None and name_of(raw)[1] == config_map_name(owner[1]):
+        owner = instance_of(raw)
+        if owner is not None and object_key(raw) == config_map_key(owner[1]):
             self.configuration(owner)
 
     def _lease(self, name: Name, raw: Object | None) -> None:
@@ -223,12 +218,6 @@ class Router:
             self.instance(name)
 
 
-def _instance_of(raw: Object) -> Name | None:
-    """The instance whose label the object has."""
-    owner = (raw["metadata"].get("labels") or {}).get(INSTANCE_LABEL)
-    return (raw["metadata"]["namespace"], owner) if owner else None
-
-
 def _written(entry: Entry) -> tuple[object, ...]:
     """What people write of a rule or a detector, or what is wrong with that."""
     return entry.raw["spec"], entry.problem, entry.raw["metadata"].get("labels")
@@ -236,5 +225,4 @@ def _written(entry: Entry) -> tuple[object, ...]:
 
 def _is_a_workloads(pod: Object) -> bool:
     """Whether the pod belongs to a workload, and not to the instance itself."""
-    owners = pod["metadata"].get("ownerReferences") or ()
-    return any(each.get("controller") and each["kind"] != ApplicationInstance.__name__ for each in owners)
+    return controller_of(pod).get("kind") not in (None, ApplicationInstance.__name__)

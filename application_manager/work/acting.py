@@ -51,13 +51,8 @@ async def acting(
 ) -> None:
     """Act whenever this manager is active, until `stop` is set; the Lease is released then.
 
-    Args:
-        leadership: knows when to act.
-        client: by which all is written.
-        queues: what works.
-        reporters: what reports the work, and therefore ends after it.
-        begin: called each time before the work begins.
-        stop: the end.
+    `reporters` report the work of the queues, and therefore end after them; `begin` is called each time before the
+    work.
     """
     stopping = asyncio.create_task(stop.wait(), name="stop")
     again = not leadership.active

@@ -26,15 +26,18 @@ from application_manager.core.health.refusals import (
 from application_manager.core.objects.ownership import (
     Applied,
     Known,
+    Manifest,
     ObjectKey,
     Obstacle,
     controller_uid,
     foreign,
+    object_key,
     our_fields,
+    owned,
     references,
 )
 from application_manager.core.objects.policy import KindKey
-from application_manager.core.objects.rendering import Manifest, Rendering, object_key, owned
+from application_manager.core.objects.rendering import Rendering
 from wayside.api import ApplicationInstance, Kind
 from wayside.kubernetes.client import Client
 from wayside.kubernetes.errors import ApiError
@@ -208,15 +211,8 @@ async def apply_owned(
 ) -> Object | Obstacle:
     """Apply an object with its owner as controller, unless it is somebody else's; the object, or what prevents it.
 
-    Args:
-        client: for the API server.
-        resource: where the kind lives.
-        manifest: the object, with its owner reference.
-        owner: the instance or Detector.
-        live: the object as it is; None where there is none. Its uid is a precondition.
-        recorded: its uid, if the owner's status lists it.
-
-    Raises ApiError or Unreachable for what may pass, and for a namespace that is being deleted.
+    `live`: the object as it is, None where there is none; its uid is a precondition. `recorded`: its uid, if the
+    owner's status lists it. Raises RequestError for what may pass, and for a namespace that is being deleted.
     """
     what = f"{manifest['kind']} {manifest['metadata']['name']}"
     if live is not None:

@@ -10,15 +10,8 @@ import logging
 from dataclasses import dataclass
 
 from application_manager.cache.cluster_cache import ClusterCache
-from application_manager.core.objects.configuration import (
-    ANNOTATION,
-    CONFIG_MAP,
-    behind,
-    config_map_name,
-    fingerprint,
-    selectors,
-)
-from application_manager.core.objects.ownership import controller_uid
+from application_manager.core.objects.configuration import ANNOTATION, behind, config_map_key, fingerprint, selectors
+from application_manager.core.objects.ownership import controller_uid, reference_key
 from application_manager.core.objects.policy import Name
 from application_manager.work.applying import Applier
 from application_manager.work.publishing import Publisher
@@ -47,7 +40,7 @@ class ConfigurationWork:
         Raises ApiError or Unreachable for what may pass; the caller tries again.
         """
         instance = self.cache.instance(name)
-        live = self.applier.live(name[0], (*CONFIG_MAP, config_map_name(name[1])))
+        live = self.applier.live(name[0], config_map_key(name[1]))
         if instance is None or live is None or controller_uid(live) != instance.metadata.uid:
             self.publisher.withdraw(name)
             return
@@ -85,5 +78,5 @@ class ConfigurationWork:
             objects = list(record.applied.objects)
         else:
             objects = list(instance.status.objects) if instance.status else []
-        found = (self.applier.live(name[0], (each.api_version, each.kind, each.name)) for each in objects)
+        found = (self.applier.live(name[0], reference_key(each)) for each in objects)
         return [each for each in found if each is not None]

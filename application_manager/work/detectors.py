@@ -89,12 +89,7 @@ class SidecarEvents:
 
 @dataclass(frozen=True, slots=True)
 class DetectorWork:
-    """Makes, changes and removes a detector's objects.
-
-    Attributes:
-        judge: enqueues the Detector's status.
-        sidecars: posts Events about pods that were to have a detector and have none.
-    """
+    """Makes, changes and removes a detector's objects; `judge` enqueues the Detector's status."""
 
     cache: ClusterCache
     client: Client

@@ -14,16 +14,17 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 from application_manager.cache.cluster_cache import INSTANCES, TASKS, ClusterCache, WorkRecord
+from application_manager.core.claims.claims import TemplateState
 from application_manager.core.claims.merging import TOO_LARGE
 from application_manager.core.conditions import Aspect, find
 from application_manager.core.demand import drafting
 from application_manager.core.demand.decisions import Decision
 from application_manager.core.health.refusals import reason_of, with_remedy
 from application_manager.core.objects import trimming
-from application_manager.core.objects.configuration import CONFIG_MAP, config_map_name
-from application_manager.core.objects.ownership import Applied, Known, ObjectKey, references
+from application_manager.core.objects.configuration import config_map_key
+from application_manager.core.objects.ownership import Applied, Known, ObjectKey, object_key, references
 from application_manager.core.objects.policy import Name
-from application_manager.core.objects.rendering import Rendering, object_key
+from application_manager.core.objects.rendering import Rendering
 from application_manager.work.applying import Applier
 from application_manager.work.recorder import EventReason, Recorder
 from application_manager.work.suspending import Suspending
@@ -45,15 +46,13 @@ LONGEST_PAUSE = 30.0  # s
 class _Start:
     """What the work on one instance starts from. It is read from the cache in one go, so it belongs together.
 
-    Attributes:
-        existing: the instance; None where it is to be made.
-        record: how the last work went, if it was this process's.
+    `existing` is None where the instance is to be made; `record`: how this process's last work on it went.
     """
 
     name: Name
     decision: Decision
     existing: ApplicationInstance | None
-    template: drafting.TemplateState
+    template: TemplateState
     record: WorkRecord | None
 
     def record_of(self, instance: ApplicationInstance) -> WorkRecord | None:
@@ -105,14 +104,11 @@ class InstanceWork:
 
     Attributes:
         again: enqueues an instance at a time, in seconds since 1970.
-        enqueue: enqueues an instance.
         done: called when an instance's record is new.
         absent: called with the decision about an instance that neither exists nor should.
-        observe: takes an object that was read.
         configured: called when an instance's configuration was applied.
         objects: the objects of an instance, or why it has none; None: they are being computed, and the instance is
             enqueued once they are.
-        attempts: knows what was refused, and when it is tried again.
         not_made: called with the reason why an instance cannot be made.
     """
 
@@ -127,7 +123,7 @@ class InstanceWork:
     absent: Callable[[Name, Decision | None], None]
     observe: Callable[[Object], None]
     configured: Callable[[Name], None]
-    objects: Callable[[ApplicationInstance, drafting.TemplateState], Rendering | Aspect | None]
+    objects: Callable[[ApplicationInstance, TemplateState], Rendering | Aspect | None]
     attempts: Attempts = field(default_factory=Attempts)
     not_made: Callable[[Name, Decision, str], None] = lambda *_: None
 
@@ -254,7 +250,7 @@ class InstanceWork:
                 self._note(start, instance, Applied(retrying, references(known.objects), complete=False), known.digest)
             raise
         self._note(start, instance, applied, rendering.digest if applied.complete else known.digest)
-        if any(object_key(each) == (*CONFIG_MAP, config_map_name(name[1])) for each in pending):
+        if any(object_key(each) == config_map_key(name[1]) for each in pending):
             self.configured(name)
         if applied.complete:
             self.attempts.forget(name)

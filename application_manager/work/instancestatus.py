@@ -21,7 +21,7 @@ from application_manager.core.health.placement import is_placed, misplaced
 from application_manager.core.health.pods import Trouble, summary
 from application_manager.core.health.readiness import is_unseen, not_ready
 from application_manager.core.health.refusals import lacks_pods, refused_by_events, refused_pods
-from application_manager.core.objects.ownership import Applied, ObjectKey
+from application_manager.core.objects.ownership import Applied, ObjectKey, reference_key
 from application_manager.core.objects.policy import Name
 from application_manager.core.statuses.status import Service, instance_status, suspension_aspect
 from application_manager.work.applying import Applier
@@ -40,14 +40,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class InstanceStatusWork:
-    """Writes statuses of instances.
-
-    Attributes:
-        task_changed: enqueues a task.
-        nodes: lists the cluster's nodes.
-        failed_pods: finds why pods could not be made.
-        again: enqueues an instance at a time, in seconds since 1970.
-    """
+    """Writes statuses of instances; `again` enqueues one at a time, in seconds since 1970, `task_changed` a task."""
 
     cache: ClusterCache
     statuses: StatusWriter
@@ -165,7 +158,7 @@ class InstanceStatusWork:
 
     def _live(self, instance: ApplicationInstance, applied: Applied) -> dict[ObjectKey, Object | None]:
         """The instance's objects, as watched."""
-        keys = [(each.api_version, each.kind, each.name) for each in applied.objects]
+        keys = map(reference_key, applied.objects)
         return {key: self.applier.live(instance.namespace, key) for key in keys}
 
     def _ready(

@@ -189,14 +189,9 @@ class Recorder:
         self._series: OrderedDict[tuple[str, str, str], _Series] = OrderedDict()
 
     def event(self, regarding: Kind, reason: EventReason, note: str, now: float, *, once: bool = False) -> None:
-        """Post an Event about the object, unless there were too many of it.
+        """Post an Event about the object, at `now` in seconds since 1970, unless there were too many of it.
 
-        Args:
-            regarding: the object.
-            reason: one word.
-            note: why, for people.
-            now: seconds since 1970.
-            once: not if there is the same already, also of an earlier run: for what follows from no change of a status.
+        `once`: not if there is the same already, also of an earlier run: for what follows from no change of a status.
         """
         event = _Event(regarding, reason, note, now, once)
         if self._repeats(event):

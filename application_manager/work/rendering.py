@@ -12,6 +12,7 @@ from collections.abc import Callable
 from functools import partial
 
 from application_manager.cache.cluster_cache import ClusterCache
+from application_manager.core.claims.claims import TemplateState
 from application_manager.core.conditions import Aspect
 from application_manager.core.demand import drafting
 from application_manager.core.objects.charts import ChartFailure, ChartOutcome, ChartRequest, Charts
@@ -37,15 +38,7 @@ class Renderings:
         again: Callable[[Name], None],
         template_changed: Callable[[Name], None],
     ) -> None:
-        """Make it.
-
-        Args:
-            cache: the policy, and what exceeded.
-            answers: computes the renderings.
-            charts: knows what became of a chart.
-            again: enqueues an instance.
-            template_changed: enqueues a template whose renderings exceed the limit, or do so no more.
-        """
+        """`again` enqueues an instance, `template_changed` a template whose renderings exceed the limit, or no more."""
         self._cache = cache
         self._answers = answers
         self._charts = charts
@@ -54,7 +47,7 @@ class Renderings:
         self._pickled: OrderedDict[tuple[str, int], bytes] = OrderedDict()
         self._plain: OrderedDict[tuple[str, int], bool] = OrderedDict()
 
-    def objects(self, wanted: ApplicationInstance, template: drafting.TemplateState) -> Rendering | Aspect | None:
+    def objects(self, wanted: ApplicationInstance, template: TemplateState) -> Rendering | Aspect | None:
         """The instance's objects, or why it has none, as the condition Applied gives it; None: it is enqueued later."""
         problem = drafting.without_template(wanted, template)
         if problem is not None or not isinstance(template, ApplicationTemplate):

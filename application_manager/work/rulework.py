@@ -31,12 +31,7 @@ Status = EventRuleStatus | DetectorStatus
 
 @dataclass(frozen=True, slots=True)
 class RuleWork:
-    """Writes the statuses of rules and detectors.
-
-    Attributes:
-        pool: where they are checked.
-        detectors: what is known of those that the manager runs.
-    """
+    """Writes the statuses of rules and detectors."""
 
     cache: ClusterCache
     statuses: StatusWriter

@@ -27,11 +27,7 @@ class KindStatus(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class StatusWriter:
-    """Writes statuses.
-
-    Attributes:
-        observe: puts the API server's answer into the cache.
-    """
+    """Writes statuses; `observe` puts the API server's answer into the cache."""
 
     client: Client
     recorder: Recorder
@@ -48,15 +44,8 @@ class StatusWriter:
     ) -> bool:
         """Write what of a status is new, if anything; whether the object is there.
 
-        Args:
-            resource: where the kind lives.
-            regarding: the object.
-            old: its status; None where it has none.
-            new: its status from now on.
-            now: seconds since 1970.
-            conditions: the types of conditions whose changes are worth an Event; None: all.
-
-        Raises ApiError or Unreachable for what may pass.
+        `old` is None where it has none; `now` in seconds since 1970; `conditions`: the types of conditions whose
+        changes are worth an Event, None for all. Raises RequestError for what may pass.
         """
         patch = difference(old.to_json() if old is not None else {}, new.to_json())
         if not patch:

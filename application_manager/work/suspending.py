@@ -11,9 +11,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from application_manager.cache.cluster_cache import INSTANCES
-from application_manager.core.objects.ownership import controller_uid
+from application_manager.core.objects.ownership import ObjectKey, controller_uid, reference_key
 from application_manager.core.objects.rendering import Rendering
-from application_manager.core.objects.suspension import ObjectKey
 from application_manager.work.applying import Applier
 from wayside.api import ApplicationInstance
 from wayside.api.applicationinstance import SuspendedReplicas
@@ -28,11 +27,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Suspending:
-    """Scales the workloads of instances.
-
-    Attributes:
-        observe: takes an object that was read.
-    """
+    """Scales the workloads of instances."""
 
     client: Client
     applier: Applier
@@ -44,7 +39,7 @@ class Suspending:
         Raises ApiError or Unreachable for what may pass.
         """
         noted = {
-            (each.api_version, each.kind, each.name): each.replicas
+            reference_key(each): each.replicas
             for each in (instance.status.suspended_replicas if instance.status else ())
         }
         if instance.spec.suspended:

@@ -39,14 +39,9 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class TaskWork:
-    """Writes the statuses of tasks.
+    """Writes the statuses of tasks, deletes them `ttl` seconds after they have finished, and measures their times.
 
-    Attributes:
-        ttl: seconds that a finished task is kept.
-        again: enqueues a task at a time, in seconds since 1970.
-        observe: takes an object that was read.
-        measures: counts refusals, and measures the times from event to service.
-        traces: emits spans, where traces are on.
+    `again` enqueues a task at a time, in seconds since 1970.
     """
 
     cache: ClusterCache

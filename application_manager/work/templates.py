@@ -23,12 +23,7 @@ from wayside.api.base import Kind, Metadata
 
 @dataclass(frozen=True, slots=True)
 class TemplateWork:
-    """Writes the statuses of templates.
-
-    Attributes:
-        pool: where templates are checked.
-        again: enqueues a template at a time, in seconds since 1970.
-    """
+    """Writes the statuses of templates; `again` enqueues one at a time, in seconds since 1970."""
 
     cache: ClusterCache
     statuses: StatusWriter

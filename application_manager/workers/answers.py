@@ -64,7 +64,6 @@ class AnswerCache:
             key: the object that it is about.
             question: what the answer follows from; compared with that of the answer that is there.
             namespace: whose CPU time it takes.
-            job: makes the job.
             done: called once, however the job ends; who still wants the answer requests it again.
         """
         known = self._kept.get(key)

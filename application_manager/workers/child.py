@@ -17,11 +17,7 @@ _ROOM = 64 * 1024  # bytes that are read ahead
 
 
 class EndedError(Exception):
-    """The process ended while it worked.
-
-    Attributes:
-        of_time: whether it used up its CPU time.
-    """
+    """The process ended while it worked; `of_time`: since it used up its CPU time."""
 
     def __init__(self, why: str, *, of_time: bool) -> None:
         super().__init__(why)

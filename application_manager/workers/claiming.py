@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
-from application_manager.core.claims.claims import Claim, InvalidTemplate, Refusal, Refused, claim
+from application_manager.core.claims.claims import Claim, Refusal, Refused, TemplateState, claim
 from application_manager.core.claims.operations import Standing, Verdict
 from application_manager.core.demand.demand import claim_or_verdict, finished, refused
 from application_manager.core.objects.policy import Name
@@ -28,9 +28,7 @@ class Claiming:
         self._answers = answers
         self._done = done
 
-    def __call__(
-        self, template: ApplicationTemplate | InvalidTemplate | None, task: ApplicationTask
-    ) -> Claim | Verdict | None:
+    def __call__(self, template: TemplateState, task: ApplicationTask) -> Claim | Verdict | None:
         """What the task claims, or its verdict where it claims nothing; None while that is being computed."""
         if not isinstance(template, ApplicationTemplate) or claims_are_plain(template):
             return claim_or_verdict(template, task)

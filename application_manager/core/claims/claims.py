@@ -89,7 +89,11 @@ class InvalidTemplate:
     problem: str
 
 
-def claim(template: ApplicationTemplate | InvalidTemplate | None, task: ApplicationTask) -> Claim | Refusal:
+TemplateState = ApplicationTemplate | InvalidTemplate | None
+"""A template of a name: None where there is none."""
+
+
+def claim(template: TemplateState, task: ApplicationTask) -> Claim | Refusal:
     """What the task requests of its template, None where there is no such template."""
     if isinstance(template, InvalidTemplate):
         message = f"spec.templateName: ApplicationTemplate {template.name} is not valid: {template.problem}"

@@ -52,12 +52,10 @@ class Conflict:
 
 @dataclass(frozen=True, slots=True)
 class Merged:
-    """One value for each parameter that somebody gives, and what became of the tasks.
+    """One value for each parameter that somebody gives, without defaults, and what became of the tasks.
 
-    Attributes:
-        parameters: without defaults.
-        conflicts: the tasks that could not take part, by name.
-        capped: a message about each sum that went beyond its parameter's bounds.
+    `conflicts`: the tasks that could not take part, by name; `capped`: a message about each sum that went beyond its
+    parameter's bounds.
     """
 
     parameters: dict[str, Any]

@@ -40,9 +40,7 @@ class Standing(StrEnum):
 class Verdict:
     """What became of one task; reason and message are those of its condition Accepted, or Finished.
 
-    Attributes:
-        instance: the one that serves it.
-        acts: whether it acts on what runs, and does not deploy it.
+    `instance`: the one that serves it; `acts`: whether it acts on what runs, and does not deploy it.
     """
 
     standing: Standing
@@ -172,12 +170,9 @@ def waiting_for_any(claim: Claim) -> Verdict:
 
 
 def gathered(claim: Claim, parts: Mapping[str, Verdict], otherwise: Verdict) -> Verdict:
-    """The one verdict of a task that means all instances of a template.
+    """The one verdict of a task that means all instances of a template, of its verdicts by instance.
 
-    Args:
-        claim: of the task.
-        parts: its verdicts, by instance.
-        otherwise: what holds where there is no instance that it could be about.
+    `otherwise`: what holds where there is no instance that it could be about.
     """
     if otherwise.standing is not Standing.WAITING:  # its holder is lost: that is so for all of them
         return otherwise

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Protocol
 
-from application_manager.core.claims.claims import Claim, InvalidTemplate, Refused, template_of_all
+from application_manager.core.claims.claims import Claim, InvalidTemplate, Refused, TemplateState, template_of_all
 from application_manager.core.claims.operations import Standing, Verdict, settle, waiting_for_any
 from application_manager.core.claims.parameters import baseline
 from application_manager.core.conditions import find, holds
@@ -28,7 +28,7 @@ from wayside.api import ApplicationInstance, ApplicationTask, ApplicationTemplat
 class Indexes(Protocol):
     """What decisions read of one namespace. Names are those of objects in it."""
 
-    def template(self, name: str) -> ApplicationTemplate | InvalidTemplate | None:
+    def template(self, name: str) -> TemplateState:
         """The template, also where it is not valid."""
 
     def instance(self, name: str) -> ApplicationInstance | None:
@@ -116,7 +116,7 @@ def fallback_claims(instance: ApplicationInstance, indexes: Indexes, now: float)
     return _decide_one(instance.name, of, indexes.claims(instance.name, of), indexes, now).fallback
 
 
-def has_baseline(template: ApplicationTemplate | InvalidTemplate | None) -> bool:
+def has_baseline(template: TemplateState) -> bool:
     """Whether the template demands its instance, which has its name, by itself."""
     return isinstance(template, ApplicationTemplate) and baseline(template) is not None
 
@@ -146,7 +146,7 @@ def _decide_one(name: str, template_name: str, claims: Iterable[Claim], indexes:
         return _left_alone(instance, ordered)
     if isinstance(template, InvalidTemplate):  # its tasks are refused, and what runs stays until it is corrected
         key = instance.spec.key if instance else None
-        return Decision(name, template_name, key, None, (), {}, None, None, paused)
+        return Decision(name, template_name, key, paused=paused)
     live, verdicts, changes = live_claims(ordered, template, indexes.leases(ordered), now)
     settled = settle(name, template, live, instance is not None)
     kept = instance.spec.key if instance else None
@@ -165,13 +165,9 @@ def _decide_one(name: str, template_name: str, claims: Iterable[Claim], indexes:
     served = [each for each in live if each.task.name in settled.tasks]
     if paused or template is None or (release_time is not None and instance is not None and instance.spec.suspended):
         suspended = None  # what lingers is not started again
+    demanded = (settled.parameters, settled.suspender is not None)
     withheld = (
-        paused
-        and wanted
-        and instance is not None
-        and (
-            instance.spec.parameters != settled.parameters or instance.spec.suspended != (settled.suspender is not None)
-        )
+        paused and wanted and instance is not None and (instance.spec.parameters, instance.spec.suspended) != demanded
     )
     return Decision(
         name=name,
@@ -218,16 +214,8 @@ def _decide_for_all(name: str, indexes: Indexes, now: float) -> Decision | None:
     usable = template if isinstance(template, ApplicationTemplate) else None
     live, verdicts, changes = live_claims(ordered, usable, indexes.leases(ordered), now)
     verdicts |= {each.task.name: waiting_for_any(each) for each in live}
-    return Decision(
-        name=name,
-        template=template_of_all(name) or "",
-        key=None,
-        parameters=None,
-        tasks=(),
-        verdicts=verdicts,
-        release_time=None,
-        next_change=min((change for change in changes if change > now), default=None),
-    )
+    change = min((each for each in changes if each > now), default=None)
+    return Decision(name, template_of_all(name) or "", verdicts=verdicts, next_change=change)
 
 
 def precedence(task: ApplicationTask) -> tuple[int, str, str]:
@@ -243,5 +231,4 @@ def _left_alone(instance: ApplicationInstance, claims: list[Claim]) -> Decision:
     refused = Verdict(Standing.REFUSED, Refused.INSTANCE_NOT_MANAGED, message)
     verdicts = {each.task.name: refused for each in claims}
     spec = instance.spec
-    paused = is_paused(instance)
-    return Decision(instance.name, spec.template_name, spec.key, None, (), verdicts, None, None, paused)
+    return Decision(instance.name, spec.template_name, spec.key, verdicts=verdicts, paused=is_paused(instance))

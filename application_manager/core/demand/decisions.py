@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from application_manager.core.claims.operations import Verdict
 from application_manager.core.demand.fallback import Fallback
@@ -39,12 +39,12 @@ class Decision:
 
     name: str
     template: str
-    key: str | None
-    parameters: dict[str, object] | None
-    tasks: tuple[str, ...]
-    verdicts: dict[str, Verdict]
-    release_time: float | None
-    next_change: float | None
+    key: str | None = None
+    parameters: dict[str, object] | None = None
+    tasks: tuple[str, ...] = ()
+    verdicts: dict[str, Verdict] = field(default_factory=dict)
+    release_time: float | None = None
+    next_change: float | None = None
     paused: bool = False
     withheld: bool = False
     capped: tuple[str, ...] = ()

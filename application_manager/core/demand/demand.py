@@ -16,6 +16,7 @@ from application_manager.core.claims.claims import (
     Claim,
     InvalidTemplate,
     Refusal,
+    TemplateState,
     all_instances,
     claim,
     template_of_all,
@@ -41,9 +42,7 @@ from wayside.api import ApplicationInstance, ApplicationTask, ApplicationTemplat
 class NamespaceOutcome:
     """What should become of a whole namespace, by name.
 
-    Attributes:
-        instances: those that exist or should.
-        waiting: those that do neither, though there are tasks for them.
+    `instances`: those that exist or should; `waiting`: those that do neither, though there are tasks for them.
     """
 
     instances: dict[str, Decision]
@@ -60,15 +59,10 @@ def demand(
     now: float,
     limit: int | None = None,
 ) -> NamespaceOutcome:
-    """What should run in one namespace.
+    """What should run in one namespace, given all of its templates, tasks, instances and Leases (by holder).
 
-    Args:
-        templates: all of the namespace, as all else.
-        tasks: those being deleted count no more.
-        instances: with their status, which holds the deadline of a linger.
-        leases: by holder; a holder that is missing is not lost.
-        now: seconds since 1970.
-        limit: how many instances the namespace may have; None: any number.
+    A holder without a Lease is not lost. `now` in seconds since 1970; `limit`: how many instances the namespace may
+    have, None for any number.
     """
     verdicts: dict[str, Verdict] = {}
     claims: list[Claim] = []
@@ -130,7 +124,7 @@ class _Snapshot:
         }
         return sorted(own | always | turned | self._instances.keys())
 
-    def template(self, name: str) -> ApplicationTemplate | InvalidTemplate | None:
+    def template(self, name: str) -> TemplateState:
         return self._templates.get(name)
 
     def instance(self, name: str) -> ApplicationInstance | None:
@@ -191,10 +185,8 @@ class TaskVerdict:
 def verdict_of(claimed: Claim, decided: Mapping[str, VerdictSource], meant: Iterable[str]) -> TaskVerdict | None:
     """What became of the task of a claim; None where its instance was not decided yet.
 
-    Args:
-        claimed: the claim.
-        decided: by instance, and by the names that mean all instances of a template.
-        meant: the instances of the template, where the task means them all.
+    `decided`: by instance, and by the names that mean all instances of a template; `meant`: the instances of the
+    template, where the task means them all.
     """
     task, own = claimed.task.name, decided.get(claimed.instance)
     if own is None or task not in own.verdicts:
@@ -211,7 +203,7 @@ def verdict_of(claimed: Claim, decided: Mapping[str, VerdictSource], meant: Iter
     return TaskVerdict(verdict, (serves,))
 
 
-def claim_or_verdict(template: ApplicationTemplate | InvalidTemplate | None, task: ApplicationTask) -> Claim | Verdict:
+def claim_or_verdict(template: TemplateState, task: ApplicationTask) -> Claim | Verdict:
     """What the task claims, or its verdict where it claims nothing, because it has ended or is refused."""
     over = finished(task)
     if over is not None:

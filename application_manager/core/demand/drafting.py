@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from application_manager.core.claims.claims import InvalidTemplate
+from application_manager.core.claims.claims import InvalidTemplate, TemplateState
 from application_manager.core.conditions import Aspect
 from application_manager.core.demand.decisions import Decision, is_managed
 from application_manager.core.demand.lingering import LINGER_ANNOTATION, linger_of
@@ -13,8 +13,6 @@ from application_manager.core.objects.policy import Name
 from wayside.api import API_VERSION, ApplicationInstance, ApplicationTemplate
 from wayside.api.applicationinstance import ApplicationInstanceSpec
 from wayside.api.base import MANAGED_BY, MANAGED_BY_LABEL, Metadata
-
-TemplateState = ApplicationTemplate | InvalidTemplate | None
 
 
 def draft(name: Name, decision: Decision, existing: ApplicationInstance | None) -> ApplicationInstance:

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
-from application_manager.core.claims.claims import Claim, InvalidTemplate, Refusal, claim
+from application_manager.core.claims.claims import Claim, InvalidTemplate, Refusal, TemplateState, claim
 from application_manager.core.claims.operations import Standing, Verdict
 from application_manager.core.conditions import Aspect, find, holds
 from wayside.api import ApplicationInstance, ApplicationTemplate
@@ -35,12 +35,10 @@ FALLBACK_FAILED = "FallbackFailed"
 
 @dataclass(frozen=True, slots=True)
 class Fallback:
-    """What the tasks of an overdue instance claim besides.
+    """What the tasks of an overdue instance claim besides: one claim for each task that the fallback template can take
+    over.
 
-    Attributes:
-        template: the fallback's.
-        claims: one for each task that it can take over.
-        refused: by task, why it cannot.
+    `refused`: by task, why it cannot.
     """
 
     template: str
@@ -57,16 +55,14 @@ class Fallback:
         return {each.instance for each in self.claims}
 
 
-def fallback_of(template: ApplicationTemplate | InvalidTemplate | None) -> str | None:
+def fallback_of(template: TemplateState) -> str | None:
     """The template that this one falls back to, if it does."""
     if not isinstance(template, ApplicationTemplate) or template.spec.lifecycle.fallback is None:
         return None
     return template.spec.lifecycle.fallback.template_name
 
 
-def overdue(
-    instance: ApplicationInstance, template: ApplicationTemplate | InvalidTemplate | None, now: float
-) -> tuple[str, float | None]:
+def overdue(instance: ApplicationInstance, template: TemplateState, now: float) -> tuple[str, float | None]:
     """The readyTimeout that the instance is beyond, empty where it is not; and when that changes by itself."""
     if not isinstance(template, ApplicationTemplate) or template.spec.lifecycle.ready_timeout is None:
         return "", None
@@ -89,19 +85,10 @@ def overdue(
     return "" if was else str(timeout), None
 
 
-def fallback(
-    instance: str,
-    template: ApplicationTemplate | InvalidTemplate | None,
-    other: ApplicationTemplate | InvalidTemplate | None,
-    claims: Iterable[Claim],
-) -> Fallback | None:
+def fallback(instance: str, template: TemplateState, other: TemplateState, claims: Iterable[Claim]) -> Fallback | None:
     """What the claims on an overdue instance become; None where its template has no fallback.
 
-    Args:
-        instance: its name.
-        template: its own.
-        other: the fallback template; None where there is none of that name.
-        claims: those that deploy it and count.
+    `other`: the fallback template, None where there is none of that name; `claims`: those that deploy it and count.
     """
     name = fallback_of(template)
     if name is None:
@@ -133,11 +120,8 @@ def _claim(other: ApplicationTemplate | InvalidTemplate, each: Claim) -> Claim |
 def turned(verdict: Verdict, task: str, to: Fallback | None, others: Mapping[str, Verdict]) -> Verdict:
     """The task's verdict, with what became of it at the fallback.
 
-    Args:
-        verdict: that of its own instance.
-        task: its name.
-        to: what it turns to, if it does.
-        others: the verdicts of the fallback's instance; empty where that was not looked at yet.
+    `verdict`: that of its own instance; `others`: the verdicts of the fallback's, empty where that was not looked at
+    yet.
     """
     if to is None or verdict.standing is not Standing.COUNTS or verdict.acts:
         return verdict
@@ -161,11 +145,8 @@ def aspects(
 ) -> Iterator[Aspect]:
     """The conditions TimedOut and StandsIn of an instance, each from when it was True for the first time.
 
-    Args:
-        known: the instance's conditions.
-        late: the readyTimeout that it is beyond; empty where it is not.
-        turns: what its tasks turn to meanwhile.
-        stands_in_for: the instances whose tasks it serves.
+    `late`: the readyTimeout that it is beyond, empty where it is not; `turns`: what its tasks turn to meanwhile;
+    `stands_in_for`: the instances whose tasks it serves.
     """
     conditions, others = list(known), ", ".join(stands_in_for)
     if late:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from application_manager.core.claims.claims import InvalidTemplate
+from application_manager.core.claims.claims import TemplateState
 from application_manager.core.conditions import Aspect, find
 from wayside.api import ApplicationInstance, ApplicationTemplate
 from wayside.api.applicationtemplate import Lifecycle
@@ -49,7 +49,7 @@ def linger_of(instance: ApplicationInstance, template: ApplicationTemplate | Non
         return Lifecycle().linger  # somebody wrote something else into the annotation
 
 
-def protected_until(instance: ApplicationInstance, template: ApplicationTemplate | InvalidTemplate | None) -> float:
+def protected_until(instance: ApplicationInstance, template: TemplateState) -> float:
     """When the instance has been there for its template's minimumUptime, in seconds since 1970; 0 where it has none."""
     if not isinstance(template, ApplicationTemplate) or not instance.metadata.creation_timestamp:
         return 0.0

@@ -99,11 +99,9 @@ class GrantedPlace:
 
 @dataclass(frozen=True, slots=True)
 class PlaceRequest:
-    """What an instance requests of the limits.
+    """What an instance requests of the limits; `candidate` None where it takes no place.
 
-    Attributes:
-        candidate: None where it takes no place.
-        next_change: when that changes by itself, in seconds since 1970; None: not at all.
+    `next_change`: when that changes by itself, in seconds since 1970; None: not at all.
     """
 
     candidate: PlaceCandidate | None
@@ -117,8 +115,7 @@ _NOTHING = PlaceRequest(None, None)
 class Placement:
     """Who has a place in one namespace, and the requests that this follows from, by name of the instance.
 
-    Attributes:
-        until: when places change by themselves, in seconds since 1970.
+    `until`: when places change by themselves, in seconds since 1970.
     """
 
     limits: Limits

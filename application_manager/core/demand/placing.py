@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 
-from application_manager.core.claims.claims import InvalidTemplate
+from application_manager.core.claims.claims import InvalidTemplate, TemplateState
 from application_manager.core.claims.operations import NOTHING_RUNS, Standing, Verdict
 from application_manager.core.demand.decisions import Decision, is_managed
 from application_manager.core.demand.lingering import is_held, protected_until
@@ -33,7 +33,7 @@ def limits(templates: Iterable[ApplicationTemplate | InvalidTemplate], namespace
 def candidate(
     decision: Decision,
     instance: ApplicationInstance | None,
-    template: ApplicationTemplate | InvalidTemplate | None,
+    template: TemplateState,
     *,
     being_made: bool = False,
 ) -> PlaceCandidate | None:

@@ -23,10 +23,7 @@ def deploy_remarks(
 ) -> list[Finding]:
     """What the tasks of the rule would be refused for, without what its annotation ignores.
 
-    Args:
-        rule: the rule.
-        templates: those of its namespace that are valid.
-        invalid: the names of its namespace's other templates.
+    `templates`: those of its namespace that are valid; `invalid`: the names of the others.
     """
     known, others = {each.name: each for each in templates}, set(invalid)
     found: list[Finding] = []

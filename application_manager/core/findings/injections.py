@@ -28,13 +28,7 @@ _NO_IMAGE = (
 
 @dataclass(frozen=True, slots=True)
 class PodRequest:
-    """A question about a pod that is to be made.
-
-    Attributes:
-        uid: of the question.
-        namespace: the pod's.
-        pod: as it would be stored; empty where nothing is to be done.
-    """
+    """A question about a pod that is to be made; `pod` is empty where nothing is to be done."""
 
     uid: str
     namespace: str
@@ -43,11 +37,9 @@ class PodRequest:
 
 @dataclass(frozen=True, slots=True)
 class Injection:
-    """What becomes of a pod.
+    """What becomes of a pod: what it gets, or why it gets nothing.
 
-    Attributes:
-        addition: what it gets; None: nothing.
-        why_not: why it gets nothing; None also where it has its detector already, or requests none.
+    Both are None where it has its detector already, or requests none.
     """
 
     addition: Addition | None = None
@@ -67,14 +59,10 @@ def injection(
     detector: Detector | None,
     defaults: PodDefaults | None,
 ) -> Injection:
-    """What becomes of a pod with this metadata and spec.
+    """What becomes of a pod with this metadata and spec, which may be those of a template of pods.
 
-    Args:
-        metadata: of the pod, or of the template that it is made from.
-        spec: likewise.
-        namespace: the pod's, for messages.
-        detector: the one of that namespace that it requests; None where there is none that can be read.
-        defaults: what holds for all detectors; None where the manager runs none.
+    `detector`: the one of the namespace that it requests, None where there is none that can be read; `defaults`: None
+    where the manager runs no detectors.
     """
     name = detector_of(metadata)
     if name is None:

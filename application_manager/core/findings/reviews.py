@@ -43,7 +43,6 @@ class Request:
     """A question of the API server.
 
     Attributes:
-        uid: of the question.
         kind: of the object; empty where it is none of those that are looked at.
         object: as it would be stored; empty where it goes.
         old: as it is stored; None for a new one.

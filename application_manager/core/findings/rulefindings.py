@@ -38,13 +38,9 @@ def selecting(rule: EventRule, detectors: Sequence[Detector]) -> list[Detector]:
 def rule_findings(
     rule: EventRule, detectors: Sequence[Detector], invalid: Sequence[str] = (), others: Sequence[EventRule] = ()
 ) -> Findings:
-    """What is wrong with the rule.
+    """What is wrong with the rule, given the valid detectors and the other rules of its namespace.
 
-    Args:
-        rule: the rule.
-        detectors: those of its namespace that are valid.
-        invalid: the names of its namespace's other detectors.
-        others: the rules of its namespace, which its signals may name.
+    `invalid`: the names of its namespace's other detectors.
     """
     judges = selecting(rule, detectors)
     if not judges:

@@ -18,7 +18,7 @@ from application_manager.core.findings.checks import FAILING_EXAMPLE
 from application_manager.core.findings.findings import Findings, field_of
 from application_manager.core.objects.charts import ChartObjects, ChartOutcome, ChartRequest
 from application_manager.core.objects.policy import Policy
-from application_manager.core.objects.rendering import Renderer, RenderError
+from application_manager.core.objects.rendering import Renderer, RenderError, error_texts
 from wayside.api import ApplicationInstance, ApplicationTemplate
 from wayside.api.base import Metadata
 from wayside.api.parameter import Parameter, ParameterType
@@ -45,12 +45,10 @@ Reads = Iterable[tuple[str, frozenset[Path]]]
 
 @dataclass(frozen=True, slots=True)
 class Example:
-    """Parameters of one instance.
+    """Parameters of one instance, as tasks give them; defaults come in besides.
 
-    Attributes:
-        given: those that tasks give; defaults come in besides.
-        made_up: the names of those whose value is no task's, nor the template's.
-        phrase: when it is so, to end a sentence.
+    `made_up`: the names of those whose value is no task's, nor the template's; `phrase`: when it is so, to end a
+    sentence.
     """
 
     given: Mapping[str, Any]
@@ -68,7 +66,7 @@ def template_findings(template: ApplicationTemplate, policy: Policy) -> Findings
     try:
         claims.key_parameters(template)
     except InterpolationError as error:
-        problems += [str(each) for each in (error, *error.others)]
+        problems += error_texts(error)
     if not problems:
         problems += _mistyped(template)
     if problems:
@@ -91,7 +89,7 @@ def _mistyped(template: ApplicationTemplate) -> Iterator[str]:
         try:
             compile_template(value, environment, path=path)
         except InterpolationError as error:
-            yield from (str(each) for each in (error, *error.others))
+            yield from error_texts(error)
 
 
 def _texts(template: ApplicationTemplate) -> Iterator[tuple[str, Any]]:

@@ -29,9 +29,8 @@ _URL = re.compile(r"https://(\[[0-9a-fA-F:]+\]|[^/:?#@\s]+)(:[0-9]{1,5})?")
 class WebhookClientConfig:
     """Where the API server finds the manager: a Service, or a URL.
 
-    Attributes:
-        client: the `clientConfig`, without the path and the authority's certificate.
-        hosts: the names that the manager's certificate must be for.
+    `client`: the `clientConfig`, without the path and the authority's certificate; `hosts`: the names that the
+    manager's certificate must be for.
     """
 
     client: dict[str, Any]
@@ -79,14 +78,10 @@ def certificate_secret(service: str) -> tuple[str, str]:
 def webhook_configuration(
     place: WebhookClientConfig, authority: bytes | None, namespaces: Sequence[str] = (), name: str = "wayside"
 ) -> dict[str, Any]:
-    """The webhook configuration for templates, rules and detectors.
+    """The webhook configuration for templates, rules and detectors; `namespaces` empty: all.
 
-    Args:
-        place: where the manager is.
-        authority: the certificate (PEM) of the authority that signed the manager's; None where somebody else writes it
-            in, as cert-manager does.
-        namespaces: those that are managed; empty: all.
-        name: the object's.
+    `authority`: the certificate (PEM) of the authority that signed the manager's; None where somebody else writes it
+    in, as cert-manager does.
     """
     rules = _rules(GROUP, VERSION, ["CREATE", "UPDATE"], sorted(REVIEWED.values()))
     webhook = {"name": f"admission.{GROUP}", "clientConfig": place.at(PATH, authority), "rules": rules}

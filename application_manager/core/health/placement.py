@@ -6,13 +6,12 @@ required. Taints, room and all else are the scheduler's to report, on the pod.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 from application_manager.core.health.pods import Trouble, TroubleReason
-from application_manager.core.objects.podspecs import pod_spec
+from application_manager.core.objects.podspecs import at, pod_spec
 
 Labels = Mapping[str, str]
 Nodes = Mapping[str, Labels]
@@ -24,12 +23,15 @@ _SHOWN = 5  # values that there are, in a message
 
 @dataclass(frozen=True, slots=True)
 class _Required:
-    """A requirement: the message if no node meets it, its field and value, and whether a node meets it."""
+    """A requirement: the message if no node meets it, its field and value, and the terms of which a node meets one."""
 
     words: str
     wanted: str
     key: str
-    meets: Callable[[str, Labels], bool]
+    terms: Sequence[Mapping[str, Any]]
+
+    def is_met(self, name: str, labels: Labels) -> bool:
+        return any(_meets(each, name, labels) for each in self.terms)
 
 
 def is_placed(live: Mapping[str, Any]) -> bool:
@@ -42,8 +44,8 @@ def misplaced(live: Mapping[str, Any], nodes: Nodes) -> Trouble | None:
     required = list(_required(pod_spec(live)))
     if not required:
         return None
-    unmet = [each for each in required if not any(each.meets(name, labels) for name, labels in nodes.items())]
-    together = any(all(each.meets(name, labels) for each in required) for name, labels in nodes.items())
+    unmet = [each for each in required if not any(each.is_met(name, labels) for name, labels in nodes.items())]
+    together = any(all(each.is_met(name, labels) for each in required) for name, labels in nodes.items())
     if together:
         return None
     if unmet:
@@ -55,48 +57,28 @@ def misplaced(live: Mapping[str, Any], nodes: Nodes) -> Trouble | None:
     return Trouble(TroubleReason.UNSCHEDULABLE, message)
 
 
-def _at(value: Any, *path: str) -> Mapping[str, Any]:
-    for each in path:
-        value = value.get(each) if isinstance(value, Mapping) else None
-    return value if isinstance(value, Mapping) else {}
-
-
 def _required(spec: Mapping[str, Any]) -> Iterator[_Required]:
     if name := spec.get("nodeName"):
-        yield _Required(f"nodeName: there is no node {name}", f"nodeName {name}", "", partial(_is_named, name))
+        term = {"matchFields": [{"operator": "In", "values": [name]}]}
+        yield _Required(f"nodeName: there is no node {name}", f"nodeName {name}", "", [term])
     for key, value in sorted((spec.get("nodeSelector") or {}).items()):
         label = f"{key}={value}"
         words, wanted = f"nodeSelector: no node has the label {label}", f"nodeSelector {label}"
-        yield _Required(words, wanted, key, partial(_is_labelled, key, value))
-    affinity = _at(spec, "affinity", "nodeAffinity", "requiredDuringSchedulingIgnoredDuringExecution")
+        yield _Required(words, wanted, key, [{"matchExpressions": [{"key": key, "operator": "In", "values": [value]}]}])
+    affinity = at(spec, ("affinity", "nodeAffinity", "requiredDuringSchedulingIgnoredDuringExecution"))
     terms = [each for each in affinity.get("nodeSelectorTerms") or () if _expressions(each)]
     if terms:
         listed = ", or ".join(_words(each) for each in terms)
         words, wanted = f"affinity.nodeAffinity: no node has {listed}", f"affinity.nodeAffinity {listed}"
         keys = {key for each in terms for key, _, _ in _expressions(each)}
-        yield _Required(words, wanted, keys.pop() if len(keys) == 1 else _SEVERAL, partial(_meets_any, terms))
-
-
-def _is_named(wanted: str, name: str, _: Labels) -> bool:
-    return name == wanted
-
-
-def _is_labelled(key: str, value: str, _: str, labels: Labels) -> bool:
-    return labels.get(key) == value
-
-
-def _meets_any(terms: Iterable[Mapping[str, Any]], name: str, labels: Labels) -> bool:
-    return any(_meets(each, name, labels) for each in terms)
+        yield _Required(words, wanted, keys.pop() if len(keys) == 1 else _SEVERAL, terms)
 
 
 def _expressions(term: Mapping[str, Any]) -> list[tuple[str, str, list[str]]]:
     """Key, operator and values of a term's requirements; the key of a node's name is empty."""
-    fields = [("", str(each.get("operator")), each.get("values") or []) for each in term.get("matchFields") or ()]
-    labels = [
-        (str(each.get("key")), str(each.get("operator")), each.get("values") or [])
-        for each in term.get("matchExpressions") or ()
-    ]
-    return fields + labels
+    fields = [{**each, "key": ""} for each in term.get("matchFields") or ()]
+    found = [*fields, *(term.get("matchExpressions") or ())]
+    return [(str(each.get("key")), str(each.get("operator")), each.get("values") or []) for each in found]
 
 
 def _words(term: Mapping[str, Any]) -> str:

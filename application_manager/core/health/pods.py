@@ -7,12 +7,12 @@ container that crashes runs for a moment. So a status that repeats them is not r
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-from application_manager.core.conditions import cut
+from application_manager.core.conditions import cut, find_raw
 
 _LONGEST = 600  # characters of a message of a kubelet or a scheduler
 
@@ -76,18 +76,21 @@ def trouble(pod: Mapping[str, Any]) -> Trouble | None:
     status = pod.get("status") or {}
     if pod["metadata"].get("deletionTimestamp") or status.get("phase") == "Succeeded":
         return None
-    images = {str(each.get("name")): str(each.get("image", "")) for each in _containers(pod.get("spec") or {})}
-    for init, container in _statuses(status):
-        found = _of_container(container, images, pod, init=init)
-        if found is not None:
-            return found
+    spec = pod.get("spec") or {}
+    containers = [*(spec.get("initContainers") or ()), *(spec.get("containers") or ())]
+    images = {str(each.get("name")): str(each.get("image", "")) for each in containers}
+    for field in ("initContainerStatuses", "containerStatuses"):
+        for container in status.get(field) or ():
+            found = _of_container(container, images, pod, init=field == "initContainerStatuses")
+            if found is not None:
+                return found
     if status.get("phase") == "Failed":
         why = status.get("message") or status.get("reason") or "no reason given"
         return Trouble(TroubleReason.POD_FAILED, f"a pod failed: {_plain(why)}")
-    for condition in status.get("conditions") or ():
-        if condition.get("type") == "PodScheduled" and condition.get("status") == "False":
-            why = condition.get("message") or condition.get("reason") or "no reason given"
-            return Trouble(TroubleReason.UNSCHEDULABLE, f"no node fits the pod: {_plain(why)}")
+    scheduled = find_raw(status, "PodScheduled")
+    if scheduled.get("status") == "False":
+        why = scheduled.get("message") or scheduled.get("reason") or "no reason given"
+        return Trouble(TroubleReason.UNSCHEDULABLE, f"no node fits the pod: {_plain(why)}")
     return None
 
 
@@ -98,19 +101,6 @@ def summary(troubles: Iterable[Trouble]) -> list[Trouble]:
     for each in sorted(troubles, key=lambda each: (order.index(each.reason), each.message, each.hint)):
         different.setdefault((each.reason, each.message), each)
     return list(different.values())
-
-
-def _containers(spec: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
-    yield from spec.get("initContainers") or ()
-    yield from spec.get("containers") or ()
-
-
-def _statuses(status: Mapping[str, Any]) -> Iterator[tuple[bool, Mapping[str, Any]]]:
-    """Whether it is an init container, and its status."""
-    for each in status.get("initContainerStatuses") or ():
-        yield True, each
-    for each in status.get("containerStatuses") or ():
-        yield False, each
 
 
 def _of_container(

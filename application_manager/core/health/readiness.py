@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from application_manager.core.conditions import find_raw
 from application_manager.core.health.refusals import without_names
 
 _OBSERVED = frozenset({"Deployment", "StatefulSet", "DaemonSet"})
@@ -63,10 +64,10 @@ def _deployment(spec: Mapping[str, Any], status: Mapping[str, Any]) -> str | Non
         problem = f"still runs {_pods(left)} of its previous version"
     if problem is None:
         return None
-    refused = _find(status, "ReplicaFailure")
+    refused = find_raw(status, "ReplicaFailure")
     if refused.get("status") == "True":
         return f"{problem}, and pods cannot be created: {without_names(str(refused.get('message', '')))}"
-    progress = _find(status, "Progressing")
+    progress = find_raw(status, "Progressing")
     if progress.get("status") == "False":
         return f"{problem}, and makes no progress"
     return problem
@@ -93,7 +94,7 @@ def _daemon_set(spec: Mapping[str, Any], status: Mapping[str, Any]) -> str | Non
 
 
 def _job(spec: Mapping[str, Any], status: Mapping[str, Any]) -> str | None:
-    failed = _find(status, "Failed")
+    failed = find_raw(status, "Failed")
     if failed.get("status") == "True":
         return f"has failed: {failed.get('message') or failed.get('reason') or 'no reason given'}"
     if spec.get("suspend"):
@@ -116,7 +117,7 @@ def _by_conditions(live: Mapping[str, Any], status: Mapping[str, Any]) -> str | 
     if not isinstance(status, Mapping) or not isinstance(status.get("conditions", []), list):
         return None  # a kind with a status of another shape
     for type_ in ("Ready", "Available"):
-        condition = _find(status, type_)
+        condition = find_raw(status, type_)
         if not condition:
             continue
         if isinstance(seen := status.get("observedGeneration"), int) and seen < live["metadata"].get("generation", 0):
@@ -146,12 +147,4 @@ def _pods(count: int) -> str:
 
 
 def _condition(status: Mapping[str, Any], type_: str) -> bool:
-    return bool(_find(status, type_).get("status") == "True")
-
-
-def _find(status: Mapping[str, Any], type_: str) -> Mapping[str, Any]:
-    """The condition of the type; empty where there is none."""
-    for each in status.get("conditions") or ():
-        if isinstance(each, Mapping) and each.get("type") == type_:
-            return each
-    return {}
+    return bool(find_raw(status, type_).get("status") == "True")

@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from application_manager.core.conditions import find_raw
 from application_manager.core.health.pods import Trouble, TroubleReason
 from wayside.times import parse_time
 
@@ -49,10 +50,8 @@ def refused_pods(live: Mapping[str, Any]) -> Trouble | None:
     """Why the pods of a Deployment or ReplicaSet are refused, if they are; of the others only Events report it."""
     if live.get("kind") not in ("Deployment", "ReplicaSet"):
         return None
-    for each in (live.get("status") or {}).get("conditions") or ():
-        if each.get("type") == "ReplicaFailure" and each.get("status") == "True":
-            return _trouble(str(each.get("message", "")))
-    return None
+    failure = find_raw(live.get("status") or {}, "ReplicaFailure")
+    return _trouble(str(failure.get("message", ""))) if failure.get("status") == "True" else None
 
 
 def lacks_pods(live: Mapping[str, Any]) -> bool:

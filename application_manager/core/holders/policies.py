@@ -24,14 +24,9 @@ _FORM = (
 
 @dataclass(frozen=True, slots=True)
 class HolderPolicy:
-    """What holders may do whose namespace and name match.
+    """What holders may do whose namespace and name match these patterns, with `*` and `?`.
 
-    Attributes:
-        namespace: a pattern with `*` and `?`.
-        holder: likewise.
-        max_tasks: how many unfinished tasks each may have; None: any number.
-        max_priority: the highest priority of its tasks; None: any.
-        operations: what its tasks may do.
+    `max_tasks`: how many unfinished tasks each may have, `max_priority`: the highest of its tasks; None: any.
     """
 
     namespace: str
@@ -68,12 +63,7 @@ class HolderPolicy:
 
 @dataclass(frozen=True, slots=True)
 class TaskPolicy:
-    """All that limits tasks.
-
-    Attributes:
-        max_tasks: how many unfinished tasks a namespace may have; None: any number.
-        holders: of several that match a holder, the first counts.
-    """
+    """The limits of tasks: of those of a namespace, None for any number, and of holders, by the first that matches."""
 
     max_tasks: int | None = None
     holders: Sequence[HolderPolicy] = field(default=())

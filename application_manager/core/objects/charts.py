@@ -49,12 +49,7 @@ class ChartSource:
 
 @dataclass(frozen=True, slots=True)
 class ChartRequest:
-    """One rendering of a chart: for one instance, with one set of values.
-
-    Attributes:
-        release: the instance's name.
-        values: canonical JSON.
-    """
+    """One rendering of a chart: of the instance named by the release, with one set of values as canonical JSON."""
 
     source: ChartSource
     namespace: str

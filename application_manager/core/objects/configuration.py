@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 from application_manager.core.claims import values
+from application_manager.core.objects.ownership import ObjectKey
 from application_manager.core.objects.podspecs import pod_template
 from wayside.expressions import CompiledTemplate, Embedded, Environment, InterpolationError, compile_template
 from wayside.manifests import to_yaml
@@ -37,6 +38,11 @@ Check = Callable[[Embedded], Iterable[InterpolationError]]
 def config_map_name(instance: str) -> str:
     """The name of an instance's ConfigMap: what `${instance.configMap}` stands for."""
     return f"{instance}-configuration"
+
+
+def config_map_key(instance: str) -> ObjectKey:
+    """What identifies it."""
+    return (*CONFIG_MAP, config_map_name(instance))
 
 
 def config_map(instance: str, files: Mapping[str, str]) -> dict[str, Any]:

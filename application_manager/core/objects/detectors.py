@@ -176,13 +176,8 @@ def container(
 ) -> Manifest:
     """The container that runs the Detector, without probes.
 
-    Args:
-        detector: the Detector.
-        defaults: what holds for all detectors.
-        mounts: as `volumes_of` has them.
-        name: the container's.
-        port: where metrics and health are served; None: nowhere.
-        port_name: how scrapers find it.
+    `mounts` as `volumes_of` has them; `port`: where metrics and health are served, None for nowhere; `port_name`: how
+    scrapers find it.
     """
     pod = detector.spec.pod or DetectorPod()
     metrics = {} if port is None else {"ports": [{"name": port_name, "containerPort": port, "protocol": "TCP"}]}

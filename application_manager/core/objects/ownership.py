@@ -14,7 +14,7 @@ from typing import Any
 from application_manager.core.conditions import Aspect
 from application_manager.core.objects.podspecs import with_pod_template
 from wayside.api import API_VERSION, ApplicationInstance, Kind
-from wayside.api.applicationinstance import ObjectReference
+from wayside.api.applicationinstance import ObjectReference, SuspendedReplicas
 from wayside.api.base import MANAGED_BY, MANAGED_BY_LABEL
 
 FIELD_MANAGER = "wayside"
@@ -32,11 +32,9 @@ Manifest = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """What was applied before.
+    """What was applied before: the digest of the rendering that was last applied in full, and the uids of the objects.
 
-    Attributes:
-        digest: of the rendering that was last applied in full.
-        objects: the uids of what belongs to the instance; None where it may not have been applied.
+    A uid is None where the object may not have been applied.
     """
 
     digest: str | None = None
@@ -45,18 +43,15 @@ class Known:
     @classmethod
     def read(cls, digest: str | None, references: Iterable[ObjectReference]) -> Known:
         """The content of references, as `references` makes them."""
-        return cls(digest, {(each.api_version, each.kind, each.name): each.uid for each in references})
+        return cls(digest, {reference_key(each): each.uid for each in references})
 
 
 @dataclass(frozen=True, slots=True)
 class Applied:
-    """What came of it.
+    """What came of it: the condition Applied, and what belongs to the instance now.
 
-    Attributes:
-        aspect: the condition Applied.
-        objects: what belongs to the instance now.
-        complete: whether everything is as rendered.
-        took: when applying began and ended, in nanoseconds since the epoch; None where nothing was applied.
+    `complete`: whether everything is as rendered; `took`: when applying began and ended, in nanoseconds since the
+    epoch, None where nothing was applied.
     """
 
     aspect: Aspect
@@ -75,28 +70,31 @@ class Obstacle:
 
 def controller_uid(live: Mapping[str, Any]) -> str | None:
     """The uid of the object's controller."""
-    controller = _controller(live)
-    return None if controller is None else str(controller["uid"])
+    return controller_of(live).get("uid")
 
 
-def _controller(live: Mapping[str, Any]) -> Mapping[str, Any] | None:
+def controller_of(live: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The reference to the object's controller; empty where it has none."""
     owners: list[Mapping[str, Any]] = live["metadata"].get("ownerReferences") or []
-    return next((each for each in owners if each.get("controller")), None)
+    return next((each for each in owners if each.get("controller")), {})
+
+
+def instance_of(live: Mapping[str, Any]) -> tuple[str, str] | None:
+    """Namespace and name of the instance whose label the object has."""
+    metadata = live["metadata"]
+    name = (metadata.get("labels") or {}).get(INSTANCE_LABEL)
+    return (metadata["namespace"], name) if name else None
 
 
 def foreign(live: Mapping[str, Any], owner: Kind, what: str, recorded: str | None = None) -> Obstacle | None:
-    """Why the object may not be applied over, or None if it is the owner's.
+    """Why the object may not be applied over, or None if it is the owner's, an instance's or Detector's.
 
-    Args:
-        live: the object.
-        owner: the instance or Detector that wants to have it.
-        what: the object's kind and name.
-        recorded: its uid, if the owner's status lists it; None: it does not.
+    `what`: the object's kind and name; `recorded`: its uid, if the owner's status lists it.
     """
     if live["metadata"].get("deletionTimestamp"):
         return Obstacle("Waiting", f"{what} is being deleted; the manager applies it again afterwards")
-    controller = _controller(live)
-    if controller is None:
+    controller = controller_of(live)
+    if not controller:
         if live["metadata"]["uid"] == recorded:
             return None
     elif controller["uid"] == owner.metadata.uid:
@@ -108,11 +106,33 @@ def foreign(live: Mapping[str, Any], owner: Kind, what: str, recorded: str | Non
     return Obstacle("ObjectExists", f"{what} already exists, {whose} and is not changed: {remedy}")
 
 
+def reference_key(of: ObjectReference | SuspendedReplicas) -> ObjectKey:
+    """What identifies the object of a reference in a status."""
+    return of.api_version, of.kind, of.name
+
+
 def references(uids: Mapping[ObjectKey, str | None]) -> tuple[ObjectReference, ...]:
     """The objects as a status lists them, in one order."""
     return tuple(
         ObjectReference(api_version=key[0], kind=key[1], name=key[2], uid=uid) for key, uid in sorted(uids.items())
     )
+
+
+def owned(manifest: Manifest, instance: ApplicationInstance) -> Manifest:
+    """The manifest with the instance, which has a uid by now, as its owner and controller."""
+    owner = {
+        "apiVersion": API_VERSION,
+        "kind": instance.kind,
+        "name": instance.name,
+        "uid": instance.metadata.uid,
+        "controller": True,
+    }
+    return {**manifest, "metadata": {**manifest["metadata"], "ownerReferences": [owner]}}
+
+
+def object_key(manifest: Mapping[str, Any]) -> ObjectKey:
+    """What identifies the objects of one instance: apiVersion, kind and name."""
+    return manifest["apiVersion"], manifest["kind"], manifest["metadata"]["name"]
 
 
 def our_fields(raw: Mapping[str, Any]) -> str:

@@ -6,7 +6,7 @@ Service), so what has `containers` is a pod's spec wherever it stands.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,18 +25,21 @@ _TEXTS = {"ConfigMap": ("data", "binaryData"), "Secret": ("data", "stringData")}
 """Fields whose keys are the user's own."""
 
 
+def at(value: Any, path: Iterable[str]) -> Mapping[str, Any]:
+    """The map at the path in another one; empty where there is none."""
+    for each in path:
+        value = value.get(each) if isinstance(value, Mapping) else None
+    return value if isinstance(value, Mapping) else {}
+
+
 def pod_template(manifest: Mapping[str, Any]) -> Mapping[str, Any]:
     """What the pods of a manifest are made of, in an unknown kind at `spec.template`; empty where there is none."""
-    here: Any = manifest
-    for part in POD_TEMPLATES.get(str(manifest.get("kind")), _USUAL):
-        here = here.get(part) if isinstance(here, Mapping) else None
-    return here if isinstance(here, Mapping) else {}
+    return at(manifest, POD_TEMPLATES.get(str(manifest.get("kind")), _USUAL))
 
 
 def pod_spec(manifest: Mapping[str, Any]) -> Mapping[str, Any]:
     """The spec of a manifest's pods; empty where there is none."""
-    spec = pod_template(manifest).get("spec")
-    return spec if isinstance(spec, Mapping) else {}
+    return at(pod_template(manifest), ("spec",))
 
 
 def with_pod_template(manifest: dict[str, Any], change: Callable[[dict[str, Any]], dict[str, Any]]) -> dict[str, Any]:

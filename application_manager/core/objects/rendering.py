@@ -19,11 +19,10 @@ from application_manager.core.claims import parameters, values
 from application_manager.core.claims.claims import unknown_members
 from application_manager.core.objects.charts import ChartFailure, ChartRequest, Charts, ChartSource, no_charts
 from application_manager.core.objects.configuration import CONFIG_MAP, Configuration, config_map, config_map_name
-from application_manager.core.objects.ownership import labelled
+from application_manager.core.objects.ownership import Manifest, ObjectKey, labelled, object_key
 from application_manager.core.objects.policy import Policy
 from application_manager.core.objects.suspension import stated_replicas, stopped, yielded
 from wayside.api import ApplicationInstance, ApplicationTemplate
-from wayside.api.base import API_VERSION
 from wayside.api.chart import Helm
 from wayside.expressions import CelType, CompiledTemplate, Embedded, Environment, InterpolationError, compile_template
 
@@ -39,8 +38,6 @@ _LONGEST_NAME = 253  # characters
 
 MOST_EXPRESSIONS = 1000
 """In one template: each takes about a millisecond to compile, and no template is to hold up the manager."""
-
-Manifest = dict[str, Any]
 
 
 class RenderError(Exception):
@@ -69,9 +66,9 @@ class Rendering:
 
     manifests: tuple[Manifest, ...]
     digest: str
-    replicas: Mapping[tuple[str, str, str], int | None] = field(default_factory=dict)
+    replicas: Mapping[ObjectKey, int | None] = field(default_factory=dict)
 
-    def keys(self) -> set[tuple[str, str, str]]:
+    def keys(self) -> set[ObjectKey]:
         """What identifies the objects: apiVersion, kind and name of each."""
         return {object_key(each) for each in self.manifests}
 
@@ -106,25 +103,21 @@ class Renderer:
             try:
                 self._configuration = Configuration(template.spec.configuration, _ENVIRONMENT, check)
             except InterpolationError as error:
-                problems += [str(each) for each in (error, *error.others)]
+                problems += error_texts(error)
         for index, manifest in enumerate(template.spec.manifests):
             path = f"spec.manifests[{index}]"
-            kind_problem = policy.kind_problem(manifest["apiVersion"], manifest["kind"])
-            if kind_problem:
-                problems.append(f"{path}.kind: {kind_problem}")
+            if problem := policy.kind_problem(manifest["apiVersion"], manifest["kind"]):
+                problems.append(f"{path}.kind: {problem}")
             try:
-                compiled = compile_template(manifest, _ENVIRONMENT, path=path, check=check)
+                self._manifests.append(compile_template(manifest, _ENVIRONMENT, path=path, check=check))
             except InterpolationError as error:
-                problems += [str(each) for each in (error, *error.others)]
-            else:
-                self._manifests.append(compiled)
+                problems += error_texts(error)
         self._values: CompiledTemplate | None = None
-        if template.spec.helm is not None:
+        if (helm := template.spec.helm) is not None:
             try:
-                where = "spec.helm.values"
-                self._values = compile_template(template.spec.helm.values, _ENVIRONMENT, path=where, check=check)
+                self._values = compile_template(helm.values, _ENVIRONMENT, path="spec.helm.values", check=check)
             except InterpolationError as error:
-                problems += [str(each) for each in (error, *error.others)]
+                problems += error_texts(error)
         if problems:
             raise RenderError(problems)
 
@@ -243,26 +236,14 @@ class Renderer:
         yield from self._policy.pod_problems(manifest)
 
 
+def error_texts(error: InterpolationError) -> list[str]:
+    """The error and all further ones that came with it."""
+    return [str(each) for each in (error, *error.others)]
+
+
 def digest(manifests: list[Manifest]) -> str:
     """A digest of manifests: equal exactly if their canonical bytes are."""
     return hashlib.sha256(values.canonical(manifests).encode()).hexdigest()
-
-
-def owned(manifest: Manifest, instance: ApplicationInstance) -> Manifest:
-    """The manifest with the instance, which has a uid by now, as its owner and controller."""
-    owner = {
-        "apiVersion": API_VERSION,
-        "kind": instance.kind,
-        "name": instance.name,
-        "uid": instance.metadata.uid,
-        "controller": True,
-    }
-    return {**manifest, "metadata": {**manifest["metadata"], "ownerReferences": [owner]}}
-
-
-def object_key(manifest: Mapping[str, Any]) -> tuple[str, str, str]:
-    """What identifies the objects of one instance: apiVersion, kind and name."""
-    return manifest["apiVersion"], manifest["kind"], manifest["metadata"]["name"]
 
 
 def _expressions(template: ApplicationTemplate) -> int:
@@ -273,7 +254,7 @@ def _expressions(template: ApplicationTemplate) -> int:
 
 
 def _duplicates(manifests: list[Manifest]) -> list[str]:
-    seen: set[tuple[str, str, str]] = set()
+    seen: set[ObjectKey] = set()
     found = []
     for manifest in manifests:
         key = object_key(manifest)

@@ -31,9 +31,7 @@ class Right:
     Attributes:
         group: the API group, empty for the core group.
         resource: the plural, with `/<subresource>` where it is one.
-        verbs: as roles name them.
-        purpose: what does not work without it.
-        vital: whether nothing works without it.
+        purpose: what does not work without it; `vital`: nothing does.
         name: the one object that it is limited to; empty: all.
     """
 
@@ -60,12 +58,7 @@ REMEDY = "apply the output of `application-manager rbac`"
 
 
 def rights(plurals: Mapping[KindKey, str], *, detectors: bool = False) -> list[Right]:
-    """The rights that are needed in each managed namespace.
-
-    Args:
-        plurals: of the kinds that are allowed.
-        detectors: whether the manager runs detectors too.
-    """
+    """The rights that are needed in each managed namespace; `detectors`: whether the manager runs detectors too."""
     return [*_own(), *_children(plurals), *(_running_detectors() if detectors else ())]
 
 
@@ -128,12 +121,7 @@ def lease_rights(name: str) -> list[Right]:
 
 
 def certificate_rights(secret: str, webhooks: str) -> tuple[list[Right], list[Right]]:
-    """What a manager needs that makes its webhook's certificate: in the Secret's namespace, and in the cluster.
-
-    Args:
-        secret: its name.
-        webhooks: the name of the webhook configurations.
-    """
+    """What a manager needs that makes its webhook's certificate: in the Secret's namespace, and in the cluster."""
     purpose = "the webhook has no certificate that the API server trusts"
     group = "admissionregistration.k8s.io"
     plurals = ("validatingwebhookconfigurations", "mutatingwebhookconfigurations")
@@ -217,11 +205,9 @@ def roles(
     Args:
         plurals: of the kinds that are allowed.
         namespaces: those that are managed; empty: all.
-        lease: namespace and name of the managers' Lease.
-        account: namespace and name of the manager's service account.
+        lease, account: namespace and name.
         name: of all roles and bindings; those of the Lease end with `-lease`, of the webhook's certificate
             with `-certificates`, the ClusterRole that writes with `-writer`.
-        detectors: whether the manager runs detectors too.
         granted: without `namespaces`: those in which the manager may write.
         certificates: namespace and name of the Secret, and the name of the webhook configurations, where the manager
             makes its webhook's certificate.

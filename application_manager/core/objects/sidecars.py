@@ -55,13 +55,7 @@ class SidecarError(ValueError):
 def addition(spec: Mapping[str, Any], detector: Detector, defaults: PodDefaults) -> Addition | None:
     """The fields that the spec of a pod needs for the Detector's sidecar; None if it has the sidecar.
 
-    Args:
-        spec: of the pod.
-        detector: the Detector.
-        defaults: what holds for all detectors.
-
-    Raises:
-        SidecarError: they do not go together.
+    Raises SidecarError where they do not go together.
     """
     if has_sidecar(spec):
         return None

@@ -12,8 +12,9 @@ import copy
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
+from application_manager.core.objects.ownership import ObjectKey, object_key
+
 Json = dict[str, Any]
-ObjectKey = tuple[str, str, str]
 
 SCALED = frozenset({("apps/v1", "Deployment"), ("apps/v1", "StatefulSet")})
 """The kinds, among those that can be allowed, whose `scale` subresource has the number of replicas."""
@@ -61,7 +62,7 @@ def stated_replicas(manifests: Iterable[Json]) -> dict[ObjectKey, int | None]:
             spec = each.get("spec")
             stated = spec.get("replicas") if isinstance(spec, dict) else None
             valid = isinstance(stated, int) and not isinstance(stated, bool) and stated >= 0
-            found[each["apiVersion"], each["kind"], each["metadata"]["name"]] = stated if valid else None
+            found[object_key(each)] = stated if valid else None
     return found
 
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from application_manager.core.objects.configuration import CONFIG_MAP, config_map_name
-from application_manager.core.objects.ownership import INSTANCE_LABEL
+from application_manager.core.objects.configuration import config_map_key
+from application_manager.core.objects.ownership import instance_of, object_key
 from wayside.api import ApplicationTemplate
 from wayside.api.base import GROUP
 
@@ -66,8 +66,8 @@ def without_objects(template: ApplicationTemplate) -> ApplicationTemplate:
 
 def _is_configuration(raw: Object) -> bool:
     """Whether the object is the ConfigMap of an instance's files, which are published."""
-    owner = (raw["metadata"].get("labels") or {}).get(INSTANCE_LABEL)
-    return (raw["apiVersion"], raw["kind"]) == CONFIG_MAP and raw["metadata"]["name"] == config_map_name(str(owner))
+    owner = instance_of(raw)
+    return owner is not None and object_key(raw) == config_map_key(owner[1])
 
 
 def _metadata(raw: Object, managers: tuple[str, ...]) -> Object:

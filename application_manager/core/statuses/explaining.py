@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from application_manager.core.claims import values
-from application_manager.core.claims.claims import InvalidTemplate, claim, template_of_all
+from application_manager.core.claims.claims import InvalidTemplate, TemplateState, claim, template_of_all
 from application_manager.core.claims.operations import Standing, Verdict
 from application_manager.core.conditions import find
 from application_manager.core.demand.deciding import precedence
@@ -54,10 +54,8 @@ _BELOW = "a Reconfigure task overrides it"
 class Found:
     """What is live in one namespace: who has a place depends on all of it.
 
-    Attributes:
-        objects: those that the instance's status lists; None where one is gone.
-        pods: those that have the instance's label.
-        leases: the Leases of holders that have one.
+    `objects`: those that the instance's status lists, None where one is gone; `pods`: those that have its label;
+    `leases`: by holder.
     """
 
     templates: Sequence[ApplicationTemplate | InvalidTemplate]
@@ -105,13 +103,9 @@ def _written_limit(task: ApplicationTask) -> Verdict | None:
 
 
 def explanation_of(found: Found, *, task: str | None, instance: str | None, now: float) -> Explanation:
-    """The chain of a task, or of an instance where `task` is None.
+    """The chain of a task, or of an instance where `task` is None; these are names, of what is in `found`.
 
-    Args:
-        found: holds that task, or that instance or tasks that claim it.
-        task: its name.
-        instance: the name of the instance that serves the task; None where none does.
-        now: seconds since 1970.
+    `instance`: the one that serves the task, None where none does; `now` in seconds since 1970.
     """
     outcome = _outcome(found, now)
     decision = (outcome.instances | outcome.waiting).get(instance) if instance else None
@@ -191,7 +185,7 @@ def _lease_age(lease: Object | None, now: float) -> float | None:
         return None
 
 
-def _template(name: str, template: ApplicationTemplate | InvalidTemplate | None) -> ExplainedTemplate:
+def _template(name: str, template: TemplateState) -> ExplainedTemplate:
     if template is None:
         return ExplainedTemplate(name=name, problem="does not exist")
     if isinstance(template, InvalidTemplate):
@@ -220,7 +214,7 @@ def _instance(
 
 
 def _parameters(
-    template: ApplicationTemplate | InvalidTemplate | None,
+    template: TemplateState,
     tasks: Sequence[ApplicationTask],
     decision: Decision | None,
     existing: ApplicationInstance | None,

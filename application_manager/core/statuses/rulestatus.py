@@ -56,16 +56,7 @@ def rule_status(
     others: Sequence[EventRule] = (),
     remarks: Sequence[Finding] = (),
 ) -> EventRuleStatus:
-    """The rule's status.
-
-    Args:
-        rule: the rule.
-        detectors: those of its namespace that are valid.
-        now: seconds since 1970.
-        invalid: the names of its namespace's other detectors.
-        others: the rules of its namespace, which its signals may name.
-        remarks: what else is worth knowing of it.
-    """
+    """The rule's status; the arguments are those of `rule_findings`, `now` is in seconds since 1970."""
     names = [each.name for each in selecting(rule, detectors)]
     findings = replace(rule_findings(rule, detectors, invalid, others), remarks=tuple(remarks))
     old = rule.status or EventRuleStatus()
@@ -89,13 +80,9 @@ def _listed(names: Sequence[str]) -> str:
 def detector_status(
     detector: Detector, rules: Sequence[EventRule], now: float, running: Aspect | None = None
 ) -> DetectorStatus:
-    """The detector's status.
+    """The detector's status, given the rules of its namespace; `now` in seconds since 1970.
 
-    Args:
-        detector: the Detector.
-        rules: those of its namespace.
-        now: seconds since 1970.
-        running: whether it runs, where the manager runs it and knows.
+    `running`: whether it runs, where the manager runs it and knows.
     """
     old = detector.status or DetectorStatus()
     aspects = [_aspect(detector_findings(detector), DETECTOR_INVALID), *([] if running is None else [running])]
@@ -109,15 +96,7 @@ def detector_status(
 
 
 def unreadable_status(status: Status, reason: str, problem: str, generation: int, now: float) -> Status:
-    """The status of a rule or detector that the API server took and that is none.
-
-    Args:
-        status: as it is.
-        reason: for programs.
-        problem: what is wrong, with its field and the remedy.
-        generation: the object's.
-        now: seconds since 1970.
-    """
+    """The status of a rule or detector that the API server took and that is none; `now` in seconds since 1970."""
     aspect = Aspect("Accepted", False, reason, problem)
     conditions = concluded(status.conditions, [aspect], generation, now, stalled=(reason,))
     return status.model_copy(update={"observed_generation": generation, "conditions": conditions})

@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 
 from application_manager.cache.cluster_cache import ClusterCache
-from application_manager.core.objects.ownership import Applied, Known, references
+from application_manager.core.objects.ownership import Applied, Known, owned, references
 from application_manager.core.objects.policy import Policy
-from application_manager.core.objects.rendering import Renderer, owned
+from application_manager.core.objects.rendering import Renderer
 from application_manager.work.applying import Applier
 from tests.unit.manager.memory_server import CONFIG_MAPS, MemoryServer, a_world, raw, work_on
 from tests.unit.manager_objects import instance, task, template

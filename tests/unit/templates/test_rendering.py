@@ -8,8 +8,9 @@ from typing import Any
 
 import pytest
 
+from application_manager.core.objects.ownership import owned
 from application_manager.core.objects.policy import DEFAULT_KINDS, SECRET, Policy
-from application_manager.core.objects.rendering import Renderer, RenderError, owned
+from application_manager.core.objects.rendering import Renderer, RenderError
 from tests.unit.manager_objects import DEPLOYMENT, instance, template
 
 CONFIG: dict[str, Any] = {
