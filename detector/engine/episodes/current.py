@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import msgspec
@@ -51,17 +51,16 @@ def new_record(
     )
 
 
-@dataclass(slots=True)
-class EpisodeState:
+class EpisodeState(msgspec.Struct, eq=False):
     """The state of an open episode."""
 
     record: EpisodeRecord
     variables: Mapping[str, Any] | None
     """The variables of the conditions at the start; None until the next evaluation if the episode was restored, or
     started while the rule had no actions."""
-    demands: dict[str, Demand] = field(default_factory=dict)
+    demands: dict[str, Demand] = {}
     """By action; an action without an entry cannot be rendered yet."""
-    outdated: set[str] = field(default_factory=set)
+    outdated: set[str] = set()
     """Actions that changed since the start: their demands stay valid until they can be rendered again."""
     statistics: Statistics | None = None
     """None if the rule has no signals over the episode."""

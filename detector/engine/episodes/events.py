@@ -81,9 +81,7 @@ class Event(msgspec.Struct, frozen=True, gc=False):
         element = "" if known.element is None else f',"element":{quote(known.element)}'
         reason = "" if self.end_time is None or self.reason is None else f',"endTime":"{time}","reason":"{self.reason}"'
         models = f',"models":{to_text(dict(self.models))}' if self.models else ""
-        classification = (
-            "" if known.classification is None else f',"classification":{to_text(dict(known.classification))}'
-        )
+        classification = "" if known.classification is None else f',"classification":{_text_once(known.classification)}'
         dry_run = ',"dryRun":true' if self.dry_run else ""
         return (
             f'{{"specversion":"1.0","id":{episode[:-1]}.{what}","source":{quote(f"/detectors/{self.holder}")}'
@@ -93,6 +91,21 @@ class Event(msgspec.Struct, frozen=True, gc=False):
             f',"onsetTime":"{onset}","startTime":"{start}"{reason}'
             f',"values":{plain_text(self.values)}{models}{classification}{dry_run}}}}}'
         )
+
+
+_MAXIMUM_TEXTS = 1000
+_texts: dict[int, tuple[Mapping[str, JsonValue], str]] = {}
+"""By id, mappings that never change, and their texts. They are kept, so that no other object gets their id."""
+
+
+def _text_once(constant: Mapping[str, JsonValue]) -> str:
+    """The same as `to_text` of a mapping that never changes; rules share theirs with all their events. Thread-safe."""
+    found = _texts.get(id(constant))
+    if found is None:
+        if len(_texts) >= _MAXIMUM_TEXTS:
+            _texts.clear()
+        found = _texts[id(constant)] = constant, to_text(dict(constant))
+    return found[1]
 
 
 class Happened(NamedTuple):

@@ -43,6 +43,10 @@ def plain_text(values: Mapping[str, JsonValue]) -> str:
                 parts.append(f"{quote(key)}:{value!r}")
         elif kind is str:
             parts.append(f"{quote(key)}:{quote(value)}")
+        elif kind is bool:
+            parts.append(f"{quote(key)}:{'true' if value else 'false'}")
+        elif kind is int:
+            parts.append(f"{quote(key)}:{value}")
         elif not _is_null(value):
             parts.append(f"{quote(key)}:{to_text(_plain(value))}")
     return f"{{{','.join(parts)}}}"

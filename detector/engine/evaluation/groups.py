@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,15 +32,8 @@ _EFFECTS[UNTIL_UNSURE : UNTIL_UNSURE + 4] = _UNSURE_END
 _EFFECTS[UNTIL:16] = _END
 
 
-class SubjectChanges(NamedTuple):
-    """The ticks of the block at which a subject must be evaluated, and its observations there."""
-
-    row: int
-    """The subject's track."""
-    at: int
-    """The client's index in the block."""
-    ticks: list[int]
-    codes: list[int]
+Changes = tuple[list[int], list[int]]
+"""Ticks of a block at which a subject must be evaluated, and its observations there."""
 
 
 class RuleGroup:
@@ -108,14 +101,14 @@ class RuleGroup:
         self._follow()
         numbers: list[int] = block.numbers.tolist()
         states: list[tuple[int, int, bool, int]] = []
-        for change in self._changed(block, codes, looked):
-            self._step(block, change, numbers[change.at], states, happened)
+        for row, at, changes in self._changed(block, codes, looked):
+            states.append((row, numbers[at], *self._step(block, row, at, changes, happened)))
         if self._measures and isinstance(block, Block):
             self._measure(block)
         if states:
-            rows, at, watched, wakes = zip(*states, strict=True)
-            self._watched[rows, at] = watched
-            self._wakes[rows, at] = wakes
+            rows, places, watched, wakes = zip(*states, strict=True)
+            self._watched[rows, places] = watched
+            self._wakes[rows, places] = wakes
         last = ticks[-1]
         for run in self._budgeted:
             run.tidy_starts(last)
@@ -166,8 +159,10 @@ class RuleGroup:
         for run in self.runs:
             run.disturbed = False
 
-    def _changed(self, block: Block | FleetBlock, codes: Codes, looked: Truths | None) -> Iterator[SubjectChanges]:
-        """Of each subject that matters, the ticks at which its observation changes or a timer expires."""
+    def _changed(
+        self, block: Block | FleetBlock, codes: Codes, looked: Truths | None
+    ) -> Iterator[tuple[int, int, Changes]]:
+        """Of each subject that matters (a track and a client of the block), what may have an effect."""
         numbers, last = block.numbers, int(block.times[-1])
         changed = np.empty(codes.shape, bool)
         np.not_equal(codes[:, :, 0], self._last[:, numbers], out=changed[:, :, 0])
@@ -206,26 +201,23 @@ class RuleGroup:
         ticks, observations = when.tolist(), seen.tolist()
         tracks, subjects = (each.tolist() for each in np.divmod(which[bounds[:-1]], len(block.clients)))
         for row, at, (begin, end) in zip(tracks, subjects, itertools.pairwise(bounds), strict=True):
-            yield SubjectChanges(row, at, ticks[begin:end], observations[begin:end])
+            yield row, at, (ticks[begin:end], observations[begin:end])
 
     def _step(
-        self,
-        block: Block | FleetBlock,
-        changes: SubjectChanges,
-        number: int,
-        states: list[tuple[int, int, bool, int]],
-        happened: list[Happened],
-    ) -> None:
-        """Advance one subject's state over all ticks of the block; notes what happened, whether it keeps a state, and
-        when to evaluate it again."""
-        row, at = changes.row, changes.at
+        self, block: Block | FleetBlock, row: int, at: int, changes: Changes, happened: list[Happened]
+    ) -> tuple[bool, int]:
+        """Advance one subject's state over all ticks of the block, and note what happened.
+
+        Returns whether it keeps a state, and when to evaluate it again.
+        """
         run, track = self._of[row], self.columns.tracks[row]
         subject = track.subject(block.clients[at])
         state = run.state(subject) or run.new_state(subject)
         ticks, timing, count = block.ticks, run.timing, len(block.ticks)
+        begins, codes = changes
         deploys, timed = run.has_deploys, self._timed[row]
         wake: int | None = None
-        for code, begin, end in zip(changes.codes, changes.ticks, (*changes.ticks[1:], count), strict=True):
+        for code, begin, end in zip(codes, begins, (*begins[1:], count), strict=True):
             first = begin
             if not timed and (code == TRUE or code >= UNTIL):
                 end = begin + 1  # noqa: PLW2901  the later ticks have no effect
@@ -247,7 +239,7 @@ class RuleGroup:
         idle = state.idle_at(ticks[-1])
         if idle:
             run.drop_state(subject)
-        states.append((row, number, not idle, NO_WAKE if wake is None else wake))
+        return not idle, NO_WAKE if wake is None else wake
 
     def _candidate(self, block: Block | FleetBlock, track: Track, subject: Subject, point: int) -> Candidate:
         if not isinstance(block, Block):

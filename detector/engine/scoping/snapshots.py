@@ -8,7 +8,7 @@ from typing import Any
 
 from detector.engine.scoping.scopes import Candidate
 from wayside.expressions import Expression
-from wayside.rules import CompiledRule, FleetSubject, PairSubject
+from wayside.rules import ClientSubject, CompiledRule, FleetSubject, PairSubject
 
 _PLAIN = frozenset({float, bool, str})
 
@@ -42,6 +42,8 @@ def signals_read(rule: CompiledRule, expression: Expression | None) -> str:
 
 def _of_the_scope(rule: CompiledRule, variables: Mapping[str, Any]) -> dict[str, Any]:
     match rule.subject:
+        case ClientSubject():
+            return _signals_of(rule, variables)
         case PairSubject():
             values: dict[str, Any] = {
                 name: variables[name] for name in ("distance", "closingSpeed") if name in variables
@@ -52,8 +54,6 @@ def _of_the_scope(rule: CompiledRule, variables: Mapping[str, Any]) -> dict[str,
         case FleetSubject():
             members = variables["members"]
             return {"count": float(len(members)), "members": [_member(rule, view) for view in members[:_MEMBERS]]}
-        case _:
-            return _signals_of(rule, variables)
 
 
 def _member(rule: CompiledRule, view: Mapping[str, Any]) -> dict[str, Any]:

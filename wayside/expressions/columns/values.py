@@ -35,6 +35,10 @@ class Tag(IntEnum):
     """Nothing, and there is no map above either that could hold it: `has()` of it is unknown, not false."""
 
 
+_, _NUMBER, _BOOLEAN, _TEXT, _OTHER, _ = map(int, Tag)
+"""As plain integers: access to members of an enum is slow in Python 3.11."""
+
+
 @final
 class _Sentinel:
     def __init__(self, name: str) -> None:
@@ -177,17 +181,16 @@ def value_at(column: Column, row: int, texts: Texts) -> Value | Unknown:
 
     Raises ValueError for a row whose tag is OTHER in a column that has no others.
     """
-    tag = Tag.NUMBER if column.tags is None else Tag(int(column.tags[row]))
-    double = float(column.values[row])
-    match tag:
-        case Tag.NUMBER:
-            return double
-        case Tag.BOOLEAN:
-            return double != 0
-        case Tag.TEXT:
-            return texts.text(int(double))
-        case Tag.OTHER:
-            if column.others is None:
-                raise ValueError(f"row {row} has a value that this column cannot represent: evaluate it with CEL")
-            return cast("Value", column.others[row])
-    return UNKNOWN
+    double: float = column.values.item(row)
+    tag = _NUMBER if column.tags is None else column.tags.item(row)
+    if tag == _NUMBER:
+        return double
+    if tag == _BOOLEAN:
+        return double != 0
+    if tag == _TEXT:
+        return texts.text(int(double))
+    if tag != _OTHER:
+        return UNKNOWN
+    if column.others is None:
+        raise ValueError(f"row {row} has a value that this column cannot represent: evaluate it with CEL")
+    return cast("Value", column.others[row])
