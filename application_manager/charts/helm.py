@@ -21,7 +21,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from application_manager.core.objects.charts import ChartRequest, ChartSource
-from wayside.api.chart import OCI
+from wayside.api.applicationtemplate import OCI
 
 PULL_TIME = 60.0  # s
 TEMPLATE_TIME = 20.0  # s; a chart takes a tenth of one

@@ -16,9 +16,9 @@ from dataclasses import dataclass
 
 from application_manager.measures import Measures
 from wayside.kubernetes.client import Client
+from wayside.kubernetes.connection import pod_namespace
 from wayside.kubernetes.errors import ApiError, RequestError, Unreachable
 from wayside.kubernetes.leases import LeaseCandidate, holder_of
-from wayside.kubernetes.podaccount import pod_namespace
 from wayside.kubernetes.resources import LEASES
 from wayside.process.backoff import retry_async
 

@@ -28,8 +28,8 @@ from application_manager.measures import Measures
 from wayside.api.base import Condition, Kind
 from wayside.kubernetes.client import Client
 from wayside.kubernetes.errors import ApiError, Unreachable
+from wayside.kubernetes.pacing import Turns
 from wayside.kubernetes.resources import EVENTS
-from wayside.kubernetes.turns import Turns
 from wayside.times import format_seconds
 
 COMPONENT = "wayside.dev/application-manager"

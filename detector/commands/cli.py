@@ -297,7 +297,7 @@ def schema(
     with importing():
         import json
 
-        from wayside.api.editing import editor_schema
+        from wayside.api.schema import editor_schema
 
     text = json.dumps(editor_schema(), indent=1) + "\n"
     if output is None:

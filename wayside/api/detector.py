@@ -7,7 +7,6 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field, model_validator
 
-from wayside.api.asn1 import Asn1Module
 from wayside.api.base import (
     ATOMIC_LIST,
     SET_LIST,
@@ -21,15 +20,16 @@ from wayside.api.base import (
     PositiveQuantity,
     map_list,
 )
-from wayside.api.constants import Constants
 from wayside.api.constraints import GIVEN_TWICE, constraint, unique
 from wayside.api.database import DatabaseConnection
+from wayside.api.freedata import Constants
 from wayside.api.place import MapFile, Place
 from wayside.api.plugin import DataSource
 from wayside.api.pod import OF_ITS_OWN_POD, DetectorMode, DetectorPod
 from wayside.api.recordings import Recordings
 from wayside.api.selector import LabelSelector
 from wayside.api.stream import (
+    Asn1Module,
     MessageDefinition,
     Stream,
 )

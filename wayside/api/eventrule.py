@@ -23,9 +23,9 @@ from wayside.api.base import (
     map_list,
 )
 from wayside.api.classification import Classification
-from wayside.api.constants import Constants
 from wayside.api.constraints import constraint, unique
 from wayside.api.evaluation import Evaluation
+from wayside.api.freedata import Constants
 from wayside.api.model import ModelSource
 from wayside.api.plugin import SignalPlugin
 from wayside.api.scopes import ClientScope, Each, Scope

@@ -1,4 +1,4 @@
-"""Free data: maps of any JSON values, and their bounds.
+"""Free data: maps of any JSON values, and their bounds; and constants, which expressions can take as well.
 
 The schema bounds each value; the total is for the programs to check, which `check`, the webhook and the manager do.
 """
@@ -100,3 +100,25 @@ FreeData = Annotated[dict[str, Value], Field(max_length=64), AfterValidator(boun
 
 NamedData = Annotated[dict[Identifier, Value], Field(max_length=64), AfterValidator(bounded)]
 """By names that expressions can use."""
+
+
+def _checked_constants(constants: dict[str, Any]) -> dict[str, Any]:
+    """The constants, if expressions can take them. Raises ValueError, which names the value and the remedy."""
+    bounded(constants)
+    for name, value in constants.items():
+        _check_constant(name, value)
+    return constants
+
+
+def _check_constant(name: str, value: object) -> None:
+    if value is None:
+        raise ValueError(f"{name} is null: give it a value, or remove it")
+    if not isinstance(value, bool | int | float | str | list | dict):
+        raise ValueError(f"{name} is a {type(value).__name__}: write it as a string, in quotes")
+    if isinstance(value, list | dict):
+        for part, child in enumerate(value) if isinstance(value, list) else value.items():
+            _check_constant(f"{name}[{part}]" if isinstance(part, int) else f"{name}.{part}", child)
+
+
+Constants = Annotated[dict[Identifier, Value], Field(max_length=64), AfterValidator(_checked_constants)]
+"""Constants that a rule's expressions share, by name: numbers, texts, booleans, and lists and maps of them."""

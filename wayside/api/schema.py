@@ -1,4 +1,7 @@
-"""Generates CRDs from the models: pydantic's JSON schema made structural, with Kubernetes' extensions."""
+"""Generates CRDs from the models: pydantic's JSON schema made structural, with Kubernetes' extensions.
+
+And from the CRDs the schema for editors.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,8 @@ from pydantic import BaseModel
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core.core_schema import ModelSchema
 
-from wayside.api.base import GROUP, VERSION, Kind, Model
+from wayside.api import API_VERSION, GROUP, KINDS
+from wayside.api.base import VERSION, Kind, Model
 
 _KEPT = {
     "type", "description", "pattern", "minLength", "maxLength", "minimum", "maximum", "exclusiveMinimum",
@@ -182,3 +186,51 @@ def _resolved(node: dict[str, Any], definitions: dict[str, Any]) -> dict[str, An
                 raise ValueError(f"a structural schema cannot express a choice of types: {node}")
             return {**_resolved(choices[0], definitions), **beside}
     return beside
+
+
+def editor_schema() -> dict[str, Any]:
+    """One JSON Schema of all kinds, with which editors complete fields, show descriptions and mark misspelt fields."""
+    return {
+        "$schema": "http://json-schema.org/draft-07/schema#",
+        "title": "Wayside",
+        "type": "object",
+        "required": ["apiVersion", "kind"],
+        "properties": {
+            "apiVersion": {"const": API_VERSION},
+            "kind": {"enum": sorted(KINDS), "description": "Which kind of object the document is."},
+        },
+        "allOf": [
+            {
+                "if": {"properties": {"kind": {"const": name}}, "required": ["kind"]},
+                "then": _for_editors(crd(kind)["spec"]["versions"][0]["schema"]["openAPIV3Schema"], name),
+            }
+            for name, kind in sorted(KINDS.items())
+        ],
+    }
+
+
+def _for_editors(schema: dict[str, Any], kind: str) -> dict[str, Any]:
+    found = _plain({key: value for key, value in schema.items() if key != "properties"})
+    properties = {name: _plain(child) for name, child in schema["properties"].items() if name != "status"}
+    metadata = properties["metadata"]
+    metadata["required"] = ["name"]
+    metadata.pop("additionalProperties", None)
+    properties["apiVersion"] = {"const": API_VERSION}
+    properties["kind"] = {"const": kind}
+    return {**found, "properties": {**properties, "status": {}}, "additionalProperties": False}
+
+
+def _plain(schema: dict[str, Any]) -> dict[str, Any]:
+    """The same without what only Kubernetes knows; a map with named fields has no others."""
+    found = {key: value for key, value in schema.items() if not key.startswith("x-kubernetes-") and key != "nullable"}
+    if found.pop("exclusiveMinimum", False):
+        found["exclusiveMinimum"] = found.pop("minimum")
+    if "properties" in found:
+        found["properties"] = {name: _plain(child) for name, child in found["properties"].items()}
+        if not schema.get("x-kubernetes-preserve-unknown-fields"):
+            found["additionalProperties"] = False
+    elif isinstance(found.get("additionalProperties"), dict):
+        found["additionalProperties"] = _plain(found["additionalProperties"])
+    if isinstance(found.get("items"), dict):
+        found["items"] = _plain(found["items"])
+    return found

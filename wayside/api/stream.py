@@ -16,7 +16,7 @@ from wayside.api.base import (
     PositiveDuration,
     PositiveQuantity,
 )
-from wayside.api.constraints import constraint
+from wayside.api.constraints import constraint, exactly_one
 from wayside.api.plugin import ZENOH
 
 
@@ -49,6 +49,18 @@ class MessageDefinition(Model):
     definition: str = Field(max_length=65_536)
     """The definition in the format of .msg files. Each type that it refers to needs a definition as well: an entry of
     its own in messages, or a part of this text, after a line of = and a line `MSG: <type>`, as `ros2 bag` writes it."""
+
+
+class Asn1Module(Model):
+    """One or several ASN.1 modules, in the Detector itself or in a file."""
+
+    constraints = (exactly_one("definition", "file"),)
+
+    definition: str | None = Field(default=None, min_length=1, max_length=500_000)
+    """The text of the modules."""
+    file: str | None = Field(default=None, min_length=1, max_length=1024)
+    """The path of a file with the modules, as the detector sees it: relative to its working directory, or on a mounted
+    volume."""
 
 
 class History(Model):

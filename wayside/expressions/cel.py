@@ -20,18 +20,16 @@ from typing import Final
 
 from cel_expr_python import cel
 
-from wayside.expressions.diagnostics import EMPTY, diagnose
+from wayside.expressions.bounds import LARGEST_PATTERN, MOST, growth, pattern_size
+from wayside.expressions.diagnostics import EMPTY, NO_MEMBERS, clean, diagnose, reports_absent
 from wayside.expressions.errors import EvaluationError, ExpressionError, position
 from wayside.expressions.expanding import NamedPlaces, expanded
-from wayside.expressions.failures import NO_MEMBERS, clean, reports_absent
 from wayside.expressions.functions import DECLARATIONS, TAKING_HANDLES
 from wayside.expressions.functions.calls import drop_lost_references
-from wayside.expressions.growth import MOST, growth
 from wayside.expressions.handles import begin, end, value_of
 from wayside.expressions.lexer import tokens
 from wayside.expressions.numbers import MAX_EXACT, doubled
 from wayside.expressions.projection import Leaf, missing_path, no_member, normalise, project, tree
-from wayside.expressions.regex import LARGEST_PATTERN, pattern_size
 from wayside.expressions.syntax import (
     Node,
     Path,

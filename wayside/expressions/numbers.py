@@ -10,7 +10,7 @@ Integer literals become doubles, and so do the results of functions that count, 
 fraction. A literal index stays an integer; any other index is wrapped in `dyn()`, because a list takes an integral
 double as its index at run time, but not when types are checked. Integers stay where only integers work: beside `%`,
 as the argument of `timestamp` and of `string`, and beyond 2^53, where a double would be another number. `digits` makes
-a whole double an integer again, since `string` writes large doubles with an exponent; `bounded` (see `regex`) takes
+a whole double an integer again, since `string` writes large doubles with an exponent; `bounded` (see `bounds`) takes
 part in the same pass. Strings, comments and `3u` are
 left alone.
 """
@@ -20,8 +20,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from wayside.expressions.bounds import BOUNDED
 from wayside.expressions.lexer import Token, TokenKind, tokens
-from wayside.expressions.regex import BOUNDED
 
 MAX_EXACT = 2**53
 """Up to here every integer is a double as well."""

@@ -11,11 +11,10 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections import Counter
-from collections.abc import AsyncIterator
+from collections import Counter, OrderedDict, deque
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
-
-from wayside.kubernetes.turns import Turns
+from typing import Generic, TypeVar
 
 AT_ONCE = 24
 """Requests that are under way at the same time, of all queues together; watches are apart."""
@@ -26,9 +25,49 @@ LONGEST_HOLD = 60.0
 MOST_WRITES = 8
 """Writes of one namespace that are under way at the same time, where the API server is quick."""
 
+Item = TypeVar("Item")
+
 _SAMPLE = 16  # writes, whose mean time decides the next step
 _SPARSE, _DENSE = 0.3, 1.0  # of a namespace's writes, those that wait at the API server: TCP Vegas' alpha and beta
 _MEMORY = 300.0  # s; the quickest time is that of this period and the one before
+
+
+class Turns(Generic[Item]):
+    """A queue that is fair by namespace: namespaces take turns, so a flood of items in one delays no other."""
+
+    def __init__(self) -> None:
+        self._waiting: OrderedDict[str, deque[Item]] = OrderedDict()  # the first has the next turn
+
+    def __bool__(self) -> bool:
+        return bool(self._waiting)
+
+    def __contains__(self, namespace: str) -> bool:
+        return namespace in self._waiting
+
+    def count(self, namespace: str) -> int:
+        """How many items of the namespace wait."""
+        return len(self._waiting.get(namespace, ()))
+
+    def add(self, namespace: str, item: Item) -> None:
+        """Put an item behind the others of its namespace."""
+        self._waiting.setdefault(namespace, deque()).append(item)
+
+    def next(self, may: Callable[[str], bool] = lambda _: True) -> Item | None:
+        """Take the next item out of the namespaces that may have a turn; None where none waits in any of these."""
+        taken = self.take(may)
+        return None if taken is None else taken[1]
+
+    def take(self, may: Callable[[str], bool]) -> tuple[str, Item] | None:
+        """The same, with its namespace."""
+        for namespace, items in self._waiting.items():
+            if may(namespace):
+                item = items.popleft()
+                if items:
+                    self._waiting.move_to_end(namespace)
+                else:
+                    del self._waiting[namespace]
+                return namespace, item
+        return None
 
 
 class Share:

@@ -19,7 +19,7 @@ from contextlib import suppress
 from typing import Any, Generic, Protocol, TypeVar
 
 from wayside.kubernetes.errors import NotGranted, RequestError
-from wayside.kubernetes.turns import Turns
+from wayside.kubernetes.pacing import Turns
 from wayside.process.backoff import pause_after
 
 Key = TypeVar("Key", bound=Hashable)

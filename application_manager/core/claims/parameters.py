@@ -17,8 +17,8 @@ from application_manager.core.claims import values
 from wayside.api import ApplicationTemplate, freedata
 from wayside.api.parameter import Parameter
 from wayside.expressions import CelType, Environment, Expression, ExpressionError
+from wayside.expressions.bounds import LARGEST_PATTERN, LONGEST_INPUT, pattern_size
 from wayside.expressions.errors import EvaluationError
-from wayside.expressions.regex import LARGEST_PATTERN, LONGEST_INPUT, pattern_size
 
 Parameters = Mapping[str, Any]
 """Parameter names to JSON values."""

@@ -14,7 +14,7 @@ from typing import Any
 
 import yaml
 
-from wayside.api.chart import Helm
+from wayside.api.applicationtemplate import Helm
 
 UNAVAILABLE = "ChartUnavailable"
 """The reason where the chart cannot be had."""

@@ -23,7 +23,7 @@ from application_manager.core.objects.ownership import Manifest, ObjectKey, labe
 from application_manager.core.objects.policy import Policy
 from application_manager.core.objects.suspension import stated_replicas, stopped, yielded
 from wayside.api import ApplicationInstance, ApplicationTemplate
-from wayside.api.chart import Helm
+from wayside.api.applicationtemplate import Helm
 from wayside.expressions import CelType, CompiledTemplate, Embedded, Environment, InterpolationError, compile_template
 
 _INSTANCE_VARIABLES = ("name", "key", "namespace")

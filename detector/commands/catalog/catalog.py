@@ -8,9 +8,8 @@ from itertools import groupby
 from pathlib import Path, PurePath
 
 from wayside.api import EventRule
-from wayside.api.classification import Classification
+from wayside.api.classification import SCHEME, CharacteristicValue, Classification, Dimension
 from wayside.api.documents import load_documents
-from wayside.api.scheme import SCHEME, CharacteristicValue, Dimension
 
 Chosen = Mapping[Dimension, frozenset[CharacteristicValue]]
 """For some dimensions, the values of which a rule must have at least one."""

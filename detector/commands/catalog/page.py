@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from html import escape
 
 from detector.commands.catalog.catalog import Catalog, CatalogEntry
-from wayside.api.scheme import SCHEME, CharacteristicValue, Dimension
+from wayside.api.classification import SCHEME, CharacteristicValue, Dimension
 
 
 def page(catalog: Catalog) -> str:

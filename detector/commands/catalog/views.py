@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from detector.commands.catalog.catalog import Catalog, CatalogEntry
-from wayside.api.scheme import SCHEME
+from wayside.api.classification import SCHEME
 
 _MEANINGFUL = re.compile(r"([\\`*_{}\[\]<>()#+!|~])")
 

@@ -15,9 +15,8 @@ from detector.commands.catalog.catalog import Catalog, CatalogEntry, ChoiceError
 from detector.commands.catalog.page import page
 from detector.commands.catalog.views import markdown_view
 from detector.commands.cli import app
-from wayside.api.classification import Classification
+from wayside.api.classification import SCHEME, Classification
 from wayside.api.documents import DocumentError
-from wayside.api.scheme import SCHEME
 from wayside.kubernetes.connection import ConfigurationError
 from wayside.process import commandline
 

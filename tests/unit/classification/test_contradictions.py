@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from detector.commands.cli import app
 from tests.driving import POSITION, a_detector, a_rule, a_stream
 from tests.guides import guide
-from wayside.api.classification import Classification
-from wayside.api.scheme import SCHEME
+from wayside.api.classification import SCHEME, Classification
 from wayside.process import commandline
 from wayside.rules import compile_rule
 from wayside.rules.contradictions import CONTRADICTIONS, contradictions

@@ -7,8 +7,7 @@ import yaml
 from pydantic import ValidationError
 
 from tests.guides import guide, yaml_blocks
-from wayside.api.classification import Classification
-from wayside.api.scheme import SCHEME
+from wayside.api.classification import SCHEME, Classification
 
 GUIDE = guide("classification")
 

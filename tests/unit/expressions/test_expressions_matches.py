@@ -6,7 +6,7 @@ import pytest
 
 from application_manager.core.claims.parameters import mismatch, pattern_problem
 from wayside.expressions import CelType, Environment, EvaluationError, ExpressionError
-from wayside.expressions.regex import LARGEST_PATTERN, LONGEST_INPUT, pattern_size
+from wayside.expressions.bounds import LARGEST_PATTERN, LONGEST_INPUT, pattern_size
 
 ENVIRONMENT = Environment({"s": CelType.STRING, "msg": CelType.DYN, "items": CelType.LIST})
 

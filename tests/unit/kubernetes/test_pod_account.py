@@ -8,15 +8,15 @@ from pathlib import Path
 import pytest
 from kubernetes.aio.client import Configuration
 
-from wayside.kubernetes import podaccount
-from wayside.kubernetes.podaccount import AccountError, use_pod_account
+from wayside.kubernetes import connection
+from wayside.kubernetes.connection import AccountError, use_pod_account
 
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("KUBERNETES_SERVICE_HOST", "fd00::1")
     monkeypatch.setenv("KUBERNETES_SERVICE_PORT", "443")
-    monkeypatch.setattr(podaccount, "_READ_EVERY", 0.0)
+    monkeypatch.setattr(connection, "_READ_EVERY", 0.0)
     (tmp_path / "ca.crt").write_text("certificate")
     (tmp_path / "token").write_text("first\n")
     return tmp_path

@@ -11,8 +11,7 @@ from application_manager.core.objects.charts import ChartFailure, ChartObjects, 
 from application_manager.core.objects.policy import Policy
 from application_manager.core.objects.rendering import ChartPending, Renderer, RenderError, Rendering
 from tests.unit.manager_objects import instance, template
-from wayside.api.applicationtemplate import ApplicationTemplateSpec
-from wayside.api.chart import Helm
+from wayside.api.applicationtemplate import ApplicationTemplateSpec, Helm
 
 SOURCE = ChartSource("app", "1.0.0", "https://charts.example.com")
 CHART = {"chart": SOURCE.chart, "version": SOURCE.version, "repository": SOURCE.repository}

@@ -6,9 +6,9 @@ from typing import Final
 
 from cel_expr_python import cel
 
+from wayside.expressions.bounds import BOUNDED, LONGEST_INPUT
 from wayside.expressions.functions.calls import Arguments, called_by_cel
 from wayside.expressions.numbers import DIGITS, MAX_EXACT
-from wayside.expressions.regex import BOUNDED, LONGEST_INPUT
 
 
 def _bounded(arguments: Arguments) -> object:

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 
 from wayside.api import Detector, EventRule
 from wayside.api.base import Duration
-from wayside.api.classification import Classification
+from wayside.api.classification import SCHEME, CharacteristicValue, Classification, Dimension
 from wayside.api.eventrule import Signal
-from wayside.api.scheme import SCHEME, CharacteristicValue, Dimension
 from wayside.rules.compiled import CompiledRule
 from wayside.rules.problems import RuleProblem
 

@@ -9,9 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 from wayside.api import Detector, EventRule
-from wayside.api.scheme import (
+from wayside.api.actions.action import ActionSpec
+from wayside.api.classification import (
     ActingEntity,
     CharacteristicValue,
     DetectionAlgorithm,
@@ -23,8 +25,8 @@ from wayside.api.scheme import (
     TypeOfAction,
     TypeOfParticipants,
 )
+from wayside.api.operation import Operation
 from wayside.rules.compiled import CompiledRule, FleetSubject, PairSubject
-from wayside.rules.contradictions.acting import delay_ns, types
 from wayside.rules.contradictions.case import Case, detecting, span
 from wayside.rules.contradictions.observation import looks_back, observation
 from wayside.rules.problems import RuleProblem
@@ -128,7 +130,7 @@ def _observed(case: Case) -> Iterator[RuleProblem]:
 
 def _late(case: Case) -> Iterator[RuleProblem]:
     every = case.compiled.every_ns or 0
-    waits = [delay_ns(action) for action in case.rule.spec.actions]
+    waits = [_delay_ns(action) for action in case.rule.spec.actions]
     wait = min(waits, default=0)
     delay, given = every + wait, case.given(TimeSensitivity)
     why = f"it is evaluated every {span(every)} (spec.evaluation.every)" if every >= wait else ""
@@ -176,6 +178,69 @@ def _learnt(rule: EventRule, others: Mapping[str, EventRule], above: frozenset[s
     return models, plugins
 
 
+# Which types an action of a rule can have. Some follow from the kind of action: `record` records. Others depend on the
+# receiver: a message to software may reconfigure it, and an application that is launched may do anything.
+
+_ANY = frozenset(TypeOfAction)
+_NOT_RECORDING = _ANY - {TypeOfAction.DATA_COLLECTION}
+
+
+class _Types(NamedTuple):
+    """The types of action that an action can have."""
+
+    needed: frozenset[TypeOfAction]
+    """One of these must be in the classification; empty: none is required."""
+    possible: frozenset[TypeOfAction]
+    """The types that the action can account for."""
+    does: str
+    """The effect of the action, for a warning."""
+
+
+_LAUNCHES = _Types(frozenset({TypeOfAction.DEPLOYMENT}), _ANY, "launches software")
+_CONFIGURES = _Types(
+    frozenset({TypeOfAction.RECONFIGURATION}),
+    _ANY - {TypeOfAction.DEPLOYMENT},
+    "reconfigures running applications, and starts none",
+)
+_SUSPENDS = _Types(
+    frozenset({TypeOfAction.RECONFIGURATION, TypeOfAction.OTHER}),
+    frozenset({TypeOfAction.RECONFIGURATION, TypeOfAction.OTHER}),
+    "stops running applications",
+)
+_RECORDS = _Types(frozenset({TypeOfAction.DATA_COLLECTION}), frozenset({TypeOfAction.DATA_COLLECTION}), "records data")
+_TRIES_RECORDING = _RECORDS._replace(needed=frozenset())
+_CALLS = _Types(frozenset(), _ANY, "calls another system")
+_ALERTS = _Types(frozenset({TypeOfAction.NOTIFICATION}), frozenset({TypeOfAction.NOTIFICATION}), "raises an alert")
+_NOTIFIES = _Types(_NOT_RECORDING, _ANY, "sends a notification")
+
+_OF_OPERATION = {
+    Operation.DEPLOY: _LAUNCHES,
+    Operation.RECONFIGURE: _CONFIGURES,
+    Operation.SUSPEND: _SUSPENDS,
+}
+
+
+def _types(action: ActionSpec) -> _Types:
+    """The types that the action can have."""
+    if action.deploy is not None:
+        return _OF_OPERATION[action.deploy.operation]
+    if action.record is not None:
+        return _RECORDS
+    if action.database is not None:
+        return _TRIES_RECORDING if action.database.dry_run else _RECORDS
+    if action.trigger is not None:
+        return _RECORDS if action.trigger.detector is not None else _CALLS
+    if action.notify is not None:
+        return _ALERTS if action.notify.alertmanager is not None else _NOTIFIES
+    return _CALLS
+
+
+def _delay_ns(action: ActionSpec) -> int:
+    """How long the action waits before it does anything, in nanoseconds."""
+    grouping = None if action.notify is None else action.notify.grouping
+    return 0 if grouping is None else grouping.wait.ns
+
+
 def _unnamed_action(case: Case) -> Iterator[RuleProblem]:
     given = set(case.given(TypeOfAction))
     actions = case.rule.spec.actions
@@ -184,7 +249,7 @@ def _unnamed_action(case: Case) -> Iterator[RuleProblem]:
     # A notification that comes with the data is a report, as in the paper's Table 2.
     report = TypeOfAction.NOTIFICATION in given and any(action.notify is not None for action in actions)
     for index, action in enumerate(actions):
-        needed, _, does = types(action)
+        needed, _, does = _types(action)
         if needed == {TypeOfAction.DATA_COLLECTION} and report:
             continue
         if needed and not needed & given:
@@ -194,7 +259,7 @@ def _unnamed_action(case: Case) -> Iterator[RuleProblem]:
 
 def _unaccounted_type(case: Case) -> Iterator[RuleProblem]:
     actions = case.rule.spec.actions
-    possible = frozenset[CharacteristicValue]().union(*(types(action).possible for action in actions))
+    possible = frozenset[CharacteristicValue]().union(*(_types(action).possible for action in actions))
     for value in case.given(TypeOfAction) if actions else ():  # without actions, another system acts on the events
         if value not in possible:
             listed = ", ".join(f"spec.actions[{index}].{each.field}" for index, each in enumerate(actions))

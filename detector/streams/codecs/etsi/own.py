@@ -16,7 +16,7 @@ from typing import Any
 from detector.streams.codecs.etsi import asn1, bounds
 from detector.streams.codecs.etsi.packaged import ALPHABETS, REMEDY
 from detector.streams.codecs.etsi.quantities import UNITS
-from wayside.api.asn1 import Asn1Module
+from wayside.api.stream import Asn1Module
 
 _SUCCESSORS = re.compile(r"\bWITH\s+(SUCCESSORS|DESCENDANTS)\b")
 """Permits a later version of a module; asn1tools does not know it."""
