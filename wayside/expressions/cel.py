@@ -22,7 +22,7 @@ from cel_expr_python import cel
 
 from wayside.expressions.bounds import LARGEST_PATTERN, MOST, growth, pattern_size
 from wayside.expressions.diagnostics import EMPTY, NO_MEMBERS, clean, diagnose, reports_absent
-from wayside.expressions.errors import EvaluationError, ExpressionError, position
+from wayside.expressions.errors import EvaluationError, ExpressionError
 from wayside.expressions.expanding import NamedPlaces, expanded
 from wayside.expressions.functions import DECLARATIONS, TAKING_HANDLES
 from wayside.expressions.functions.calls import drop_lost_references
@@ -320,9 +320,8 @@ def _check_static(actual: cel.Type, wanted: CelType, source: str) -> None:
     if wanted is CelType.DYN or name == "DYN" or wanted is kind or name.split("<")[0] == wanted.name:
         return
     start = len(source) - len(source.lstrip())
-    line, column = position(source, start)
     is_text = kind.value if kind else name.lower()
-    raise ExpressionError(f"must be {wanted.value}; got {is_text}", source=source, line=line, column=column)
+    raise ExpressionError(f"must be {wanted.value}; got {is_text}", source=source, offset=start)
 
 
 def _check_patterns(node: Node, source: str) -> None:
@@ -340,8 +339,8 @@ def _check_patterns(node: Node, source: str) -> None:
             hint = "use fewer repetitions, or smaller character classes"
         else:
             continue
-        line, column = position(source, names[index] if len(names) == len(found) else 0)
-        raise ExpressionError(message, source=source, line=line, column=column, hint=hint)
+        offset = names[index] if len(names) == len(found) else 0
+        raise ExpressionError(message, source=source, offset=offset, hint=hint)
 
 
 def _not_text(source: object) -> ExpressionError:

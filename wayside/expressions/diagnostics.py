@@ -10,7 +10,7 @@ import re
 from collections.abc import Collection
 from typing import Final
 
-from wayside.expressions.errors import ExpressionError, position
+from wayside.expressions.errors import ExpressionError
 from wayside.expressions.functions import FUNCTIONS
 from wayside.expressions.lexer import TokenKind, tokens
 from wayside.expressions.numbers import DIGITS, Doubled
@@ -57,12 +57,11 @@ def diagnose(report: str, source: str, compiled: Doubled, names: Collection[str]
         if source[at : at + 1] == "." and (undeclared := _UNDECLARED.search(text)):
             at = source.rfind(undeclared[1].split(".")[0], 0, at)  # of `x.y`, CEL points at the dot
         message, hint = _explain(text.removesuffix("[INVALID_ARGUMENT]").strip(), source, at, names)
-        author_line, author_column = position(source, at)
-        errors.append(ExpressionError(message, source=source, line=author_line, column=author_column, hint=hint))
+        errors.append(ExpressionError(message, source=source, offset=at, hint=hint))
     if not errors:
         message, hint = _explain(re.sub(r"^[A-Z_]+: | \[[A-Z_]+\]$", "", report), source, 0, names)
         return ExpressionError(message, source=source, hint=hint)
-    errors.sort(key=lambda error: (error.line, error.column))
+    errors.sort(key=lambda error: error.offset)
     errors[0].others = tuple(errors[1:])
     return errors[0]
 

@@ -8,26 +8,20 @@ from typing import Self
 class _LocatedError(Exception):
     """An error at a place in the author's text.
 
-    `line` and `column` count from 1, in characters of that text. `hint` is the remedy where one is known. `others`
-    holds the further errors of the same text. `path` is that of its field, or empty.
+    `source` is that text, and `offset` the place; `line` and `column` count from 1, in characters. `path` is that of
+    its field, or empty. `hint` is the remedy where one is known. `others` holds the further errors of the same text.
     """
 
     def __init__(
-        self,
-        message: str,
-        *,
-        path: str = "",
-        line: int = 1,
-        column: int = 1,
-        hint: str | None = None,
-        others: tuple[Self, ...] = (),
+        self, message: str, *, source: str = "", offset: int = 0, path: str = "", hint: str | None = None
     ) -> None:
         self.message = message
+        self.source = source
+        self.offset = offset
+        self.line, self.column = position(source, offset)
         self.path = path
-        self.line = line
-        self.column = column
         self.hint = hint
-        self.others = others
+        self.others: tuple[Self, ...] = ()
         super().__init__(message)
 
     def __str__(self) -> str:
@@ -38,19 +32,6 @@ class _LocatedError(Exception):
 
 class ExpressionError(_LocatedError):
     """An expression, `source`, that does not compile."""
-
-    def __init__(
-        self,
-        message: str,
-        *,
-        source: str,
-        line: int = 1,
-        column: int = 1,
-        hint: str | None = None,
-        others: tuple[Self, ...] = (),
-    ) -> None:
-        self.source = source
-        super().__init__(message, line=line, column=column, hint=hint, others=others)
 
 
 class EvaluationError(Exception):

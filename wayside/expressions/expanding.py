@@ -14,8 +14,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple, NoReturn
 
-from wayside.expressions.errors import ExpressionError, position
-from wayside.expressions.lexer import Token, TokenKind, tokens
+from wayside.expressions.errors import ExpressionError
+from wayside.expressions.lexer import TokenKind, tokens
 from wayside.geo.geometry import Shape
 from wayside.names import did_you_mean
 
@@ -252,6 +252,4 @@ class _Expansion:
         return self._tokens[at].text if 0 <= at < len(self._tokens) else ""
 
     def _refuse(self, at: int, message: str, hint: str) -> NoReturn:
-        token: Token = self._tokens[at]
-        line, column = position(self._source, token.start)
-        raise ExpressionError(message, source=self._source, line=line, column=column, hint=hint)
+        raise ExpressionError(message, source=self._source, offset=self._tokens[at].start, hint=hint)

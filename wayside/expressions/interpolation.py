@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from wayside.expressions.cel import Environment, Expression
-from wayside.expressions.errors import EvaluationError, ExpressionError, InterpolationError, position
+from wayside.expressions.errors import EvaluationError, ExpressionError, InterpolationError
 from wayside.expressions.lexer import TokenKind, tokens
 from wayside.expressions.numbers import MAX_EXACT
 from wayside.expressions.syntax import Path
@@ -34,6 +34,10 @@ class Embedded:
     path: str
     text: str
     offset: int
+
+    def error(self, message: str, hint: str | None = None) -> InterpolationError:
+        """An error at its place."""
+        return InterpolationError(message, source=self.text, offset=self.offset, path=self.path, hint=hint)
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,9 +162,9 @@ class _Compiler:
             literal.append(text[at:start])
             end = _closing(text, start + 2)
             if end is None:
-                line, column = position(text, start)
-                error = InterpolationError("`${` is not closed", path=path, line=line, column=column, hint=LITERAL)
-                self.errors.append(error)
+                self.errors.append(
+                    InterpolationError("`${` is not closed", source=text, offset=start, path=path, hint=LITERAL)
+                )
                 return _Literal(text)
             if joined := "".join(literal):
                 parts.append(joined)
@@ -200,15 +204,11 @@ def _closing(text: str, start: int) -> int | None:
 
 def _relocated(error: ExpressionError, text: str, path: str, start: int) -> InterpolationError:
     """The error of an expression, as one of the text around it; a shell's `${HOME}` is the usual mistake."""
-    lines = error.source.split("\n")
-    offset = start + sum(len(line) + 1 for line in lines[: error.line - 1]) + error.column - 1
-    line, column = position(text, offset)
-    message = error.message
     if not error.source.strip():
         hint = f"write an expression between the braces; {LITERAL}"
     else:
         hint = f"{error.hint}; {LITERAL}" if error.hint else LITERAL
-    return InterpolationError(message, path=path, line=line, column=column, hint=hint)
+    return InterpolationError(error.message, source=text, offset=start + error.offset, path=path, hint=hint)
 
 
 def _render(node: _Node, values: Mapping[str, object], integers: bool) -> Json | _Dropped:
@@ -216,7 +216,7 @@ def _render(node: _Node, values: Mapping[str, object], integers: bool) -> Json |
         case _Literal(value):
             return _numbers(value, integers) if integers else value
         case Embedded():
-            value = _json(node, node.expression, values)
+            value = _json(node, values)
             if value is None:
                 return _DROPPED
             return _numbers(value, integers)
@@ -243,25 +243,20 @@ def _joined(mixed: _Mixed, values: Mapping[str, object]) -> str:
 
 
 def _text(embedded: Embedded, values: Mapping[str, object]) -> str:
-    value = _json(embedded, embedded.expression, values)
+    value = _json(embedded, values)
     if value is None:
         hint = 'give a value for that case, as in `x == null ? "" : x`'
-        raise _failure(embedded, f"`{embedded.expression.source.strip()}` is null inside a text", hint)
+        raise embedded.error(f"`{embedded.expression.source.strip()}` is null inside a text", hint)
     if isinstance(value, str):
         return value
     return json.dumps(_numbers(value, integers=True), ensure_ascii=False, separators=(",", ":"))
 
 
-def _json(embedded: Embedded, expression: Expression, values: Mapping[str, object]) -> Json:
+def _json(embedded: Embedded, values: Mapping[str, object]) -> Json:
     try:
-        return _checked(expression.evaluate(values))
+        return _checked(embedded.expression.evaluate(values))
     except EvaluationError as error:
-        raise _failure(embedded, f"`{expression.source.strip()}`: {error.message}", None) from None
-
-
-def _failure(embedded: Embedded, message: str, hint: str | None) -> InterpolationError:
-    line, column = position(embedded.text, embedded.offset)
-    return InterpolationError(message, path=embedded.path, line=line, column=column, hint=hint)
+        raise embedded.error(f"`{embedded.expression.source.strip()}`: {error.message}") from None
 
 
 def _checked(value: object) -> Json:

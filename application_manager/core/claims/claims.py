@@ -24,7 +24,6 @@ from wayside.expressions import (
     InterpolationError,
     compile_template,
 )
-from wayside.expressions.errors import position
 
 MAXIMUM_KEY_LENGTH = 1024  # characters, as ApplicationInstance's spec.key allows
 
@@ -234,6 +233,4 @@ def unknown_members(known: Mapping[str, tuple[str, ...]], each: Embedded) -> Ite
         hint = f"there {'is' if len(members) == 1 else 'are'} {', '.join(members) or 'none'}"
         if each.text.strip() != f"${{{each.expression.source}}}":
             hint += "; write `$${` for a literal `${`"
-        line, column = position(each.text, each.offset)
-        message = f"`{path[0]}.{path[1]}` does not exist"
-        yield InterpolationError(message, path=each.path, line=line, column=column, hint=hint)
+        yield each.error(f"`{path[0]}.{path[1]}` does not exist", hint)
