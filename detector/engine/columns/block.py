@@ -96,6 +96,8 @@ class Block:
         self.signals: list[Column] = []
         self.fresh: dict[str, Truths] = {}
         """By stream: whether it is fresh, at each point; shape (clients, ticks)."""
+        self.stale: set[str] = set()
+        """The streams that are not fresh at some point."""
         self.latest: dict[str, Integers] = {}
         """By stream: the time of the newest sample, or NEVER."""
         self.present: Truths | None = None
@@ -119,6 +121,11 @@ class Block:
             return None if self.present is None else self.present.ravel()
         looked = np.repeat(self.looked[row], len(self.ticks))
         return looked if self.present is None else looked & self.present.ravel()
+
+    def evaluated(self, row: int) -> int:
+        """How many points a track evaluates."""
+        own = self.points(row)
+        return len(self.clients) * len(self.ticks) if own is None else int(own.sum())
 
     def count(self, row: int, points: Truths) -> int:
         """How many of the points a track evaluates."""

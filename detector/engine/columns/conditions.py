@@ -13,14 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detector.engine.columns.block import Block, Context, Track
-from detector.engine.columns.leaves import ClientLeaves, stacked
+from detector.engine.columns.leaves import ClientLeaves
 from detector.engine.columns.table import Truths
 from detector.engine.columns.verdicts import Ternary
 from detector.engine.episodes.episodes import FALSE, TRUE, UNSURE
 from wayside.expressions import Expression, Reason
 from wayside.expressions.columns.lowering import Graph
 from wayside.expressions.columns.program import Program
-from wayside.expressions.columns.values import Tag
+from wayside.expressions.columns.values import Tag, stacked
 from wayside.rules import CompiledRule
 
 _OF_CLIENTS = frozenset({"client", "labels", "parameters"})
@@ -45,6 +45,35 @@ class ClientCondition(NamedTuple):
     """Whether it reads variables that differ between clients."""
 
 
+class _Field(NamedTuple):
+    """A condition of all rules that have it."""
+
+    has: Truths
+    """Which tracks have it; shape (tracks, 1)."""
+    rows: slice | list[int]
+    """The tracks whose condition is in the program."""
+    nodes: tuple[int, ...]
+    """Their truths in the program."""
+    in_columns: list[tuple[int, ClientCondition, int]]
+    """The same tracks, with their conditions and nodes."""
+    by_cel: list[tuple[int, ClientCondition]]
+    """The tracks whose condition CEL evaluates."""
+
+    @classmethod
+    def of(cls, conditions: Sequence[ClientCondition | None]) -> _Field:
+        """`conditions`: by track; None: it has none."""
+        chosen = [(row, each) for row, each in enumerate(conditions) if each is not None]
+        in_columns = [(row, each, each.node) for row, each in chosen if each.node is not None]
+        rows = [row for row, _, _ in in_columns]
+        return cls(
+            np.array([[each is not None] for each in conditions]),
+            slice(None) if len(rows) == len(conditions) else rows,
+            tuple(node for _, _, node in in_columns),
+            in_columns,
+            [(row, each) for row, each in chosen if each.node is None],
+        )
+
+
 class Conditions:
     """Evaluates the conditions of a group of rules at the points of a block."""
 
@@ -60,11 +89,7 @@ class Conditions:
         self._of: list[dict[str, ClientCondition]] = [self._conditions(track) for track in tracks]
         """By track and field."""
         fields = dict.fromkeys(field for each in self._of for field in each)
-        self._chosen_by_field = {
-            field: [(row, each[field]) for row, each in enumerate(self._of) if field in each] for field in fields
-        }
-        """By field, the tracks that have the condition, by their rows."""
-        self._has = {field: np.array([[field in each] for each in self._of]) for field in fields}
+        self._by_field = {field: _Field.of([each.get(field) for each in self._of]) for field in fields}
         roots = [each.node for conditions in self._of for each in conditions.values() if each.node is not None]
         self._program = Program(self._graph, roots, context.tables.texts)
         self._cache: dict[tuple[int, str], dict[str, tuple[Hashable, int, tuple[Reason, str] | None]]] = {}
@@ -85,7 +110,7 @@ class Conditions:
 
     def has(self, field: str) -> Truths:
         """Which tracks have the condition; shape (tracks, 1)."""
-        return self._has[field]
+        return self._by_field[field].has
 
     def verdicts(self, block: Block) -> dict[str, Ternary]:
         """The verdicts, by field, shape (tracks, points); unknown in tracks without the field. Counts unknowns."""
@@ -95,26 +120,23 @@ class Conditions:
         values, tags = stacked([self._leaves.at_points(block, each) for each in self._program.leaves], points)
         results = self._program.run(values, tags)
         strange = tags is not None and bool((tags > Tag.NUMBER).any())
-        for field, chosen in self._chosen_by_field.items():
+        for field, these in self._by_field.items():
             true, false = found[field] = Ternary(np.zeros(shape, bool), np.zeros(shape, bool))
-            ours = [(row, each.node) for row, each in chosen if each.node is not None]
-            if ours:
-                rows = [row for row, _ in ours]
-                true[rows], false[rows] = results.truths([node for _, node in ours])
-            for row, condition in chosen if strange or len(ours) < len(chosen) else ():
-                foreign: Truths | None = None
-                if condition.node is None:
-                    self._evaluate_by_cel(block, row, condition, true[row], false[row])
-                    continue
-                if strange and (foreign := results.foreign(condition.node)) is not None and foreign.any():
+            if these.nodes:
+                true[these.rows], false[these.rows] = results.truths(these.nodes)
+            for row, condition in these.by_cel:
+                self._evaluate_by_cel(block, row, condition, true[row], false[row])
+            for row, condition, node in these.in_columns if strange else ():
+                foreign = results.foreign(node)
+                if foreign is not None:
                     own = block.points(row)
                     foreign = foreign if own is None else foreign & own
                     for point in np.flatnonzero(foreign).tolist():
                         self._evaluate_point_by_cel(block, row, condition, point, true[row], false[row])
             unknown = ~(true | false)
             if unknown.any():
-                for row, condition in chosen:
-                    if condition.node is not None and unknown[row].any():
+                for row, condition, _ in these.in_columns:
+                    if unknown[row].any():
                         self._note_unknown(block, row, condition, unknown[row], tags)
         block.verdicts = found
         return found

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from detector.engine.columns.block import Block, Context, Track
 from detector.engine.columns.conditions import Conditions
 from detector.engine.columns.group import present
-from detector.engine.columns.leaves import ClientLeaves, stacked
+from detector.engine.columns.leaves import ClientLeaves
 from detector.engine.columns.reading import constant
 from detector.engine.columns.signals import SignalColumns
 from detector.engine.columns.table import Integers, Truths
@@ -26,7 +26,7 @@ from wayside.expressions import Expression, Path
 from wayside.expressions.columns.folds import Fold, How, folded
 from wayside.expressions.columns.lowering import Constant, Graph
 from wayside.expressions.columns.program import Program, Results
-from wayside.expressions.columns.values import Column, Tag
+from wayside.expressions.columns.values import Column, Tag, stacked
 from wayside.rules import CompiledRule, FleetSubject
 
 _MEMBERS = "members"

@@ -8,14 +8,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from detector.engine.columns.leaves import stacked
 from detector.engine.columns.table import Truths
 from detector.engine.columns.verdicts import Ternary
 from wayside.expressions import Expression, Path, Reason
 from wayside.expressions.columns.lowering import Constant, Graph
 from wayside.expressions.columns.nodes import Op
 from wayside.expressions.columns.program import Program
-from wayside.expressions.columns.values import Column, Tag, Texts, column_of
+from wayside.expressions.columns.values import Column, Tag, Texts, column_of, stacked
 
 
 class Rows(NamedTuple):

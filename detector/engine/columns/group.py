@@ -81,9 +81,10 @@ class ClientGroup:
         self._signals.look(block, floor)
         if self._derived is not None:
             self._derived.look(block)
+        count = len(clients) * len(ticks)
+        whole = block.present is None and block.looked is None
         for row, track in enumerate(self.tracks):
-            points = block.points(row)
-            track.counters.evaluations += len(clients) * len(ticks) if points is None else int(points.sum())
+            track.counters.evaluations += count if whole else block.evaluated(row)
         return block, self._observed(block)
 
     def _observed(self, block: Block) -> Codes:

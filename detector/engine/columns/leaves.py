@@ -6,13 +6,12 @@ from collections.abc import Hashable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from detector.engine.columns.block import Block, Context, Track
 from detector.engine.columns.reading import constant
 from wayside.expressions import Path
 from wayside.expressions.columns.lowering import Constant
-from wayside.expressions.columns.values import MISSING, Column, Doubles, Tag, column_of
+from wayside.expressions.columns.values import MISSING, Column, Tag, column_of
 
 
 class ClientLeaves:
@@ -78,17 +77,3 @@ class ClientLeaves:
             for step in leaf[2:]:
                 value = value.get(step, MISSING) if isinstance(value, Mapping) else MISSING
             yield value
-
-
-def stacked(columns: Sequence[Column], size: int) -> tuple[Doubles, NDArray[np.uint8] | None]:
-    """The values and tags of columns of this size, in the form that programs take; no tags: all are numbers."""
-    values = np.empty((len(columns), size))
-    for at, column in enumerate(columns):
-        values[at] = column.values
-    if all(column.tags is None for column in columns):
-        return values, None
-    tags = np.full(values.shape, Tag.NUMBER, np.uint8)
-    for at, column in enumerate(columns):
-        if column.tags is not None:
-            tags[at] = column.tags
-    return values, tags

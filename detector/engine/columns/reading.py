@@ -7,6 +7,7 @@ decide, and expressions that they cannot represent.
 from __future__ import annotations
 
 from collections.abc import Collection, Hashable, Iterator, Mapping, Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,8 +20,8 @@ from detector.engine.counters import Counters
 from detector.engine.samples.sample import DecodeError, Decoder, Sample
 from wayside.expressions import UNKNOWN, Expression, Path, Reason, Unknown, Value
 from wayside.expressions.columns.lowering import Constant, Graph
-from wayside.expressions.columns.program import Program
-from wayside.expressions.columns.values import Column, Tag, Texts, column_of
+from wayside.expressions.columns.program import Program, Results
+from wayside.expressions.columns.values import Column, Tag, Texts, column_of, stacked
 from wayside.rules import CompiledElement
 from wayside.rules.parameters import Parameters
 
@@ -116,7 +117,7 @@ class Reader:
             tags, values = table.columns[at].tags[rows], table.columns[at].values[rows]
             missing = rows[tags == Tag.ABSENT]
             if len(missing):
-                batch = _Batch(table.samples[missing].tolist(), table.clients_of(missing), _Leaves([], None, {}, ()))
+                batch = _Batch(table.samples[missing].tolist(), table.clients_of(missing), _Leaves(None, [], {}, ()))
                 for row in range(len(missing)):
                     why: tuple[Reason | None, str] = self._value_by_cel(at, batch, row)[1] or (None, "")
                     yield Failure(int(batch.clients[row]), *why, 1)
@@ -154,28 +155,23 @@ class Reader:
         assert self._program is not None  # noqa: S101  the caller prepared it
         assert self._fields is not None  # noqa: S101
         if not self._paths:
-            return _Leaves([], None, {}, ())
+            return _Leaves(None, [], {}, ())
         fields = self._fields.read(samples, self._texts)
         for at, error in fields.errors.items():
             self._messages.unreadable(self._stream, samples[at], error)
-        columns = fields.columns
-        tags = None
-        if any(column.tags is not None for column in columns):
-            tags = np.stack(
-                [np.full(len(samples), Tag.NUMBER, np.uint8) if each.tags is None else each.tags for each in columns]
-            )
-        results = self._program.run(np.stack([column.values for column in columns]), tags)
-        return _Leaves(columns, results, fields.errors, fields.odd)
+        return _Leaves(self._program, fields.columns, fields.errors, fields.odd)
 
     def _evaluated(self, batch: _Batch, at: int, node: int | None) -> tuple[Column, dict[int, tuple[Reason, str]]]:
         """A column's values for the batch, and by row the reason why CEL has none."""
         count, leaves = len(batch.samples), batch.leaves
         failed: dict[int, tuple[Reason, str]] = {}
-        if node is None or leaves.results is None:
+        if node is None or not leaves.columns:
             return self._by_cel(at, batch, range(count), failed), failed
         odd = set(leaves.odd)
         if node in self._fields_at:
             column = leaves.columns[self._fields_at[node]]
+            if column.tags is None and not leaves.errors and not odd:
+                return column, failed
             if column.others is not None and column.tags is not None:  # in the form of CEL's lists and maps
                 odd.update(np.flatnonzero(column.tags == Tag.OTHER).tolist())
         else:
@@ -263,13 +259,26 @@ class Reader:
             yield Failure(client, reason, message, count)
 
 
-class _Leaves(NamedTuple):
+class _Leaves:
     """The fields of some samples."""
 
-    columns: list[Column]
-    results: Any
-    errors: dict[int, DecodeError]
-    odd: Collection[int]
+    def __init__(
+        self,
+        program: Program | None,
+        columns: Sequence[Column],
+        errors: dict[int, DecodeError],
+        odd: Collection[int],
+    ) -> None:
+        self._program = program
+        self.columns = columns
+        self.errors = errors
+        self.odd = odd
+
+    @cached_property
+    def results(self) -> Results:
+        """The program's results; there must be columns."""
+        assert self._program is not None  # noqa: S101  the caller looked
+        return self._program.run(*stacked(self.columns, len(self.columns[0].values)))
 
 
 class _Batch(NamedTuple):

@@ -15,6 +15,7 @@ from detector.engine.columns.reading import Reading, Used
 from detector.engine.columns.table import Integers, Truths, rows_between, sorted_rows
 from detector.engine.columns.watching import SampleAges
 from detector.engine.columns.windows import EXTREMES, Ranges, aggregated_ranges, extremes, misfits
+from detector.engine.counters.ages import Ages
 from wayside.api.eventrule import OF_A_SAMPLE, Aggregate
 from wayside.expressions.columns.values import Column, Tag, value_at
 from wayside.rules import CompiledSignal
@@ -65,6 +66,8 @@ class SignalColumns:
         shared."""
         self._version = -1
         self.ages = SampleAges()
+        self._watching: dict[str, list[Ages]] = {}
+        """By stream, the ages of each rule, once per signal."""
         self._all_streams = False
         for row, track in enumerate(tracks):
             own = {signal.name: signal for signal in track.element.signals}
@@ -184,7 +187,10 @@ class SignalColumns:
         block.latest[stream] = latest
         limit = self._context.stale_after[stream]
         there = latest != NEVER
-        block.fresh[stream] = there if limit is None else there & (block.times - np.where(there, latest, 0) <= limit)
+        fresh = there if limit is None else there & (block.times - np.where(there, latest, 0) <= limit)
+        block.fresh[stream] = fresh
+        if not fresh.all():
+            block.stale.add(stream)
         return high, lows
 
     def _fill(self, stream: str, block: Block, high: Integers, windows: Sequence[tuple[Key, Integers]]) -> None:
@@ -287,7 +293,7 @@ class SignalColumns:
         if key.aggregate in _ALWAYS_KNOWN:
             return column
         fresh = block.fresh[key.stream].ravel()
-        if not fresh.all():
+        if key.stream in block.stale:
             tags = Tag.NUMBER if column.tags is None else column.tags
             column = Column(column.values, np.where(fresh, tags, Tag.ABSENT).astype(np.uint8), column.others)
         self._note_unknown_signal(block, at, key, column, fresh)
@@ -333,13 +339,11 @@ class SignalColumns:
 
     def _watch(self, block: Block, stream: str, high: Integers, keys: Sequence[tuple[int, Key]]) -> None:
         """Note the ages of the newest samples, if ages are measured."""
-        watching = [
-            ages
-            for at, key in keys
-            if key.aggregate is not Aggregate.AGE
-            for row, _ in self._users[at]
-            if (ages := self._tracks[row].counters.ages) is not None
-        ]
+        if stream not in self._watching:
+            used = [row for at, key in keys if key.aggregate is not Aggregate.AGE for row, _ in self._users[at]]
+            found = (self._tracks[row].counters.ages for row in used)
+            self._watching[stream] = [ages for ages in found if ages is not None]
+        watching = self._watching[stream]
         if watching:
             fresh, tables = block.fresh[stream], self._context.tables
             seen = fresh if block.present is None else fresh & block.present

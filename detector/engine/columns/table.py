@@ -121,17 +121,16 @@ class Table:
         """The index after the last row up to each time. Shapes: (T,), (C,) to (C, T)."""
         if self._base is None:
             return np.repeat(self.end[clients][:, None], len(times), axis=1)
-        behind = np.clip(times - self._base, -1, _REACH - 1)
-        keys = (clients << _SHIFT)[:, None] + behind[None, :]
-        found = np.searchsorted(self.keys, keys.ravel(), side="right").reshape(keys.shape)
-        return np.clip(found, self.first[clients][:, None], self.end[clients][:, None])
+        keys = (clients << _SHIFT)[:, None] + _within(times - self._base, -1, _REACH - 1)
+        found = self.keys.searchsorted(keys.ravel(), side="right").reshape(keys.shape)
+        return _within(found, self.first[clients][:, None], self.end[clients][:, None])
 
     def find_each(self, times: Integers, clients: Integers) -> Integers:
         """The index after the last row of each client up to its time. Shapes: (n,), (n,) to (n,)."""
         if self._base is None:
             return self.end[clients]
-        keys = (clients << _SHIFT) + np.clip(times - self._base, -1, _REACH - 1)
-        return np.clip(np.searchsorted(self.keys, keys, side="right"), self.first[clients], self.end[clients])
+        keys = (clients << _SHIFT) + _within(times - self._base, -1, _REACH - 1)
+        return _within(self.keys.searchsorted(keys, side="right"), self.first[clients], self.end[clients])
 
     def clients_of(self, rows: Integers) -> Integers:
         """The clients of these rows."""
@@ -167,7 +166,7 @@ class Table:
 
     def _keys(self, clients: NDArray[np.integer[Any]], times: Integers) -> Integers:
         assert self._base is not None  # noqa: S101  the caller set it
-        return (clients.astype(np.int64) << _SHIFT) + np.clip(times - self._base, 0, _REACH - 2)
+        return (clients.astype(np.int64) << _SHIFT) + _within(times - self._base, 0, _REACH - 2)
 
     def _sort(self, client: int) -> None:
         """Sort a client's rows by time; rows of equal time keep their order of arrival."""
@@ -208,6 +207,11 @@ class Table:
         self.marks[:] = [start + np.maximum(mark - self.first, 0) for mark in self.marks]
         self.keys, self.times, self.samples, self.filled = keys, times, samples, filled
         self.start, self.room, self.first, self.end = start, room, start.copy(), start + live
+
+
+def _within(numbers: Integers, least: Integers | int, most: Integers | int) -> Integers:
+    """The same as np.clip, which takes several times as long for few numbers."""
+    return np.minimum(np.maximum(numbers, least), most)
 
 
 def rows_between(begin: Integers, end: Integers) -> Integers:

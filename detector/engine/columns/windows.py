@@ -73,22 +73,24 @@ def extremes(aggregate: Aggregate, values: Numbers, lows: Sequence[Integers], hi
     begin = int(lows[-1].min(initial=len(values)))
     end = max(int(high.max(initial=0)), begin)
     longer = values[begin : end + 1] if end < len(values) else np.append(values[begin:end], 0.0)
-    borders = np.stack([*(low.ravel() for low in reversed(lows)), high.ravel()], axis=1) - begin
+    count = len(lows)
+    borders = np.empty((high.size, count + 1), np.int64)  # of each point, the first row of the longest window first
+    for at, low in enumerate(lows, start=1):
+        borders[:, count - at] = low.ravel()
+    borders[:, count] = high.ravel()
+    borders -= begin
     least = np.minimum if aggregate is Aggregate.MIN else np.maximum
     parts = least.reduceat(longer, borders.ravel()).reshape(borders.shape)[:, :-1]
     # For an empty part, reduceat returns the row at which it would begin.
     nothing = np.inf if aggregate is Aggregate.MIN else -np.inf
     parts = np.where(borders[:, 1:] > borders[:, :-1], parts, nothing)
     found = least.accumulate(parts[:, ::-1], axis=1) + 0.0  # the sign of zero does not matter: no -0.0
-    columns = []
-    for at, low in enumerate(lows):
-        some = (high > low).ravel() & ~np.isnan(found[:, at])
-        if some.all():
-            columns.append(Column(found[:, at], None, None))
-        else:
-            tags = np.where(some, Tag.NUMBER, Tag.ABSENT).astype(np.uint8)
-            columns.append(Column(np.where(some, found[:, at], 0.0), tags, None))
-    return columns
+    some = (borders[:, :-1] < borders[:, -1:])[:, ::-1] & ~np.isnan(found)
+    if some.all():
+        return [Column(found[:, at], None, None) for at in range(count)]
+    found = np.where(some, found, 0.0)
+    tags = some.astype(np.uint8) * np.uint8(Tag.NUMBER)
+    return [Column(found[:, at], tags[:, at], None) for at in range(count)]
 
 
 def aggregated_ranges(aggregate: Aggregate, rows: Ranges, texts: Texts, quantile: float | None = None) -> Column:

@@ -195,6 +195,7 @@ class Blocks:
         begin = stopwatch()
         found = group.evaluate(ticks, clients, self._floor(), only)
         spent = (stopwatch() - begin) // max(len(group.runs), 1)
+        count, last = len(ticks), ticks[-1]
         for run in group.runs:
-            run.counters.timed(ticks[-1], spent, len(ticks))
+            run.counters.timed(last, spent, count)
         return found

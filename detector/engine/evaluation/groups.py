@@ -140,12 +140,9 @@ class RuleGroup:
             self._watched = np.zeros(nobody, bool)
             for run in self.runs:
                 run.disturbed = True
+        disturbed = [row for row, run in enumerate(self._of) if run.disturbed]
         # This comes before there is room for all clients: a restored subject may not have received a sample yet.
-        watched = {
-            row: [self.columns.number(each) for each in run.subjects if each.element == track.element.name]
-            for row, (run, track) in enumerate(zip(self._of, self.columns.tracks, strict=True))
-            if run.disturbed
-        }
+        watched = {row: self._watched_numbers(row) for row in disturbed}
         clients, room = self.columns.room, self._last.shape[1]
         if clients > room:
             more = (len(self._of), max(clients, 2 * room) - room)
@@ -156,42 +153,46 @@ class RuleGroup:
             self._last[row] = UNSEEN
             self._watched[row] = False
             self._watched[row, numbers] = True
-        for run in self.runs:
-            run.disturbed = False
+            self._of[row].disturbed = False
+
+    def _watched_numbers(self, row: int) -> list[int]:
+        """The numbers of a track's subjects that have a state."""
+        element = self.columns.tracks[row].element.name
+        return [self.columns.number(each) for each in self._of[row].subjects if each.element == element]
 
     def _changed(
         self, block: Block | FleetBlock, codes: Codes, looked: Truths | None
     ) -> Iterator[tuple[int, int, Changes]]:
         """Of each subject that matters (a track and a client of the block), what may have an effect."""
-        numbers, last = block.numbers, int(block.times[-1])
+        numbers, count = block.numbers, len(block.ticks)
+        before, wakes, watched = self._last[:, numbers], self._wakes[:, numbers], self._watched[:, numbers]
         changed = np.empty(codes.shape, bool)
-        np.not_equal(codes[:, :, 0], self._last[:, numbers], out=changed[:, :, 0])
+        np.not_equal(codes[:, :, 0], before, out=changed[:, :, 0])
         np.not_equal(codes[:, :, 1:], codes[:, :, :-1], out=changed[:, :, 1:])
-        watched, unseen = self._watched[:, numbers], self._last[:, numbers] == UNSEEN
-        changed[:, :, 0] |= self._wakes[:, numbers] <= last
+        changed[:, :, 0] |= wakes <= block.ticks[-1]
         for row, run in self._deploying:
             if run.open_episodes:
                 track = self.columns.tracks[row]
                 for at in np.flatnonzero(watched[row]).tolist():
                     if run.needs_every_tick(track.subject(block.clients[at])):
                         changed[row, at] = True
-        matters = watched | (codes & 3 == TRUE).any(axis=2)
-        if looked is not None:
-            matters &= looked
-            kept = np.where(looked, codes[:, :, -1], self._last[:, numbers])
-            self._last[:, numbers] = kept
-        else:
+        if looked is None:
             self._last[:, numbers] = codes[:, :, -1]
-        changed &= matters[:, :, None]
+        else:
+            changed &= looked[:, :, None]
+            self._last[:, numbers] = np.where(looked, codes[:, :, -1], before)
+        if not changed.any():
+            return
+        changed &= (watched | (codes & 3 == TRUE).any(axis=2))[:, :, None]
         if block.present is not None:
             changed &= block.present
         flat = np.flatnonzero(changed)
         if not len(flat):
             return
-        which, when = np.divmod(flat, len(block.ticks))
+        which, when = np.divmod(flat, count)
         seen = codes.ravel()[flat]
-        if not all(self._timed):
-            alert = watched & ((self._wakes[:, numbers] != NO_WAKE) | unseen)
+        if count > 1 and not all(self._timed):
+            alert = watched & ((wakes != NO_WAKE) | (before == UNSEEN))
             timed = np.array(self._timed)[which // len(block.clients)]
             kept = _with_effect(which, _EFFECTS[seen], timed, watched.ravel()[which], alert.ravel()[which])
             which, when, seen = which[kept], when[kept], seen[kept]

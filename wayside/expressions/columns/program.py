@@ -7,9 +7,10 @@ calls for each depth and operation, however many rules and rows there are.
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from wayside.expressions.columns.foreign import Foreign, Found
 from wayside.expressions.columns.frame import ABSENT, NUMBER, Array, Frame, Memory, Operand, Rows, Sizes
@@ -21,6 +22,7 @@ from wayside.expressions.columns.values import Bools, Bytes, Column, Doubles, Ta
 _SOURCES: Final = {Holds.NUMBERS: Array.NUMBERS, Holds.TRUTHS: Array.TRUTHS, Holds.ANY: Array.MIXED}
 _NO_DOUBLES: Final = np.zeros((0, 1))
 _CACHE_SIZE: Final = 256
+_Scalar = TypeVar("_Scalar", bound=np.generic)
 _TAGS: Final[dict[type, Tag]] = {bool: Tag.BOOLEAN, str: Tag.TEXT}
 
 
@@ -186,6 +188,10 @@ def _rows(rows: Sequence[int]) -> Rows:
     return np.array(rows, np.intp)
 
 
+def _spread(array: NDArray[_Scalar], shape: tuple[int, ...]) -> NDArray[_Scalar]:
+    return array if array.shape == shape else np.broadcast_to(array, shape)
+
+
 class Results:
     """The results of the roots for the n rows of a run."""
 
@@ -213,14 +219,14 @@ class Results:
         if operand.partial and not self._frame.tagged:  # nobody wrote where the others are false
             false = np.where(self._program.partial(roots), false, ~true)
         shape = (len(roots), n)
-        return np.broadcast_to(true, shape), np.broadcast_to(false, shape)
+        return _spread(true, shape), _spread(false, shape)
 
     def column(self, root: int) -> Column:
         """The values of a root; NaN, as 0/0 gives it, is absent. Of a leaf what went in, but for the others."""
         n = self._frame.leaves.shape[1]
         several, several_tags = self._frame.anything(self._program.operand((root,)))
-        values = np.broadcast_to(several[0], n)
-        tags = None if several_tags is None else np.broadcast_to(several_tags[0], n)
+        values = _spread(several[0], (n,))
+        tags = None if several_tags is None else _spread(several_tags[0], (n,))
         absent = np.isnan(values)
         if absent.any():
             tags = np.where(absent, ABSENT, NUMBER if tags is None else tags)

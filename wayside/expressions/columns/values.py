@@ -194,3 +194,17 @@ def value_at(column: Column, row: int, texts: Texts) -> Value | Unknown:
     if column.others is None:
         raise ValueError(f"row {row} has a value that this column cannot represent: evaluate it with CEL")
     return cast("Value", column.others[row])
+
+
+def stacked(columns: Sequence[Column], size: int) -> tuple[Doubles, Bytes | None]:
+    """The values and tags of columns of this size, in the form that programs take; no tags: all are numbers."""
+    values = np.empty((len(columns), size))
+    for at, column in enumerate(columns):
+        values[at] = column.values
+    if all(column.tags is None for column in columns):
+        return values, None
+    tags = np.full(values.shape, Tag.NUMBER, np.uint8)
+    for at, column in enumerate(columns):
+        if column.tags is not None:
+            tags[at] = column.tags
+    return values, tags
