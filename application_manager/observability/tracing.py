@@ -11,6 +11,7 @@ import time
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from prometheus_client.core import CounterMetricFamily, Metric
 from prometheus_client.registry import Collector
@@ -23,8 +24,10 @@ from application_manager.measures import PREFIX
 from wayside.api import ApplicationTask
 from wayside.api.applicationtask import TRACEPARENT_ANNOTATION, ApplicationTaskStatus
 from wayside.process.tracecontext import Attribute, Span, TraceContext, parse_traceparent
-from wayside.process.tracing import Tracing
 from wayside.times import parse_seconds
+
+if TYPE_CHECKING:
+    from wayside.process.spans import Tracing
 
 _REMEMBERED = 10_000
 """Tasks that are not ready yet; beyond it the oldest are forgotten, and their `ready` has the task as its parent."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Awaitable, Callable, Iterable
+from typing import TYPE_CHECKING
 
 from application_manager.cache.cluster_cache import DETECTOR, INSTANCE, ClusterCache
 from application_manager.cache.detector_index import DetectorIndex
@@ -41,7 +42,9 @@ from application_manager.workers.pool import Pool
 from wayside.kubernetes.client import Client
 from wayside.kubernetes.resources import Resource
 from wayside.kubernetes.workqueue import Key, WorkQueue
-from wayside.process.tracing import Tracing
+
+if TYPE_CHECKING:
+    from wayside.process.spans import Tracing
 
 _JUDGING_PAUSE = 0.3  # s from a change of a template, rule or detector to its status: several changes are one
 _INSTANCE_WORKERS = 16

@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -20,7 +21,10 @@ from detector.engine.episodes.record import EpisodeRecord
 from wayside.api import ApplicationTask
 from wayside.api.applicationtask import TRACEPARENT_ANNOTATION
 from wayside.process.tracecontext import Attribute, Span, TraceContext, episode_context
-from wayside.process.tracing import Tracing, tracing
+from wayside.process.tracing import tracing
+
+if TYPE_CHECKING:
+    from wayside.process.spans import Tracing
 
 
 class EpisodeTraces:

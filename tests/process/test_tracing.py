@@ -26,7 +26,7 @@ CONTEXTS = st.builds(TraceContext, st.integers(1, 2**128 - 1), st.integers(1, 2*
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """No variable of the machine counts, spans are handed over soon, and the end waits until they are."""
-    monkeypatch.setattr("wayside.process.tracing._PATIENCE", 60.0)
+    monkeypatch.setattr("wayside.process.spans._PATIENCE", 60.0)
     for name in ("ENDPOINT", "TRACES_ENDPOINT", "PROTOCOL", "TRACES_PROTOCOL"):
         monkeypatch.delenv(f"OTEL_EXPORTER_OTLP_{name}", raising=False)
     monkeypatch.delenv("OTEL_SDK_DISABLED", raising=False)

@@ -16,9 +16,12 @@ from opentelemetry.sdk.trace.id_generator import IdGenerator, RandomIdGenerator
 from opentelemetry.sdk.trace.sampling import Decision
 
 from wayside.process.tracecontext import Span, TraceContext
+from wayside.process.tracing import ENDPOINTS
 
 _QUEUE = 2048
 """The SDK's default for OTEL_BSP_MAX_QUEUE_SIZE."""
+_PATIENCE = 2.0
+"""Seconds that the end of the program waits for the exporter."""
 
 
 class _Ids(IdGenerator):
@@ -87,8 +90,8 @@ class _Bounded(SpanProcessor):
         self._queue.shutdown()  # type: ignore[no-untyped-call]
 
 
-class Exporting:
-    """The SDK, as the standard environment variables set it."""
+class Tracing:
+    """Takes spans, from any thread: the SDK, as the standard environment variables set it."""
 
     def __init__(self, service: str, *, export: bool) -> None:
         """`service` counts where OTEL_SERVICE_NAME or OTEL_RESOURCE_ATTRIBUTES name none."""
@@ -115,13 +118,18 @@ class Exporting:
         """Spans that the endpoint did not take."""
         return self._exporter.failed if self._exporter is not None else 0
 
-    def samples(self, context: TraceContext, name: str) -> bool:
-        """Whether the sampler records a trace that begins with this span."""
+    @property
+    def endpoint(self) -> str:
+        """The endpoint, for messages."""
+        return next((os.environ[each] for each in ENDPOINTS if os.environ.get(each)), "")
+
+    def sampled(self, context: TraceContext, name: str) -> bool:
+        """Whether the trace that begins with this span is recorded; the result is always the same for a trace."""
         decision = self._provider.sampler.should_sample(None, context.trace_id, name).decision
         return decision is Decision.RECORD_AND_SAMPLE
 
     def emit(self, span: Span) -> TraceContext:
-        """Queue a span; where it stands."""
+        """Queue a span; where it stands. Never waits."""
         parent = None if span.parent is None else trace.set_span_in_context(_remote(span.parent))
         self._ids.wanted.context = span.context
         try:
@@ -141,8 +149,10 @@ class Exporting:
         return TraceContext(at.trace_id, at.span_id, at.trace_flags.sampled)
 
     def close(self) -> None:
-        """Hand over what waits. May take as long as the exporter does."""
-        self._provider.shutdown()
+        """Hand over what waits, for at most two seconds."""
+        closing = threading.Thread(target=self._provider.shutdown, name="spans", daemon=True)
+        closing.start()
+        closing.join(_PATIENCE)
 
 
 def _remote(context: TraceContext) -> trace.NonRecordingSpan:

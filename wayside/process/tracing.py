@@ -11,57 +11,15 @@ from __future__ import annotations
 
 import logging
 import os
-import threading
 from typing import TYPE_CHECKING
 
-from wayside.process.tracecontext import Span, TraceContext
-
 if TYPE_CHECKING:
-    from wayside.process.spans import Exporting
+    from wayside.process.spans import Tracing
 
 ENDPOINTS = ("OTEL_EXPORTER_OTLP_TRACES_ENDPOINT", "OTEL_EXPORTER_OTLP_ENDPOINT")
 PROTOCOLS = ("OTEL_EXPORTER_OTLP_TRACES_PROTOCOL", "OTEL_EXPORTER_OTLP_PROTOCOL")
 PROTOCOL = "http/protobuf"
-_PATIENCE = 2.0
-"""Seconds that the end of the program waits for the exporter."""
-
 log = logging.getLogger(__name__)
-
-
-class Tracing:
-    """Takes spans, from any thread."""
-
-    def __init__(self, exporting: Exporting) -> None:
-        self._exporting = exporting
-
-    def sampled(self, context: TraceContext, name: str) -> bool:
-        """Whether the trace that begins with this span is recorded; the result is always the same for a trace."""
-        return self._exporting.samples(context, name)
-
-    def emit(self, span: Span) -> TraceContext:
-        """Take a span; where it stands. Never waits."""
-        return self._exporting.emit(span)
-
-    @property
-    def dropped(self) -> int:
-        """Spans that found too many waiting."""
-        return self._exporting.dropped
-
-    @property
-    def failed(self) -> int:
-        """Spans that nobody took."""
-        return self._exporting.failed
-
-    @property
-    def endpoint(self) -> str:
-        """The endpoint, for messages."""
-        return next((os.environ[each] for each in ENDPOINTS if os.environ.get(each)), "")
-
-    def close(self) -> None:
-        """Hand over what waits, for at most two seconds."""
-        closing = threading.Thread(target=self._exporting.close, name="spans", daemon=True)
-        closing.start()
-        closing.join(_PATIENCE)
 
 
 def tracing(service: str, *, export: bool = True) -> Tracing | None:
@@ -88,10 +46,10 @@ def tracing(service: str, *, export: bool = True) -> Tracing | None:
         )
         return None
     try:
-        from wayside.process.spans import Exporting  # noqa: PLC0415  a slow import of an extra
+        from wayside.process.spans import Tracing  # noqa: PLC0415  a slow import of an extra
     except ImportError as error:
         log.warning(
             "sending no traces, although %s is set: %s; pip install 'wayside[otel]', or unset it", endpoint, error
         )
         return None
-    return Tracing(Exporting(service, export=export))
+    return Tracing(service, export=export)

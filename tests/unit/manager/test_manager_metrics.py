@@ -25,7 +25,7 @@ from tests.unit.manager_objects import instance, task, template
 from wayside.kubernetes.connection import ConfigurationError
 from wayside.kubernetes.errors import ApiError
 from wayside.kubernetes.workqueue import WorkQueue
-from wayside.process.tracing import Tracing
+from wayside.process.spans import Tracing
 
 GUIDE = guide("manager")
 
