@@ -1,7 +1,7 @@
 """An ambulance in operation, two that are in no hurry, a road sweeper, and five cars on and near the route.
 
 The truth is where everybody drives, and the operation. Who is on the route follows from the distance to its roads; the
-control center receives a polygon around them instead.
+control centre receives a polygon around them instead.
 """
 
 from __future__ import annotations

@@ -100,13 +100,13 @@ class ApplicationInstanceStatus(Model):
     phase: InstancePhase | None = None
     """A one-word summary of the state."""
     message: str | None = Field(default=None, max_length=512)
-    """The reason why the instance is waiting or is being kept. Absent in normal operation."""
+    """Why the instance is waiting or is being kept. Absent in normal operation."""
     observed_generation: int = 0
     """The metadata.generation that the status was computed from."""
     spec_hash: str | None = Field(default=None, max_length=64)
     """The digest of the manifests at the last complete apply."""
     release_time: Time | None = None
-    """The end of the linger time. The instance is then removed, unless a new demand arrives before."""
+    """The end of the linger time. The instance is then removed, unless a new demand arrives first."""
     objects: list[ObjectReference] = Field(default_factory=list, max_length=128, json_schema_extra=ATOMIC_LIST)
     """The objects of the instance. An object that is added later is listed before it is applied. Until the list of a
     new instance is written, its objects are identified by label and controller reference."""
@@ -121,8 +121,9 @@ class ApplicationInstanceStatus(Model):
     """Applied: all objects match the template. Ready: the objects are applied and the workloads are ready. Stalled: the
     objects were refused, or did not become ready in time. Capped: a merged Sum is limited to its parameter's maximum.
     Suspended: the workloads are scaled to zero. Paused: the annotation wayside.dev/pause stops changes to the instance.
-    Held: the annotation wayside.dev/hold keeps the instance without demand. TimedOut: the instance was not ready for
-    the template's readyTimeout. StandsIn: the instance is a fallback and serves tasks of instances that timed out."""
+    Held: the annotation wayside.dev/hold keeps the instance even without demand. TimedOut: the instance was not ready
+    for the template's readyTimeout. StandsIn: the instance is a fallback and serves tasks of instances that timed
+    out."""
 
 
 class ApplicationInstance(Kind):

@@ -109,7 +109,7 @@ class ApplicationTaskStatus(Model):
     instance_name: str | None = Field(default=None, max_length=63)
     """The name of the ApplicationInstance that serves the task."""
     message: str | None = Field(default=None, max_length=512)
-    """The reason why the task is waiting or does not count. Absent in normal operation."""
+    """Why the task is waiting or does not count. Absent in normal operation."""
     observed_generation: int = 0
     """The metadata.generation that the status was computed from."""
     applied_time: Time | None = None

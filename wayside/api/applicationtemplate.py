@@ -130,7 +130,7 @@ class Helm(Model):
     values: dict[str, Any] = Field(
         default_factory=dict, json_schema_extra={"x-kubernetes-preserve-unknown-fields": True}
     )
-    """The values of the chart, with ${…} over parameters and instance (name, key, namespace, configMap)."""
+    """The values of the chart. They can contain ${…} with parameters and instance (name, key, namespace, configMap)."""
 
     @model_validator(mode="after")
     def _one_place(self) -> Helm:
@@ -175,13 +175,13 @@ class ApplicationTemplateSpec(Model):
     lifecycle: Lifecycle = Lifecycle()
     """The lifetime of instances."""
     configuration: dict[FileName, Value] = Field(default_factory=dict, max_length=64)
-    """Files that can change while the application runs, by name, with ${…} as in manifests. They are stored in a
-    ConfigMap, named by ${instance.configMap}, which changes without a rollout. A text is written unchanged; a map or
-    list is written in the format of the file extension, .yaml or .json."""
+    """Files, by name, that can change while the application runs. They can contain ${…}, as in manifests. The manager
+    writes them to the ConfigMap ${instance.configMap} and changes them without a rollout. A string is written
+    unchanged; a map or list is written in the format of the file extension, .yaml or .json."""
     manifests: list[Manifest] = Field(default_factory=list, min_length=1, max_length=64, json_schema_extra=ATOMIC_LIST)
-    """The objects of an instance, with ${…} over parameters and instance (name, key, namespace, and configMap if there
-    is a configuration). apiVersion and kind must be literal. The namespace is that of the template. With a key, every
-    name must contain ${instance.name}."""
+    """The objects of an instance. Values can contain ${…} with parameters and instance (name, key, namespace, and
+    configMap if there is a configuration). apiVersion and kind must be literal. The namespace is that of the template.
+    With a key, every name must contain ${instance.name}."""
     helm: Helm | None = None
     """A Helm chart instead of manifests. The same kinds of object are allowed, and they are applied in the same way.
     The release has the name of the instance."""

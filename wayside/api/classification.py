@@ -51,9 +51,9 @@ class TypeOfParticipants(CharacteristicValue):
     """The kinds of entity that take part directly in the processing of the data."""
 
     VEHICLE = "vehicle", "a car or another motor vehicle"
-    VRU = "VRU", "a vulnerable road user: on foot, on a bicycle or on a motorcycle"
-    ROAD_INFRASTRUCTURE = "road infrastructure", "equipment at the road: signs, signals, roadside ITS stations"
-    REMOTE_INFRASTRUCTURE = "remote infrastructure", "equipment far from the road: a control center, a cloud"
+    VRU = "VRU", "a vulnerable road user (pedestrian, cyclist or motorcyclist)"
+    ROAD_INFRASTRUCTURE = "road infrastructure", "equipment by the road: signs, signals, roadside ITS stations"
+    REMOTE_INFRASTRUCTURE = "remote infrastructure", "equipment far from the road: a control centre, a cloud"
 
 
 class NumberOfParticipants(CharacteristicValue):
@@ -76,7 +76,7 @@ class EventDetectionEntity(CharacteristicValue):
 
     EVENT_SOURCE_ENTITY = "event source entity", "the detecting entity is the one whose change of state is the event"
     DATA_SOURCE_ENTITY = "data source entity", "the detecting entity is the one that produces the data"
-    EXTERNAL = "external", "the detecting entity is neither the source of the event nor of the data"
+    EXTERNAL = "external", "the detecting entity is the source of neither the event nor the data"
 
 
 class ActingEntity(CharacteristicValue):

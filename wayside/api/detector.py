@@ -133,11 +133,11 @@ class DetectorSpec(Model):
     """ASN.1 modules for uper streams. They define messages that no package defines, such as etsi/cpm, or replace the
     definitions of the packages. Include all modules that they import."""
     messages: list[MessageDefinition] = Field(default_factory=list, max_length=256, json_schema_extra=map_list("name"))
-    """Definitions of ROS 2 message types that the common packages lack or define differently."""
+    """Definitions of ROS 2 message types that are not in the common packages, or differ from them."""
     places: list[Place] = Field(default_factory=list, max_length=512, json_schema_extra=map_list("name"))
     """The areas, lines and lanes that rules can name, as in at(position, "crossing")."""
     maps: list[MapFile] = Field(default_factory=list, max_length=16, json_schema_extra=ATOMIC_LIST)
-    """Files with more places. Lanelet2 maps and origin need pip install 'wayside[maps]'."""
+    """Files with more places. Lanelet2 maps and the field origin need pip install 'wayside[maps]'."""
     buffer: BufferLimits = BufferLimits()
     """The limits of the buffer of samples."""
     client_timeout: PositiveDuration = PositiveDuration("30s")

@@ -84,8 +84,8 @@ _SOURCE = "give exactly one of stream, ruleName, model, plugin and of (aggregate
 _OF = "a signal with of cannot have value, where, or the aggregates Age and Active: remove them"
 _LAG = "lag needs a signal with of, and is not valid with over: Episode"
 _EPISODE = (
-    f"over: Episode needs a signal with of and one of the aggregates {', '.join(sorted(OF_AN_EPISODE))}; "
-    "Age is used without of"
+    f"over: Episode needs one of the aggregates {', '.join(sorted(OF_AN_EPISODE))}; Age must not have of, and all "
+    "others need it"
 )
 _QUANTILE = "aggregate Quantile needs quantile, e.g. quantile: 0.95; with any other aggregate, remove quantile"
 _CLIENT = "client is valid only with stream or ruleName: remove it"
@@ -142,8 +142,8 @@ class Signal(Model):
     stream: ObjectName | None = None
     """The name of a stream of the Detector."""
     rule_name: ObjectName | None = None
-    """Instead of a stream: another rule that the Detector selects. Its samples are the starts (or ends, see samples) of
-    those episodes of that rule in which the client is a subject. msg contains episode, subject, subjects, onsetTime and
+    """Instead of a stream: another rule that the Detector selects. The samples are the starts (or ends, see samples) of
+    that rule's episodes in which the client is a subject. msg contains episode, subject, subjects, onsetTime and
     startTime (seconds since the epoch), and the values at the start."""
     samples: Samples = Samples.STARTS
     """Only with ruleName. Starts: the samples are the starts of episodes. Ends: the samples are the ends of episodes;
@@ -156,15 +156,15 @@ class Signal(Model):
     of: Expression | None = None
     """Instead of a stream: CEL over the variables of `when`, such as another signal or the distance of a pair. Each
     evaluation of the subject adds one sample, the value of the expression. Without over and lag, the signal is the
-    value itself. In a pairs scope, the value belongs to the pair: expressions use its name without a or b. Samples that
-    over and lag need are kept, with at most 25 bytes each."""
+    value itself. In a pairs scope, the value belongs to the pair: expressions use its name without a or b. Samples are
+    kept as long as over and lag need them, with at most 25 bytes each."""
     client: ClientName | None = None
     """Only with stream or ruleName: the client whose samples or episodes the signal uses for every subject, e.g. a
     traffic light. The signal is unknown while the detector does not know this client. Default: the subject's own
     client."""
     value: Expression | None = None
     """CEL over msg (the decoded sample), item (its item, if the stream has items), before (the client's previous
-    message or item, unless that was stale already), key (the captured chunks), sample (stamp, received, latency, size)
+    message or item, unless it was already stale), key (the captured chunks), sample (stamp, received, latency, size)
     and parameters. Required, except with the aggregates Count, Age and Active."""
     where: Expression | None = None
     """CEL over msg, key, sample and parameters. Only samples for which it is true count."""
@@ -239,7 +239,7 @@ class EventRuleSpec(Model):
     enabled: bool = True
     """If false, the rule is loaded and validated, but not evaluated, and its open episodes end."""
     dry_run: bool = False
-    """If true, events are published with the mark dryRun, but no action runs."""
+    """If true, events are published with `dryRun: true` in their data, but no action runs."""
     scope: Scope = Scope(client=ClientScope())
     """The subjects of the rule."""
     each: Each | None = None
@@ -247,24 +247,24 @@ class EventRuleSpec(Model):
     evaluation: Evaluation = Evaluation()
     """When the rule is evaluated."""
     parameters: Constants = Field(default_factory=dict)
-    """Constants for expressions, used as parameters.<name>: numbers, texts, booleans, and lists and maps of them, such
-    as polygons; at most 64 KiB in total. A Detector can override them per client."""
+    """Constants for expressions, which read them as parameters.<name>: numbers, strings, booleans, and lists and maps
+    of these, such as polygons; at most 64 KiB in total. A Detector can override them per client."""
     signals: list[Signal] = Field(default_factory=list, max_length=64, json_schema_extra=map_list("name"))
-    """The values that conditions use. In a pairs scope, each client has its own: a.speed, b.speed."""
+    """The values that conditions use. In a pairs scope, each client has its own values, e.g. a.speed and b.speed."""
     when: Expression
     """CEL, boolean: the condition that starts an episode."""
     margin: dict[Identifier, Annotated[float, Field(gt=0)]] | None = Field(default=None, max_length=64)
     """Adds a signal named margin to the rule: how far `when` is from changing. It is positive while `when` is true, and
     negative while `when` is false. The margin of a comparison is the distance to its threshold; && takes the smaller
-    margin of its two sides, || the larger; ! negates. If `when` compares several quantities, give a scale for each: the
-    signal (or distance, closingSpeed) and the difference that counts as 1. The results of a replay list the ten largest
-    margins without an episode."""
+    margin of its two sides, || the larger; ! negates. If `when` compares several quantities, map each signal (or
+    distance, closingSpeed) to the difference that counts as 1. The results of a replay list the ten largest margins
+    without an episode."""
     until: Expression | None = None
     """CEL, boolean: the condition that ends an open episode. Default: the negation of `when`."""
     for_: Duration = Field(default=Duration("0s"), alias="for")
     """How long `when` must hold before an episode starts."""
     cooldown: Duration = Duration("0s")
-    """The time after the end of an episode during which the subject cannot have a new onset."""
+    """After an episode ends, its subject cannot have a new onset for this time."""
     max_episodes_per_hour: int | None = Field(default=None, ge=1, le=1_000_000)
     """The maximum number of episodes per client and hour. Further episodes are skipped and counted. Default: no
     limit."""

@@ -116,7 +116,7 @@ class ModelPoints(Model):
 
 
 class ModelInput(Model):
-    """One input of the model: exactly one of signals, window, image and points."""
+    """One input of the model. It has exactly one of signals, window, image and points."""
 
     name: TensorName
     """The input's name in the model file."""

@@ -117,8 +117,8 @@ class Parameter(Model):
     """The maximum of a number. A task with a larger value is refused. A larger merged Sum is capped, and the condition
     Capped of the instance reports it."""
     pattern: str | None = Field(default=None, min_length=1, max_length=256)
-    """A regular expression (RE2 syntax) for a text, or for each text of an array. It may match anywhere in the text;
-    use ^…$ to match the whole text."""
+    """A regular expression (RE2 syntax) for a string, or for each string of an array. It may match anywhere in the
+    string; use ^…$ to match the whole string."""
     enum: list[JsonValue] | None = Field(default=None, min_length=1, max_length=64, json_schema_extra=ATOMIC_LIST)
     """The allowed values. Not with merge Union, Intersection or Sum, whose results may be other values."""
     merge: Merge = Merge.SAME

@@ -45,7 +45,7 @@ class ActionPlugin(Model):
     parameters: FreeData = Field(default_factory=dict)
     """The parameters of the plugin; see its documentation."""
     values: NamedData = Field(default_factory=dict)
-    """Values that the plugin receives for each episode, with ${…} over the rule's variables at the start of the
-    episode."""
+    """Values that the plugin receives for each episode. They can contain ${…} with the rule's variables, as at the
+    start of the episode."""
     window: Window | None = None
     """The samples that the plugin receives. Default: none."""

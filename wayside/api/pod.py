@@ -103,7 +103,7 @@ class DetectorResources(Model):
     requests: Amounts = Field(default_factory=lambda: {"cpu": Quantity("100m"), "memory": Quantity("256Mi")})
     """The resources that a node must have available. Default: cpu 100m, memory 256Mi."""
     limits: Amounts = Field(default_factory=lambda: {"memory": Quantity("1Gi")})
-    """The maximum resources. The memory limit must cover the buffer (spec.buffer.bytes) plus some 200Mi. Default:
+    """The maximum resources. The memory limit must cover the buffer (spec.buffer.bytes) plus about 200Mi. Default:
     memory 1Gi."""
 
     @model_validator(mode="after")
@@ -277,8 +277,7 @@ class DetectorPod(Model):
     """Fields of the pod's security context, as in a PodSpec, e.g. fsGroup. They override the defaults. The defaults
     meet the restricted Pod Security Standard. Not with mode Sidecar."""
     env: list[DetectorVariable] = Field(default_factory=list, max_length=64, json_schema_extra=map_list("name"))
-    """Environment variables. They are added to those of the manager's option --detector-env and take precedence over
-    them."""
+    """Environment variables. They are added to those of the manager's option --detector-env, and override them."""
     volumes: list[DetectorVolume] = Field(default_factory=list, max_length=16, json_schema_extra=map_list("name"))
     """Volumes for volumeMounts."""
     volume_mounts: list[DetectorVolumeMount] = Field(

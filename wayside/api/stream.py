@@ -47,8 +47,9 @@ class MessageDefinition(Model):
     name: MessageType
     """The type, e.g. my_package/msg/Track."""
     definition: str = Field(max_length=65_536)
-    """The definition in the format of .msg files. Each type that it refers to needs a definition as well: an entry of
-    its own in messages, or a part of this text, after a line of = and a line `MSG: <type>`, as `ros2 bag` writes it."""
+    """The definition in the format of .msg files. Each type that it refers to needs a definition as well: either its
+    own entry in messages, or a section of this text that begins with a line of = and a line `MSG: <type>`, as `ros2
+    bag` writes it."""
 
 
 class Asn1Module(Model):

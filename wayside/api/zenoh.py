@@ -50,7 +50,7 @@ class Zenoh(Access):
     listen: list[Endpoint] = Field(default_factory=list, max_length=16, json_schema_extra=ATOMIC_LIST)
     """The endpoints to listen on, e.g. tcp/0.0.0.0:7447. Default: a free port (peer) or port 7447 (router)."""
     scouting: bool = False
-    """If true, discovers other Zenoh nodes by multicast."""
+    """If true, the session discovers other Zenoh nodes by multicast."""
     shared_memory: bool = False
     """If true, publishers on the same machine can pass samples in shared memory. The pods must then share /dev/shm."""
 

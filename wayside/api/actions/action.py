@@ -30,7 +30,7 @@ class ActionSpec(Model):
     record: RecordAction | None = None
     """Records the samples around the episode as rosbag2 with MCAP files."""
     trigger: TriggerAction | None = None
-    """Makes another system record while the episode lasts."""
+    """Requests another system to record while the episode lasts."""
     database: DatabaseAction | None = None
     """Writes the samples around the episode to the Detector's database (MongoDB)."""
     notify: NotifyAction | None = None

@@ -18,7 +18,8 @@ class Deploy(Model):
     priority: int = Field(default=0, ge=-1_000_000, le=1_000_000)
     """The priority of the task; the highest comes first. Ties are ordered by creation time, then by name."""
     parameters: NamedData = Field(default_factory=dict)
-    """The values for the template's parameters, with ${…} over the rule's variables at the start of the episode."""
+    """The values for the template's parameters. They can contain ${…} with the rule's variables, as at the start of the
+    episode."""
     follow: bool = False
     """If true, the parameters are computed again at each evaluation while the episode lasts, and the task is patched
     when they change. A parameter that is unknown or fails keeps its last value."""

@@ -105,11 +105,12 @@ class NotifyAction(Model):
     events: list[Moment] | None = Field(default=None, min_length=1, max_length=2, json_schema_extra=SET_LIST)
     """The events that cause a notification. Default: Started and Ended."""
     title: Template | None = None
-    """The title of the message, with ${…}; the summary of an alert."""
+    """The title of the message, or the summary of an alert. It can contain ${…}."""
     text: Template | None = None
-    """The text of the message, with ${…}; the description of an alert."""
+    """The text of the message, or the description of an alert. It can contain ${…}."""
     labels: dict[Identifier, Annotated[str, Field(max_length=1024)]] = Field(default_factory=dict, max_length=32)
-    """Labels for the receiver to filter or route by, such as severity, with ${…}. An alert has them as its labels."""
+    """Labels by which the receiver can filter or route, such as severity. Values can contain ${…}. An alert has them as
+    its labels."""
     grouping: Grouping | None = None
     """Groups several events into one message. Default: one message per event."""
     rate: Rate | None = None

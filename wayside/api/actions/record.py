@@ -40,10 +40,11 @@ class RecordAction(Window):
     split: Split = Split()
     """When to continue in a new file. Default: never."""
     renew_after: PositiveDuration | None = None
-    """Complete the recording after this time and continue the episode in a new one. Each sample is in exactly one of
-    them. For rules whose episodes never end. Default: one recording per episode."""
+    """The recording is completed after this time, and the episode continues in a new one. Each sample is in exactly one
+    recording. For rules whose episodes never end. Default: one recording per episode."""
     metadata: FreeData = Field(default_factory=dict)
-    """Additional metadata of the recording, with ${…} over the rule's variables at the start of the episode."""
+    """Additional metadata of the recording. Values can contain ${…} with the rule's variables, as at the start of the
+    episode."""
 
     @property
     def templates(self) -> Mapping[str, JsonValue]:

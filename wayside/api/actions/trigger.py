@@ -44,8 +44,8 @@ class TriggerDetector(Model):
     """A recording by another detector of the same Zenoh network, which must allow it (spec.recordings.onRequest)."""
 
     name: str = Field(min_length=1, max_length=512, pattern=r"^([A-Za-z0-9_.-]{1,253}|.*[$][{].*)$")
-    """The holder name of the other detector: the name of the Detector, or <detector>.<pod> for a Sidecar. With ${…}
-    over the rule's variables, e.g. recorder.${client}."""
+    """The holder name of the other detector: the name of the Detector, or <detector>.<pod> for a Sidecar. It can
+    contain ${…} with the rule's variables, e.g. recorder.${client}."""
     streams: list[ObjectName] | None = Field(default=None, min_length=1, max_length=128, json_schema_extra=SET_LIST)
     """The streams of the other detector. Default: all that it records on request."""
     clients: WindowClients = WindowClients.ALL
@@ -53,9 +53,9 @@ class TriggerDetector(Model):
     with_clients: list[ClientName] = Field(default_factory=list, max_length=64, json_schema_extra=SET_LIST)
     """With `clients: Subjects`: additional clients."""
     before: Duration = Duration("0s")
-    """How long before the onset the recording begins, as far as the other detector's buffer reaches."""
+    """The time from the start of the recording to the onset, as far as the other detector's buffer reaches."""
     after: Duration = Duration("0s")
-    """How long after the end of the episode the recording ends."""
+    """The time from the end of the episode to the end of the recording."""
 
 
 class ServiceCall(Model):
@@ -69,8 +69,8 @@ class ServiceCall(Model):
     """The definition of the type, in the format of .srv files. Not needed for the services of rosbag2's recorder and of
     std_srvs (ROS 2 Jazzy)."""
     request: NamedData = Field(default_factory=dict)
-    """The fields of the request, with ${…} over the rule's variables at the start of the episode. Omitted fields are
-    zero or empty."""
+    """The fields of the request. Values can contain ${…} with the rule's variables, as at the start of the episode.
+    Omitted fields are zero or empty."""
 
 
 class TriggerRos2(Model):
@@ -120,8 +120,8 @@ class HttpCall(Model):
     url: HttpUrl
     """The URL, e.g. https://recorder/recordings/{id}. {id} is replaced with the ID of the recording."""
     body: FreeData | None = None
-    """The JSON body, with ${…} over the rule's variables at the start of the episode. Default: id, do (start or stop),
-    maximumDuration, and event: the CloudEvent of the start."""
+    """The JSON body. Values can contain ${…} with the rule's variables, as at the start of the episode. Default: an
+    object with id, do (start or stop), maximumDuration, and event (the CloudEvent of the start)."""
 
     @field_validator("url")
     @classmethod
