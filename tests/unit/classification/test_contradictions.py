@@ -95,7 +95,7 @@ WAYS = [
     way("numberOfParticipants", "One", "[0]: One (a single participant) contradicts the rule: spec.scope.fleet",
         "Multiple", scope=FLEET, when="size(members) > 3.0"),
     Way({"numberOfParticipants": ["One"], "eventDetectionEntity": ["External"]}, {},
-        "spec.classification.eventDetectionEntity[0]: External (the detecting entity is neither",
+        "spec.classification.eventDetectionEntity[0]: External (the detecting entity is the source of neither",
         {"numberOfParticipants": ["Two"], "eventDetectionEntity": ["External"]}),
     way("actingEntity", "External", "[0]: External (the acting entity is another one) "
         "contradicts the rule: the detector itself carries out spec.actions[0].record, spec.actions[1].database: "
