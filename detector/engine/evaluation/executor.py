@@ -238,6 +238,7 @@ class Executor:
         happened: dict[str, list[Event]] = {}
         for stream, runs in self._blocks.with_samples.items():
             chosen: dict[str, Only] = {}
+            named: set[str] = set()
             for run in runs:
                 name = run.rule.name
                 happened[name] = self._lost(name, time) if regular else []
@@ -245,13 +246,15 @@ class Executor:
                 run.counters.skipped += thinned
                 if only.clients or only.subjects:
                     chosen[name] = only
-            present = {only: only.present(self._clients) for only in set(chosen.values())}  # mostly the same for all
-            clients = sorted({client for each in present.values() for client in each})
+                    named |= only.named
             if chosen:
+                clients = sorted([client for client in named if client in self._clients])
                 for each in self._blocks.run_with_samples(stream, time, clients, chosen, self._instruments.stopwatch):
                     happened[each.event.episode.rule].append(each.event)
                 for name, only in chosen.items():
-                    self._wake(self._runs[name], time, _looked_at(self._runs[name], only, present[only]))
+                    # The others have no wake that is due, and none of their timers has changed.
+                    due = [subject for subject in only.subjects if subject.clients[0] in self._clients]
+                    self._wake(self._runs[name], time, (*self._runs[name].looked_at, *due))
         return happened
 
     def _seen(self, events: list[Event]) -> list[Event]:
@@ -322,9 +325,3 @@ class Executor:
         for run in self._runs.values():
             run.gap(time)
         self.wake_all(time)
-
-
-def _looked_at(run: RuleRun, only: Only, present: Sequence[str]) -> list[Subject]:
-    """The subjects of a rule about clients that were evaluated; `present`: the clients that `only` selects."""
-    subjects = [Subject((client,), element.name) for element in run.rule.elements for client in present]
-    return [subject for subject in subjects if only.takes(subject)] if only.subjects else subjects

@@ -92,6 +92,9 @@ class RuleGroup:
         if not clients and self.columns.needs_clients:
             return happened
         looked = None if only is None else self._looked(clients, only)
+        if only is not None:
+            for run in self.runs:
+                run.looked_at = []
         block, codes = self.columns.evaluate(ticks, clients, floor, looked)
         if self.observer is not None:
             if isinstance(block, Block):
@@ -103,6 +106,8 @@ class RuleGroup:
         states: list[tuple[int, int, bool, int]] = []
         for row, at, changes in self._changed(block, codes, looked):
             states.append((row, numbers[at], *self._step(block, row, at, changes, happened)))
+            if only is not None:
+                self._of[row].looked_at.append(self.columns.tracks[row].subject(block.clients[at]))
         if self._measures and isinstance(block, Block):
             self._measure(block)
         if states:

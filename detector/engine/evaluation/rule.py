@@ -67,7 +67,7 @@ class RuleRun:
         self._budget = Budget()
         self._answers: list[OnDemandResult] | None = None
         self.looked_at: list[Subject] = []
-        """The subjects of the last evaluation."""
+        """The subjects whose states may have changed since the last evaluation with samples began."""
         self.disturbed = True
         """Whether states changed outside the rule's group, so that every subject must be evaluated again."""
         self.journal: list[DemandChange] | None = None

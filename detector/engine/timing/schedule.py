@@ -13,7 +13,7 @@ class begins when the one below it has reached its last step. At level 0 no eval
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from detector.engine.buffering.clients import Clients
 from detector.engine.episodes.subjects import Subject
@@ -39,8 +39,7 @@ def thinning(level: int, priorities: Collection[int]) -> Mapping[int, int]:
     return found
 
 
-@dataclass(frozen=True, slots=True)
-class Only:
+class Only(NamedTuple):
     """A selection of subjects: those that one of the clients belongs to, and these subjects."""
 
     clients: frozenset[str]
@@ -54,8 +53,12 @@ class Only:
 
     def present(self, clients: Clients) -> list[str]:
         """The clients that can form its single-client subjects, in order of their names."""
-        named = self.clients.union(*(subject.clients for subject in self.subjects))
-        return sorted([client for client in named if client in clients])
+        return sorted([client for client in self.named if client in clients])
+
+    @property
+    def named(self) -> frozenset[str]:
+        """The clients, and those of the subjects."""
+        return self.clients.union(*(subject.clients for subject in self.subjects)) if self.subjects else self.clients
 
 
 class Schedule:
