@@ -19,8 +19,7 @@ from detector.plugins.registry import plugin_problems
 from detector.streams.codecs import DefinitionError, UnknownTypeError, codec_for
 from detector.streams.codecs.definitions import Definition, DefinitionsError
 from detector.streams.codecs.etsi import EtsiDecoder, OwnDefinitions, own_definitions, read_module
-from detector.streams.codecs.fields import message_fields
-from detector.streams.codecs.ros import RosTypes, standard, types_with
+from detector.streams.codecs.ros import RosTypes, message_fields, standard, types_with
 from wayside.api import Detector, EventRule
 from wayside.api.stream import MessageDefinition
 from wayside.inputerror import InputError

@@ -20,7 +20,7 @@ from wayside.process.commandline import refuse, table_console
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-    from detector.streams.querying import Reply
+    from detector.streams.answering import Reply
     from wayside.api.zenoh import Zenoh
 
 DetectorFile = Annotated[
@@ -124,7 +124,8 @@ def _inquire_all(
         return [answer.payload for answer in query_selected("status", {}, None, None, connect, timeout)], {}
     with importing():
         from detector.resources.files import load_detectors
-        from detector.streams.querying import NetworkError, NoAnswerError, query_detectors
+        from detector.streams.answering import NoAnswerError, query_detectors
+        from detector.streams.session import NetworkError
         from wayside.api.pod import DetectorMode
 
     networks: list[tuple[Zenoh, list[str]]] = []
@@ -206,7 +207,7 @@ def query_selected(
     """Query the detectors that the options name. Raises NoAnswerError, NetworkError, DocumentError."""
     with importing():
         from detector.resources.files import load_rules
-        from detector.streams.querying import query_detectors
+        from detector.streams.answering import query_detectors
         from wayside.api.pod import DetectorMode
         from wayside.api.zenoh import Zenoh, ZenohMode
 

@@ -1,10 +1,12 @@
-"""The destinations of a running detector's events, demands and consequences: Zenoh, a file, the task reconciler,
-actions."""
+"""Where a running detector's events, demands and consequences go: Zenoh, a file, the task reconciler, actions."""
 
 from __future__ import annotations
 
 import logging
+import queue
+import threading
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 
 from detector.actions.base import ActionError, Surroundings
 from detector.actions.deploy.reconciler import DemandReconciler
@@ -14,7 +16,6 @@ from detector.engine.consequences.consequences import Consequence
 from detector.engine.episodes.demands import Demand
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.open_episodes import OpenEpisode
-from detector.live.event_log import EventLog
 from detector.live.requested import with_requested
 from detector.live.state import StateFile
 from detector.streams.zenoh import EVENT_ENCODING, Network, NetworkError
@@ -104,3 +105,50 @@ class LiveOutlet:
     def demands(self, demands: Mapping[str, Demand], ended: Mapping[str, int]) -> None:
         """Pass the demands to the reconciler."""
         self._reconciler.update(demands, ended)
+
+
+class EventLog:
+    """Appends one CloudEvent a line of `events.jsonl`, on a separate thread: a slow disk does not slow the evaluation.
+
+    At most `capacity` events are queued; further ones are dropped and counted.
+    """
+
+    def __init__(self, path: Path, *, capacity: int = 65536) -> None:
+        """Creates the file's folder; existing contents of the file are kept.
+
+        Raises:
+            OSError: the file cannot be opened.
+        """
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._path = path
+        self._file = path.open("a", encoding="utf-8")
+        self._lines: queue.Queue[str | None] = queue.Queue(capacity)
+        self._thread = threading.Thread(target=self._run, name="event-log", daemon=True)
+        self._thread.start()
+        self.dropped = 0
+        """Events dropped because the queue was full, or that could not be written."""
+
+    def write(self, line: str) -> None:
+        """Queue a line; never waits."""
+        try:
+            self._lines.put_nowait(line)
+        except queue.Full:
+            self.dropped += 1
+
+    def close(self) -> None:
+        """Write the queued lines, and close the file."""
+        self._lines.put(None)
+        self._thread.join()
+        self._file.close()
+        if self.dropped:
+            _log.error("%d events are missing in %s", self.dropped, self._path)
+
+    def _run(self) -> None:
+        while (line := self._lines.get()) is not None:
+            try:
+                self._file.write(line + "\n")
+                if self._lines.empty():
+                    self._file.flush()
+            except (OSError, ValueError) as error:  # a disk that refuses, a text that is not valid UTF-8
+                self.dropped += 1
+                _log.error("cannot write an event to %s: %s", self._path, error)

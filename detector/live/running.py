@@ -22,8 +22,7 @@ from detector.engine.samples.liveliness import LIVELINESS
 from detector.findings.losses import Loss
 from detector.live.answers import Answers
 from detector.live.evaluator import Evaluator, LiveObserver
-from detector.live.event_log import EventLog
-from detector.live.outlet import LiveOutlet
+from detector.live.outlet import EventLog, LiveOutlet
 from detector.live.requested import Requested
 from detector.live.restoring import Restored
 from detector.live.state import StateFile

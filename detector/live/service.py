@@ -21,8 +21,7 @@ from detector.assembly.memory import tune_garbage_collection
 from detector.live.restoring import what_was_open
 from detector.live.running import Running, View
 from detector.live.state import state_file
-from detector.resources.files import load_rules
-from detector.resources.following import follow_files, hangups
+from detector.resources.files import follow_files, hangups, load_rules
 from detector.status.server import PagesAddress
 
 _log = logging.getLogger(__name__)

@@ -3,11 +3,16 @@
 An intake file is an MCAP file, so any MCAP tool opens it. A channel contains the messages of one stream and key as
 received; its metadata names the stream. One more channel contains the controls: all other inputs of the engine. The
 order in the file counts, not the order of the times.
+
+A file replays with the defaults and the time order of its detector's version. Version 1: a stream becomes stale after
+`clientTimeout`, and a position is known while its stream is not stale. Version 2: `staleAfter` is 5 s and `maxAge` of a
+position 1 s by default; for the order, see `engine.timing.timeline`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,6 +25,7 @@ from mcap.stream_reader import StreamReader
 from detector.engine.samples.sample import Arrival
 from detector.plugins.outages import KIND as OUTAGE
 from detector.replay.errors import DAMAGE, RecordingError
+from wayside.rules import CompiledRule, PairSubject
 
 LIBRARY = "wayside intake 1"
 """The text in the header that identifies an intake file; the number is the version of the contents."""
@@ -103,3 +109,27 @@ def _item(record: McapRecord, channels: dict[int, Channel]) -> Arrival | Control
             return Control(record.log_time, msgspec.json.decode(record.data, type=dict[str, Any]))
         return Arrival(record.log_time, stream, channel.topic, record.data)
     return None
+
+
+_CLIENT_TIMEOUT = "30s"
+
+
+def detector_as_of(document: dict[str, Any], version: int) -> dict[str, Any]:
+    """A recorded Detector, with the defaults of its version written out."""
+    if version > 1:
+        return document
+    spec = document["spec"]
+    stale = spec.get("clientTimeout", _CLIENT_TIMEOUT)
+    streams = [
+        stream if stream.get("latched") or "staleAfter" in stream else {**stream, "staleAfter": stale}
+        for stream in spec["streams"]
+    ]
+    return {**document, "spec": {**spec, "streams": streams}}
+
+
+def rule_as_of(rule: CompiledRule, version: int) -> CompiledRule:
+    """A recorded rule, evaluated as in its version."""
+    if version > 1 or not isinstance(rule.subject, PairSubject):
+        return rule
+    position = replace(rule.subject.position, max_age_ns=None)
+    return replace(rule, subject=replace(rule.subject, position=position))

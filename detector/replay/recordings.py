@@ -11,11 +11,17 @@ from detector.replay.json_lines import json_lines_span, read_json_lines
 from detector.replay.mcap_file import MAGIC as MCAP_MAGIC
 from detector.replay.mcap_file import mcap_span, mcap_types, read_mcap
 from detector.replay.message import OnCut, RecordedType, Wanted, ignore
-from detector.replay.own_recording import is_own_recording, own_recording_types, read_own_recording
 from detector.replay.pcap import MAGICS as PCAP_MAGICS
 from detector.replay.pcap import read_pcap
 from detector.replay.rosbag1 import ROSBAG1_MAGIC, read_rosbag1, rosbag1_span, rosbag1_types
-from detector.replay.rosbag2 import SQLITE_MAGIC, read_rosbag2, rosbag2_types
+from detector.replay.rosbag2 import (
+    SQLITE_MAGIC,
+    is_own_recording,
+    own_recording_types,
+    read_own_recording,
+    read_rosbag2,
+    rosbag2_types,
+)
 
 _Read = Callable[[Path, Wanted, OnCut], Iterator[Batch]]
 

@@ -25,8 +25,7 @@ from detector.engine.timing.timeline import ORDER
 from detector.findings.losses import Losses
 from detector.replay.clips import Clips, Recorders
 from detector.replay.errors import RecordingError
-from detector.replay.intake_file import Control
-from detector.replay.intake_versions import detector_as_of, rule_as_of
+from detector.replay.intake_file import Control, detector_as_of, rule_as_of
 from detector.replay.message import Cut
 from detector.replay.parts import PAUSE, parts_of
 from wayside.api import ApplicationTask, Detector, EventRule

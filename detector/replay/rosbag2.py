@@ -1,15 +1,23 @@
-"""rosbag2: a folder with metadata.yaml and files in MCAP or SQLite, or one SQLite file, read through rosbags."""
+"""rosbag2: a folder with metadata.yaml and files in MCAP or SQLite, or one SQLite file, read through rosbags.
+
+Recordings of the record action are such folders that may contain JSON and other streams in addition to ROS topics.
+rosbags skips those, so their MCAP files are read here. In a split recording each file begins with the last samples of
+latched streams; such a message has its original number, and is used only once.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import json
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import apsw
 from backports.zstd import ZstdError
+from mcap.records import Channel
 from rosbags.interfaces import ConnectionExtRosbag2, MessageDefinitionFormat
 from rosbags.rosbag2 import Reader, ReaderError
 
+from detector.actions.record.description import DESCRIPTION, FORMAT
 from detector.replay.batches import Batch, batched, merged_batches
 from detector.replay.errors import DAMAGE, RecordingError
 from detector.replay.mcap_file import is_cut, mcap_types, read_mcap
@@ -74,3 +82,49 @@ def _damaged(path: Path, error: Exception) -> RecordingError:
 
 def _repair(file: Path) -> str:
     return f"mcap recover {file}" if file.suffix == ".mcap" else f"sqlite3 {file} .recover"
+
+
+def is_own_recording(path: Path) -> bool:
+    """Whether the folder was written by the record action."""
+    try:
+        metadata = json.loads((path / DESCRIPTION).read_bytes())
+    except (OSError, ValueError):
+        return False
+    return isinstance(metadata, dict) and metadata.get("format") == FORMAT
+
+
+def read_own_recording(path: Path, wanted: Wanted, on_cut: OnCut) -> Iterator[Batch]:
+    """The messages, file by file, in time order. Raises RecordingError if a file has been altered."""
+    taken: set[tuple[str, str, int]] = set()
+
+    def repeated(channel: Channel) -> Callable[[int], bool] | None:
+        if channel.metadata.get("latched") != "true":
+            return None
+        client = channel.metadata.get("client", "")
+
+        def is_repeated(sequence: int) -> bool:
+            about = channel.topic, client, sequence
+            if about in taken:
+                return True
+            taken.add(about)
+            return False
+
+        return is_repeated
+
+    for file in _files(path):
+        yield from read_mcap(file, wanted, on_cut, repeated)
+
+
+def own_recording_types(path: Path) -> list[RecordedType]:
+    """The message types that the files define. Raises RecordingError."""
+    return list(dict.fromkeys(each for file in _files(path) for each in mcap_types(file)))
+
+
+def _files(path: Path) -> list[Path]:
+    files = [path / name for name in json.loads((path / DESCRIPTION).read_bytes()).get("files", [])]
+    missing = [file.name for file in files if not file.is_file()]
+    if missing:
+        raise RecordingError(
+            f"{path}: {missing[0]} is missing, although {DESCRIPTION} lists it: copy all files of the recording"
+        )
+    return files

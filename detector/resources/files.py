@@ -1,8 +1,11 @@
-"""A Detector and its EventRules from YAML files."""
+"""A Detector and its EventRules from YAML files, which SIGHUP makes a running detector read again."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import asyncio
+import logging
+import signal
+from collections.abc import AsyncIterator, Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -116,3 +119,35 @@ def _not_one(given: str, detectors: list[Document]) -> Iterable[Problem]:
         yield Problem(given, 0, 0, "", "contains no Detector: give one object of kind: Detector")
     for document in detectors[1:]:
         yield document.problem(("metadata", "name"), "is a second Detector: give only one")
+
+
+_log = logging.getLogger(__name__)
+
+
+def hangups() -> asyncio.Event:
+    """An event that every SIGHUP sets from now on. Call it before the files are first read, so that no signal is
+    lost."""
+    changed = asyncio.Event()
+    asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, changed.set)
+    return changed
+
+
+async def follow_files(
+    detector: Path, rules: Sequence[Path], check: Check, changed: asyncio.Event
+) -> AsyncIterator[RuleSet]:
+    """The content of the files each time `changed` is set. Invalid files are logged and change nothing."""
+    try:
+        while True:
+            await changed.wait()
+            changed.clear()
+            try:
+                loaded = load_rules(detector, rules, check)
+            except (DocumentError, OSError) as error:
+                _log.error("cannot watch the files; keeping the last good version: %s", error)
+                continue
+            for warning in loaded.warnings:
+                _log.warning("%s", warning)
+            _log.info("reloaded the files: %d rules", len(loaded.rule_set.rules))
+            yield loaded.rule_set
+    finally:
+        asyncio.get_running_loop().remove_signal_handler(signal.SIGHUP)

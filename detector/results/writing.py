@@ -72,8 +72,7 @@ def write_results(folder: Path, results: Sequence[Result], kinds: frozenset[Resu
     for number, result in enumerate(results, start=1):
         suffix = f"-{number}" if len(results) > 1 else ""
         if ResultKind.MCAP in kinds:
-            from detector.results.foxglove_file import write_mcap  # noqa: PLC0415  an extra
-            from detector.results.layout import layout_of  # noqa: PLC0415
+            from detector.results.foxglove_file import layout_of, write_mcap  # noqa: PLC0415  an extra
 
             write_mcap(path(f"results{suffix}.mcap"), result)
             path(f"layout{suffix}.json").write_text(layout_of(result) + "\n", encoding="utf-8")

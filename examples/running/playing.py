@@ -25,7 +25,7 @@ from detector.assembly import inlets
 from detector.engine.engine import Engine
 from detector.engine.episodes.events import Event
 from detector.engine.samples.sample import Arrival
-from detector.replay.latched import recorded_arrivals
+from detector.replay.playing import recorded_arrivals
 from detector.replay.recorded_types import with_recorded_types
 from detector.replay.replaying import Replay, Replayed
 from detector.replay.routing import MessageRouter

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from detector.actions.notify.dead_letters import DeadLetters
+from detector.actions.notify.keeping import DeadLetters
 from detector.actions.store import action_store
 from tests.http_servers import answers, endpoint, hangs
 from tests.notifying import a_desk, an_episode

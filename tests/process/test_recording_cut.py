@@ -25,8 +25,7 @@ from detector.actions.base import ActionError
 from detector.actions.episode import Completion, OutcomeState
 from detector.actions.outcomes import Outcomes, Which
 from detector.actions.record.destination import Destination
-from detector.actions.record.recovery import recover
-from detector.actions.record.salvage import contents_of, salvage
+from detector.actions.record.recovery import contents_of, recover, salvage
 from detector.actions.worker import Worker
 from detector.engine.consequences.consequences import Begun, Completed, Run, Sampled
 from detector.engine.episodes.events import Event

@@ -13,12 +13,12 @@ import bson
 
 from detector.actions.base import Action, ActionError, Setting
 from detector.actions.database import scenario as scenarios
+from detector.actions.database.attachments import AttachmentFolder, FolderError
 from detector.actions.database.documents import Documents, Made
 from detector.actions.database.episodes import Writing
-from detector.actions.database.folder import AttachmentFolder, FolderError
+from detector.actions.database.queue import BATCH_BYTES, BATCH_DOCUMENTS, Write
 from detector.actions.database.scenario import Scenario
 from detector.actions.database.values import bson_bytes
-from detector.actions.database.work import BATCH_BYTES, BATCH_DOCUMENTS, Write
 from detector.actions.database.writer import DatabaseWriter, acquire, release
 from detector.actions.episode import Completion, Episode, EpisodeSample, Outcome, OutcomeState
 from wayside.api.actions.database import Attachments, DatabaseAction

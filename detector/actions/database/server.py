@@ -27,7 +27,7 @@ from pymongo.errors import (
     ServerSelectionTimeoutError,
 )
 
-from detector.actions.database.work import Write
+from detector.actions.database.queue import Write
 
 _log = logging.getLogger(__name__)
 logging.getLogger("pymongo").setLevel(logging.INFO)  # it would log every document

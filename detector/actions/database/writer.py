@@ -17,9 +17,8 @@ import bson
 from detector.access.mounted import AccessError, database_uri
 from detector.actions.base import ActionError
 from detector.actions.database import scenario as scenarios
-from detector.actions.database.queue import Queue
+from detector.actions.database.queue import Queue, Write
 from detector.actions.database.server import DatabaseUnavailableError, Server, WriteRefusedError
-from detector.actions.database.work import Write
 from detector.actions.store import StoreError
 from wayside.api.database import DatabaseConnection, DatabaseSpool, WriteConcern
 from wayside.process.backoff import Backoff, retry

@@ -17,8 +17,7 @@ from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 
-from detector.actions.deploy.ledger import Ledger
-from detector.actions.deploy.steps import StoreChange, differences
+from detector.actions.deploy.ledger import Ledger, StoreChange, differences
 from detector.actions.deploy.stores import (
     Snapshot,
     StoredTask,

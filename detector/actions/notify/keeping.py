@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import errno
+import json
 import logging
-from collections.abc import Iterable
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
 
 from detector.actions.base import Setting
 from detector.actions.journal import Journal
-from detector.actions.notify.dead_letters import DeadLetters
 from detector.actions.notify.notice import Notice, NoticeTexts, notice_from, texts
 from wayside.times import format_seconds
 
@@ -86,3 +90,29 @@ class Keeping:
         """The last call. Without `keep` everything is removed."""
         self._journal.drop(key for key in self._journal.keys(_OPEN) if not keep or key not in self._claimed)
         self._journal.close()
+
+
+SIZE = 10 << 20
+"""Maximum size of one file in bytes."""
+
+
+class DeadLetters:
+    """Undelivered events in a file: a JSON object per line, with the reason. Used by one thread at a time.
+
+    A full file is renamed to `….old.jsonl`, replacing the previous one, and a new file begins.
+    """
+
+    def __init__(self, path: Path, size: int = SIZE) -> None:
+        self.path, self._size = path, size
+
+    def write(self, letter: Mapping[str, Any]) -> None:
+        """Append a letter. Raises OSError if the disk refuses, ValueError if it is not valid JSON."""
+        line = json.dumps(letter, separators=(",", ":"), ensure_ascii=False, allow_nan=False).encode() + b"\n"
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        if self.path.exists() and self.path.stat().st_size + len(line) > self._size:
+            os.replace(self.path, self.path.with_suffix(".old.jsonl"))
+        with self.path.open("ab", buffering=0) as file:
+            begun = file.tell()
+            if file.write(line) != len(line):
+                file.truncate(begun)  # remove a partial line
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

@@ -20,9 +20,8 @@ from itertools import count
 from typing import Any
 
 from detector.actions.base import ActionError, Messenger
-from detector.actions.trigger.composing import ServiceError
 from detector.actions.trigger.orders import Order, Progress, Report, nested_value
-from detector.actions.trigger.services import service
+from detector.actions.trigger.services import ServiceError, service
 from detector.streams.codecs.definitions import Definition, DefinitionsError
 from detector.streams.codecs.ros import RosTypes, types_with
 from wayside.api import Detector

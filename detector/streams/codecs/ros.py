@@ -3,17 +3,52 @@
 from __future__ import annotations
 
 import difflib
+import re
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache, cached_property, lru_cache
+from importlib.resources import files
+from typing import Any, cast
 
+import msgspec
+from rosbags.interfaces import Nodetype
 from rosbags.interfaces.typing import FieldDesc
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.base import TypesysError
 from rosbags.typesys.store import Typestore
 
 from detector.streams.codecs.definitions import Definition, DefinitionsError, check_definitions, merged_types
-from detector.streams.codecs.release import MessageFields, release_fields
+from wayside.api.stream import Encoding, Stream
+from wayside.rules import BYTES, Fields, ItemFields
+
+MessageFields = list[tuple[str, FieldDesc]]
+"""The fields of a message in their order."""
+
+_FILE = "jazzy.json"
+"""Written by `python -m tests.ros_definitions`."""
+_FIELD = re.compile(r"(?P<name>[\w/]+)(?:<=(?P<limit>\d+))?(?:\[(?P<most><=)?(?P<count>\d*)\])?")
+
+
+def release_fields() -> dict[str, MessageFields]:
+    """The fields of each type of the release, in rosbags' form."""
+    written = msgspec.json.decode(files(__package__).joinpath(_FILE).read_bytes(), type=dict[str, dict[str, str]])
+    described: dict[str, FieldDesc] = {}
+    for each in {text for fields in written.values() for text in fields.values()}:
+        described[each] = _described(each)
+    return {name: [(field, described[text]) for field, text in fields.items()] for name, fields in written.items()}
+
+
+def _described(text: str) -> FieldDesc:
+    """A field's type: `float64`, `string<=16`, `geometry_msgs/msg/Point[2]`, `uint8[]`, `uint8[<=4]`."""
+    match = _FIELD.fullmatch(text)
+    assert match is not None  # noqa: S101  a test compares the file with rosbags
+    name, count = match["name"], match["count"]
+    element: Any = (Nodetype.NAME, name) if "/" in name else (Nodetype.BASE, (name, int(match["limit"] or 0)))
+    if count is None:
+        return cast("FieldDesc", element)
+    kind = Nodetype.ARRAY if count and not match["most"] else Nodetype.SEQUENCE
+    return cast("FieldDesc", (kind, (element, int(count or 0))))
+
 
 HEADER = "std_msgs/msg/Header"
 TIME = "builtin_interfaces/msg/Time"
@@ -117,3 +152,27 @@ def types_with(definitions: tuple[Definition, ...]) -> RosTypes:
     except (TypesysError, SyntaxError, ValueError) as error:
         raise DefinitionsError([(definitions[0].name, f"cannot use the definitions: {error}")]) from error
     return RosTypes(lambda: store)
+
+
+def message_fields(stream: Stream, types: RosTypes | None = None) -> Fields | None:
+    """The fields of a ROS message type, none for a raw message; None for other encodings, which can have any fields."""
+    if stream.encoding is Encoding.RAW:
+        return BYTES
+    types = types or standard()
+    if stream.encoding is not Encoding.CDR or stream.type is None or not types.known(stream.type):
+        return None
+    return _fields(types, stream.type)
+
+
+@lru_cache(maxsize=4096)
+def _fields(types: RosTypes, type_name: str) -> Fields:
+    return {name: _below(types, desc) for name, desc in types.fields(type_name)}
+
+
+def _below(types: RosTypes, desc: FieldDesc) -> Fields | None:
+    """The fields below a field, or of each of its items; None below numbers, texts and arrays of these."""
+    kind, detail = desc
+    if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+        inner, name = cast("FieldDesc", detail[0])
+        return ItemFields(_fields(types, str(name))) if inner is Nodetype.NAME else None
+    return _fields(types, str(detail)) if kind is Nodetype.NAME else None

@@ -15,10 +15,8 @@ from bson import Decimal128
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from detector.actions.database.attachments import detach
+from detector.actions.database.attachments import detach, pcd, png
 from detector.actions.database.documents import LARGEST, Documents
-from detector.actions.database.pcd import pcd
-from detector.actions.database.png import png
 from detector.actions.database.values import UnfitError, bson_bytes
 from detector.actions.episode import EpisodeSample
 from detector.streams.codecs import codec_for

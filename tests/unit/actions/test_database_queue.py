@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from pathlib import Path
 
-from detector.actions.database.queue import Queue
-from detector.actions.database.work import Write
+from detector.actions.database.queue import Queue, Write
 from wayside.api.database import DatabaseSpool
 
 

@@ -7,8 +7,7 @@ import dataclasses
 from hypothesis import given
 from hypothesis import strategies as st
 
-from detector.actions.deploy.ledger import Ledger
-from detector.actions.deploy.steps import StoreChange, next_step
+from detector.actions.deploy.ledger import Ledger, StoreChange, next_step
 from detector.actions.deploy.stores import Snapshot, StoredTask, Update
 from detector.engine.episodes.demands import Demand, to_task
 from tests.unit.actions.test_demands import DEMAND

@@ -8,7 +8,7 @@ import hypothesis.strategies as st
 import pytest
 from hypothesis import given
 
-from detector.actions.notify.grouping import Groups
+from detector.actions.notify.events import Groups
 from detector.actions.notify.notice import GROUP_TYPE, Notice, NoticeTexts, event_of_group
 from detector.actions.notify.outbox import (
     LONGEST,

@@ -6,8 +6,7 @@ from typing import Any
 
 import pytest
 
-from detector.actions.trigger.composing import ServiceError
-from detector.actions.trigger.services import KNOWN, service
+from detector.actions.trigger.services import KNOWN, ServiceError, service
 from detector.streams.codecs.definitions import Definition
 from detector.streams.codecs.ros import standard, types_with
 

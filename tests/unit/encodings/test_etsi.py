@@ -13,7 +13,7 @@ from detector.assembly import DetectorError, inlets
 from detector.engine.samples.sample import DecodeError
 from detector.streams.codecs.etsi import DefinitionError, EtsiDecoder
 from detector.streams.codecs.etsi.messages import BY_NAME, packaged_definitions
-from detector.streams.codecs.etsi.times import its_ms, nearest_time, unix_ns
+from detector.streams.codecs.etsi.quantities import its_ms, nearest_time, unix_ns
 from tests.driving import a_detector, a_rule
 from tests.unit.encodings.its_messages import PDUS, a_cam, encode, random_message
 from wayside.rules import RuleError, compile_rule

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from rosbags.typesys import Stores, get_typestore
 
-import detector.streams.codecs.release as module
-from detector.streams.codecs.release import release_fields
+import detector.streams.codecs.ros as module
+from detector.streams.codecs.ros import release_fields
 from tests.ros_definitions import text
 
 

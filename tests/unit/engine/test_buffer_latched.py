@@ -14,7 +14,7 @@ from msgspec.structs import replace
 from detector.engine.buffering.buffer import Buffer, Lane
 from detector.engine.buffering.latched import LatchedLane, by_key
 from detector.engine.samples.sample import SAMPLE_OVERHEAD, Sample, Stamped
-from detector.replay.latched import recorded_arrivals
+from detector.replay.playing import recorded_arrivals
 from detector.replay.replaying import replay_arrivals
 from detector.replay.routing import MessageRouter
 from tests.driving import START, Drive, a_detector, a_rule, a_stream, arrival, at

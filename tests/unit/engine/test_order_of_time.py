@@ -17,7 +17,7 @@ from detector.engine.episodes.events import Event
 from detector.engine.samples.sample import Arrival
 from detector.replay import parts, replaying
 from detector.replay.intake_file import Control
-from detector.replay.latched import recorded_arrivals
+from detector.replay.playing import recorded_arrivals
 from detector.replay.replaying import Replayed, replay_arrivals, replay_intake
 from detector.replay.routing import MessageRouter
 from tests.driving import (

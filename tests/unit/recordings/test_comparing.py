@@ -13,7 +13,7 @@ from detector.commands import cli
 from detector.engine.episodes.episodes import Ending
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.record import EpisodeRecord
-from detector.replay.comparing import compare
+from detector.results.variants import compare
 from tests import onnx_models
 from tests.driving import START, a_detector, a_rule, at
 from tests.recorded import write_json_lines

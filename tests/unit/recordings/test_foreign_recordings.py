@@ -13,7 +13,7 @@ from mcap_ros2.writer import Writer
 from detector.assembly import inlets
 from detector.engine.samples.sample import Arrival
 from detector.replay.intake_writer import IntakeWriter
-from detector.replay.latched import recorded_arrivals
+from detector.replay.playing import recorded_arrivals
 from detector.replay.recorded_types import with_recorded_types
 from detector.replay.replaying import replay_arrivals
 from detector.replay.routing import MessageRouter

@@ -10,7 +10,7 @@ import pytest
 
 from detector.replay.errors import RecordingError
 from detector.replay.message import Cut, Message
-from detector.streams.codecs.etsi.times import its_ms
+from detector.streams.codecs.etsi.quantities import its_ms
 from tests.driving import a_detector, a_rule, a_stream
 from tests.recorded import messages_in
 from tests.unit.encodings.its_messages import a_cam, random_message

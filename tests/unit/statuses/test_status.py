@@ -20,8 +20,7 @@ from detector.status.explaining import Watching
 from detector.status.keeping import StatusKeeper
 from detector.status.model import CertificateStatus, RuleExplanation, RuleState, Status, read_status, to_json
 from detector.status.table import status_view
-from detector.streams.answering import Answering
-from detector.streams.querying import NoAnswerError, query_detectors
+from detector.streams.answering import Answering, NoAnswerError, query_detectors
 from detector.streams.zenoh import Network
 from tests.driving import POSITION, Drive, a_detector, a_rule, a_stream, arrival, at
 from tests.ports import free_endpoint

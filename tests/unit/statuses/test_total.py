@@ -14,8 +14,7 @@ from detector.commands.cli import app
 from detector.engine.samples.sample import Arrival
 from detector.status.model import Drops, RuleState, Status, read_status, to_json
 from detector.status.total import Total, total
-from detector.streams.answering import Answering
-from detector.streams.querying import NoAnswerError
+from detector.streams.answering import Answering, NoAnswerError
 from detector.streams.zenoh import Network
 from tests.driving import Drive, a_detector, a_rule, arrival
 from tests.ports import free_endpoint

@@ -8,7 +8,7 @@ import pytest
 
 from detector.assembly import DetectorError, inlets
 from detector.engine.samples.sample import Arrival
-from detector.streams.codecs.etsi.times import its_ms
+from detector.streams.codecs.etsi.quantities import its_ms
 from tests.driving import Drive, a_detector, a_rule, at
 from tests.unit.encodings.its_messages import a_cam
 

@@ -11,10 +11,10 @@ from typing import Any
 from detector.engine.samples.sample import DecodeError
 from detector.streams.codecs.etsi.asn1 import DefinitionError
 from detector.streams.codecs.etsi.bits import Bits
-from detector.streams.codecs.etsi.members import message_members
 from detector.streams.codecs.etsi.messages import BY_NAME, BY_NUMBER, KINDS, PREFIX, MessageKind, definitions, reader
 from detector.streams.codecs.etsi.own import OwnDefinitions, own_definitions, read_module
 from detector.streams.codecs.etsi.packets import message_in
+from detector.streams.codecs.etsi.reading import message_members
 
 __all__ = ["DefinitionError", "EtsiDecoder", "OwnDefinitions", "own_definitions", "read_module"]
 

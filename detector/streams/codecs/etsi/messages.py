@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cache, lru_cache
 from typing import Any
 
-from detector.streams.codecs.etsi import times
+from detector.streams.codecs.etsi import quantities
 from detector.streams.codecs.etsi.asn1 import DefinitionError, Type
 from detector.streams.codecs.etsi.own import OwnDefinitions
 from detector.streams.codecs.etsi.packaged import packaged_type
@@ -25,7 +25,9 @@ def _milliseconds(seconds: float) -> int:
 
 
 def _generation(part: str) -> Stamp:
-    return lambda message, received: times.nearest_time(round(message[part]["generationDeltaTime"] * 1000), received)
+    return lambda message, received: quantities.nearest_time(
+        round(message[part]["generationDeltaTime"] * 1000), received
+    )
 
 
 def _denm(message: Mapping[str, Any], received: int) -> int | None:
@@ -42,7 +44,7 @@ def _spatem(message: Mapping[str, Any], received: int) -> int | None:
     minute, rest = first.get("moy"), first.get("timeStamp")
     if minute is None or rest is None:
         return None
-    return times.in_year(round(minute / 60), round(rest * 1000), received)
+    return quantities.in_year(round(minute / 60), round(rest * 1000), received)
 
 
 def _none(message: Mapping[str, Any], received: int) -> int | None:

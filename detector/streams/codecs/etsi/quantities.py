@@ -3,10 +3,14 @@
 The meaning of a number depends on the name of its type in the ETSI Common Data Dictionary (TS 102 894-2, releases 1 and
 2) and DSRC (ISO/TS 19091, SAE J2735). A type that is not listed here is a plain number: a code, an identifier, a count,
 or already in the unit that its definition names.
+
+ITS time is milliseconds of TAI since 2004-01-01T00:00:00Z (TimestampIts); some fields contain only a remainder of it.
+All other times here are nanoseconds since the Unix epoch unless a name states otherwise.
 """
 
 from __future__ import annotations
 
+import datetime
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
@@ -14,7 +18,6 @@ from fractions import Fraction
 from detector.engine.samples.sample import DecodeError
 from detector.streams.codecs.doubles import as_double
 from detector.streams.codecs.etsi.asn1 import Integer
-from detector.streams.codecs.etsi.times import unix_ns
 
 UNAVAILABLE = frozenset({"unavailable", "outOfRange"})
 """The names of numbers and enumeration values that mean "no value"."""
@@ -122,3 +125,55 @@ def _time(milliseconds: int) -> float:
     if time >= 1 << 63:
         raise DecodeError(f"the time {milliseconds} ms is beyond the year 2262")
     return time / 10**9
+
+
+_SECOND = 10**9
+_MILLISECOND = 10**6
+
+_UTC = datetime.UTC
+
+
+def _seconds(year: int, month: int, day: int) -> int:
+    return int(datetime.datetime(year, month, day, tzinfo=_UTC).timestamp())
+
+
+EPOCH = _seconds(2004, 1, 1)
+"""The beginning of ITS time, in seconds since the Unix epoch."""
+
+_LEAPS = tuple(
+    _seconds(*day) for day in ((2006, 1, 1), (2009, 1, 1), (2012, 7, 1), (2015, 7, 1), (2017, 1, 1))
+)  # fmt: skip
+"""The days that began after a leap second since then (IERS Bulletin C); there has been none since 2017."""
+
+WRAP = 65536
+"""generationDeltaTime is ITS time in milliseconds modulo this."""
+
+
+def unix_ns(milliseconds: int) -> int:
+    """The Unix time of an ITS time, in nanoseconds since the epoch."""
+    seconds = milliseconds // 1000
+    leaps = sum(seconds >= day - EPOCH + index + 1 for index, day in enumerate(_LEAPS))
+    return (EPOCH - leaps) * _SECOND + milliseconds * _MILLISECOND
+
+
+def its_ms(unix: int) -> int:
+    """The ITS time, in milliseconds, of a Unix time in nanoseconds; negative before 2004."""
+    leaps = sum(unix >= day * _SECOND for day in _LEAPS)
+    return (unix - (EPOCH - leaps) * _SECOND) // _MILLISECOND
+
+
+def nearest_time(remainder: int, near: int) -> int:
+    """The Unix time nearest to `near` whose ITS time leaves the remainder modulo 65 536 ms."""
+    reference = its_ms(near)
+    ahead = (remainder - reference) % WRAP
+    return unix_ns(reference + (ahead if ahead <= WRAP // 2 else ahead - WRAP))
+
+
+def in_year(minute: int, milliseconds: int, near: int) -> int:
+    """The Unix time nearest to `near` that is this far into this minute of some year (UTC)."""
+    year = datetime.datetime.fromtimestamp(near / _SECOND, _UTC).year
+    candidates = [
+        (_seconds(each, 1, 1) + minute * 60) * _SECOND + milliseconds * _MILLISECOND
+        for each in range(max(year - 1, 1970), year + 2)
+    ]
+    return min(candidates, key=lambda time: abs(time - near))
