@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import logging
 import sys
+import time
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -272,13 +273,15 @@ def render(
     """
     with importing():
         from application_manager.charts.helm import HelmRunner
-        from application_manager.commands.offline import charts_at_once, render_files
+        from application_manager.commands.offline import charts_at_once, render_objects
+        from wayside.api.documents import load_documents
+        from wayside.manifests import to_yaml
 
     policy = policy_of(allowed_kinds, service_accounts)
-    result = render_files(
-        [*templates, *tasks], policy, max_instances, charts_at_once(HelmRunner(helm), chart_cache, chart_folder)
-    )
-    sys.stdout.write(result.text)
+    objects = [document.object for document in load_documents([*templates, *tasks])]
+    charts = charts_at_once(HelmRunner(helm), chart_cache, chart_folder)
+    result = render_objects(objects, policy, time.time(), max_instances, charts)
+    sys.stdout.write(to_yaml(result.objects))
     for line in (*result.notes, *result.refusals):
         typer.echo(line, err=True)
     if result.refusals:

@@ -8,9 +8,10 @@ from typing import TypeVar
 from application_manager.core.claims.claims import TemplateState
 from application_manager.core.conditions import Aspect
 from application_manager.core.demand import drafting
+from application_manager.core.objects.ownership import Obstacle
 from application_manager.core.objects.policy import Policy
 from application_manager.core.objects.rendering import Rendering
-from application_manager.workers.jobs import RenderProblem, render
+from application_manager.workers.jobs import render
 from application_manager.workers.process import Job
 from wayside.api import ApplicationInstance, ApplicationTemplate
 
@@ -30,7 +31,7 @@ def objects(wanted: ApplicationInstance, template: TemplateState) -> Rendering |
     if not isinstance(template, ApplicationTemplate):
         return drafting.without_template(wanted, template)
     found = render(pickle.dumps(template), Policy(), wanted)
-    if isinstance(found, RenderProblem):
+    if isinstance(found, Obstacle):
         return drafting.problem(template, found.reason, found.message)
     assert isinstance(found, Rendering)
     return found

@@ -53,32 +53,17 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Issuing:
-    """Keeps the certificate valid, the files in `folder` as in the Secret, and the webhooks' authority as in it.
+    """Keeps the certificate valid, the files in the folder as in the Secret, which exists, and the webhooks' authority.
 
-    `client` writes also while this manager is not the active one; `secret`: namespace and name of a Secret that exists.
+    `client` writes also while this manager is not the active one.
     """
 
     client: Client
-    service: str
-    secret: tuple[str, str]
-    webhooks: str
-    folder: Path
-
-    async def first(self) -> None:
-        """Have a certificate, however long the API server takes to answer.
-
-        Raises ConfigurationError where the Secret does not exist, and ApiError where the API server refuses for good.
-        """
-        await until_answered(self.look)
-
-    async def follow(self) -> None:
-        """Look again and again, until cancelled."""
-        await asyncio.sleep(EVERY)
-        await repeatedly(self.look, EVERY, "cannot renew the webhook's certificate")
+    serving: Serving
 
     async def look(self) -> None:
         """Look once: make a certificate where one is due, give the API server its authority, and write the files."""
-        namespace, name = self.secret
+        namespace, name = self.serving.secret
         secret = await self.client.get(_SECRETS, namespace, name)
         if secret is None:
             raise ConfigurationError(
@@ -86,7 +71,7 @@ class Issuing:
             )
         files = {key: base64.b64decode(value) for key, value in (secret.get("data") or {}).items()}
         if _due(files, now := datetime.datetime.now(datetime.UTC)):
-            files = issued(WebhookClientConfig.of_service(self.service).hosts)
+            files = issued(WebhookClientConfig.of_service(self.serving.service).hosts)
             files[AUTHORITY] += _trusted(secret, now)
             data = {key: base64.b64encode(content).decode() for key, content in files.items()}
             try:
@@ -97,18 +82,18 @@ class Issuing:
                 raise
             log.info("created a certificate for the webhook, valid for %d days", VALID.days)
         await self._trust(base64.b64encode(files[AUTHORITY]).decode())
-        write_whole(self.folder, {each: files[each] for each in (AUTHORITY, CERTIFICATE, KEY)})
+        write_whole(self.serving.certificates, {each: files[each] for each in (AUTHORITY, CERTIFICATE, KEY)})
 
     async def _trust(self, bundle: str) -> None:
         """Write the authority into those of the configurations that there are."""
         for resource in _CONFIGURATIONS:
-            found: Object | None = await self.client.get(resource, "", self.webhooks)
+            found: Object | None = await self.client.get(resource, "", self.serving.webhooks)
             if found is None:
                 continue
             webhooks: list[Any] = found.get("webhooks") or []
             if any(each["clientConfig"].get("caBundle") != bundle for each in webhooks):
                 changed = [{"name": each["name"], "clientConfig": {"caBundle": bundle}} for each in webhooks]
-                await self.client.merge_members(resource, self.webhooks, {"webhooks": changed})
+                await self.client.merge_members(resource, self.serving.webhooks, {"webhooks": changed})
                 log.info("wrote the CA of the webhook's certificate into the %s", resource.kind)
 
 
@@ -136,13 +121,18 @@ def _trusted(secret: Object, now: datetime.datetime) -> bytes:
 
 @asynccontextmanager
 async def issuing(client: Client, serving: Serving | None) -> AsyncIterator[None]:
-    """Keep the webhook's certificate valid while the block runs, where the manager makes it; see `Issuing.first`."""
+    """Keep the webhook's certificate valid while the block runs, where the manager makes it.
+
+    First it waits for a certificate, however long the API server takes to answer. Raises ConfigurationError where the
+    Secret does not exist, and ApiError where the API server refuses for good.
+    """
     if serving is None or not serving.service:
         yield
         return
-    made = Issuing(client, serving.service, serving.secret, serving.webhooks, serving.certificates)
-    await made.first()
-    following = asyncio.create_task(made.follow(), name="issuing")
+    look = Issuing(client, serving).look
+    await until_answered(look)
+    renewing = repeatedly(look, EVERY, "cannot renew the webhook's certificate")
+    following = asyncio.create_task(renewing, name="issuing")
     try:
         yield
     finally:

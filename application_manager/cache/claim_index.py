@@ -9,14 +9,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 from application_manager.cache.budget_index import BudgetIndex
-from application_manager.cache.store import Entry
-from application_manager.core.claims.claims import (
-    Claim,
-    Refused,
-    TemplateState,
-    all_instances,
-    template_of_all,
-)
+from application_manager.cache.store import Entry, Groups
+from application_manager.core.claims.claims import Claim, Refused, TemplateState, all_instances, template_of_all
 from application_manager.core.claims.operations import Standing, Verdict
 from application_manager.core.demand.demand import claim_or_verdict, finished
 from application_manager.core.holders.leases import HolderKey
@@ -54,8 +48,8 @@ class ClaimIndex:
         self._unsettled: dict[Name, set[Name]] = {}  # of these, the tasks that were there at the beginning
         self._claims: dict[Name, Claim] = {}
         self._verdicts: dict[Name, Verdict] = {}
-        self._by_instance: dict[Name, dict[Name, Claim]] = {}
-        self._by_template: dict[Name, dict[Name, ApplicationTask]] = {}
+        self._by_instance: Groups[Name, Name, Claim] = Groups()
+        self._by_template: Groups[Name, Name, ApplicationTask] = Groups()
         self._templates: dict[Name, Name] = {}  # task → template
 
     def note(self, name: Name, entry: Entry, template: TemplateState) -> set[Name]:
@@ -96,7 +90,7 @@ class ClaimIndex:
         assert claimed is not None  # noqa: S101  what is being computed has returned above
         instance = (name[0], claimed.instance)
         self._claims[name] = claimed
-        self._by_instance.setdefault(instance, {})[name] = claimed
+        self._by_instance.put(instance, name, claimed)
         return touched | {instance}
 
     def _beforehand(self, entry: Entry, task: ApplicationTask) -> Verdict | None:
@@ -118,7 +112,7 @@ class ClaimIndex:
     def _file(self, name: Name, task: ApplicationTask) -> None:
         of = (name[0], task.spec.template_name)
         self._templates[name] = of
-        self._by_template.setdefault(of, {})[name] = task
+        self._by_template.put(of, name, task)
 
     def _resolve(self, name: Name, found: Claim | Verdict | None) -> None:
         """Note that a task's claim is known; one that takes too much to work out is as unknown as before."""
@@ -155,12 +149,12 @@ class ClaimIndex:
         self._verdicts.pop(name, None)
         of = self._templates.pop(name, None)
         if of is not None:
-            _discard(self._by_template, of, name)
+            self._by_template.drop(of, name)
         claimed = self._claims.pop(name, None)
         if claimed is None:
             return set()
         instance = (name[0], claimed.instance)
-        _discard(self._by_instance, instance, name)
+        self._by_instance.drop(instance, name)
         return {instance}
 
     def verdict(self, name: Name) -> Verdict | None:
@@ -199,13 +193,3 @@ class ClaimIndex:
     def instances(self) -> Iterable[Name]:
         """The instances that are claimed."""
         return list(self._by_instance)
-
-
-def _discard(
-    index: dict[Name, dict[Name, Claim]] | dict[Name, dict[Name, ApplicationTask]], at: Name, of: Name
-) -> None:
-    members = index.get(at)
-    if members is not None:
-        members.pop(of, None)
-        if not members:
-            del index[at]

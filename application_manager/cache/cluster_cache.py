@@ -11,7 +11,7 @@ from application_manager.cache.fallback_index import FallbackIndex
 from application_manager.cache.overlap_index import OverlapIndex
 from application_manager.cache.place_index import PlaceIndex
 from application_manager.cache.pod_index import PodIndex
-from application_manager.cache.store import Store
+from application_manager.cache.store import Groups, Store
 from application_manager.core.claims.claims import Claim, InvalidTemplate, TemplateState, template_of_all
 from application_manager.core.claims.operations import Verdict
 from application_manager.core.demand.deciding import (
@@ -128,7 +128,7 @@ class ClusterCache:
     overlap: OverlapIndex = field(default_factory=OverlapIndex)
     places: PlaceIndex = field(default_factory=PlaceIndex)
     _limits: dict[str, dict[str, int]] = field(default_factory=dict)  # by namespace, of its templates
-    exceeded: dict[Name, dict[Name, str]] = field(default_factory=dict)
+    exceeded: Groups[Name, Name, str] = field(default_factory=Groups)
     _findings: dict[Name, tuple[_Version, Findings]] = field(default_factory=dict)
 
     def __post_init__(self, full: Callable[[], bool], tasks: TaskPolicy | None) -> None:
@@ -179,6 +179,11 @@ class ClusterCache:
             and isinstance(entry.model, ApplicationInstance)
             and entry.model.spec.template_name == template[1]
         ]
+
+    def record_of(self, instance: ApplicationInstance) -> WorkRecord | None:
+        """How the last work on the instance went; None where this process did none."""
+        record = self.records.get((instance.namespace, instance.name))
+        return record if record is not None and record.uid == instance.metadata.uid else None
 
     def decide(self, name: Name, now: float) -> Decided:
         """What should become of the instance as of `now`, in seconds since 1970, and which others to enqueue."""

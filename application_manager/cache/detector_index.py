@@ -47,11 +47,10 @@ class DetectorIndex:
         found: dict[Name, list[Trouble]] = {}
         for pod in pods:
             if _deployment_of(pod) in deployments and (each := trouble(pod)) is not None:
-                found.setdefault(_detector_of(pod), []).append(each)
+                found.setdefault(_detector_of(pod, DETECTOR_LABEL), []).append(each)
         self.requesting = {}
         for pod in requesting:
-            metadata = pod["metadata"]
-            self.requesting.setdefault((metadata["namespace"], metadata["labels"][SIDECAR_LABEL]), []).append(pod)
+            self.requesting.setdefault(_detector_of(pod, SIDECAR_LABEL), []).append(pod)
         self._troubles = {name: summary(troubles) for name, troubles in found.items()}
 
     def owned(self, uid: str) -> dict[str, Object]:
@@ -72,6 +71,5 @@ def _deployment_of(pod: Object) -> tuple[str, str] | None:
     return metadata["namespace"], str(controller["name"]).removesuffix(ending)
 
 
-def _detector_of(raw: Object) -> Name:
-    metadata = raw["metadata"]
-    return metadata["namespace"], metadata["labels"][DETECTOR_LABEL]
+def _detector_of(pod: Object, label: str) -> Name:
+    return pod["metadata"]["namespace"], pod["metadata"]["labels"][label]

@@ -6,7 +6,7 @@ are nearly all, nothing is kept here.
 
 from __future__ import annotations
 
-from application_manager.cache.store import name_of
+from application_manager.cache.store import Groups, name_of
 from application_manager.core.health.pods import Trouble, summary, trouble
 from application_manager.core.objects.ownership import instance_of
 from application_manager.core.objects.policy import Name
@@ -17,7 +17,7 @@ class PodIndex:
     """Troubles of pods."""
 
     def __init__(self) -> None:
-        self._troubles: dict[Name, dict[Name, Trouble]] = {}
+        self._troubles: Groups[Name, Name, Trouble] = Groups()
 
     def note(self, pod: Object) -> bool:
         """Note a pod as it is now; whether that changes the `troubles` of its instance."""
@@ -27,9 +27,9 @@ class PodIndex:
         before = self.troubles(instance)
         found = trouble(pod)
         if found is None:
-            self._drop(instance, name_of(pod))
+            self._troubles.drop(instance, name_of(pod))
         else:
-            self._troubles.setdefault(instance, {})[name_of(pod)] = found
+            self._troubles.put(instance, name_of(pod), found)
         return before != self.troubles(instance)
 
     def forget(self, pod: Object) -> bool:
@@ -38,17 +38,9 @@ class PodIndex:
         if instance is None:
             return False
         before = self.troubles(instance)
-        self._drop(instance, name_of(pod))
+        self._troubles.drop(instance, name_of(pod))
         return before != self.troubles(instance)
 
     def troubles(self, instance: Name) -> list[Trouble]:
         """The different troubles of an instance's pods, the most important first."""
-        members = self._troubles.get(instance)
-        return summary(members.values()) if members else []
-
-    def _drop(self, instance: Name, pod: Name) -> None:
-        members = self._troubles.get(instance)
-        if members is not None:
-            members.pop(pod, None)
-            if not members:
-                del self._troubles[instance]
+        return summary(self._troubles.get(instance, {}).values())

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Set
 from dataclasses import dataclass
+from typing import TypeVar
 
 from application_manager.core.claims.parameters import size_problem
 from application_manager.core.objects import trimming
@@ -18,6 +19,10 @@ from wayside.api import ApplicationTask
 from wayside.api.base import Kind
 from wayside.api.documents import parse_object
 from wayside.kubernetes.resources import Object
+
+Group = TypeVar("Group")
+Member = TypeVar("Member")
+Value = TypeVar("Value")
 
 _TOMBSTONES = 10_000  # uids of deleted objects that are remembered; the oldest are forgotten
 
@@ -42,6 +47,21 @@ class Entry:
     def version(self) -> int:
         """The object's resourceVersion, which grows."""
         return int(self.raw["metadata"]["resourceVersion"])
+
+
+class Groups(dict[Group, dict[Member, Value]]):
+    """Values of members, by group; there is no group without members."""
+
+    def put(self, group: Group, member: Member, value: Value) -> None:
+        """Note the value of a member."""
+        self.setdefault(group, {})[member] = value
+
+    def drop(self, group: Group, member: Member) -> None:
+        """Forget a member, if it is there."""
+        members = self.get(group, {})
+        members.pop(member, None)
+        if not members:
+            self.pop(group, None)
 
 
 class Store:
@@ -71,9 +91,8 @@ class Store:
         kind, name = kind_of(raw), name_of(raw)
         uid = raw["metadata"]["uid"]
         known = self.get(kind, name)
-        if uid in self._deleted:
-            return None
-        if known is not None and known.version >= int(raw["metadata"]["resourceVersion"]):
+        version = int(raw["metadata"]["resourceVersion"])
+        if uid in self._deleted or (known is not None and known.version >= version):
             return None
         if known is None and kind[1] == ApplicationTask.__name__:
             if not _was_served(raw) and self._full():

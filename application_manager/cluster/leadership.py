@@ -15,6 +15,7 @@ import time
 from dataclasses import dataclass
 
 from application_manager.measures import Measures
+from wayside.api.applicationtemplate import TemplateManager
 from wayside.kubernetes.client import Client
 from wayside.kubernetes.connection import pod_namespace
 from wayside.kubernetes.errors import ApiError, RequestError, Unreachable
@@ -107,10 +108,10 @@ class Leadership:
         return self.remaining() > 0
 
     @property
-    def lease(self) -> tuple[str, str] | None:
-        """The Lease's namespace and name, and when it was created; None while it was not seen."""
+    def lease(self) -> TemplateManager | None:
+        """The Lease, and when it was created, as statuses of templates have it; None while it was not seen."""
         created = self._candidate.created
-        return (str(self._key), created) if created else None
+        return TemplateManager(lease=str(self._key), since=created) if created else None
 
     @property
     def role(self) -> str:

@@ -30,8 +30,8 @@ _contexts: Any = list_kube_config_contexts  # the package claims to be typed, ye
 
 _PODS = Resource("v1", "Pod", "pods")
 
-_TASK_WORDS = frozenset({"task", "apptask", "applicationtask", "applicationtasks"})
-_INSTANCE_WORDS = frozenset({"instance", "appinst", "applicationinstance", "applicationinstances"})
+_TASK_WORDS = frozenset({"", "task", "apptask", "applicationtask", "applicationtasks"})
+_INSTANCE_WORDS = frozenset({"", "instance", "appinst", "applicationinstance", "applicationinstances"})
 
 
 class InquiryError(InputError):
@@ -64,10 +64,11 @@ def _namespace_of_context() -> str:
 
 async def _inquire(client: Client, subject: str, namespace: str) -> Explanation:
     kind, _, name = subject.rpartition("/")
-    task = await _read(client, TASKS, ApplicationTask, namespace, name, kind, _TASK_WORDS)
-    existing = await _read(client, INSTANCES, ApplicationInstance, namespace, name, kind, _INSTANCE_WORDS)
-    if kind and kind.lower() not in _TASK_WORDS | _INSTANCE_WORDS:
+    of = kind.lower()
+    if of not in _TASK_WORDS | _INSTANCE_WORDS:
         raise InquiryError(f"{subject}: {kind} is not a kind: write task/{name} or instance/{name}")
+    task = await _read(client, TASKS, ApplicationTask, namespace, name) if of in _TASK_WORDS else None
+    existing = await _read(client, INSTANCES, ApplicationInstance, namespace, name) if of in _INSTANCE_WORDS else None
     if task is None and existing is None:
         what = kind or "ApplicationTask or ApplicationInstance"
         raise InquiryError(
@@ -97,18 +98,8 @@ async def _inquire(client: Client, subject: str, namespace: str) -> Explanation:
     return explanation_of(whole, task=task.name if task else None, instance=instance, now=now)
 
 
-async def _read(
-    client: Client,
-    resource: Resource,
-    model: type[Model],
-    namespace: str,
-    name: str,
-    kind: str = "",
-    words: frozenset[str] = frozenset(),
-) -> Model | None:
-    """The object, or None where there is none or another kind was requested."""
-    if kind and kind.lower() not in words:
-        return None
+async def _read(client: Client, resource: Resource, model: type[Model], namespace: str, name: str) -> Model | None:
+    """The object, or None where there is none."""
     raw = await client.get(resource, namespace, name)
     if raw is None:
         return None

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,8 +19,6 @@ from application_manager.core.objects.charts import Charts, no_charts
 from application_manager.core.objects.policy import Policy
 from application_manager.core.objects.rendering import Renderer, RenderError
 from wayside.api import ApplicationTask, ApplicationTemplate, Kind
-from wayside.api.documents import load_documents
-from wayside.manifests import to_yaml
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,27 +34,6 @@ class OfflineResult:
     objects: list[dict[str, Any]] = field(default_factory=list)
     refusals: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
-
-    @property
-    def text(self) -> str:
-        """The objects as YAML documents."""
-        return to_yaml(self.objects)
-
-
-def render_files(
-    paths: Iterable[Path], policy: Policy, limit: int | None = None, charts: Charts = no_charts
-) -> OfflineResult:
-    """What the templates and tasks in the files make run; other kinds are passed over.
-
-    Args:
-        paths: files or folders.
-        policy: what templates may create.
-        limit: how many instances a namespace may have; None: any number.
-        charts: renders charts.
-
-    Raises DocumentError for files that cannot be read as our kinds.
-    """
-    return render_objects([document.object for document in load_documents(paths)], policy, time.time(), limit, charts)
 
 
 def charts_at_once(helm: HelmRunner, cache: Path | None, folder: Path) -> Charts:

@@ -14,7 +14,6 @@ from application_manager.core.objects.policy import KindKey
 from application_manager.measures import gauge, gauges
 from wayside.api.applicationinstance import InstancePhase
 from wayside.api.applicationtask import TaskPhase
-from wayside.kubernetes.resources import Object
 
 NO_PHASE = "None"
 """The phase of what the manager has not looked at yet."""
@@ -31,7 +30,8 @@ class Overview(Collector):
         """The metrics as of now."""
         yield self._phases("tasks", "ApplicationTasks by phase", TASK, TaskPhase)
         yield self._phases("instances", "ApplicationInstances by phase", INSTANCE, InstancePhase)
-        accepted = Counter(_accepted(entry.raw) for _, entry in self._cache.store.all(TEMPLATE))
+        statuses = (entry.raw.get("status") or {} for _, entry in self._cache.store.all(TEMPLATE))
+        accepted = Counter(find_raw(each, "Accepted").get("status", "Unknown") for each in statuses)
         by_status = [(each, accepted[each]) for each in ("True", "False", "Unknown")]
         yield gauges("templates", "ApplicationTemplates by Accepted", "accepted", by_status)
         queues = list(self._queues())
@@ -54,7 +54,3 @@ class Overview(Collector):
         stored = (entry.raw.get("status") or {} for _, entry in self._cache.store.all(kind))
         found = Counter(each.get("phase") or NO_PHASE for each in stored)
         return gauges(name, text, "phase", [(each, found[each]) for each in (*phases, NO_PHASE)])
-
-
-def _accepted(raw: Object) -> str:
-    return str(find_raw(raw.get("status") or {}, "Accepted").get("status", "Unknown"))

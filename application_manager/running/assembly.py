@@ -28,14 +28,13 @@ from application_manager.work.configurations import ConfigurationWork
 from application_manager.work.detectors import DetectorWork, SidecarEvents
 from application_manager.work.instances import InstanceWork
 from application_manager.work.instancestatus import InstanceStatusWork
+from application_manager.work.judging import RuleKey, RuleWork, TemplateWork
 from application_manager.work.publishing import Publisher
 from application_manager.work.recorder import Recorder
 from application_manager.work.rendering import Renderings
-from application_manager.work.rulework import RuleKey, RuleWork
 from application_manager.work.statuses import StatusWriter
 from application_manager.work.suspending import Suspending
 from application_manager.work.tasks import TaskWork
-from application_manager.work.templates import TemplateWork
 from application_manager.workers.answers import AnswerCache
 from application_manager.workers.claiming import Claiming
 from application_manager.workers.pool import Pool

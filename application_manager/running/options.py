@@ -45,7 +45,7 @@ class Options:
     admission: Serving | None = None
     lease: LeaseKey = field(default_factory=lambda: LeaseKey("default"))
     stalled_after: float = STALLED_AFTER
-    watch_timeout: float = 90.0
+    watch_timeout: float = 90.0  # the API server sends each watch a bookmark a minute
     detectors: PodDefaults | None = None
     memory_limit: int | None = None
     cpu_time: float = CPU_TIME

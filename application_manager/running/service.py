@@ -10,10 +10,8 @@ from __future__ import annotations
 import asyncio
 import logging
 import signal
-from collections.abc import Coroutine
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import kopf
 
@@ -36,8 +34,7 @@ from application_manager.watching.leasewatch import LeaseWatch
 from application_manager.watching.listing import Listing
 from application_manager.watching.operator import watch
 from application_manager.watching.pulse import Pulse
-from application_manager.work.acting import acting, ended
-from wayside.api.applicationtemplate import TemplateManager
+from application_manager.work.acting import acting, done_before, ended
 from wayside.kubernetes.connection import ConfigurationError, load_configuration
 from wayside.kubernetes.errors import ApiError
 from wayside.kubernetes.pacing import Pacing, Share
@@ -100,7 +97,7 @@ class Manager:
             every=options.resync,
             measures=measures,
         )
-        work.cache.overlap.own = self._own_lease
+        work.cache.overlap.own = lambda: leadership.lease
         self._pulse = Pulse(options.watch_timeout, lambda: work.cache.healthy.elapsed)
         measures.registry.register(self._pulse)
         self._detector_watch = DetectorWatch(
@@ -149,7 +146,7 @@ class Manager:
             webhook(self._work.options.admission, review_handlers),
         ):
             try:
-                if await _until(stop, self._first()):
+                if await done_before(stop, self._first()):
                     await self._watch_and_act(watching, stop)
                 else:
                     await self._leadership.release()
@@ -220,20 +217,13 @@ class Manager:
             self._listing.children,
             observe=self._work.router.observe,
             vanished=self._work.router.vanished,
-            relist=self._relist,
+            relist=self._listing.again,
             failed=self._work.measures.unhandled,
             connect=self._connection,
             namespaces=self._work.options.namespaces,
             ready=watching,
             pulse=self._pulse,
         )
-
-    def _own_lease(self) -> TemplateManager | None:
-        found = self._leadership.lease
-        return TemplateManager(lease=found[0], since=found[1]) if found is not None else None
-
-    async def _relist(self, resource: Any, namespace: str | None, labels: str) -> None:
-        await self._listing.again(resource.group, resource.plural, namespace, labels)
 
     async def _connection(self) -> kopf.ConnectionInfo:
         configuration = self._work.client.configuration
@@ -255,17 +245,3 @@ def _on_signals(stop: asyncio.Event) -> None:
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
-
-
-async def _until(stop: asyncio.Event, work: Coroutine[None, None, None]) -> bool:
-    """Do the work unless `stop` is set; whether it was done."""
-    working = asyncio.create_task(work)
-    stopping = asyncio.create_task(stop.wait())
-    await asyncio.wait((working, stopping), return_when=asyncio.FIRST_COMPLETED)
-    stopping.cancel()
-    if not working.done():
-        working.cancel()
-        await asyncio.gather(working, return_exceptions=True)
-        return False
-    working.result()
-    return True

@@ -7,6 +7,7 @@ import logging
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from application_manager.cache.cluster_cache import OWN, ClusterCache
 from application_manager.cache.store import name_of
@@ -61,13 +62,13 @@ class Listing:
             self.cache.leases.forget_except(self.cache.claims.holders())
             await asyncio.sleep(max(0.0, self.every - (time.monotonic() - began)))
 
-    async def again(self, group: str, plural: str, namespace: str | None, labels: str) -> None:
-        """List a kind, in a namespace or (None) in all, and route both the objects found and the deletions missed.
+    async def again(self, of_kopf: Any, namespace: str | None, labels: str) -> None:
+        """List one of kopf's resources, in a namespace or (None) in all, and route the objects and missed deletions.
 
-        Raises ApiError or Unreachable.
+        Raises RequestError.
         """
         for resource in (LEASES, *OWN.values(), *self.children):
-            if (resource.group, resource.plural) == (group, plural):
+            if (resource.group, resource.plural) == (of_kopf.group, of_kopf.plural):
                 await self._list(resource, labels, (namespace,))
 
     async def _everything(self) -> None:

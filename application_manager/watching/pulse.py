@@ -21,9 +21,6 @@ from prometheus_client.registry import Collector
 
 from application_manager.measures import PREFIX, gauges
 
-WATCH_TIMEOUT = 90.0
-"""Seconds without an event or a bookmark after which a watch is restarted: the API server sends one a minute."""
-
 NEVER = 10 * 365 * 86400.0
 """Seconds: for kopf's own timeout."""
 

@@ -57,7 +57,7 @@ async def acting(
     stopping = asyncio.create_task(stop.wait(), name="stop")
     again = not leadership.active
     try:
-        while await _first(leadership.wait_active(), stopping):
+        while await done_before(stop, leadership.wait_active()) and not stop.is_set():
             over = asyncio.create_task(leadership.wait_over(), name="lost")
             work = asyncio.create_task(_work(queues, reporters, begin, again), name="work")
             try:
@@ -109,14 +109,16 @@ async def ended(*tasks: asyncio.Task[Any]) -> None:
         _, pending = await asyncio.wait(pending, timeout=_AGAIN)
 
 
-async def _first(wanted: Coroutine[None, None, None], stopping: asyncio.Task[bool]) -> bool:
-    """Whether the wanted comes before the end."""
-    waiting = asyncio.create_task(wanted)
+async def done_before(stop: asyncio.Event, work: Coroutine[None, None, None]) -> bool:
+    """Do the work unless `stop` is set meanwhile; whether it was done. Raises what the work does."""
+    working, stopping = asyncio.create_task(work), asyncio.create_task(stop.wait())
     try:
-        await asyncio.wait((waiting, stopping), return_when=asyncio.FIRST_COMPLETED)
-        return not stopping.done()
+        await asyncio.wait((working, stopping), return_when=asyncio.FIRST_COMPLETED)
+        if working.done():
+            working.result()
+        return working.done()
     finally:
-        waiting.cancel()
+        await ended(working, stopping)
 
 
 async def _release(leadership: Leadership, client: Client) -> None:

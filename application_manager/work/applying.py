@@ -14,7 +14,7 @@ import re
 import time
 from collections.abc import Iterable, Mapping, Sequence
 
-from application_manager.cache.store import Store
+from application_manager.cache.store import Groups, Store
 from application_manager.core.conditions import Aspect
 from application_manager.core.health.refusals import (
     ADMISSION_REFUSED,
@@ -58,7 +58,7 @@ class Applier:
         self._resources = dict(resources)
         self._fields: dict[str, str] = {}  # uid → the fields that are ours, as of our last apply
         self._drifted: set[str] = set()
-        self._controlled: dict[str, dict[str, ObjectKey]] = {}  # uid of the controller → uid → object
+        self._controlled: Groups[str, str, ObjectKey] = Groups()  # uid of the controller → uid → object
 
     def live(self, namespace: str, key: ObjectKey) -> Object | None:
         """The object, where we watch it: it has an instance's label."""
@@ -70,7 +70,7 @@ class Applier:
         uid, fields = raw["metadata"]["uid"], our_fields(raw)
         if self._fields.setdefault(uid, fields) != fields:
             self._drifted.add(uid)
-        self._controlled.setdefault(controller_uid(raw) or "", {})[uid] = object_key(raw)
+        self._controlled.put(controller_uid(raw) or "", uid, object_key(raw))
 
     def has_drifted(self, uid: str) -> bool:
         """Whether somebody took a field of the object from us."""
@@ -88,12 +88,7 @@ class Applier:
         uid = raw["metadata"]["uid"]
         self._fields.pop(uid, None)
         self._drifted.discard(uid)
-        controller = controller_uid(raw) or ""
-        members = self._controlled.get(controller)
-        if members is not None:
-            members.pop(uid, None)
-            if not members:
-                del self._controlled[controller]
+        self._controlled.drop(controller_uid(raw) or "", uid)
 
     def pending(self, instance: ApplicationInstance, rendering: Rendering, known: Known) -> list[Manifest]:
         """The manifests that need applying: all of a new rendering, else those that are missing or have drifted."""
@@ -157,7 +152,8 @@ class Applier:
         for key in (recorded.keys() | set(controlled.values())) - wanted:
             await self._prune(instance, key)
             uids.pop(key, None)
-        done = Aspect("Applied", True, "Applied", _counted(len(wanted)))
+        matching = "1 object matches" if len(wanted) == 1 else f"{len(wanted)} objects match"
+        done = Aspect("Applied", True, "Applied", f"{matching} the template")
         return Applied(done, references(uids), complete=True, took=(began, time.time_ns()))
 
     async def _apply_one(
@@ -245,7 +241,3 @@ def _readable(message: str) -> str:
     if "expected string, got" in plain:
         plain += " (a value inside other text becomes text; alone, it keeps its type)"
     return f"{plain}: correct the template"
-
-
-def _counted(count: int) -> str:
-    return "1 object matches the template" if count == 1 else f"{count} objects match the template"

@@ -37,7 +37,7 @@ class ConfigurationWork:
     async def reconcile(self, name: Name) -> None:
         """Publish the instance's configuration, and announce it to those of its pods that do not have it.
 
-        Raises ApiError or Unreachable for what may pass; the caller tries again.
+        Raises RequestError for what may pass.
         """
         instance = self.cache.instance(name)
         live = self.applier.live(name[0], config_map_key(name[1]))
@@ -73,10 +73,7 @@ class ConfigurationWork:
         return count
 
     def _workloads(self, name: Name, instance: ApplicationInstance) -> list[Object]:
-        record = self.cache.records.get(name)
-        if record is not None and record.uid == instance.metadata.uid:
-            objects = list(record.applied.objects)
-        else:
-            objects = list(instance.status.objects) if instance.status else []
+        record, status = self.cache.record_of(instance), instance.status
+        objects = record.applied.objects if record is not None else status.objects if status else ()
         found = (self.applier.live(name[0], reference_key(each)) for each in objects)
         return [each for each in found if each is not None]

@@ -13,9 +13,8 @@ import hashlib
 import json
 import logging
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Any
 
 from application_manager.cache.cluster_cache import DETECTOR, ClusterCache
 from application_manager.cache.detector_index import DetectorIndex
@@ -70,7 +69,8 @@ class SidecarEvents:
         before, posted, now = self._posted.pop(name, {}), dict[str, _Posted](), time.time()
         for pod in self.index.requesting.get(name, []):
             metadata, spec = pod["metadata"], pod["spec"]
-            if has_sidecar(spec) or metadata.get("deletionTimestamp") or not _is_new(metadata, now):
+            age = now - parse_seconds(metadata["creationTimestamp"])
+            if has_sidecar(spec) or metadata.get("deletionTimestamp") or age >= NEW:
                 continue
             uid, last = metadata["uid"], before.get(metadata["uid"])
             if last is not None and last.version == version:
@@ -99,10 +99,7 @@ class DetectorWork:
     _applied: dict[str, tuple[str, str]] = field(default_factory=dict)  # uid → what was applied, and our fields since
 
     async def reconcile(self, name: Name) -> None:
-        """Make the Detector's objects, and note whether it runs.
-
-        Raises ApiError or Unreachable for what may pass; the caller tries again.
-        """
+        """Make the Detector's objects, and note whether it runs. Raises RequestError for what may pass."""
         entry = self.cache.store.get(DETECTOR, name)
         self.sidecars.report(name)
         if entry is None:
@@ -190,7 +187,3 @@ class DetectorWork:
             self.index.owned(uid).pop(kind, None)
             self._applied.pop(raw["metadata"]["uid"], None)
             log.info("detector %s/%s: removed %s %s", *name, kind, raw["metadata"]["name"])
-
-
-def _is_new(metadata: Mapping[str, Any], now: float) -> bool:
-    return now - parse_seconds(metadata["creationTimestamp"]) < NEW

@@ -128,10 +128,7 @@ class InstanceWork:
     not_made: Callable[[Name, Decision, str], None] = lambda *_: None
 
     async def reconcile(self, name: Name) -> None:
-        """Make the cluster match what is demanded of this instance.
-
-        Raises ApiError or Unreachable for what may pass; the caller tries again.
-        """
+        """Make the cluster match what is demanded of this instance. Raises RequestError for what may pass."""
         try:
             await self._reconcile(name)
         except ApiError as error:

@@ -51,16 +51,13 @@ class InstanceStatusWork:
     again: Callable[[Name, float], None]
 
     async def reconcile(self, name: Name) -> None:
-        """Write the instance's status if it differs.
-
-        Raises ApiError or Unreachable for what may pass; the caller tries again.
-        """
-        instance, record = self.cache.instance(name), self.cache.records.get(name)
-        if instance is None or record is None or record.uid != instance.metadata.uid:
+        """Write the instance's status if it differs. Raises RequestError for what may pass."""
+        instance = self.cache.instance(name)
+        if instance is None or (record := self.cache.record_of(instance)) is None:
             return
         looked_up = await self._looked_up(instance, record.applied)
-        instance, record = self.cache.instance(name), self.cache.records.get(name)
-        if instance is None or record is None or record.uid != instance.metadata.uid:
+        instance = self.cache.instance(name)
+        if instance is None or (record := self.cache.record_of(instance)) is None:
             return
         now = time.time()
         old = instance.status or ApplicationInstanceStatus()

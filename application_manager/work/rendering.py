@@ -10,21 +10,26 @@ import pickle
 from collections import OrderedDict
 from collections.abc import Callable
 from functools import partial
+from typing import TypeVar
 
 from application_manager.cache.cluster_cache import ClusterCache
 from application_manager.core.claims.claims import TemplateState
 from application_manager.core.conditions import Aspect
 from application_manager.core.demand import drafting
-from application_manager.core.objects.charts import ChartFailure, ChartOutcome, ChartRequest, Charts
+from application_manager.core.objects.charts import ChartOutcome, ChartRequest, Charts
+from application_manager.core.objects.ownership import Obstacle
 from application_manager.core.objects.policy import Name
 from application_manager.core.objects.rendering import Rendering
 from application_manager.workers.answers import AnswerCache, Exceeded
-from application_manager.workers.jobs import RenderProblem, objects_are_plain, render, values_are_small
+from application_manager.workers.jobs import objects_are_plain, render, values_are_small
 from application_manager.workers.process import Job
 from wayside.api import ApplicationInstance, ApplicationTemplate
 
 _PICKLED = 64  # templates that are kept as bytes
 _JUDGED = 1024  # templates of which is known whether they are plain
+
+Value = TypeVar("Value")
+_OfTemplates = OrderedDict[tuple[str, int], Value]  # by uid and generation
 
 
 class Renderings:
@@ -44,8 +49,8 @@ class Renderings:
         self._charts = charts
         self._again = again
         self._template_changed = template_changed
-        self._pickled: OrderedDict[tuple[str, int], bytes] = OrderedDict()
-        self._plain: OrderedDict[tuple[str, int], bool] = OrderedDict()
+        self._pickled: _OfTemplates[bytes] = OrderedDict()
+        self._plain: _OfTemplates[bool] = OrderedDict()
 
     def objects(self, wanted: ApplicationInstance, template: TemplateState) -> Rendering | Aspect | None:
         """The instance's objects, or why it has none, as the condition Applied gives it; None: it is enqueued later."""
@@ -57,7 +62,7 @@ class Renderings:
             outcome = self._charts(found)
             if outcome is None:
                 return drafting.chart_pending(template, found)
-            if isinstance(outcome, ChartFailure):
+            if isinstance(outcome, Obstacle):
                 return drafting.problem(template, outcome.reason, outcome.message)
             found = self._answer("chart", wanted, template, outcome)
         name = (wanted.namespace, wanted.name)
@@ -65,7 +70,7 @@ class Renderings:
         match found:
             case Rendering():
                 return found
-            case RenderProblem(reason, message):
+            case Obstacle(reason, message):
                 return drafting.problem(template, reason, message)
             case Exceeded(message):
                 return drafting.problem(template, drafting.EXPRESSION_LIMIT, f"rendering this instance {message}")
@@ -76,7 +81,7 @@ class Renderings:
         for kind in ("rendering", "chart"):
             self._answers.forget((kind, *name))
         for template in [each for each, instances in self._cache.exceeded.items() if name in instances]:
-            self._note(name, template, RenderProblem("", ""))
+            self._note(name, template, Obstacle("", ""))
 
     def _answer(
         self, kind: str, wanted: ApplicationInstance, template: ApplicationTemplate, chart: ChartOutcome | None
@@ -86,9 +91,10 @@ class Renderings:
         bare = wanted.model_copy(update={"status": None})
 
         def job() -> Job[object]:
-            return partial(render, self._bytes(template), self._cache.policy, bare, chart)
+            written = _kept(self._pickled, template, _pickled, _PICKLED)
+            return partial(render, written, self._cache.policy, bare, chart)
 
-        if self._is_plain(template) and values_are_small(bare):
+        if _kept(self._plain, template, objects_are_plain, _JUDGED) and values_are_small(bare):
             return job()()
         return self._answers.answer(
             key=(kind, *name),
@@ -98,38 +104,33 @@ class Renderings:
             done=partial(self._again, name),
         )
 
-    def _is_plain(self, template: ApplicationTemplate) -> bool:
-        key = (template.metadata.uid, template.metadata.generation)
-        if key not in self._plain:
-            self._plain[key] = objects_are_plain(template)
-            while len(self._plain) > _JUDGED:
-                self._plain.popitem(last=False)
-        return self._plain[key]
-
-    def _bytes(self, template: ApplicationTemplate) -> bytes:
-        key = (template.metadata.uid, template.metadata.generation)
-        known = self._pickled.get(key)
-        if known is None:
-            bare = template.model_copy(update={"status": None})
-            known = self._pickled[key] = pickle.dumps(bare, pickle.HIGHEST_PROTOCOL)
-            while len(self._pickled) > _PICKLED:
-                self._pickled.popitem(last=False)
-        self._pickled.move_to_end(key)
-        return known
-
     def _note(self, name: Name, template: Name, found: object | None) -> None:
         """Note whether the instance's rendering exceeds the limit; nothing while it is being computed."""
         if found is None:
             return
-        known = self._cache.exceeded.get(template, {})
-        before = known.get(name)
+        before = self._cache.exceeded.get(template, {}).get(name)
         after = found.message if isinstance(found, Exceeded) else None
         if before == after:
             return
         if after is None:
-            del known[name]
-            if not known:
-                del self._cache.exceeded[template]
+            self._cache.exceeded.drop(template, name)
         else:
-            self._cache.exceeded.setdefault(template, {})[name] = after
+            self._cache.exceeded.put(template, name, after)
         self._template_changed(template)
+
+
+def _kept(
+    known: _OfTemplates[Value], template: ApplicationTemplate, make: Callable[[ApplicationTemplate], Value], most: int
+) -> Value:
+    """What is known of the template, made where it is not; those not requested for longest are forgotten."""
+    key = (template.metadata.uid, template.metadata.generation)
+    if key not in known:
+        known[key] = make(template)
+        if len(known) > most:
+            known.popitem(last=False)
+    known.move_to_end(key)
+    return known[key]
+
+
+def _pickled(template: ApplicationTemplate) -> bytes:
+    return pickle.dumps(template.model_copy(update={"status": None}), pickle.HIGHEST_PROTOCOL)

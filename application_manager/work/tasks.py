@@ -56,7 +56,7 @@ class TaskWork:
     async def reconcile(self, name: Name) -> None:
         """Write the task's status if it differs; delete the task when its time has come.
 
-        Raises ApiError or Unreachable for what may pass; the caller tries again.
+        Raises RequestError for what may pass.
         """
         if name in self.cache.store.shed:
             await self._write_shed(name)

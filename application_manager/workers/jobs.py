@@ -20,6 +20,7 @@ from application_manager.core.findings.demanding import deploy_remarks
 from application_manager.core.findings.findings import Findings
 from application_manager.core.findings.rulefindings import detector_findings, newly_wrong, rule_findings
 from application_manager.core.objects.charts import ChartOutcome, ChartRequest
+from application_manager.core.objects.ownership import Obstacle
 from application_manager.core.objects.policy import Policy
 from application_manager.core.objects.rendering import ChartPending, Renderer, RenderError, Rendering
 from application_manager.core.statuses.rulestatus import rule_status
@@ -33,38 +34,30 @@ _MOST = 256  # expressions in them
 _VALUES = 16 * 1024  # characters of the values: with the above, of 4 MB at most
 
 
-@dataclass(frozen=True, slots=True)
-class RenderProblem:
-    """Why an instance has no objects: as the condition Applied gives it."""
-
-    reason: str
-    message: str
-
-
 def render(
     template: bytes, policy: Policy, instance: ApplicationInstance, chart: ChartOutcome | None = None
-) -> Rendering | RenderProblem | ChartRequest:
+) -> Rendering | Obstacle | ChartRequest:
     """An instance's objects, or why there are none, or the chart that is to be rendered first.
 
     `template` is pickled; `chart` is what became of the instance's chart, where that was requested.
     """
     compiled = _compiled(template, policy)
-    if isinstance(compiled, RenderProblem):
+    if isinstance(compiled, Obstacle):
         return compiled
     try:
         return compiled.render(instance, lambda _: chart)
     except ChartPending as pending:
         return pending.request
     except RenderError as error:
-        return RenderProblem(error.reason, str(error))
+        return Obstacle(error.reason, str(error))
 
 
 @lru_cache(maxsize=_COMPILED)
-def _compiled(template: bytes, policy: Policy) -> Renderer | RenderProblem:
+def _compiled(template: bytes, policy: Policy) -> Renderer | Obstacle:
     try:
         return Renderer(pickle.loads(template), policy)  # noqa: S301  from the manager
     except RenderError as error:
-        return RenderProblem(error.reason, str(error))
+        return Obstacle(error.reason, str(error))
 
 
 @dataclass(frozen=True, slots=True)

@@ -291,6 +291,8 @@ def test_a_restart_and_a_resync_write_nothing(api: Api, processes: Processes, na
     api.create(task("wrong", of="nowhere"))
     there(api, NORTH)
     wait_settled(api)
+    counted = "its status counts the instance"  # which follows a check in a worker process, and may come late
+    api.wait_for("ApplicationTemplate", "app", lambda raw: raw.get("status", {}).get("instances") == 1, what=counted)
     before = quiet(api)
     manager.restart()
     manager.wait_for_output("watching")

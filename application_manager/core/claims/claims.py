@@ -16,14 +16,7 @@ from typing import Any
 from application_manager.core.claims import parameters, values
 from wayside.api import ApplicationTask, ApplicationTemplate
 from wayside.api.operation import Operation
-from wayside.expressions import (
-    CelType,
-    CompiledTemplate,
-    Embedded,
-    Environment,
-    InterpolationError,
-    compile_template,
-)
+from wayside.expressions import CelType, CompiledTemplate, Embedded, Environment, InterpolationError, compile_template
 
 MAXIMUM_KEY_LENGTH = 1024  # characters, as ApplicationInstance's spec.key allows
 

@@ -146,13 +146,11 @@ class _Snapshot:
 
     def fallbacks(self, template: str, now: float) -> list[Fallback]:
         if template not in self._fallbacks:
-            of = [each for each in self._instances.values() if self._falls_to(each.spec.template_name) == template]
+            falling = {name for name, each in self._templates.items() if fallback_of(each) == template}
+            of = [each for each in self._instances.values() if each.spec.template_name in falling]
             turned = (fallback_claims(each, self, now) for each in of)
             self._fallbacks[template] = [each for each in turned if each is not None]
         return self._fallbacks[template]
-
-    def _falls_to(self, template: str) -> str | None:
-        return fallback_of(self._templates.get(template))
 
     def placement(self, name: str, unlimited: Decision | None, now: float) -> Placement | None:
         del name, unlimited

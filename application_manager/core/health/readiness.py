@@ -61,7 +61,7 @@ def _deployment(spec: Mapping[str, Any], status: Mapping[str, Any]) -> str | Non
     problem = _count("available", status.get("availableReplicas"), wanted) or _present(updated, wanted)
     left = (status.get("replicas") or 0) - updated
     if problem is None and left > 0:
-        problem = f"still runs {_pods(left)} of its previous version"
+        problem = f"still runs {left} pod{'' if left == 1 else 's'} of its previous version"
     if problem is None:
         return None
     refused = find_raw(status, "ReplicaFailure")
@@ -140,10 +140,6 @@ def _count(word: str, have: int | None, want: int) -> str | None:
 
 def _present(have: int, want: int) -> str | None:
     return _count("of its current version", have, want)
-
-
-def _pods(count: int) -> str:
-    return "1 pod" if count == 1 else f"{count} pods"
 
 
 def _condition(status: Mapping[str, Any], type_: str) -> bool:

@@ -91,10 +91,7 @@ class LeaseIndex:
         """Note the holder's Lease as it is, None where there is none. Returns whether it changed, i.e. was renewed."""
         identity = _identity(lease)
         known = self._observed.get(key)
-        if known is None:
-            self._observed[key] = _Observation(identity, at, at, _duration(lease))
-            return False
-        if not known.seen and lease is not None:
+        if known is None or (not known.seen and lease is not None):
             self._observed[key] = _Observation(identity, at, at, _duration(lease))
             return False
         known.looked, known.seen = at, True

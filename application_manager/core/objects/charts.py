@@ -14,6 +14,7 @@ from typing import Any
 
 import yaml
 
+from application_manager.core.objects.ownership import Obstacle
 from wayside.api.applicationtemplate import Helm
 
 UNAVAILABLE = "ChartUnavailable"
@@ -72,15 +73,7 @@ class ChartObjects:
     objects: tuple[ChartObject, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class ChartFailure:
-    """Why there is none: the reason of the condition Applied, and the problem with its remedy."""
-
-    reason: str
-    message: str
-
-
-ChartOutcome = ChartObjects | ChartFailure
+ChartOutcome = ChartObjects | Obstacle
 
 Charts = Callable[[ChartRequest], ChartOutcome | None]
 """What came of a request; None where it is still to come."""
@@ -88,7 +81,7 @@ Charts = Callable[[ChartRequest], ChartOutcome | None]
 
 def no_charts(request: ChartRequest) -> ChartOutcome:
     """For where there is no Helm."""
-    return ChartFailure(UNAVAILABLE, f"spec.helm: cannot render chart {request.source} here: helm is not available")
+    return Obstacle(UNAVAILABLE, f"spec.helm: cannot render chart {request.source} here: helm is not available")
 
 
 def parse_chart(source: ChartSource, text: str) -> ChartOutcome:
@@ -114,7 +107,7 @@ def parse_chart(source: ChartSource, text: str) -> ChartOutcome:
     if not objects and not problems:
         problems.append("it renders no objects with these values: correct the values")
     if problems:
-        return ChartFailure(FAILED, f"spec.helm: chart {source}: {'; '.join(problems)}")
+        return Obstacle(FAILED, f"spec.helm: chart {source}: {'; '.join(problems)}")
     return ChartObjects(tuple(objects))
 
 

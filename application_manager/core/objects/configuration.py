@@ -89,8 +89,9 @@ class Configuration:
                 continue
             text = _text(name, value)
             if text is None:
+                kind = "a map" if isinstance(value, dict) else "a list"
                 problems.append(
-                    f"{_path(name)}: is {_kind(value)}, but the file name gives no format: end the name with .yaml "
+                    f"{_path(name)}: is {kind}, but the file name gives no format: end the name with .yaml "
                     "or .json, or give a text"
                 )
             else:
@@ -119,10 +120,6 @@ def _text(name: str, value: Any) -> str | None:
         case "yaml" | "yml":
             return to_yaml([plain])
     return None if isinstance(value, dict | list) else values.canonical(value)
-
-
-def _kind(value: Any) -> str:
-    return "a map" if isinstance(value, dict) else "a list"
 
 
 def fingerprint(files: Mapping[str, str]) -> str:
@@ -157,10 +154,6 @@ def _mounts(pod: Object, config_map: str) -> bool:
 
 def _selector(workload: Object) -> str:
     # What selects the pods, since that never changes; the template's labels may, and older pods keep theirs.
-    labels = ((workload["spec"].get("selector") or {}).get("matchLabels")) or _labels(workload)
+    labels = (workload["spec"].get("selector") or {}).get("matchLabels")
+    labels = labels or (pod_template(workload).get("metadata") or {}).get("labels") or {}
     return ",".join(f"{key}={value}" for key, value in sorted(labels.items()))
-
-
-def _labels(workload: Object) -> Mapping[str, str]:
-    labels: Mapping[str, str] = (pod_template(workload).get("metadata") or {}).get("labels") or {}
-    return labels

@@ -62,7 +62,7 @@ class Applied:
 
 @dataclass(frozen=True, slots=True)
 class Obstacle:
-    """What keeps an object from being applied, as a condition gives it."""
+    """What keeps objects from being applied: the reason of the condition Applied, and the problem with its remedy."""
 
     reason: str
     message: str

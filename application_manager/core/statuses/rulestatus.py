@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import Any
 
 from application_manager.core.conditions import Aspect, concluded
 from application_manager.core.findings.findings import Findings
@@ -22,7 +22,7 @@ from wayside.api.detector import DetectorStatus
 from wayside.api.eventrule import EventRuleStatus
 from wayside.findings import Finding
 
-Status = TypeVar("Status", EventRuleStatus, DetectorStatus)
+Status = EventRuleStatus | DetectorStatus
 
 RULE_INVALID = "RuleInvalid"
 DETECTOR_INVALID = "DetectorInvalid"

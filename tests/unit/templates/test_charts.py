@@ -7,7 +7,8 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from application_manager.core.objects.charts import ChartFailure, ChartObjects, ChartRequest, ChartSource, parse_chart
+from application_manager.core.objects.charts import ChartObjects, ChartRequest, ChartSource, parse_chart
+from application_manager.core.objects.ownership import Obstacle
 from application_manager.core.objects.policy import Policy
 from application_manager.core.objects.rendering import ChartPending, Renderer, RenderError, Rendering
 from tests.unit.manager_objects import instance, template
@@ -34,7 +35,7 @@ def objects(text: str) -> ChartObjects:
 
 def refusal(text: str) -> str:
     outcome = parse_chart(SOURCE, text)
-    assert isinstance(outcome, ChartFailure), outcome
+    assert isinstance(outcome, Obstacle), outcome
     return outcome.message
 
 
