@@ -17,6 +17,7 @@ from typing import Annotated
 import typer
 
 from application_manager.commands.options import (
+    PullPolicy,
     detectors_of,
     lease_of,
     option_bytes,
@@ -26,7 +27,6 @@ from application_manager.commands.options import (
     tasks_of,
 )
 from application_manager.commands.printing import detector_rbac, inject, rbac, webhooks
-from application_manager.core.objects.pullpolicy import PullPolicy
 from wayside.inputerror import InputError
 from wayside.process import commandline
 from wayside.process.beginning import importing

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
 
-from application_manager.core.objects.pullpolicy import PullPolicy
 from wayside.process import commandline
 
 if TYPE_CHECKING:
@@ -21,6 +21,14 @@ if TYPE_CHECKING:
     from application_manager.core.holders.policies import TaskPolicy
     from application_manager.core.objects.poddefaults import PodDefaults
     from application_manager.core.objects.policy import Policy
+
+
+class PullPolicy(StrEnum):
+    """When a node pulls an image, as Kubernetes names it."""
+
+    ALWAYS = "Always"
+    IF_NOT_PRESENT = "IfNotPresent"
+    NEVER = "Never"
 
 
 @contextmanager

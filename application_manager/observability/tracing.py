@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import time
 from collections import OrderedDict
-from collections.abc import Awaitable, Callable, Iterator, Mapping
+from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -108,6 +108,7 @@ class TaskTraces:
             self._remembered(task.metadata.uid).unserved = True
 
     def _reconciled(self, name: Name, began: int, record: WorkRecord) -> None:
+        """Emit `reconcile` and `apply` of each task that the instance serves."""
         ended = time.time_ns()
         served: dict[str, tuple[ApplicationTask, TraceContext]] = {}
         for task_name, verdict in record.decision.verdicts.items():
@@ -115,49 +116,35 @@ class TaskTraces:
             if verdict.standing is Standing.COUNTS and task is not None and (context := _context(task)) is not None:
                 served[task_name] = (task, context)
         for task, context in served.values():
-            self._serves(name, task, context, served, began, ended, record)
-
-    def _serves(
-        self,
-        name: Name,
-        task: ApplicationTask,
-        context: TraceContext,
-        served: Mapping[str, tuple[ApplicationTask, TraceContext]],
-        began: int,
-        ended: int,
-        record: WorkRecord,
-    ) -> None:
-        """Emit `reconcile` and `apply` of a task, unless it was applied before, or this failure was emitted."""
-        if task.status is not None and task.status.applied_time is not None:
-            return
-        known = self._remembered(task.metadata.uid)
-        aspect, took = record.applied.aspect, record.applied.took
-        failure = "" if aspect.holds else f"{aspect.reason}: {aspect.message}"
-        if known.applied or (failure and failure == known.failure):
-            return
-        about = {**_about(task), "wayside.instance": name[1]}
-        links = [other for each, other in served.items() if each != task.name][:_LINKS]
-        known.failure = failure
-        known.reconcile = self._emit(
-            Span(
-                f"reconcile {record.decision.template}",
-                began,
-                ended,
-                parent=context,
-                attributes={**about, "wayside.demands": len(served)},
-                links=[other for _, other in links],
-                error=failure or None,
+            # Unless it was applied before, or this failure was emitted.
+            if task.status is not None and task.status.applied_time is not None:
+                continue
+            known = self._remembered(task.metadata.uid)
+            aspect, took = record.applied.aspect, record.applied.took
+            failure = "" if aspect.holds else f"{aspect.reason}: {aspect.message}"
+            if known.applied or (failure and failure == known.failure):
+                continue
+            about = {**_about(task), "wayside.instance": name[1]}
+            known.failure = failure
+            known.reconcile = self._emit(
+                Span(
+                    f"reconcile {record.decision.template}",
+                    began,
+                    ended,
+                    parent=context,
+                    attributes={**about, "wayside.demands": len(served)},
+                    links=[other for each, (_, other) in served.items() if each != task.name][:_LINKS],
+                    error=failure or None,
+                )
             )
-        )
-        if took is not None:
-            span = Span("apply", *took, parent=known.reconcile, attributes=about, error=failure or None)
-            self._emit(span)
-        if aspect.holds:
-            known.applied = ended
-        if task.status is not None and holds(task.status.conditions, "Finished"):  # it ended during this work
-            if known.unserved:
-                self._finished(task, context, task.status, task.status, ended)
-            self._known.pop(task.metadata.uid, None)
+            if took is not None:
+                self._emit(Span("apply", *took, parent=known.reconcile, attributes=about, error=failure or None))
+            if aspect.holds:
+                known.applied = ended
+            if task.status is not None and holds(task.status.conditions, "Finished"):  # it ended during this work
+                if known.unserved:
+                    self._finished(task, context, task.status, task.status, ended)
+                self._known.pop(task.metadata.uid, None)
 
     def _ready(
         self, task: ApplicationTask, context: TraceContext, status: ApplicationTaskStatus, now: int, failure: str | None

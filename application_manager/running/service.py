@@ -193,7 +193,7 @@ class Manager:
             stop,
         )
 
-    async def _begin(self, *, again: bool) -> None:
+    async def _begin(self, again: bool) -> None:
         """Get ready to act. Where others may have acted since we looked, what we know comes from the cluster alone."""
         if again:  # else it is listed since the Lease is ours
             self._work.begin_term(self._listing.children)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Coroutine, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from typing import Any, Protocol
 
 from application_manager.cluster.leadership import Leadership
@@ -24,11 +24,8 @@ _AGAIN = 0.5  # s until a task that continues is cancelled again
 log = logging.getLogger(__name__)
 
 
-class Begin(Protocol):
-    """Gets ready to act; `again`: somebody else may have acted since the first look at everything."""
-
-    async def __call__(self, *, again: bool) -> None:
-        """Get ready."""
+Begin = Callable[[bool], Awaitable[None]]
+"""Gets ready to act; True: somebody else may have acted since the first look at everything."""
 
 
 class ActiveWork(Protocol):
@@ -78,7 +75,7 @@ async def acting(
 
 async def _work(queues: Sequence[ActiveWork], reporters: Sequence[ActiveWork], begin: Begin, again: bool) -> None:
     """Act; returns once all queues have finished, and then all reporters."""
-    await begin(again=again)
+    await begin(again)
     working = asyncio.create_task(_run(queues), name="queues")
     reporting = asyncio.create_task(_run(reporters), name="reporters")
     try:

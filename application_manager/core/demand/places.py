@@ -175,16 +175,11 @@ def places(candidates: Iterable[PlaceCandidate], limits: Limits, now: float) -> 
     result |= {
         each.name: GrantedPlace(preempts=victims[each.name].text if each.name in victims else "") for each in chosen
     }
-    bars, none = _bars(chosen, limits, now), _Bar(None, None)
+    bars = _bars(chosen, limits, now)
     for each in losers:
-        bar = bars.get("" if limits.namespace is not None else each.template, none)
-        result[each.name] = GrantedPlace(
-            given=False,
-            limit=beyond[each.name],
-            yields_to=by[each.name][1].text if each.name in by else "",
-            outbid_from=bar.outbid_from,
-            next_change=bar.next_change,
-        )
+        bar = bars.get("" if limits.namespace is not None else each.template, GrantedPlace(given=False))
+        yields_to = by[each.name][1].text if each.name in by else ""
+        result[each.name] = replace(bar, limit=beyond[each.name], yields_to=yields_to)
     result |= _waiting(everybody, chosen, result, limits)
     return result
 
@@ -253,21 +248,11 @@ def _preemptions(
     return found
 
 
-@dataclass(frozen=True, slots=True)
-class _Bar:
-    """What it takes to get a place among those that have one.
+def _bars(chosen: Iterable[PlaceCandidate], limits: Limits, now: float) -> dict[str, GrantedPlace]:
+    """What it takes to get a place among those that have one, and when the first of them may be stopped.
 
-    Attributes:
-        outbid_from: the lowest priority that would have one; None where none would.
-        next_change: when the first of them may be stopped, in seconds since 1970.
+    By template; by an empty name that of all together, where the namespace has a limit.
     """
-
-    outbid_from: int | None
-    next_change: float | None
-
-
-def _bars(chosen: Iterable[PlaceCandidate], limits: Limits, now: float) -> dict[str, _Bar]:
-    """By template; by an empty name that of all together, where the namespace has a limit."""
     groups: dict[str, list[PlaceCandidate]] = {}
     for each in chosen:
         groups.setdefault("" if limits.namespace is not None else each.template, []).append(each)
@@ -277,7 +262,7 @@ def _bars(chosen: Iterable[PlaceCandidate], limits: Limits, now: float) -> dict[
         lowest = min((each.priority for each in movable), default=None)
         ends = [each.protected_until for each in movable if now < each.protected_until]
         outbid_from = None if lowest is None else max(lowest, -BASELINE_RANK[0]) + 1
-        found[name] = _Bar(outbid_from, min(ends, default=None))
+        found[name] = GrantedPlace(given=False, outbid_from=outbid_from, next_change=min(ends, default=None))
     return found
 
 

@@ -184,7 +184,7 @@ def container(
     return {
         "name": name,
         "image": pod.image or defaults.image,
-        **({"imagePullPolicy": defaults.pull_policy.value} if defaults.pull_policy else {}),
+        **({"imagePullPolicy": str(defaults.pull_policy)} if defaults.pull_policy else {}),
         "command": [
             "detector",
             "run",

@@ -6,7 +6,6 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
-from application_manager.core.objects.pullpolicy import PullPolicy
 from wayside.api.pod import RESERVED_VARIABLES
 
 _VARIABLE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
@@ -31,7 +30,7 @@ class PodDefaults:
     """
 
     image: str
-    pull_policy: PullPolicy | None = None
+    pull_policy: str | None = None
     pull_secrets: tuple[str, ...] = ()
     environment: Mapping[str, str] = field(default_factory=dict)
     user: int | None = USER

@@ -12,11 +12,11 @@ from pydantic import ValidationError
 from typer.testing import CliRunner
 
 from application_manager.cli import app
+from application_manager.commands.options import PullPolicy
 from application_manager.core.conditions import find
 from application_manager.core.health.pods import Trouble, TroubleReason
 from application_manager.core.objects.detectors import detector_objects, detector_roles, secrets_of
 from application_manager.core.objects.poddefaults import PodDefaults, parse_user
-from application_manager.core.objects.pullpolicy import PullPolicy
 from application_manager.core.objects.rights import detector_rights, merged_rules, rights
 from application_manager.core.statuses.rulestatus import NOT_RUN, detector_status, running
 from tests.cluster.manifests import DETECTOR
