@@ -69,6 +69,8 @@ class Engine:
         self.counters = Counters()
         self._runs: dict[str, RuleRun] = {}
         self._rules_version = 0
+        self._deploying: list[RuleRun] = []
+        """The rules whose episodes have demands."""
         self._exact = order >= ORDER
         self._ticks = Ticks()
         self.schedule = Schedule(self._ticks)
@@ -172,6 +174,7 @@ class Engine:
         self._plugins.configure(rules, kept)
         self.schedule.set_rules([run.rule for run in self._runs.values()])
         self._executor.set_rules(self._runs)
+        self._deploying = [run for run in self._runs.values() if run.has_deploys]
         self._rules_version += 1
         return events
 
@@ -270,7 +273,7 @@ class Engine:
     @property
     def demands_version(self) -> tuple[int, int]:
         """Changes whenever the demands do, so that a caller reads them again only then."""
-        return self._rules_version, sum(run.version for run in self._runs.values())
+        return self._rules_version, sum(run.version for run in self._deploying)
 
     def next_tick(self) -> int:
         """When the next tick is due, with clock Wall; nanoseconds since the epoch."""

@@ -40,8 +40,11 @@ _log = logging.getLogger(__name__)
 
 Result = TypeVar("Result")
 
-_DRAIN_EVERY = 0.05
+_DRAIN_EVERY = 0.1
 """Seconds between two drains of the intake, so that its queue stays short even if ticks are rare."""
+
+_READ_EVERY = 0.05
+"""The same with clock Data, where samples determine when a tick is due: how late it may be evaluated."""
 
 _LOG_EVERY = 1.0
 """Seconds between two checks for losses: there are counters for each rule and stream."""
@@ -133,7 +136,7 @@ class Evaluator:
         self._overload = Overload()
         self._sweeper = Sweeper()
         self._saved = 0
-        """When open episodes were last written; nanoseconds on the engine's time axis."""
+        """When open episodes were last written, or had not changed; nanoseconds on the engine's time axis."""
         self._version: tuple[int, int] | None = None
         self._demands: dict[str, Demand] = {}
         self.losses = Losses(engine, intake)
@@ -258,7 +261,7 @@ class Evaluator:
     def pause(self) -> float:
         """Seconds until the next cycle. With clock Data only the samples determine when a tick is due."""
         if not self._engine.on_wall_clock:
-            return _DRAIN_EVERY
+            return _READ_EVERY
         return min(_DRAIN_EVERY, max(0.0, (self._engine.next_tick() - self._now()) / 1e9))
 
     def _look(self, wanted: RuleSet | None) -> None:
@@ -358,9 +361,10 @@ class Evaluator:
             self._onlooker.looked(self._engine, events)
         if events:
             self._outlet.events(events)
-        if events or (abs(self._engine.now - self._saved) >= _SAVE_EVERY and self._engine.measures):
+        if events or abs(self._engine.now - self._saved) >= _SAVE_EVERY:
             self._saved = self._engine.now
-            self._outlet.open_episodes(self._engine.open_episodes)
+            if events or self._engine.measures:
+                self._outlet.open_episodes(self._engine.open_episodes)
         if consequences := self._engine.consequences.take(self._engine.now):
             self._outlet.consequences(consequences)
         version = self._engine.demands_version
