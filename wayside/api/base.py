@@ -234,18 +234,6 @@ def map_list(key: str) -> JsonDict:
     return {"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": [key]}
 
 
-class OwnerReference(BaseModel):
-    """The object that owns this one."""
-
-    model_config = ConfigDict(alias_generator=to_camel, validate_by_name=True, validate_by_alias=True, extra="allow")
-
-    api_version: str
-    kind: str
-    name: str
-    uid: str
-    controller: bool = False
-
-
 class Metadata(BaseModel):
     """The part of Kubernetes' ObjectMeta that we read; the rest passes through."""
 
@@ -260,7 +248,6 @@ class Metadata(BaseModel):
     resource_version: str = ""
     creation_timestamp: str = ""
     deletion_timestamp: str | None = None
-    owner_references: list[OwnerReference] = Field(default_factory=list)
 
 
 class Condition(Model):

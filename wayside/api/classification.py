@@ -177,8 +177,13 @@ SCHEME = tuple(map(_dimension, CharacteristicValue.__subclasses__()))
 """All dimensions, in the order of the paper's Table 1, in which they are defined."""
 
 
+def dimension_of(values: type[CharacteristicValue]) -> Dimension:
+    """The dimension that has these values."""
+    return next(dimension for dimension in SCHEME if dimension.values is values)
+
+
 def _field(values: type[CharacteristicValue]) -> Any:
-    description = next(each.described() for each in SCHEME if each.values is values)
+    description = dimension_of(values).described()
     return Field(default_factory=list, description=description, max_length=len(values), json_schema_extra=SET_LIST)
 
 

@@ -11,7 +11,7 @@ import asyncio
 import logging
 from collections.abc import AsyncGenerator
 from contextlib import aclosing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from wayside.kubernetes.client import Client
 from wayside.kubernetes.errors import ApiError, RequestError
@@ -55,47 +55,31 @@ def version_of(obj: Object) -> int:
     return int(obj["metadata"]["resourceVersion"])
 
 
+@dataclass
 class Reflector:
     """Follows the objects of one kind in one namespace, as long as the caller iterates."""
 
-    def __init__(
-        self,
-        client: Client,
-        resource: Resource,
-        namespace: str,
-        *,
-        labels: str = "",
-        fields: str = "",
-        resync: float = 30.0,
-    ) -> None:
-        """Prepare.
-
-        Args:
-            client: for the API server.
-            resource: which kind.
-            namespace: where.
-            labels: only what this label selector matches.
-            fields: only what this field selector matches.
-            resync: seconds after which all is listed again, even if nothing seems to be missing.
-        """
-        self._client = client
-        self._resource = resource
-        self._namespace = namespace
-        self._labels = labels
-        self._fields = fields
-        self._resync = resync
-        self._backoff = Backoff(0.1, 5.0)
-        self.lists = 0
-        """Number of lists until now."""
-        self.outages = 0
-        """How often the server stopped responding or refused."""
+    client: Client
+    resource: Resource
+    namespace: str
+    labels: str = field(default="", kw_only=True)
+    """Only what this label selector matches."""
+    fields: str = field(default="", kw_only=True)
+    """Only what this field selector matches."""
+    resync: float = field(default=30.0, kw_only=True)
+    """Seconds after which all is listed again, even if nothing seems to be missing."""
+    lists: int = field(default=0, init=False)
+    """Number of lists until now."""
+    outages: int = field(default=0, init=False)
+    """How often the server stopped responding or refused."""
+    _backoff: Backoff = field(default_factory=lambda: Backoff(0.1, 5.0), init=False)
 
     async def follow(self) -> AsyncGenerator[Change, None]:
         """The list, then its changes. Never ends and raises nothing; errors are logged, counted and retried."""
         while True:
             try:
-                objects, version = await self._client.list(
-                    self._resource, self._namespace, labels=self._labels, fields=self._fields
+                objects, version = await self.client.list(
+                    self.resource, self.namespace, labels=self.labels, fields=self.fields
                 )
                 self._recovered()
                 yield Replaced(objects, int(version))
@@ -108,13 +92,13 @@ class Reflector:
                 await asyncio.sleep(_PAUSE if gone else self._failed(error))
 
     async def _watch(self, since: str) -> AsyncGenerator[Change, None]:
-        events = self._client.watch(
-            self._resource,
-            self._namespace,
-            labels=self._labels,
-            fields=self._fields,
+        events = self.client.watch(
+            self.resource,
+            self.namespace,
+            labels=self.labels,
+            fields=self.fields,
             since=since,
-            seconds=self._resync,
+            seconds=self.resync,
         )
         async with aclosing(events):
             async for event in events:
@@ -124,7 +108,7 @@ class Reflector:
     def _recovered(self) -> None:
         self.lists += 1
         if self._backoff.failures:
-            _log.info("reading the %s of namespace %s again", self._resource.plural, self._namespace)
+            _log.info("reading the %s of namespace %s again", self.resource.plural, self.namespace)
         self._backoff.succeed()
 
     def _failed(self, error: RequestError) -> float:
@@ -132,8 +116,8 @@ class Reflector:
             self.outages += 1
             _log.warning(
                 "cannot read the %s of namespace %s; retrying with backoff: %s",
-                self._resource.plural,
-                self._namespace,
+                self.resource.plural,
+                self.namespace,
                 error,
             )
         return self._backoff.fail(error.retry_after or 0.0)

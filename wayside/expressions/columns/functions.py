@@ -25,28 +25,12 @@ Answer = tuple[Doubles, Bools | None]
 Vectorised = Callable[..., Answer]
 
 
-def _absolute(x: Doubles) -> Answer:
-    return np.abs(x), None
-
-
-def _square_root(x: Doubles) -> Answer:
-    return np.sqrt(x), x >= 0
-
-
 def _smaller(x: Doubles, y: Doubles) -> Answer:
     return np.where(y < x, y, x), None
 
 
 def _larger(x: Doubles, y: Doubles) -> Answer:
     return np.where(y > x, y, x), None
-
-
-def _degrees(radians: Doubles) -> Answer:
-    return radians * (180.0 / math.pi), None
-
-
-def _radians(degrees: Doubles) -> Answer:
-    return degrees * (math.pi / 180.0), None
 
 
 def _within(angle: Doubles, whole: float) -> Doubles:
@@ -65,20 +49,19 @@ def _turn(whole: float) -> Vectorised:
     return turn
 
 
-def _time_to_collision(gap: Doubles, closing_speed: Doubles) -> Answer:
-    return np.where(gap <= 0, 0.0, np.where(closing_speed > 0, gap / closing_speed, np.inf)), None
-
-
 VECTORISED: Final[dict[tuple[str, int], Vectorised]] = {
-    ("abs", 1): _absolute,
-    ("sqrt", 1): _square_root,
+    ("abs", 1): lambda x: (np.abs(x), None),
+    ("sqrt", 1): lambda x: (np.sqrt(x), x >= 0),
     ("smaller", 2): _smaller,
     ("larger", 2): _larger,
-    ("degrees", 1): _degrees,
-    ("radians", 1): _radians,
+    ("degrees", 1): lambda radians: (radians * (180.0 / math.pi), None),
+    ("radians", 1): lambda degrees: (degrees * (math.pi / 180.0), None),
     ("headingDifference", 2): _turn(360.0),
     ("angleDifference", 2): _turn(math.tau),
-    ("timeToCollision", 2): _time_to_collision,
+    ("timeToCollision", 2): lambda gap, closing: (
+        np.where(gap <= 0, 0.0, np.where(closing > 0, gap / closing, np.inf)),
+        None,
+    ),
 }
 """By name and count of arguments. No argument is NaN where the answer counts."""
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from wayside.api import Detector, EventRule
 from wayside.api.base import Duration
-from wayside.api.classification import SCHEME, CharacteristicValue, Classification, Dimension
+from wayside.api.classification import CharacteristicValue, Classification, dimension_of
 from wayside.api.eventrule import Signal
 from wayside.rules.compiled import CompiledRule
 from wayside.rules.problems import RuleProblem
@@ -29,7 +29,7 @@ class Case:
     def given(self, values: type[CharacteristicValue]) -> list[CharacteristicValue]:
         """The values of the classification in the dimension; empty if it has none."""
         classification = self.rule.spec.classification or Classification()
-        return classification.values_of(_dimension(values))
+        return classification.values_of(dimension_of(values))
 
     def only(self, *values: CharacteristicValue) -> bool:
         """Whether the classification has values in the dimension, and only these."""
@@ -38,7 +38,7 @@ class Case:
 
     def against(self, value: CharacteristicValue, fact: str) -> RuleProblem:
         """The warning that a given value contradicts the fact; the fact also contains the remedy."""
-        dimension = _dimension(type(value))
+        dimension = dimension_of(type(value))
         index = self.given(type(value)).index(value)
         return RuleProblem(
             ("spec", "classification", dimension.name, index), f"{value.explained()} contradicts the rule: {fact}"
@@ -46,7 +46,7 @@ class Case:
 
     def lacks(self, values: type[CharacteristicValue], fact: str) -> RuleProblem:
         """The warning that a value is missing in a dimension; the fact names the value."""
-        return RuleProblem(("spec", "classification", _dimension(values).name), fact)
+        return RuleProblem(("spec", "classification", dimension_of(values).name), fact)
 
 
 def conditions(rule: EventRule) -> Iterator[str]:
@@ -84,7 +84,3 @@ def span(nanoseconds: int) -> str:
         if nanoseconds >= factor and nanoseconds % factor == 0:
             return str(Duration(f"{nanoseconds // factor}{unit}"))
     return str(Duration(f"{nanoseconds // 10**6}ms"))
-
-
-def _dimension(values: type[CharacteristicValue]) -> Dimension:
-    return next(dimension for dimension in SCHEME if dimension.values is values)
