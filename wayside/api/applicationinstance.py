@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar
 
 from pydantic import Field, field_validator
 from pydantic.config import JsonDict
@@ -131,7 +131,7 @@ class ApplicationInstance(Kind):
 
     plural: ClassVar[str] = "applicationinstances"
     short_name: ClassVar[str] = "appinst"
-    printer_columns: ClassVar[list[dict[str, str]]] = [
+    printer_columns: ClassVar[list[dict[str, Any]]] = [
         {"name": "Template", "type": "string", "jsonPath": ".spec.templateName"},
         {"name": "Key", "type": "string", "jsonPath": ".spec.key"},
         {"name": "Demands", "type": "integer", "jsonPath": ".status.demands.count"},

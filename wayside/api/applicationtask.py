@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar
 
 from pydantic import Field
 from pydantic.config import JsonDict
@@ -126,15 +126,15 @@ class ApplicationTask(Kind):
 
     plural: ClassVar[str] = "applicationtasks"
     short_name: ClassVar[str] = "apptask"
-    printer_columns: ClassVar[list[dict[str, str]]] = [
+    printer_columns: ClassVar[list[dict[str, Any]]] = [
         {"name": "Template", "type": "string", "jsonPath": ".spec.templateName"},
         {"name": "Operation", "type": "string", "jsonPath": ".spec.operation"},
         {"name": "Rule", "type": "string", "jsonPath": ".spec.event.rule"},
         {"name": "Subject", "type": "string", "jsonPath": ".spec.event.subject"},
         {"name": "Instance", "type": "string", "jsonPath": ".status.instanceName"},
         {"name": "Phase", "type": "string", "jsonPath": ".status.phase"},
-        {"name": "Priority", "type": "integer", "jsonPath": ".spec.priority", "priority": "1"},
-        {"name": "Holder", "type": "string", "jsonPath": ".spec.requester.holder", "priority": "1"},
+        {"name": "Priority", "type": "integer", "jsonPath": ".spec.priority", "priority": 1},
+        {"name": "Holder", "type": "string", "jsonPath": ".spec.requester.holder", "priority": 1},
         {"name": "Age", "type": "date", "jsonPath": ".metadata.creationTimestamp"},
         {"name": "Message", "type": "string", "jsonPath": ".status.message"},
     ]

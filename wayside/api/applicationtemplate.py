@@ -229,7 +229,7 @@ class ApplicationTemplate(Kind):
     plural: ClassVar[str] = "applicationtemplates"
     short_name: ClassVar[str] = "apptpl"
     name_limit: ClassVar[int] = 40
-    printer_columns: ClassVar[list[dict[str, str]]] = [
+    printer_columns: ClassVar[list[dict[str, Any]]] = [
         {"name": "Key", "type": "string", "jsonPath": ".spec.key"},
         {"name": "Instances", "type": "integer", "jsonPath": ".status.instances"},
         {"name": "Max", "type": "integer", "jsonPath": ".spec.maxInstances"},

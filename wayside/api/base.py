@@ -279,7 +279,7 @@ class Kind(Model):
 
     plural: ClassVar[str]
     short_name: ClassVar[str]
-    printer_columns: ClassVar[list[dict[str, str]]] = []
+    printer_columns: ClassVar[list[dict[str, Any]]] = []
     selectable_fields: ClassVar[list[str]] = []
     name_limit: ClassVar[int] = 63
     object_validations: ClassVar[list[JsonDict]] = []

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar
 
 from pydantic import Field, model_validator
 
@@ -233,7 +233,7 @@ class Detector(Kind):
 
     plural: ClassVar[str] = "detectors"
     short_name: ClassVar[str] = "det"
-    printer_columns: ClassVar[list[dict[str, str]]] = [
+    printer_columns: ClassVar[list[dict[str, Any]]] = [
         {"name": "Clock", "type": "string", "jsonPath": ".spec.clock"},
         {"name": "Rules", "type": "integer", "jsonPath": ".status.rules"},
         {"name": "Ready", "type": "string", "jsonPath": '.status.conditions[?(@.type=="Ready")].status'},
@@ -241,7 +241,7 @@ class Detector(Kind):
             "name": "Running",
             "type": "string",
             "jsonPath": '.status.conditions[?(@.type=="Running")].status',
-            "priority": "1",
+            "priority": 1,
         },
         {"name": "Age", "type": "date", "jsonPath": ".metadata.creationTimestamp"},
         {"name": "Message", "type": "string", "jsonPath": '.status.conditions[?(@.status=="False")].message'},

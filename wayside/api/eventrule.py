@@ -295,7 +295,7 @@ class EventRule(Kind):
 
     plural: ClassVar[str] = "eventrules"
     short_name: ClassVar[str] = "er"
-    printer_columns: ClassVar[list[dict[str, str]]] = [
+    printer_columns: ClassVar[list[dict[str, Any]]] = [
         {"name": "Enabled", "type": "boolean", "jsonPath": ".spec.enabled"},
         {"name": "Ready", "type": "string", "jsonPath": '.status.conditions[?(@.type=="Ready")].status'},
         {"name": "Detectors", "type": "string", "jsonPath": ".status.selectedBy"},

@@ -35,7 +35,7 @@ def crd(kind: type[Kind]) -> dict[str, Any]:
         "storage": True,
         "schema": {"openAPIV3Schema": _object_schema(kind)},
         "subresources": {"status": {}},
-        "additionalPrinterColumns": [_column(column) for column in kind.printer_columns],
+        "additionalPrinterColumns": [dict(column) for column in kind.printer_columns],
     }
     if kind.selectable_fields:
         version["selectableFields"] = [{"jsonPath": path} for path in kind.selectable_fields]
@@ -66,10 +66,6 @@ def field_names_at(kind: type[Kind], path: Sequence[str | int]) -> list[str]:
         inner = node.get("items") if isinstance(part, int) else node.get("properties", {}).get(part)
         node = inner or node.get("additionalProperties") or {}
     return list(node.get("properties", ()))
-
-
-def _column(column: dict[str, str]) -> dict[str, Any]:
-    return {**column, "priority": int(column["priority"])} if "priority" in column else dict(column)
 
 
 class _Described(GenerateJsonSchema):

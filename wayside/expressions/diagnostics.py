@@ -49,7 +49,7 @@ EMPTY = "YAML interprets a leading `!`, `#` or quote itself: put the whole expre
 def diagnose(report: str, source: str, compiled: Doubled, names: Collection[str]) -> ExpressionError:
     """The first error of CEL's report, the further ones in its `others`."""
     errors: list[ExpressionError] = []
-    lines = _line_starts(compiled.text)
+    lines = [0, *(match.end() for match in re.finditer("\n", compiled.text))]
     for line, column, text in _ENTRY.findall(report):
         start = lines[min(max(int(line), 1), len(lines)) - 1]
         offset = start + max(int(column), 1) - 1
@@ -66,10 +66,6 @@ def diagnose(report: str, source: str, compiled: Doubled, names: Collection[str]
     return errors[0]
 
 
-def _line_starts(text: str) -> list[int]:
-    return [0, *(match.end() for match in re.finditer("\n", text))]
-
-
 def _explain(text: str, source: str, at: int, names: Collection[str]) -> tuple[str, str | None]:
     text = text.removeprefix("Syntax error: ")
     if match := _UNDECLARED.search(text):
@@ -82,7 +78,7 @@ def _explain(text: str, source: str, at: int, names: Collection[str]) -> tuple[s
     if match := _UNEXPECTED.search(text):
         if match[1] == "<EOF>":
             return "the expression ends too early", _stray_sign(source)
-        word = _word_at(source, at) or match[1]
+        word = next((token.text for token in tokens(source) if token.start <= at < token.end), match[1])
         return f"unexpected `{word}`", _WORDS.get(word) or _after(source, at) or _stray_sign(source)
     if "recursion" in text:
         return "the expression is nested too deeply", _DEPTH
@@ -132,13 +128,6 @@ def _takes(function: str) -> str:
 def _is_call(source: str, at: int, name: str) -> bool:
     """CEL points at the bracket of a call that it cannot resolve, and at the name of anything else."""
     return source[at : at + 1] == "(" or source[at : at + len(name) + 1] == f"{name}("
-
-
-def _word_at(source: str, at: int) -> str | None:
-    for token in tokens(source):
-        if token.start <= at < token.end:
-            return token.text
-    return None
 
 
 def _after(source: str, at: int) -> str | None:

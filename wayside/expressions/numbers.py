@@ -77,6 +77,8 @@ def _edits(line: list[Token]) -> tuple[dict[int, str], dict[int, str], dict[int,
         after[end] = ")" + after.get(end, "")
 
     for i, token in enumerate(line):
+        is_method = i > 0 and line[i - 1].text == "."
+        closing = matches[i + 1] if i + 1 in matches and line[i + 1].text == "(" else 0
         if token.kind is TokenKind.INT and not _stays_integer(line, matches, i, i):
             value = int(token.text, 0) if token.text.startswith("0x") else int(token.text)
             if value <= MAX_EXACT:
@@ -84,25 +86,20 @@ def _edits(line: list[Token]) -> tuple[dict[int, str], dict[int, str], dict[int,
         elif token.text == "[" and i in matches and _ends_operand(line, i - 1):
             if not _is_lone_literal(line, i + 1, matches[i]):
                 wrap(i + 1, matches[i] - 1, "dyn")
-        elif token.text in _COUNTING_METHODS and i + 1 in matches and line[i + 1].text == "(":
-            if i > 0 and line[i - 1].text == ".":
-                wrap(_operand_start(line, matches, i - 2), matches[i + 1], "double")
-            elif token.text == "size":
-                wrap(i, matches[i + 1], "double")
-        elif token.text == "matches" and i + 1 in matches and line[i + 1].text == "(":
-            if i > 1 and line[i - 1].text == ".":
-                wrap(_operand_start(line, matches, i - 2), i - 2, BOUNDED)
-            elif (comma := _first_comma(line, matches, i + 1)) > i + 2:
-                wrap(i + 2, comma - 1, BOUNDED)
-        elif token.text == "string" and i + 1 in matches and _is_call(line, i) and matches[i + 1] > i + 2:
-            wrap(i + 2, matches[i + 1] - 1, DIGITS)
-        elif (
-            token.text == "int"
-            and i + 1 in matches
-            and line[i + 1].text == "("
-            and not _stays_integer(line, matches, i, matches[i + 1])
-        ):
-            wrap(i, matches[i + 1], "double")
+        elif not closing:
+            continue
+        elif token.text in _COUNTING_METHODS and is_method:
+            wrap(_operand_start(line, matches, i - 2), closing, "double")
+        elif token.text == "size":
+            wrap(i, closing, "double")
+        elif token.text == "matches" and is_method and i > 1:
+            wrap(_operand_start(line, matches, i - 2), i - 2, BOUNDED)
+        elif token.text == "matches" and (comma := _first_comma(line, matches, i + 1)) > i + 2:
+            wrap(i + 2, comma - 1, BOUNDED)
+        elif token.text == "string" and not is_method and closing > i + 2:
+            wrap(i + 2, closing - 1, DIGITS)
+        elif token.text == "int" and not _stays_integer(line, matches, i, closing):
+            wrap(i, closing, "double")
     return before, after, replaced
 
 
@@ -141,11 +138,6 @@ def _stays_integer(line: list[Token], matches: dict[int, int], i: int, last: int
     if opening == "[":
         return _ends_operand(line, first - 2)
     return opening == "(" and first > 1 and line[first - 2].text in ("timestamp", "string")
-
-
-def _is_call(line: list[Token], i: int) -> bool:
-    """Whether the name at i is called as a function, not as a method."""
-    return line[i + 1].text == "(" and (i == 0 or line[i - 1].text != ".")
 
 
 def _is_lone_literal(line: list[Token], first: int, end: int) -> bool:

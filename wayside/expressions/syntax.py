@@ -228,21 +228,9 @@ def _constant(fields: _Fields) -> Scalar:
     return Scalar(None)
 
 
-def _name(fields: _Fields) -> Name:
-    return Name(_text(fields, 1))
-
-
-def _select(fields: _Fields) -> Select:
-    return Select(_node(_only(fields, 1)), _text(fields, 2), test_only=3 in fields)
-
-
 def _call(fields: _Fields) -> Call:
     target = _node(_only(fields, 1)) if 1 in fields else None
     return Call(_text(fields, 2), target, _nodes(fields, 3))
-
-
-def _list(fields: _Fields) -> Collection:
-    return Collection(is_map=False, elements=_nodes(fields, 1))
 
 
 def _map(fields: _Fields) -> Collection:
@@ -265,10 +253,10 @@ def _loop(fields: _Fields) -> Loop:
 
 _DECODERS: Mapping[int, Callable[[_Fields], Node]] = {
     3: _constant,
-    4: _name,
-    5: _select,
+    4: lambda fields: Name(_text(fields, 1)),
+    5: lambda fields: Select(_node(_only(fields, 1)), _text(fields, 2), test_only=3 in fields),
     6: _call,
-    7: _list,
+    7: lambda fields: Collection(is_map=False, elements=_nodes(fields, 1)),
     8: _map,
     9: _loop,
 }

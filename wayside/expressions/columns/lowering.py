@@ -52,11 +52,6 @@ Leaves = Callable[[Path], Hashable | Constant | None]
 """The leaf of a path, a constant in its place, or None where the columns do not have it."""
 
 
-def lower(graph: Nodes, expression: Expression | Part, leaf: Leaves) -> int:
-    """The node of the expression's result. Raises LoweringError where there is none."""
-    return _Lowering(graph, expression, leaf).root()
-
-
 class _Lowering:
     def __init__(self, graph: Nodes, expression: Expression | Part, leaf: Leaves) -> None:
         self._graph = graph
@@ -66,7 +61,10 @@ class _Lowering:
         self._names = expression.names
 
     def root(self) -> int:
-        """The result, checked against the kind that the expression was compiled for."""
+        """The node of the result, checked against the kind that the expression was compiled for.
+
+        Raises LoweringError where there is none.
+        """
         found = self._lower(self._tree)
         holds = self._holds(found)
         match self._expression.result, holds:
@@ -241,7 +239,7 @@ class Graph(Nodes):
         """
         before = len(self.nodes)
         try:
-            return lower(self, expression, leaf)
+            return _Lowering(self, expression, leaf).root()
         except LoweringError:
             self.forget(before)
             return None

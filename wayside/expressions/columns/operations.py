@@ -71,15 +71,9 @@ def _arithmetic(calculation: np.ufunc, frame: Frame, step: Step) -> None:
     _put_known(frame, step, x_known, y_known)
 
 
-def _negate(frame: Frame, step: Step) -> None:
+def _one_number(calculation: np.ufunc, frame: Frame, step: Step) -> None:
     x, known = frame.number(step.operands[0])
-    np.negative(x, out=frame.numbers[step.out])
-    _put_known(frame, step, known)
-
-
-def _number(frame: Frame, step: Step) -> None:
-    x, known = frame.number(step.operands[0])
-    frame.numbers[step.out] = x
+    calculation(x, out=frame.numbers[step.out])
     _put_known(frame, step, known)
 
 
@@ -142,15 +136,7 @@ def _comparable(tags: Bytes) -> Bools:
     return found
 
 
-def _and(frame: Frame, step: Step) -> None:
-    _junction(frame, step, np.logical_and, np.logical_or)
-
-
-def _or(frame: Frame, step: Step) -> None:
-    _junction(frame, step, np.logical_or, np.logical_and)
-
-
-def _junction(frame: Frame, step: Step, of_true: np.ufunc, of_false: np.ufunc) -> None:
+def _junction(of_true: np.ufunc, of_false: np.ufunc, frame: Frame, step: Step) -> None:
     first, second = step.operands
     if not (frame.tagged or step.partial):
         of_true(_true(frame, first), _true(frame, second), out=frame.true[step.out])
@@ -224,17 +210,17 @@ _OPERATIONS: Final[Mapping[Op, Run]] = {
     Op.SUBTRACT: partial(_arithmetic, np.subtract),
     Op.MULTIPLY: partial(_arithmetic, np.multiply),
     Op.DIVIDE: partial(_arithmetic, np.divide),
-    Op.NEGATE: _negate,
+    Op.NEGATE: partial(_one_number, np.negative),
     Op.CALL: _call,
     Op.LESS: partial(_order, np.less),
     Op.LESS_EQUAL: partial(_order, np.less_equal),
     Op.EQUAL: _equal,
-    Op.AND: _and,
-    Op.OR: _or,
+    Op.AND: partial(_junction, np.logical_and, np.logical_or),
+    Op.OR: partial(_junction, np.logical_or, np.logical_and),
     Op.NOT: _not,
     Op.HAS: _has,
     Op.CHOOSE: _choose,
-    Op.NUMBER: _number,
+    Op.NUMBER: partial(_one_number, np.positive),
     Op.TRUTH: _truth,
     Op.TEXT: _text,
     Op.NEVER: _never,
