@@ -7,6 +7,7 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import Field, model_validator
 
+from wayside.api.access import FilePath
 from wayside.api.base import (
     ATOMIC_LIST,
     SET_LIST,
@@ -75,7 +76,7 @@ class Clock(StrEnum):
 class State(Model):
     """The storage of open episodes, so that a restart does not lose them."""
 
-    path: str = Field(min_length=1, max_length=1024)
+    path: FilePath
     """The folder, on a volume that outlives the process, e.g. /var/lib/wayside. It is created if missing. A change
     takes effect at the next start."""
 

@@ -23,8 +23,7 @@ from wayside.api.base import (
     map_list,
 )
 from wayside.api.classification import Classification
-from wayside.api.constraints import constraint, unique
-from wayside.api.evaluation import Evaluation
+from wayside.api.constraints import checked, constraint, unique
 from wayside.api.freedata import Constants
 from wayside.api.model import ModelSource
 from wayside.api.plugin import SignalPlugin
@@ -224,6 +223,49 @@ class Signal(Model):
             raise ValueError(f"aggregate {self.aggregate} needs a value, e.g. value: msg.speed")
         if self.aggregate in WITHOUT_VALUE and self.value is not None:
             raise ValueError(f"aggregate {self.aggregate} uses no value: remove value (use where to select samples)")
+        return self
+
+
+_DEFAULT_PERIOD = Duration("1s")
+"""The default period of a rule."""
+
+
+class Evaluation(Model):
+    """When the rule is evaluated: at most one of every, onSample and onDemand."""
+
+    constraints = (
+        constraint(
+            "[has(self.every), has(self.onSample), has(self.onDemand)].filter(given, given).size() <= 1",
+            "give at most one of every, onSample and onDemand",
+            holds=lambda when: (when.every, when.on_sample, when.on_demand).count(None) >= 2,
+        ),
+    )
+
+    every: Duration | None = Field(
+        default=None, json_schema_extra=checked("duration(self) >= duration('10ms')", "give 10ms or more")
+    )
+    """Evaluate the rule at whole multiples of this period, 10ms or more. Default: 1s."""
+    on_sample: ObjectName | None = None
+    """Evaluate the rule at each sample of this stream, for the subjects of the sample's client, and whenever a `for`, a
+    cooldown or an unknownTimeout expires."""
+    on_demand: bool | None = Field(default=None, json_schema_extra=checked("self", "write true, or leave it out"))
+    """If true, evaluate the rule only on request."""
+    priority: int = Field(default=0, ge=-1_000, le=1_000)
+    """Under overload, the detector evaluates rules of lower priority less often, the lowest first."""
+
+    @property
+    def period_ns(self) -> int | None:
+        """The period in nanoseconds; None where the rule has none."""
+        if self.on_sample is not None or self.on_demand:
+            return None
+        return (self.every or _DEFAULT_PERIOD).ns
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Evaluation:
+        if self.every is not None and self.every.ns < 10_000_000:
+            raise ValueError(f"every: {self.every} is too short: give 10ms or more")
+        if self.on_demand is False:
+            raise ValueError("onDemand: write true, or leave it out")
         return self
 
 

@@ -7,6 +7,7 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
+from wayside.api.access import FilePath
 from wayside.api.base import ATOMIC_LIST, Identifier, Model, ObjectName, PositiveDuration, map_list
 from wayside.api.constraints import unique
 
@@ -155,7 +156,7 @@ class ModelSource(Model):
 
     constraints = (unique("inputs", wording="the name {!r} is used twice: give each input once"),)
 
-    file: str = Field(min_length=1, max_length=1024)
+    file: FilePath
     """The path of the .onnx file, e.g. on a volume: /models/risk.onnx. Events contain its SHA-256 digest."""
     sha256: str | None = Field(default=None, pattern=r"^[0-9a-f]{64}$", max_length=64)
     """The expected SHA-256 digest of the file. Any other file is refused."""

@@ -7,6 +7,7 @@ from typing import Annotated
 
 from pydantic import Field
 
+from wayside.api.access import FilePath
 from wayside.api.base import ATOMIC_LIST, ClientName, Model
 from wayside.api.constraints import constraint
 
@@ -69,7 +70,7 @@ class Projection(StrEnum):
 class MapFile(Model):
     """A file with places."""
 
-    file: str = Field(min_length=1, max_length=1024)
+    file: FilePath
     """The path of a GeoJSON file (.geojson, .json) or a lanelet2 map (.osm), as the detector sees it: relative to its
     working directory, or on a mounted volume. The name of a place is the property or tag `name`, or else the id."""
     origin: Origin | None = None

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
 from pydantic import Field
 
 from wayside.api.actions.window import Window
@@ -13,16 +11,13 @@ from wayside.api.freedata import FreeData, NamedData
 ZENOH = "zenoh"
 """The default source of a stream: the session of `spec.zenoh`."""
 
-PluginName = Annotated[str, Field(min_length=1, max_length=63, pattern=r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?$")]
-"""The name of an entry point."""
-
 
 class DataSource(Model):
     """A plugin that receives samples, and its parameters."""
 
     name: ObjectName
     """The name by which streams refer to the source."""
-    plugin: PluginName
+    plugin: ObjectName
     """The plugin: mqtt, bag, or the name of a wayside.sources entry point of an installed package."""
     parameters: FreeData = Field(default_factory=dict)
     """The parameters of the plugin; see its documentation."""
@@ -31,7 +26,7 @@ class DataSource(Model):
 class SignalPlugin(Model):
     """A plugin that computes a signal, and its parameters."""
 
-    name: PluginName
+    name: ObjectName
     """The plugin: unmatched-objects, or the name of a wayside.signals entry point of an installed package."""
     parameters: FreeData = Field(default_factory=dict)
     """The parameters of the plugin; see its documentation."""
@@ -40,7 +35,7 @@ class SignalPlugin(Model):
 class ActionPlugin(Model):
     """An action of an installed package, and its parameters."""
 
-    name: PluginName
+    name: ObjectName
     """The plugin: the name of a wayside.actions entry point of an installed package."""
     parameters: FreeData = Field(default_factory=dict)
     """The parameters of the plugin; see its documentation."""

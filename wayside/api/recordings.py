@@ -6,6 +6,7 @@ from enum import StrEnum
 
 from pydantic import Field
 
+from wayside.api.access import FilePath
 from wayside.api.base import SET_LIST, Model, ObjectName, PositiveDuration, PositiveQuantity, Quantity
 
 
@@ -30,7 +31,7 @@ class OnRequest(Model):
 class Recordings(Model):
     """The folder of all recordings of a Detector, with limits for all rules together."""
 
-    path: str = Field(min_length=1, max_length=1024)
+    path: FilePath
     """The folder, e.g. /var/lib/wayside/recordings. It is created if missing. Each detector needs its own, since the
     limits apply to everything in the folder and assume a single writer."""
     bytes: PositiveQuantity = PositiveQuantity("16Gi")

@@ -7,6 +7,7 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
+from wayside.api.access import FilePath
 from wayside.api.base import (
     Duration,
     Expression,
@@ -59,7 +60,7 @@ class Asn1Module(Model):
 
     definition: str | None = Field(default=None, min_length=1, max_length=500_000)
     """The text of the modules."""
-    file: str | None = Field(default=None, min_length=1, max_length=1024)
+    file: FilePath | None = None
     """The path of a file with the modules, as the detector sees it: relative to its working directory, or on a mounted
     volume."""
 
