@@ -216,9 +216,11 @@ class Executor:
                 if own is None and name not in self._blocks.names:
                     self._losing.discard(name)
                     own = self._seen(self._turn(run, time, sampled, regular))
-                for event in sorted(own or (), key=lambda event: event.episode.subject):
-                    self._consequences.note(run.rule, event)
-                    events.append(event)
+                if own:
+                    own.sort(key=lambda event: event.episode.subject)
+                    events += own
+                    for event in own:
+                        self._consequences.note(run.rule, event)
         self._starts.settle(time)
         self._known.forget_rows(time)
         self._known.looked(self._now())

@@ -119,20 +119,21 @@ class RuleGroup:
             run.tidy_starts(last)
         return happened
 
-    def _looked(self, clients: Sequence[str], only: Mapping[str, Only]) -> Truths:
-        """Which track evaluates which client."""
-        looked = np.zeros((len(self._of), len(clients)), bool)
-        of_clients: dict[frozenset[str], list[bool]] = {}  # most rules look at the same clients, with all elements
-        for row, (run, track) in enumerate(zip(self._of, self.columns.tracks, strict=True)):
-            chosen = only.get(run.rule.name)
-            if chosen is None:
-                continue
-            if chosen.subjects:
-                looked[row] = [chosen.takes(track.subject(client)) for client in clients]
-                continue
-            if chosen.clients not in of_clients:
-                of_clients[chosen.clients] = [client in chosen.clients for client in clients]
-            looked[row] = of_clients[chosen.clients]
+    def _looked(self, clients: Sequence[str], only: Mapping[str, Only]) -> Truths | None:
+        """Which track evaluates which client; None: each track all clients."""
+        chosen = [only.get(run.rule.name) for run in self._of]
+        first = chosen[0]
+        if (
+            first is not None
+            and not first.subjects
+            and first.clients.issuperset(clients)
+            and all(each is first for each in chosen)
+        ):
+            return None
+        looked = np.zeros((len(chosen), len(clients)), bool)
+        for row, (these, track) in enumerate(zip(chosen, self.columns.tracks, strict=True)):
+            if these is not None:
+                looked[row] = [these.takes(track.subject(client)) for client in clients]
         return looked
 
     def _follow(self) -> None:

@@ -61,6 +61,9 @@ class Only(NamedTuple):
         return self.clients.union(*(subject.clients for subject in self.subjects)) if self.subjects else self.clients
 
 
+_NOBODY: frozenset[str] = frozenset()
+
+
 class Schedule:
     """Tracks the rules' periods and wakes, pauses, and thinning."""
 
@@ -72,6 +75,8 @@ class Schedule:
         """By rule, the number of samples that triggered it."""
         self._priorities: frozenset[int] = frozenset()
         self._thinning: Mapping[int, int] = {}
+        self._only = Only(_NOBODY, frozenset())
+        """The last selection without single subjects: mostly that of all rules."""
         self.paused: frozenset[str] = frozenset()
         """The names of paused rules."""
         self.level = 0
@@ -114,17 +119,24 @@ class Schedule:
 
         `sampled` has, by stream, the clients with samples at this time.
         """
-        clients = sampled.get(rule.on_sample or "", frozenset())
+        clients = sampled.get(rule.on_sample or "", _NOBODY)
         thinned = False
         if clients:
             count = self._samples[rule.name] = self._samples.get(rule.name, -1) + 1
-            thinned = count % self.thinning(rule) != 0
-        due: frozenset[Subject] = frozenset()
-        if wakes := self._wakes.get(rule.name):
-            due = frozenset(subject for subject, time in wakes.items() if time <= now)
-            for subject in due:  # an evaluation sets the next wake; a subject that no longer exists needs none
-                del wakes[subject]
-        return Only(frozenset() if thinned else clients, due), thinned
+            thinned = self.level > 0 and count % self.thinning(rule) != 0
+        wakes = self._wakes.get(rule.name)
+        if not wakes and not thinned:
+            if clients is not self._only.clients:
+                self._only = Only(clients, frozenset())
+            return self._only, False
+        due = frozenset(subject for subject, time in wakes.items() if time <= now) if wakes else frozenset()
+        for subject in due:  # an evaluation sets the next wake; a subject that no longer exists needs none
+            del self._wakes[rule.name][subject]
+        return Only(_NOBODY if thinned else clients, due), thinned
+
+    def has_wakes(self, rule: str) -> bool:
+        """Whether any of the rule's subjects must be evaluated without a sample."""
+        return bool(self._wakes.get(rule))
 
     def forget(self, rule: str) -> None:
         """The rule was removed or has changed its meaning: remove the wakes of its subjects."""
