@@ -20,7 +20,7 @@ from functools import partial
 from application_manager.core.objects.policy import Policy
 from application_manager.core.objects.rendering import Renderer, Rendering
 from application_manager.measures import Measures
-from application_manager.workers.jobs import render
+from application_manager.workers.jobs import render_instance
 from application_manager.workers.pool import Pool
 from benchmarks.task_to_deployment import TEMPLATE
 from wayside.api import ApplicationInstance, ApplicationTemplate
@@ -46,12 +46,12 @@ async def measured(renders: int, rounds: int) -> tuple[float, float, float]:
     inside: list[float] = []
     try:
         began = time.perf_counter()
-        await pool.run("site", partial(render, written, Policy(), instance(0)))
+        await pool.run("site", partial(render_instance, written, Policy(), instance(0)))
         start = time.perf_counter() - began
         for _ in range(rounds):
             for number in range(renders):
                 began = time.perf_counter()
-                found = await pool.run("site", partial(render, written, Policy(), instance(number)))
+                found = await pool.run("site", partial(render_instance, written, Policy(), instance(number)))
                 through.append(time.perf_counter() - began)
                 assert isinstance(found, Rendering)
             for number in range(renders):

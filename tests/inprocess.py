@@ -11,7 +11,7 @@ from application_manager.core.demand import drafting
 from application_manager.core.objects.ownership import Obstacle
 from application_manager.core.objects.policy import Policy
 from application_manager.core.objects.rendering import Rendering
-from application_manager.workers.jobs import render
+from application_manager.workers.jobs import render_instance
 from application_manager.workers.process import Job
 from wayside.api import ApplicationInstance, ApplicationTemplate
 
@@ -30,7 +30,7 @@ def objects(wanted: ApplicationInstance, template: TemplateState) -> Rendering |
     """The instance's objects, or why it has none."""
     if not isinstance(template, ApplicationTemplate):
         return drafting.without_template(wanted, template)
-    found = render(pickle.dumps(template), Policy(), wanted)
+    found = render_instance(pickle.dumps(template), Policy(), wanted)
     if isinstance(found, Obstacle):
         return drafting.problem(template, found.reason, found.message)
     assert isinstance(found, Rendering)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 from application_manager.cache.budget_index import BudgetIndex
-from application_manager.cache.store import Entry, Groups
+from application_manager.cache.store import Entry, MembersByGroup
 from application_manager.core.claims.claims import Claim, Refused, TemplateState, all_instances, template_of_all
 from application_manager.core.claims.operations import Standing, Verdict
 from application_manager.core.demand.demand import claim_or_verdict, finished
@@ -48,8 +48,8 @@ class ClaimIndex:
         self._unsettled: dict[Name, set[Name]] = {}  # of these, the tasks that were there at the beginning
         self._claims: dict[Name, Claim] = {}
         self._verdicts: dict[Name, Verdict] = {}
-        self._by_instance: Groups[Name, Name, Claim] = Groups()
-        self._by_template: Groups[Name, Name, ApplicationTask] = Groups()
+        self._by_instance: MembersByGroup[Name, Name, Claim] = MembersByGroup()
+        self._by_template: MembersByGroup[Name, Name, ApplicationTask] = MembersByGroup()
         self._templates: dict[Name, Name] = {}  # task → template
 
     def note(self, name: Name, entry: Entry, template: TemplateState) -> set[Name]:

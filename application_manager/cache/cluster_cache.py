@@ -7,13 +7,11 @@ from dataclasses import InitVar, dataclass, field, replace
 from typing import Final, TypeVar
 
 from application_manager.cache.claim_index import ClaimIndex
-from application_manager.cache.fallback_index import FallbackIndex
+from application_manager.cache.decision_index import FallbackIndex, PlaceIndex
 from application_manager.cache.overlap_index import OverlapIndex
-from application_manager.cache.place_index import PlaceIndex
 from application_manager.cache.pod_index import PodIndex
-from application_manager.cache.store import Groups, Store
+from application_manager.cache.store import MembersByGroup, Store
 from application_manager.core.claims.claims import Claim, InvalidTemplate, TemplateState, template_of_all
-from application_manager.core.claims.operations import Verdict
 from application_manager.core.demand.deciding import (
     Decided,
     decide,
@@ -75,9 +73,8 @@ _Version = tuple[str, int, frozenset[str]]
 class Served:
     """What was last decided of an instance, and what it has given since."""
 
-    verdicts: dict[str, Verdict]
+    decision: Decision
     service: Service
-    fallback: Fallback | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +125,7 @@ class ClusterCache:
     overlap: OverlapIndex = field(default_factory=OverlapIndex)
     places: PlaceIndex = field(default_factory=PlaceIndex)
     _limits: dict[str, dict[str, int]] = field(default_factory=dict)  # by namespace, of its templates
-    exceeded: Groups[Name, Name, str] = field(default_factory=Groups)
+    exceeded: MembersByGroup[Name, Name, str] = field(default_factory=MembersByGroup)
     _findings: dict[Name, tuple[_Version, Findings]] = field(default_factory=dict)
 
     def __post_init__(self, full: Callable[[], bool], tasks: TaskPolicy | None) -> None:
@@ -172,13 +169,8 @@ class ClusterCache:
 
     def instances_of(self, template: Name) -> list[Name]:
         """The instances of a template."""
-        return [
-            name
-            for name, entry in self.store.all(INSTANCE)
-            if name[0] == template[0]
-            and isinstance(entry.model, ApplicationInstance)
-            and entry.model.spec.template_name == template[1]
-        ]
+        found = self.models(INSTANCE, ApplicationInstance, template[0])
+        return [(each.namespace, each.name) for each in found if each.spec.template_name == template[1]]
 
     def record_of(self, instance: ApplicationInstance) -> WorkRecord | None:
         """How the last work on the instance went; None where this process did none."""

@@ -6,7 +6,7 @@ are nearly all, nothing is kept here.
 
 from __future__ import annotations
 
-from application_manager.cache.store import Groups, name_of
+from application_manager.cache.store import MembersByGroup, name_of
 from application_manager.core.health.pods import Trouble, summary, trouble
 from application_manager.core.objects.ownership import instance_of
 from application_manager.core.objects.policy import Name
@@ -17,7 +17,7 @@ class PodIndex:
     """Troubles of pods."""
 
     def __init__(self) -> None:
-        self._troubles: Groups[Name, Name, Trouble] = Groups()
+        self._troubles: MembersByGroup[Name, Name, Trouble] = MembersByGroup()
 
     def note(self, pod: Object) -> bool:
         """Note a pod as it is now; whether that changes the `troubles` of its instance."""

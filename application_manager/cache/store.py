@@ -49,7 +49,7 @@ class Entry:
         return int(self.raw["metadata"]["resourceVersion"])
 
 
-class Groups(dict[Group, dict[Member, Value]]):
+class MembersByGroup(dict[Group, dict[Member, Value]]):
     """Values of members, by group; there is no group without members."""
 
     def put(self, group: Group, member: Member, value: Value) -> None:

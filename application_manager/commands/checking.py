@@ -7,9 +7,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from application_manager.core.findings.checks import INVALID_RULE, INVALID_TEMPLATE
-from application_manager.core.findings.demanding import deploy_remarks
 from application_manager.core.findings.findings import Findings, field_of
-from application_manager.core.findings.rulefindings import detector_findings, rule_findings
+from application_manager.core.findings.rulefindings import deploy_remarks, detector_findings, rule_findings
 from application_manager.core.findings.templatefindings import template_findings
 from application_manager.core.objects.policy import Policy
 from wayside.api import ApplicationTemplate, Detector, EventRule

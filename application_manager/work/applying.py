@@ -14,7 +14,7 @@ import re
 import time
 from collections.abc import Iterable, Mapping, Sequence
 
-from application_manager.cache.store import Groups, Store
+from application_manager.cache.store import MembersByGroup, Store
 from application_manager.core.conditions import Aspect
 from application_manager.core.health.refusals import (
     ADMISSION_REFUSED,
@@ -58,7 +58,7 @@ class Applier:
         self._resources = dict(resources)
         self._fields: dict[str, str] = {}  # uid → the fields that are ours, as of our last apply
         self._drifted: set[str] = set()
-        self._controlled: Groups[str, str, ObjectKey] = Groups()  # uid of the controller → uid → object
+        self._controlled: MembersByGroup[str, str, ObjectKey] = MembersByGroup()  # uid of the controller → uid → object
 
     def live(self, namespace: str, key: ObjectKey) -> Object | None:
         """The object, where we watch it: it has an instance's label."""

@@ -109,16 +109,16 @@ class InstanceStatusWork:
         """Let the tasks know whose verdict or service changed; the service is None where there is no instance."""
         old = self.cache.served.pop(name, None)
         verdicts = decision.verdicts if decision is not None else {}
-        for task in old.verdicts.keys() - verdicts.keys() if old is not None else ():
+        before = old.decision.verdicts if old is not None else {}
+        for task in before.keys() - verdicts.keys():
             self.task_changed((name[0], task))  # one that means all instances may have others yet
         if decision is None:
             return
-        given = service or Service(name[1], applied=False, ready=False)
-        served = Served(decision.verdicts, given, decision.fallback)
-        self.cache.served[name] = served
-        all_changed = old is None or old.service != served.service or old.fallback != served.fallback
-        for task, verdict in decision.verdicts.items():
-            if all_changed or old is None or old.verdicts.get(task) != verdict:
+        new = Served(decision, service or Service(name[1], applied=False, ready=False))
+        self.cache.served[name] = new
+        all_changed = old is None or (old.service, old.decision.fallback) != (new.service, decision.fallback)
+        for task, verdict in verdicts.items():
+            if all_changed or before.get(task) != verdict:
                 self.task_changed((name[0], task))
 
     def _troubles(

@@ -21,7 +21,7 @@ from application_manager.core.objects.ownership import Obstacle
 from application_manager.core.objects.policy import Name
 from application_manager.core.objects.rendering import Rendering
 from application_manager.workers.answers import AnswerCache, Exceeded
-from application_manager.workers.jobs import objects_are_plain, render, values_are_small
+from application_manager.workers.jobs import objects_are_plain, render_instance, values_are_small
 from application_manager.workers.process import Job
 from wayside.api import ApplicationInstance, ApplicationTemplate
 
@@ -92,7 +92,7 @@ class Renderings:
 
         def job() -> Job[object]:
             written = _kept(self._pickled, template, _pickled, _PICKLED)
-            return partial(render, written, self._cache.policy, bare, chart)
+            return partial(render_instance, written, self._cache.policy, bare, chart)
 
         if _kept(self._plain, template, objects_are_plain, _JUDGED) and values_are_small(bare):
             return job()()

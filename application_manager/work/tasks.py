@@ -125,19 +125,20 @@ class TaskWork:
         claimed = self.cache.claims.claim(name)
         if claimed is None:
             return None
-        served = self.cache.served
-        decided = {each[1]: served[each] for each in self._decided(name[0], claimed) if each in served}
-        found = verdict_of(claimed, decided, decided)
+        known = self.cache.served
+        served = {each[1]: known[each] for each in self._decided(name[0], claimed) if each in known}
+        found = verdict_of(claimed, {of: each.decision for of, each in served.items()}, served)
         if found is None:
             return None
-        services = [decided[each].service for each in found.serving]
+        services = [served[each].service for each in found.serving]
         return found.verdict, together(services) if services else None
 
     def _decided(self, namespace: str, claimed: Claim) -> Iterator[Name]:
         """The instances whose decisions the verdict of a claim takes."""
         yield from self.cache.meant((namespace, claimed.instance))
         served = self.cache.served.get((namespace, claimed.instance))
-        instead = served.fallback.instance_of(claimed.task.name) if served and served.fallback else None
+        fallback = served.decision.fallback if served is not None else None
+        instead = fallback.instance_of(claimed.task.name) if fallback is not None else None
         if instead is not None:
             yield namespace, instead
 

@@ -16,9 +16,8 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
-from application_manager.core.findings.demanding import deploy_remarks
 from application_manager.core.findings.findings import Findings
-from application_manager.core.findings.rulefindings import detector_findings, newly_wrong, rule_findings
+from application_manager.core.findings.rulefindings import deploy_remarks, detector_findings, newly_wrong, rule_findings
 from application_manager.core.objects.charts import ChartOutcome, ChartRequest
 from application_manager.core.objects.ownership import Obstacle
 from application_manager.core.objects.policy import Policy
@@ -34,7 +33,7 @@ _MOST = 256  # expressions in them
 _VALUES = 16 * 1024  # characters of the values: with the above, of 4 MB at most
 
 
-def render(
+def render_instance(
     template: bytes, policy: Policy, instance: ApplicationInstance, chart: ChartOutcome | None = None
 ) -> Rendering | Obstacle | ChartRequest:
     """An instance's objects, or why there are none, or the chart that is to be rendered first.

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Protocol
 
 from application_manager.core.claims.claims import (
     Claim,
@@ -77,7 +76,7 @@ def demand(
     found = {name: decide(name, indexes, now).decision for name in indexes.names(now)}
     decisions = {name: each for name, each in found.items() if each is not None}
     changes = [each.next_change for each in decisions.values() if each.next_change is not None]
-    decided: dict[str, VerdictSource] = {**decisions}
+    decided = dict(decisions)
     for name in {each.instance for each in claims if template_of_all(each.instance) is not None}:
         alone = decide(name, indexes, now).decision
         if alone is not None:
@@ -160,18 +159,6 @@ class _Snapshot:
         return self._placement
 
 
-class VerdictSource(Protocol):
-    """The part of a decision that verdicts need: for an instance, or for the tasks for all instances of a template."""
-
-    @property
-    def verdicts(self) -> Mapping[str, Verdict]:
-        """By task."""
-
-    @property
-    def fallback(self) -> Fallback | None:
-        """The template that its tasks turn to while it is not ready."""
-
-
 @dataclass(frozen=True, slots=True)
 class TaskVerdict:
     """The verdict of a task that claims something, and the names of the instances that serve it."""
@@ -180,7 +167,7 @@ class TaskVerdict:
     serving: tuple[str, ...]
 
 
-def verdict_of(claimed: Claim, decided: Mapping[str, VerdictSource], meant: Iterable[str]) -> TaskVerdict | None:
+def verdict_of(claimed: Claim, decided: Mapping[str, Decision], meant: Iterable[str]) -> TaskVerdict | None:
     """What became of the task of a claim; None where its instance was not decided yet.
 
     `decided`: by instance, and by the names that mean all instances of a template; `meant`: the instances of the

@@ -2,17 +2,30 @@
 
 The same compiler that the detector runs checks here. A rule is checked with all Detectors that select it. What the rule
 alone has, or has with every one of them, is its own fault; what only some have, what stands in a field of theirs, and
-what is merely not there yet is a doubt.
+what is merely not there yet is a doubt. What its deploy actions require of templates is only a remark: the rule is in
+order all the same, and a template may yet come or change. What `${…}` will be nobody knows before the episode, so of
+these parameters only the names are looked at.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import difflib
+import json
+from collections.abc import Iterable, Iterator, Sequence
 
-from application_manager.core.findings.checks import BROKEN_RULE, RULE_NOT_READY, RULE_NOT_SELECTED
+from application_manager.core.claims import parameters
+from application_manager.core.findings.checks import (
+    BROKEN_RULE,
+    DEPLOY_PARAMETERS,
+    RULE_NOT_READY,
+    RULE_NOT_SELECTED,
+    UNKNOWN_TEMPLATE,
+)
 from application_manager.core.findings.findings import Findings
-from wayside.api import Detector, EventRule
-from wayside.findings import Finding
+from wayside.api import ApplicationTemplate, Detector, EventRule
+from wayside.api.actions.deploy import Deploy
+from wayside.api.operation import Operation
+from wayside.findings import Finding, ignored_by
 from wayside.rules import (
     RuleError,
     RuleProblem,
@@ -118,3 +131,41 @@ def _remedies(detectors: Sequence[Detector], invalid: Sequence[str]) -> Iterator
     if wanted:
         yield f"correct metadata.labels: {'; '.join(wanted)}"
     yield from (f"correct Detector {name}; its status gives the error" for name in sorted(invalid))
+
+
+def deploy_remarks(
+    rule: EventRule, templates: Iterable[ApplicationTemplate], invalid: Iterable[str] = ()
+) -> list[Finding]:
+    """What the tasks of the rule would be refused for, without what its annotation ignores.
+
+    `templates`: those of its namespace that are valid; `invalid`: the names of the others.
+    """
+    known, others = {each.name: each for each in templates}, set(invalid)
+    found: list[Finding] = []
+    for index, action in enumerate(rule.spec.actions):
+        if action.deploy is None or action.deploy.template_name in others:
+            continue
+        where = f"spec.actions[{index}].deploy"
+        template = known.get(action.deploy.template_name)
+        if template is None:
+            close = difflib.get_close_matches(action.deploy.template_name, [*known, *others], n=1)
+            remedy = f"did you mean {close[0]}?" if close else "create it, or tasks of this rule are refused"
+            missing = (
+                f"there is no ApplicationTemplate {action.deploy.template_name} in namespace {rule.namespace}: {remedy}"
+            )
+            found.append(Finding(UNKNOWN_TEMPLATE.name, f"{where}.templateName: {missing}", rule.name))
+        else:
+            for each in _of_parameters(action.deploy, template, f"{where}.parameters"):
+                found.append(Finding(DEPLOY_PARAMETERS.name, each, rule.name))
+    ignored = ignored_by(rule.metadata.annotations)
+    return [each for each in found if each.check not in ignored]
+
+
+def _of_parameters(deploy: Deploy, template: ApplicationTemplate, where: str) -> Iterator[str]:
+    declared, given = template.spec.parameters, deploy.parameters
+    literal = {name: each for name, each in given.items() if name not in declared or "${" not in json.dumps(each)}
+    yield from parameters.problems(declared, literal, template.name, where, whole=False)
+    if deploy.operation is Operation.DEPLOY:
+        for name, parameter in declared.items():
+            if parameter.required and given.get(name) is None:
+                yield f"{where}.{name}: is missing, and template {template.name} requires it: give a {parameter.type}"

@@ -254,14 +254,13 @@ def volumes_of(detector: Detector, defaults: PodDefaults, prefix: str = "") -> t
     for index, path in enumerate(_without_volume(detector, pod)):
         volumes.append({"name": f"{prefix}folder-{index}", "emptyDir": {}})
         mounts.append({"name": f"{prefix}folder-{index}", "mountPath": path})
-    for index, secret in enumerate(secrets_of(detector)):
-        name = f"{prefix}secret-{index}"
-        volumes.append({"name": name, "secret": {"secretName": secret, "optional": True}})
-        mounts.append({"name": name, "mountPath": f"{_SECRETS_FOLDER}/{secret}", "readOnly": True})
+    named = enumerate(secrets_of(detector))
+    secrets = [(f"{prefix}secret-{index}", each, f"{_SECRETS_FOLDER}/{each}") for index, each in named]
     if defaults.metrics_secret is not None:
-        name = f"{prefix}metrics"
-        volumes.append({"name": name, "secret": {"secretName": defaults.metrics_secret, "optional": True}})
-        mounts.append({"name": name, "mountPath": _METRICS_FOLDER, "readOnly": True})
+        secrets.append((f"{prefix}metrics", defaults.metrics_secret, _METRICS_FOLDER))
+    for name, secret, folder in secrets:
+        volumes.append({"name": name, "secret": {"secretName": secret, "optional": True}})
+        mounts.append({"name": name, "mountPath": folder, "readOnly": True})
     return volumes, mounts
 
 

@@ -8,8 +8,7 @@ from typing import Any
 
 import pytest
 
-from application_manager.core.findings.demanding import deploy_remarks
-from application_manager.core.findings.rulefindings import detector_findings, rule_findings
+from application_manager.core.findings.rulefindings import deploy_remarks, detector_findings, rule_findings
 from application_manager.core.findings.templatefindings import template_findings
 from application_manager.core.objects.policy import Policy
 from application_manager.core.objects.rendering import MOST_EXPRESSIONS
