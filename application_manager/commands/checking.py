@@ -23,7 +23,7 @@ _INVALID: Mapping[type[Kind], Check] = {
 }
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Checked:
     """What would be refused and what would be warned of, a line each, and the number of objects that were looked at."""
 
@@ -40,13 +40,18 @@ def review_files(paths: Iterable[Path], policy: Policy, ignored: Set[str] = froz
     Raises DocumentError for files that cannot be read as our kinds.
     """
     documents = load_documents(paths)
-    found = {index: _findings(each.object, documents, policy) for index, each in enumerate(documents)}
-    judged = [(documents[index], each) for index, each in found.items() if each is not None]
-    return Checked(
-        [line for document, findings in judged for line in _lines(document, _errors(document, findings))],
-        [line for document, findings in judged for line in _lines(document, _warnings(document, findings, ignored))],
-        len(judged),
-    )
+    checked = Checked()
+    for document in documents:
+        findings = _findings(document.object, documents, policy)
+        if findings is None:
+            continue
+        checked.looked_at += 1
+        name = _INVALID[type(document.object)].name
+        checked.problems += _lines(document, [Finding(name, each) for each in findings.problems])
+        found = dict.fromkeys((*findings.doubts, *findings.remarks))
+        shown = [each for each in found if each.check not in ignored and not document.ignores(each.check)]
+        checked.warnings += _lines(document, shown)
+    return checked
 
 
 def _findings(about: Kind, documents: Sequence[Document], policy: Policy) -> Findings | None:
@@ -65,16 +70,6 @@ def _findings(about: Kind, documents: Sequence[Document], policy: Policy) -> Fin
             remarks = deploy_remarks(about, templates) if templates else []
             return replace(rule_findings(about, detectors, (), rules), remarks=tuple(remarks))
     return None
-
-
-def _errors(document: Document, findings: Findings) -> Iterable[Finding]:
-    name = _INVALID[type(document.object)].name
-    return (Finding(name, each) for each in findings.problems)
-
-
-def _warnings(document: Document, findings: Findings, ignored: Set[str]) -> Iterable[Finding]:
-    found = dict.fromkeys((*findings.doubts, *findings.remarks))
-    return (each for each in found if each.check not in ignored and not document.ignores(each.check))
 
 
 def _lines(document: Document, findings: Iterable[Finding]) -> list[str]:

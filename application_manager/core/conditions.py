@@ -7,7 +7,7 @@ there only while waiting alone helps nothing.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -76,6 +76,19 @@ def holds(conditions: Iterable[Condition], type_: str) -> bool:
     """Whether there is a condition of the type and it is True."""
     condition = find(conditions, type_)
     return condition is not None and condition.status == "True"
+
+
+def from_first(
+    known: Iterable[Condition], type_: str, now: tuple[str, str] | None, otherwise: tuple[str, str]
+) -> Iterator[Aspect]:
+    """A condition that is absent until it is True for the first time, and False afterwards.
+
+    `now` and `otherwise`: its reason and message while it is True, None where it is not, and while it is False.
+    """
+    if now is not None:
+        yield Aspect(type_, True, *now)
+    elif find(known, type_) is not None:
+        yield Aspect(type_, False, *otherwise)
 
 
 def changed(old: Iterable[Condition], new: Iterable[Condition]) -> list[Condition]:

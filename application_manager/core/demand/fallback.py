@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 
 from application_manager.core.claims.claims import Claim, InvalidTemplate, Refusal, TemplateState, claim
 from application_manager.core.claims.operations import Standing, Verdict
-from application_manager.core.conditions import Aspect, find, holds
+from application_manager.core.conditions import Aspect, find, from_first, holds
 from wayside.api import ApplicationInstance, ApplicationTemplate
 from wayside.api.base import Condition
 from wayside.api.operation import Operation
@@ -148,7 +148,7 @@ def aspects(
     `late`: the readyTimeout that it is beyond, empty where it is not; `turns`: what its tasks turn to meanwhile;
     `stands_in_for`: the instances whose tasks it serves.
     """
-    conditions, others = list(known), ", ".join(stands_in_for)
+    conditions, others, timed_out = list(known), ", ".join(stands_in_for), None
     if late:
         message = f"it was not ready for {late}"
         if turns is not None and turns.instances:
@@ -160,10 +160,7 @@ def aspects(
             message += (
                 f", and its fallback, template {turns.template}, cannot serve: {next(iter(turns.refused.values()))}"
             )
-        yield Aspect(TIMED_OUT, True, READY_TIMEOUT, message)
-    elif find(conditions, TIMED_OUT) is not None:
-        yield Aspect(TIMED_OUT, False, "InTime", "it is ready, or within its readyTimeout")
-    if others:
-        yield Aspect("StandsIn", True, "Fallback", f"it serves the tasks of {others}, which is not ready")
-    elif find(conditions, "StandsIn") is not None:
-        yield Aspect("StandsIn", False, "NoFallback", "it serves only its own tasks")
+        timed_out = READY_TIMEOUT, message
+    yield from from_first(conditions, TIMED_OUT, timed_out, ("InTime", "it is ready, or within its readyTimeout"))
+    stands_in = ("Fallback", f"it serves the tasks of {others}, which is not ready") if others else None
+    yield from from_first(conditions, "StandsIn", stands_in, ("NoFallback", "it serves only its own tasks"))

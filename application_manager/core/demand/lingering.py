@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from application_manager.core.claims.claims import TemplateState
-from application_manager.core.conditions import Aspect, find
+from application_manager.core.conditions import Aspect, from_first
 from wayside.api import ApplicationInstance, ApplicationTemplate
 from wayside.api.applicationtemplate import Lifecycle
 from wayside.api.base import Duration
@@ -72,12 +72,10 @@ def manual_aspects(instance: ApplicationInstance) -> Iterator[Aspect]:
     known = instance.status.conditions if instance.status else ()
     for type_, annotation, meaning in _CONDITIONS:
         reason = _reason(instance, annotation)
-        if reason is not None:
-            why = "" if reason in _BARE else f" ({reason})"
-            message = f"{meaning} until the annotation {annotation} is removed{why}"
-            yield Aspect(type_, True, f"{type_}ByAnnotation", message)
-        elif find(known, type_) is not None:
-            yield Aspect(type_, False, f"Not{type_}", f"there is no annotation {annotation}")
+        why = "" if reason in _BARE else f" ({reason})"
+        message = f"{meaning} until the annotation {annotation} is removed{why}"
+        now = (f"{type_}ByAnnotation", message) if reason is not None else None
+        yield from from_first(known, type_, now, (f"Not{type_}", f"there is no annotation {annotation}"))
 
 
 def _reason(instance: ApplicationInstance, annotation: str) -> str | None:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from application_manager.core.claims.operations import ACCEPTED, Standing, Verdict
-from application_manager.core.conditions import STALLED, Aspect, concluded, cut, find, updated
+from application_manager.core.conditions import STALLED, Aspect, concluded, cut, find, from_first, updated
 from application_manager.core.demand import fallback
 from application_manager.core.demand.decisions import Decision
 from application_manager.core.demand.lingering import is_held, manual_aspects
@@ -21,7 +21,6 @@ from wayside.api import ApplicationInstance, ApplicationTask
 from wayside.api.applicationinstance import ApplicationInstanceStatus, Demands, InstancePhase, ObjectReference
 from wayside.api.applicationtask import ApplicationTaskStatus, TaskPhase
 from wayside.api.applicationtemplate import ApplicationTemplateStatus, TemplateManager
-from wayside.api.base import Condition
 from wayside.api.operation import Operation
 from wayside.times import format_seconds, parse_seconds
 
@@ -193,12 +192,13 @@ def instance_status(
     else:
         phase = InstancePhase.READY if ready.holds else InstancePhase.APPLIED
     generation = instance.metadata.generation
+    capped = ("SumBeyondBounds", "; ".join(decision.capped)) if decision.capped else None
     aspects = (
         applied,
         ready,
         *_stalled(phase, applied, ready, decision),
         *([suspended] if suspended else []),
-        *_capped(old.conditions, decision),
+        *from_first(old.conditions, "Capped", capped, ("WithinBounds", "no merged value is capped")),
         *fallback.aspects(old.conditions, decision.overdue, decision.fallback, decision.stands_in_for),
         *manual_aspects(instance),
     )
@@ -239,15 +239,6 @@ def _stalled(phase: InstancePhase, applied: Aspect, ready: Aspect, decision: Dec
         return [Aspect(STALLED, True, applied.reason, applied.message)]
     if decision.overdue and not ready.holds and phase is not InstancePhase.SUSPENDED:
         return [Aspect(STALLED, True, fallback.READY_TIMEOUT, ready.message)]
-    return []
-
-
-def _capped(known: Sequence[Condition], decision: Decision) -> list[Aspect]:
-    """The condition Capped, from when a merged sum went beyond its bounds for the first time."""
-    if decision.capped:
-        return [Aspect("Capped", True, "SumBeyondBounds", "; ".join(decision.capped))]
-    if find(known, "Capped") is not None:
-        return [Aspect("Capped", False, "WithinBounds", "no merged value is capped")]
     return []
 
 
