@@ -50,7 +50,7 @@ def parse_subject(text: str) -> tuple[tuple[str, ...], str | None]:
     element = decode(tail) if mark else None
     if subject_text(clients, element) != text or "" in clients or element == "":
         raise ValueError(
-            f"{text!r} is not a subject: write car1, car1+car2 or {FLEET}, with ~element if the rule has each"
+            f"the subject must be like car1, car1+car2 or {FLEET}, with ~element if the rule has each; got {text!r}"
         )
     return clients, element
 

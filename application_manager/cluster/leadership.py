@@ -68,8 +68,8 @@ def lease_key(given: str | None, namespaces: tuple[str, ...]) -> LeaseKey:
     namespace, _, name = (given or LEASE_NAME).rpartition("/")
     if not name or holder_of(name) is not None:
         raise ValueError(
-            f"--lease {given!r}: not a name for the managers' Lease: write NAME or NAMESPACE/NAME; names that "
-            "begin with wayside- are those of detectors"
+            f"--lease must be NAME or NAMESPACE/NAME; got {given!r}; names that begin with wayside- are reserved for "
+            "detectors"
         )
     if not namespace:
         namespace = os.environ.get("POD_NAMESPACE") or pod_namespace() or next(iter(sorted(namespaces)), "default")

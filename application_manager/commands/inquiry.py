@@ -66,7 +66,7 @@ async def _inquire(client: Client, subject: str, namespace: str) -> Explanation:
     kind, _, name = subject.rpartition("/")
     of = kind.lower()
     if of not in _TASK_WORDS | _INSTANCE_WORDS:
-        raise InquiryError(f"{subject}: {kind} is not a kind: write task/{name} or instance/{name}")
+        raise InquiryError(f"{subject}: must be task/{name} or instance/{name}; got the kind {kind}")
     task = await _read(client, TASKS, ApplicationTask, namespace, name) if of in _TASK_WORDS else None
     existing = await _read(client, INSTANCES, ApplicationInstance, namespace, name) if of in _INSTANCE_WORDS else None
     if task is None and existing is None:

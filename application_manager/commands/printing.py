@@ -148,9 +148,9 @@ def rbac(
 
     where, _, who = account.partition("/")
     if not where or not who:
-        raise typer.BadParameter(f"{account!r} is not a service account: write NAMESPACE/NAME", param_hint="--account")
+        raise typer.BadParameter(f"must be NAMESPACE/NAME; got {account!r}", param_hint="--account")
     if grant and namespace:
-        raise typer.BadParameter("remove it, or --namespace, whose Roles already permit writing", param_hint="--grant")
+        raise typer.BadParameter("has no effect with --namespace: remove one of them", param_hint="--grant")
     policy = policy_of(allowed_kinds, None, everywhere=not namespace)
     key = lease_of(lease if lease and "/" in lease else f"{where}/{lease or LEASE_NAME}", ())
     certificates = None
@@ -201,7 +201,7 @@ def _check_name(name: str, what: str, option: str) -> None:
         TypeAdapter(ObjectName).validate_python(name)
     except ValidationError:
         raise typer.BadParameter(
-            f"{name!r} is not a {what} name: use at most 63 lower-case letters, digits and -", param_hint=option
+            f"must be a {what} name of at most 63 lower-case letters, digits and -; got {name!r}", param_hint=option
         ) from None
 
 

@@ -192,7 +192,9 @@ class DurableStore:
         except (sqlite3.Error, OSError) as refused:
             raise self._error(refused) from None
         _log.error(
-            "cannot read %s; set it aside: `sqlite3 %s .recover` prints the remaining records", self._path, aside
+            "cannot read %s; renamed it and started a new one: `sqlite3 %s .recover` prints the remaining records",
+            self._path,
+            aside,
         )
 
     def _error(self, error: Exception) -> StoreError:

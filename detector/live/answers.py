@@ -160,12 +160,12 @@ class Answers:
         try:
             return future.result(_PATIENCE)
         except TimeoutError:
-            raise ValueError(f"the evaluation did not answer within {_PATIENCE:g} s: it is overloaded") from None
+            raise ValueError(f"the evaluation did not respond within {_PATIENCE:g} s: it is overloaded") from None
 
     def _explanation(self, rule: str, subject: str | None, wait: str) -> RuleExplanation | None:
         """The values that the rule's next evaluation reads; None if there is none within `wait` seconds."""
         if not re.fullmatch(r"[0-9]{1,2}(\.[0-9]{1,3})?", wait):
-            raise ValueError(f"wait={wait}: give seconds below 100, e.g. wait=2.5")
+            raise ValueError(f"wait must be a number of seconds below 100, e.g. wait=2.5; got {wait}")
         watching = None
         try:
             watching = self._evaluator.call(lambda: self._evaluator.status.watch(rule, subject)).result(_PATIENCE)

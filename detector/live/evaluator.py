@@ -301,7 +301,12 @@ class Evaluator:
         if self._overload.observe(self._now(), spent, self._engine.schedule.highest):
             level, highest = self._overload.level, self._engine.schedule.highest
             text = "the evaluation is overloaded" if spent > LONG else "the evaluation keeps up with the load"
-            _log.warning("%s: low-priority rules are now thinned at level %d of %d", text, level, highest)
+            _log.warning(
+                "%s: now skipping evaluations of low-priority rules at level %d of %d",
+                text,
+                level,
+                highest,
+            )
             self._record(self._engine.now, {"kind": "level", "level": level})
             self._engine.set_level(level)
 

@@ -242,7 +242,7 @@ def _of_state(state: StateFile) -> Iterator[Loss]:
     """Failures to write to or read from the state volume."""
     unwritten = "times the state volume could not be written"
     yield Loss(unwritten, state.failures, state.last_failure, cause="state_unwritten")
-    yield Loss("unreadable files of the state volume set aside", state.set_aside, cause="state_unreadable")
+    yield Loss("unreadable files of the state volume that were renamed", state.set_aside, cause="state_unreadable")
 
 
 def _of_traces(traces: EpisodeTraces) -> Iterator[Loss]:

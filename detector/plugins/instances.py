@@ -120,6 +120,6 @@ def plain_value(value: Any, depth: int = _DEEPEST) -> Value:
     if scalar is not None and getattr(value, "shape", None) == ():
         return plain_value(scalar(), depth - 1)
     raise TypeError(
-        f"the value is a {type(value).__name__}: return None, a boolean, a number, a text, or lists and "
-        "maps (with text keys) of these"
+        f"the value is a {type(value).__name__}: return None, a boolean, a number, a string, or lists and maps (with "
+        "string keys) of these"
     )

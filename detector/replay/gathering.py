@@ -75,7 +75,7 @@ def _expanded(path: Path) -> Iterator[Path]:
     if not path.exists() and glob.has_magic(str(path)):
         matching = sorted((Path(each) for each in glob.glob(str(path), recursive=True)), key=_natural)
         if not matching:
-            raise RecordingError(f"{path}: nothing matches: correct the pattern")
+            raise RecordingError(f"{path}: no file matches: correct the pattern")
         for each in matching:
             yield from _expanded(each) if not each.is_dir() or _is_bag(each) or list(_inside(each)) else ()
     elif path.is_dir() and not _is_bag(path):

@@ -71,7 +71,7 @@ def scan_mcap(file: BinaryIO) -> UnindexedMcap:
         elif opcode == Opcode.MESSAGE and there == length:
             found.places.append(ChunkLocation(_MESSAGE.unpack(file.read(_MESSAGE.size))[2], at, there, is_chunk=False))
         if there < length:
-            found.cut = f"a record of {length} bytes at byte {at} reaches beyond the end"
+            found.cut = f"the record at byte {at} has {length} bytes and ends after the end of the file"
             return found
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             _define(opcode, file.read(length), found)

@@ -126,7 +126,7 @@ def _pcap(data: bytes) -> Iterator[_Frame]:
         seconds, fraction, length, _ = record.unpack_from(data, position)
         position += record.size
         if position + length > len(data):
-            raise _CutError(f"a packet of {length} bytes reaches beyond the end")
+            raise _CutError(f"the packet at byte {position} has {length} bytes and ends after the end of the file")
         yield _Frame(seconds * _SECOND + fraction * step, link, data[position : position + length])
         position += length
 
@@ -141,21 +141,21 @@ def _pcapng(data: bytes) -> Iterator[_Frame]:
             interfaces = []
         (length,) = struct.unpack_from(order + "I", data, position + 4)
         if length < 12 or length % 4 or length > _LARGEST:
-            raise ValueError(f"a block of {length} bytes at byte {position}, which is not a valid length")
+            raise ValueError(f"the block at byte {position} has the invalid length {length}")
         if position + length > len(data):
-            raise _CutError(f"a block of {length} bytes at byte {position} reaches beyond the end")
+            raise _CutError(f"the block at byte {position} has {length} bytes and ends after the end of the file")
         body = data[position + 8 : position + length - 4]
         if kind == _INTERFACE:
             interfaces.append(_interface(body, order))
         elif kind == _PACKET:
             index, high, low, captured, _ = struct.unpack_from(order + "IIIII", body, 0)
             if index >= len(interfaces) or 20 + captured > len(body):
-                raise ValueError(f"the packet at byte {position} names interface {index}, or is longer than its block")
+                raise ValueError(f"the packet at byte {position} has no interface {index}, or is longer than its block")
             link, units, offset = interfaces[index]
             time = (high << 32 | low) * _SECOND // units + offset * _SECOND
             yield _Frame(time, link, body[20 : 20 + captured])
         elif kind == _SIMPLE:
-            raise ValueError("it has packets without times (simple packet blocks)")
+            raise ValueError("it has packets without timestamps (simple packet blocks)")
         position += length
 
 

@@ -80,7 +80,7 @@ def scan_bag(path: Path, magic: bytes) -> UnindexedBag:
                 if times:
                     found.chunks.append(Chunk(min(times), at, there, compression))
             if there < length:
-                found.cut = f"a record of {length} bytes at byte {at} reaches beyond the end"
+                found.cut = f"the record at byte {at} has {length} bytes and ends after the end of the file"
                 return found
             at += length
     found.cut = "it was not closed"

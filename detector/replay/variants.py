@@ -75,7 +75,7 @@ def variants_of(rules: Sequence[EventRule], sets: Sequence[str], sweeps: Sequenc
         rule, path, text = _parts("--sweep", option, known)
         chosen += [(rule, [*fixed.get(rule, ()), Change(rule, path, value)]) for value in _values(option, text)]
     if len(chosen) > _MOST:
-        raise VariantError(f"--sweep: {len(chosen)} variants are more than {_MOST}: take larger steps")
+        raise VariantError(f"--sweep: {len(chosen)} variants are more than {_MOST}: use larger steps")
     taken = set(known)
     return [*others, *(_variant(known[rule], changes, taken) for rule, changes in chosen)]
 
@@ -103,7 +103,7 @@ def _parts(option: str, text: str, rules: Mapping[str, EventRule]) -> tuple[str,
     before, equals, value = text.partition("=")
     rule, *path = before.strip().split(".")
     if not equals or (not path and option != "--set"):
-        raise VariantError(f"{option} {text}: write RULE.FIELD=VALUE, e.g. close.when='distance < 120'")
+        raise VariantError(f"{option} must be RULE.FIELD=VALUE, e.g. close.when='distance < 120'; got {text}")
     _known(option, text, rule, rules)
     if path[:1] == ["parameters"] and path[1:2] and path[1] not in rules[rule].spec.parameters:
         there = ", ".join(sorted(rules[rule].spec.parameters)) or "none"
@@ -137,9 +137,9 @@ def _values(option: str, text: str) -> Iterator[Any]:
     try:
         first, last, step = (float(part) for part in span.groups())
     except ValueError:
-        raise VariantError(f"--sweep {option}: {text} is not a range of numbers: write first:last:step") from None
+        raise VariantError(f"--sweep {option}: must be a range of numbers, first:last:step; got {text}") from None
     if step <= 0 or last < first:
-        raise VariantError(f"--sweep {option}: write first:last:step, with step above 0 and last not below first")
+        raise VariantError(f"--sweep {option}: must be first:last:step, with step above 0 and last not below first")
     for number in range(int((last - first) / step + 1e-9) + 1):
         value = round(first + number * step, 9)
         yield int(value) if value == int(value) else value

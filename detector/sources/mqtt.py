@@ -53,7 +53,7 @@ class MqttParameters(Access):
     @classmethod
     def _plain(cls, prefix: str) -> str:
         if any(character in prefix for character in "+#"):
-            raise ValueError("is not a filter: use wildcards in the keys of the streams")
+            raise ValueError("must not contain an MQTT wildcard: use wildcards in the keys of the streams")
         return prefix
 
 

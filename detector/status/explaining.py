@@ -127,7 +127,7 @@ class Watching:
         try:
             clients, _ = parse_subject(text)
         except ValueError:
-            return f"{text!r} is not a subject: write car1, car1+car2 or ~fleet, or with an element car1~north"
+            return f"the subject must be like car1, car1+car2 or ~fleet, or with an element car1~north; got {text!r}"
         missing = [client for client in clients if client not in self._engine.clients]
         if missing:
             return f"unknown client {missing[0]}: no sample arrived from it within clientTimeout"

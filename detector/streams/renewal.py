@@ -194,8 +194,8 @@ class Renewal:
                 break
         if not self._stop.is_set() and any(inlet.only_first for inlet in self._inlets):
             raise NetworkError(
-                "zenoh: received nothing with the new certificates or password: permit the new name to subscribe "
-                "at the router"
+                "zenoh: received nothing with the new certificates or password: the router must permit the new name "
+                "to subscribe"
             )
 
     def _reopen(self, material: Material) -> None:

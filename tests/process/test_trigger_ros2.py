@@ -150,8 +150,8 @@ def test_what_is_wrong_with_a_call_is_reported_with_its_place(tmp_path: Path) ->
     assert [text.split("all.yaml:", 1)[1].split(" ", 1)[1] for text in reported] == [
         "spec.actions[0].trigger.ros2.start.type: unknown service type my/srv/Own: give its .srv file as definition",
         "spec.actions[0].trigger.ros2.stop.request: request.data must be of type bool; got 3",
-        "spec.actions[0].trigger.ros2.start.definition: the definition of my/srv/Own has 0 lines of ---: there must "
-        "be exactly one, between request and response",
+        "spec.actions[0].trigger.ros2.start.definition: the definition of my/srv/Own must have exactly one "
+        "line of ---, between request and response; got 0",
     ]
 
 

@@ -66,7 +66,7 @@ class _PatternString(str):
     def parse(cls, text: str) -> Self:
         """The value that the text stands for. Raises ValueError, with the text and what is expected."""
         if len(text) > cls.maximum_length or not re.fullmatch(cls.pattern, text):
-            raise ValueError(f"{text!r} is not {cls.expectation}")
+            raise ValueError(f"must be {cls.expectation}; got {text!r}")
         return cls(text)
 
     @classmethod
@@ -91,7 +91,7 @@ class Duration(_PatternString):
     """A length of time as Go writes it, such as ``500ms``, ``10s`` or ``1h30m``."""
 
     pattern = r"([0-9]{1,6}(\.[0-9]{1,9})?(h|m)|[0-9]{1,9}(\.[0-9]{1,9})?(s|ms|us|ns))+"
-    expectation = "a duration: write numbers with units, such as 500ms, 10s, 1.5s or 1h30m"
+    expectation = "a duration with units, such as 500ms, 10s, 1.5s or 1h30m"
     _UNITS: ClassVar[dict[str, int]] = {
         "ns": 1,
         "us": 10**3,
@@ -115,7 +115,7 @@ class Duration(_PatternString):
 class PositiveDuration(Duration):
     """A length of time that is not zero."""
 
-    expectation = "a duration above zero: write numbers with units, such as 500ms, 10s, 1.5s or 1h30m"
+    expectation = "a duration above zero, with units, such as 500ms, 10s, 1.5s or 1h30m"
     rules = ({"rule": "!self.matches('^[0.hmnsu]*$')", "message": "give a duration above zero, such as 500ms or 10s"},)
 
     @classmethod
@@ -123,7 +123,7 @@ class PositiveDuration(Duration):
         """As for any duration; raises ValueError for zero as well."""
         parsed = super().parse(text)
         if parsed.ns == 0:
-            raise ValueError(f"{text!r} is not {cls.expectation}")
+            raise ValueError(f"must be {cls.expectation}; got {text!r}")
         return parsed
 
 
@@ -148,7 +148,7 @@ class Quantity(_PatternString):
     """An amount in Kubernetes notation, such as ``64Mi``, ``1e9`` or ``250m``; whole numbers need no quotes."""
 
     pattern = r"([0-9]{1,18}(\.[0-9]{0,9})?|\.[0-9]{1,9})([numkMGTPE]|[KMGTPE]i|[eE][+-]?[0-9]{1,2})?"
-    expectation = "a quantity: write a number with or without a unit, such as 512Mi, 2G or 1e9"
+    expectation = "a quantity, such as 512Mi, 2G or 1e9"
     minimum: ClassVar[int] = 0
     _UNITS: ClassVar[dict[str, Decimal]] = {
         **{unit: Decimal(10) ** (3 * power) for power, unit in enumerate(("n", "u", "m", "", "k", *"MGTPE"), -3)},
@@ -188,7 +188,7 @@ class PositiveQuantity(Quantity):
     pattern = (
         r"(0*[1-9][0-9]{0,17}(\.[0-9]{0,9})?|0*\.0{0,8}[1-9][0-9]{0,8})([numkMGTPE]|[KMGTPE]i|[eE][+-]?[0-9]{1,2})?"
     )
-    expectation = "a quantity above zero: write a number with or without a unit, such as 512Mi, 2G or 1e9"
+    expectation = "a quantity above zero, such as 512Mi, 2G or 1e9"
     minimum = 1
 
 

@@ -280,7 +280,7 @@ class Stream(Model):
             try:
                 PositiveDuration.parse(self.stale_after)
             except ValueError as error:
-                raise ValueError(f"staleAfter: {error}; or Never") from None
+                raise ValueError(f"staleAfter: {error}: give a duration, or Never") from None
         return self
 
     def _check_items(self) -> None:

@@ -348,7 +348,7 @@ def _not_text(source: object) -> ExpressionError:
         return ExpressionError("the expression is empty", source="", hint=EMPTY)
     written = str(source).lower() if isinstance(source, bool) else str(source)
     return ExpressionError(
-        f"an expression must be a text; got {type(source).__name__} {written}",
+        f"an expression must be a string; got {type(source).__name__} {written}",
         source=written,
         hint=f'put it in quotes: "{written}"',
     )

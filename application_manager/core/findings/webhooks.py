@@ -41,7 +41,7 @@ class WebhookClientConfig:
         """NAMESPACE/NAME[:PORT]. Raises ValueError."""
         found = _SERVICE.fullmatch(text)
         if found is None:
-            raise ValueError(f"{text!r} is not a Service: write NAMESPACE/NAME or NAMESPACE/NAME:PORT")
+            raise ValueError(f"must be NAMESPACE/NAME or NAMESPACE/NAME:PORT of a Service; got {text!r}")
         namespace, name, port = found["namespace"], found["name"], int(found["port"] or 443)
         client = {"service": {"namespace": namespace, "name": name, "port": port}}
         return cls(client, tuple(f"{name}.{namespace}{end}" for end in (".svc", ".svc.cluster.local", "")))
@@ -51,7 +51,7 @@ class WebhookClientConfig:
         """https://HOST[:PORT]. Raises ValueError."""
         found = _URL.fullmatch(text.rstrip("/"))
         if found is None:
-            raise ValueError(f"{text!r} is not the URL of a manager: write https://HOST:PORT, without a path")
+            raise ValueError(f"must be https://HOST:PORT, without a path; got {text!r}")
         return cls({"url": text.rstrip("/")}, (found[1].strip("[]"),))
 
     def at(self, path: str, authority: bytes | None) -> dict[str, Any]:
@@ -70,7 +70,7 @@ def certificate_secret(service: str) -> tuple[str, str]:
     Raises ValueError where that is none.
     """
     if _SERVICE.fullmatch(service) is None or ":" in service:
-        raise ValueError(f"{service!r} is not a Service: write NAMESPACE/NAME")
+        raise ValueError(f"must be NAMESPACE/NAME of a Service; got {service!r}")
     namespace, _, name = service.partition("/")
     return namespace, f"{name}-certificates"
 

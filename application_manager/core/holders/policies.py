@@ -41,7 +41,7 @@ class HolderPolicy:
         who, colon, rest = text.partition(":")
         namespace, slash, holder = who.partition("/")
         if not (colon and slash and namespace and holder):
-            raise ValueError(f"{text!r} is not a holder policy: write {_FORM}")
+            raise ValueError(f"must be {_FORM}; got {text!r}")
         numbers: dict[str, int | None] = {"max-tasks": None, "max-priority": None}
         operations = frozenset(Operation)
         for part in rest.split(","):
@@ -51,9 +51,9 @@ class HolderPolicy:
             elif name in numbers and value.removeprefix("-").isdigit():
                 numbers[name] = int(value)
             else:
-                raise ValueError(f"{part!r} in {text!r} is not a limit of a holder policy: write {_FORM}")
+                raise ValueError(f"must be {_FORM}; got {part!r} in {text!r}")
         if (numbers["max-tasks"] or 0) < 0:
-            raise ValueError(f"max-tasks in {text!r} is below 0: write {_FORM}")
+            raise ValueError(f"max-tasks must be 0 or more; got {text!r}")
         return cls(namespace, holder, numbers["max-tasks"], numbers["max-priority"], operations)
 
     def matches(self, namespace: str, holder: str) -> bool:
@@ -96,4 +96,4 @@ def _operation(text: str, whole: str) -> Operation:
     try:
         return Operation(text)
     except ValueError:
-        raise ValueError(f"{text!r} in {whole!r} is not an operation: write {' or '.join(Operation)}") from None
+        raise ValueError(f"operations must be {' or '.join(Operation)}; got {text!r} in {whole!r}") from None

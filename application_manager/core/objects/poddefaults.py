@@ -42,7 +42,7 @@ def parse_user(given: str) -> int | None:
     if given == "cluster":
         return None
     if not given.isdigit() or int(given) == 0:
-        raise ValueError(f"{given!r} is not a user: give a number other than 0, or `cluster` to let the cluster choose")
+        raise ValueError(f"must be a user ID other than 0, or `cluster` to let the cluster choose; got {given!r}")
     return int(given)
 
 
@@ -52,9 +52,7 @@ def parse_environment(given: Iterable[str]) -> dict[str, str]:
     for each in given:
         name, equals, value = each.partition("=")
         if not equals or _VARIABLE.fullmatch(name) is None:
-            raise ValueError(
-                f"{each!r} is not an environment variable: write NAME=VALUE; names have letters, digits and _"
-            )
+            raise ValueError(f"must be NAME=VALUE, with a name of letters, digits and _; got {each!r}")
         if name in RESERVED_VARIABLES:
             raise ValueError(f"{name} is set automatically in each pod: remove it")
         found[name] = value

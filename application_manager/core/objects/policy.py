@@ -139,7 +139,7 @@ class Policy:
 def _parse_kind(text: str) -> KindKey:
     api_version, slash, kind = text.rpartition("/")
     if not slash or not api_version or not kind[:1].isupper():
-        raise ValueError(f"{text!r} is not a kind: write apiVersion/Kind, e.g. apps/v1/Deployment or v1/Service")
+        raise ValueError(f"must be apiVersion/Kind, e.g. apps/v1/Deployment or v1/Service; got {text!r}")
     return api_version, kind
 
 

@@ -206,7 +206,7 @@ class Renderer:
             return
         name = metadata.get("name")
         if not isinstance(name, str) or not name:
-            yield "metadata.name", f"{values.shown(name)} is not a name: give a text, e.g. ${{instance.name}}"
+            yield "metadata.name", f"must be a string, e.g. ${{instance.name}}; got {values.shown(name)}"
         elif len(name) > _LONGEST_NAME or not _NAME.fullmatch(name):
             yield (
                 "metadata.name",
@@ -232,7 +232,7 @@ class Renderer:
         for member in ("labels", "annotations"):
             texts = metadata.get(member)
             if texts is not None and not isinstance(texts, dict):
-                yield f"metadata.{member}", f"{values.shown(texts)} is not a map: give names and texts"
+                yield f"metadata.{member}", f"must be a map of strings; got {values.shown(texts)}"
         yield from self._policy.pod_problems(manifest)
 
 

@@ -39,7 +39,7 @@ def read_headers(access: HttpAccess, field: str) -> Headers:
         value = _value(header, at)
         if any(character in value for character in "\r\n\0"):
             raise AccessError(
-                f"{at}: the value has line breaks, which an HTTP header cannot have: write it in one line"
+                f"{at}: the value has line breaks, which an HTTP header cannot have: write it on one line"
             )
         values[header.name] = value
         if header.value is None and value:

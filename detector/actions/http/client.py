@@ -114,7 +114,7 @@ async def _watched(exchange: _Exchange, give_up: Callable[[], bool]) -> Answer:
     try:
         while not task.done():
             if give_up():
-                raise HttpError(f"{exchange.where}: aborted before it answered, because the detector is stopping")
+                raise HttpError(f"{exchange.where}: aborted before the response, because the detector is stopping")
             await asyncio.wait({task}, timeout=_LOOK)
         return task.result()
     finally:

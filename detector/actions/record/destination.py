@@ -90,7 +90,7 @@ class Destination:
                 if self._limits.when_full is WhenFull.STOP:
                     raise NoRoomError(f"{short}; whenFull is Stop: make room in {self.path}, or raise the limit")
                 if not self._kept:
-                    raise NoRoomError(f"{short}; there is no finished recording left to delete: raise the limit")
+                    raise NoRoomError(f"{short}; no finished recording is left to delete: raise the limit")
                 dropped.append(self._drop(self._kept[0]))
             self._bytes += needed
             self._files += files

@@ -148,7 +148,7 @@ class Course:
             self.failures = 0
             self.due = now + _POLL
             if now - self._since >= self._limits.give_up:
-                self.failed(now, "the recording does not finish", silent=False)
+                self.failed(now, "the recording did not finish", silent=False)
 
     def _started(self, now: float, report: Report) -> None:
         if report.progress.over:

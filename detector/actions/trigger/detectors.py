@@ -43,9 +43,7 @@ class OtherDetector:
         """The other detector's holder."""
         name = nested_value(order.rendered, "detector", "name")
         if not isinstance(name, str) or not _HOLDER.fullmatch(name):
-            raise ActionError(
-                f"detector.name: {name!r} is not a detector name: it may have letters, digits, _, . and - only"
-            )
+            raise ActionError(f"detector.name must have only letters, digits, _, . and -; got {name!r}")
         return name
 
     def start(self, order: Order, ago: float, *, again: bool) -> Report:

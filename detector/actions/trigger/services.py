@@ -118,8 +118,8 @@ def _parsed(name: str, text: str) -> Typesdict:
     borders = [number for number, line in enumerate(lines) if line.strip() == "---"]
     if len(borders) != 1:
         raise ServiceError(
-            f"the definition of {name} has {len(borders)} lines of ---: there must be exactly one, between "
-            "request and response"
+            f"the definition of {name} must have exactly one line of ---, between request and response; got "
+            f"{len(borders)}"
         )
     parts = {"Request": lines[: borders[0]], "Response": lines[borders[0] + 1 :]}
     types: Typesdict = {}
@@ -128,8 +128,8 @@ def _parsed(name: str, text: str) -> Typesdict:
             parsed = get_types_from_msg("\n".join(its_lines) + "\n", f"{package}/msg/{short}_{part}")
         except _PARSER as error:
             raise ServiceError(
-                f"cannot read the {part.lower()} in the definition of {name}: write a type and a name on "
-                f"each line, as float64 x ({str(error)[:120]})"
+                f"cannot read the {part.lower()} in the definition of {name}: write a type and a name on each line, "
+                f"such as float64 x ({str(error)[:120]})"
             ) from error
         for key, value in parsed.items():
             types[f"{name}_{part}" if key == f"{package}/msg/{short}_{part}" else key] = value

@@ -47,7 +47,7 @@ def from_document(document: Mapping[str, Any]) -> OpenEpisode:
     texts = ("rule", "subject", "episode", "onsetTime", "startTime", "ruleDigest")
     for field in texts:
         if not isinstance(document.get(field), str):
-            raise ValueError(f"an episode's {field} must be a text; got {document.get(field)!r:.80}")
+            raise ValueError(f"an episode's {field} must be a string; got {document.get(field)!r:.80}")
     values, classification = document.get("values"), document.get("classification")
     if not isinstance(values, dict) or not isinstance(classification, dict | None):
         raise ValueError("the values of an episode, and its classification, must be maps")

@@ -65,7 +65,7 @@ def _plain(value: Any) -> Any:
 def _key(key: Any) -> str:
     if type(key) is int:
         return str(as_double(key)).removesuffix(".0")
-    raise DecodeError(f"unsupported CBOR: {type(key).__name__} as a key of a map; use text or integers")
+    raise DecodeError(f"unsupported CBOR: {type(key).__name__} as a key of a map; use strings or integers")
 
 
 def _untagged(tag: cbor2.CBORTag, immutable: bool) -> Any:

@@ -198,7 +198,7 @@ def _wrong_line(text: str) -> str | None:
             get_types_from_msg(line, "a/msg/A")
         except _PARSER:
             return (
-                f"line {number}: {line.strip()[:80]!r} is not a line of a .msg file: write a type and a "
-                "name, as float64 x"
+                f"line {number}: {line.strip()[:80]!r} is not a line of a .msg file: write a type and a name, such as "
+                "float64 x"
             )
     return None

@@ -127,7 +127,7 @@ def test_who_gives_up_waits_no_longer() -> None:
     with endpoint(hangs()) as there:
         threading.Thread(target=lambda: (there.received(1), closing.set())).start()
         begun = time.monotonic()
-        with pytest.raises(HttpError, match="aborted before it answered"):
+        with pytest.raises(HttpError, match="aborted before the response"):
             client("30s").send("POST", there.url, {}, b"", give_up=closing.is_set)
         assert time.monotonic() - begun < 15
 

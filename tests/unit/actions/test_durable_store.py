@@ -178,7 +178,10 @@ def test_a_file_that_cannot_be_read_is_set_aside_and_replaced(
     assert store.put("a", b"new")
     assert contents(store) == {"a": b"new"}
     assert len(losses) == 1
-    assert f"set it aside: `sqlite3 {path}.unreadable .recover` prints the remaining records" in caplog.text
+    assert (
+        f"renamed it and started a new one: `sqlite3 {path}.unreadable .recover` prints the remaining records"
+        in caplog.text
+    )
 
 
 def test_a_full_disk_leaves_the_records_as_they_were(tmp_path: Path, losses: Losses) -> None:

@@ -58,7 +58,7 @@ def test_a_definition_may_use_messages_of_the_detector() -> None:
             {"t": 4},
             "request.t must be a map with the fields of builtin_interfaces/msg/Time; got 4",
         ),
-        ("int8 x\n", {}, "has 0 lines of ---: there must be exactly one, between request and response"),
+        ("int8 x\n", {}, "must have exactly one line of ---, between request and response; got 0"),
         ("int8\n---\n", {}, "cannot read the request in the definition of a/srv/B: write a type and a name"),
         ("foo/Bar x\n---\n", {}, "x has the unknown type foo/msg/Bar: define it in spec.messages"),
         (None, {}, "unknown service type a/srv/B: give its .srv file as definition"),

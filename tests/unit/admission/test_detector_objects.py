@@ -113,7 +113,7 @@ def test_the_user_is_the_one_of_the_manager_or_left_to_the_cluster(user: int | N
     assert security["runAsNonRoot"] is True
     assert parse_user("cluster" if user is None else str(user)) == user
     for wrong in ("0", "root", "-1"):
-        with pytest.raises(ValueError, match="is not a user"):
+        with pytest.raises(ValueError, match="must be a user ID"):
             parse_user(wrong)
 
 
@@ -188,7 +188,10 @@ def test_metrics_by_tls_are_probed_by_tls_and_their_secret_is_not_among_those_of
     [
         (["--detector-metrics-secret", "a"], "have no effect without --detector-image"),
         (["--detector-env", "A=b"], "have no effect without --detector-image"),
-        (["--detector-image", "a", "--detector-env", "A"], "'A' is not an environment variable: write NAME=VALUE"),
+        (
+            ["--detector-image", "a", "--detector-env", "A"],
+            "must be NAME=VALUE, with a name of letters, digits and _; got 'A'",
+        ),
         (["--detector-image", "a", "--detector-env", "POD_NAME=b"], "POD_NAME is set automatically in each pod"),
     ],
 )
@@ -262,7 +265,7 @@ def test_a_command_prints_the_account_of_a_detector_that_somebody_else_runs() ->
     assert list(yaml.safe_load_all(done.stdout)) == detector_roles("site", "town")
     refused = CliRunner().invoke(app, ["detector-rbac", "Town", "-n", "site"])
     assert refused.exit_code == 2
-    assert "'Town' is not a Detector name" in refused.stderr
+    assert "must be a Detector name" in refused.stderr
 
 
 def deployment(available: int) -> dict[str, Any]:

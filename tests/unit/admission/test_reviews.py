@@ -138,9 +138,9 @@ def test_the_configuration_covers_three_kinds_and_stands_in_nobodys_way() -> Non
 
 @pytest.mark.parametrize("url", ["http://a", "https://", "a:1", "https://a/b", "https://u@a", "https://a:123456"])
 def test_a_place_that_is_none_is_refused(url: str) -> None:
-    with pytest.raises(ValueError, match="write https://HOST:PORT"):
+    with pytest.raises(ValueError, match="must be https://HOST:PORT"):
         WebhookClientConfig.of_url(url)
-    with pytest.raises(ValueError, match="write NAMESPACE/NAME"):
+    with pytest.raises(ValueError, match="must be NAMESPACE/NAME"):
         WebhookClientConfig.of_service(url)
 
 

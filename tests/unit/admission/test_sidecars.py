@@ -310,7 +310,7 @@ def test_who_puts_it_into_pods_by_hand_gets_the_same_rights() -> None:
     done = CliRunner().invoke(app, options)
     assert list(yaml.safe_load_all(done.stdout)) == sidecar_roles("site", "town", ["vehicle"])
     refused = CliRunner().invoke(app, [*options[:-1], "Vehicle"])
-    assert "'Vehicle' is not a service account name" in refused.stderr
+    assert "must be a service account name" in refused.stderr
 
 
 def state(one: Json, **how: Any) -> Json:

@@ -241,7 +241,10 @@ def test_check_finds_nothing_that_would_be_refused_in_the_examples(
     [
         (["run", "--admission-port", "9443"], "give both --admission-port"),
         (["webhooks"], "give either --service NAMESPACE/NAME or --url"),
-        (["webhooks", "--service", "manager"], "'manager' is not a Service: write NAMESPACE/NAME"),
+        (
+            ["webhooks", "--service", "manager"],
+            "must be NAMESPACE/NAME or NAMESPACE/NAME:PORT of a Service; got 'manager'",
+        ),
         (["webhooks", "--service", "a/b", "--ca-bundle", "nowhere.crt"], "nowhere.crt: No such file"),
         (["webhooks", "--service", "a/b", "--ca-bundle", "pyproject.toml"], "contains no certificate"),
     ],

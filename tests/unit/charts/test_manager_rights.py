@@ -81,11 +81,11 @@ def test_the_command_prints_the_table() -> None:
 @pytest.mark.parametrize(
     ("arguments", "logged"),
     [
-        (["--account", "manager"], "write NAMESPACE/NAME"),
+        (["--account", "manager"], "must be NAMESPACE/NAME"),
         (["--allowed-kinds", "rbac.authorization.k8s.io/v1/Role"], "can never be allowed"),
-        (["--lease", "wayside-town"], "write NAME or NAMESPACE/NAME"),
+        (["--lease", "wayside-town"], "must be NAME or NAMESPACE/NAME"),
         (["--allowed-kinds", "v1/Secret"], "needs --namespace"),
-        (["--namespace", "a", "--grant", "b"], "remove it, or --namespace"),
+        (["--namespace", "a", "--grant", "b"], "has no effect with --namespace"),
     ],
 )
 def test_what_cannot_be_is_refused(arguments: list[str], logged: str) -> None:

@@ -75,7 +75,7 @@ def test_one_beyond_them_waits_and_reports_for_what() -> None:
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
-        ("town", "is not a holder policy"),
+        ("town", "must be NAMESPACE/HOLDER:"),
         ("town/det:max-tasks=many", "'max-tasks=many'"),
         ("town/det:operations=Stop", "'Stop'"),
         ("town/det:max-tasks=-1", "max-tasks"),
@@ -84,4 +84,4 @@ def test_one_beyond_them_waits_and_reports_for_what() -> None:
 def test_a_policy_that_is_none_is_refused_with_its_form(text: str, problem: str) -> None:
     with pytest.raises(ValueError, match=problem) as refused:
         HolderPolicy.parse(text)
-    assert "write " in str(refused.value)
+    assert "must be " in str(refused.value)

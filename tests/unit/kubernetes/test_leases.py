@@ -177,5 +177,5 @@ def test_the_lease_of_a_pod_is_in_its_namespace(monkeypatch: pytest.MonkeyPatch)
 
 @pytest.mark.parametrize("given", ["wayside-town", "system/wayside-town", "system/"])
 def test_a_name_that_is_a_detectors_is_refused(given: str) -> None:
-    with pytest.raises(ValueError, match="write NAME or NAMESPACE/NAME"):
+    with pytest.raises(ValueError, match="must be NAME or NAMESPACE/NAME"):
         lease_key(given, ())

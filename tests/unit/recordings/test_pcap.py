@@ -127,7 +127,7 @@ def test_a_capture_that_is_cut_is_read_up_to_there(write: object, tmp_path: Path
 def test_a_capture_that_is_damaged_is_reported(tmp_path: Path) -> None:
     raw = bytearray(pcapng([(START, ethernet(CAM))]))
     raw[4:8] = struct.pack("<I", 27)  # no length of a block
-    with pytest.raises(RecordingError, match="capture: the capture is damaged: a block of 27 bytes at byte 0"):
+    with pytest.raises(RecordingError, match="the capture is damaged: the block at byte 0 has the invalid length 27"):
         read(tmp_path / "capture", bytes(raw))
 
 

@@ -90,7 +90,7 @@ def test_a_recording_in_progress_is_never_dropped(tmp_path: Path) -> None:
     bench.record(an_episode(2), THREE)  # finds room for one sample beside it
     bench.action.completed(an_episode(1), Completion())
     assert bench.outcome(an_episode(1)).state is OutcomeState.DONE
-    assert "no finished recording left to delete" in bench.outcome(an_episode(2)).message
+    assert "no finished recording is left to delete" in bench.outcome(an_episode(2)).message
 
 
 def test_samples_after_the_end_of_a_recording_are_counted(tmp_path: Path) -> None:

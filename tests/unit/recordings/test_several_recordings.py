@@ -126,7 +126,7 @@ def test_a_folder_stands_for_the_recordings_in_it(tmp_path: Path) -> None:
     assert recordings_of([tmp_path]) == expected
     assert recordings_of([tmp_path / "day", files[0]]) == expected
     assert recordings_of([tmp_path / "d*" / "a*.mcap"]) == expected[:2]
-    with pytest.raises(RecordingError, match="nothing matches: correct the pattern"):
+    with pytest.raises(RecordingError, match="no file matches: correct the pattern"):
         recordings_of([tmp_path / "*.bag"])
     empty = tmp_path / "empty"
     empty.mkdir()

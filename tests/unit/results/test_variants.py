@@ -77,7 +77,7 @@ def test_parameters_of_single_clients_hold_for_variants_that_do_not_set_them(tmp
 @pytest.mark.parametrize(
     ("sets", "sweeps", "words"),
     [
-        (["close"], [], "--set close: write RULE.FIELD=VALUE"),
+        (["close"], [], "--set must be RULE.FIELD=VALUE"),
         (["clos.when=true"], [], "there is no rule clos; did you mean close?"),
         ([], ["too-fast.parameters.limits=1:2:1"], "rule too-fast has no parameter limits; it has area, limit"),
         ([], ["too-fast.parameters.limit=3:1:1"], "last not below first"),

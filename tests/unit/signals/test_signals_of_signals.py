@@ -138,7 +138,7 @@ def test_the_replay_of_lags_and_statistics_gives_the_same_events() -> None:
         ({"of": "v", "over": "Episode", "lag": "1s", "aggregate": "Max"}, "not valid with over: Episode"),
         ({"of": "v", "over": "Episode", "aggregate": "StdDev"}, "over: Episode needs one of the aggregates"),
         ({"stream": "speed", "value": "msg.v", "over": "Episode", "aggregate": "Max"}, "over: Episode needs"),
-        ({"of": "v", "over": "Episodes", "aggregate": "Max"}, "'Episodes' is not a duration above zero.*or Episode"),
+        ({"of": "v", "over": "Episodes", "aggregate": "Max"}, "must be a duration above zero.*or Episode"),
         ({"of": "v", "over": "1s", "aggregate": "Quantile"}, "Quantile needs quantile"),
     ],
 )  # fmt: skip

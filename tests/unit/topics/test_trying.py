@@ -41,7 +41,7 @@ def test_a_boolean_shows_how_long_it_is_true_and_a_text_its_value(tmp_path: Path
         ("msg.w", [], "msg has no field w"),
         ("msg.v >", [], "msg.v >"),
         ("msg.v", ["--stream", "imu"], "--stream imu: there is no such stream; the streams"),
-        ("msg.v", ["--every", "often"], "'often' is not a duration"),
+        ("msg.v", ["--every", "often"], "must be a duration"),
         ("1", [], "fits the streams odom, state: give --stream odom"),
     ],
 )

@@ -16,7 +16,7 @@ from wayside.expressions.functions.members import Place, place, sequence
 def unmatched(items: object, others: object, within: float, path: str = "") -> list[float]:
     """The indices of the items of one list that have no item of the other within that many metres."""
     if within < 0:
-        raise ValueError(f"within {within:g} is negative: give 0 or more metres")
+        raise ValueError(f"within must be 0 or more metres; got {within:g}")
     places = _places(items, "items", path)
     by_x = sorted(_places(others, "others", path))
     xs = [each[0] for each in by_x]

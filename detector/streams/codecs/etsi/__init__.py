@@ -62,7 +62,7 @@ class EtsiDecoder:
     def _read(self, payload: bytes) -> tuple[MessageKind, dict[str, Any]]:
         data = message_in(payload)
         if len(data) <= _HEADER:
-            raise DecodeError(f"{len(data)} bytes: an ITS message has more than {_HEADER}")
+            raise DecodeError(f"an ITS message must have more than {_HEADER} bytes; got {len(data)}")
         version, number = data[0], data[1]
         kind = BY_NUMBER.get(number)
         if kind is None or number not in self._readers:
@@ -70,7 +70,7 @@ class EtsiDecoder:
             raise DecodeError(f"message {number} ({'unknown' if kind is None else PREFIX + kind.name}){wanted}")
         read = self._readers[number].get(version)
         if read is None:
-            raise DecodeError(f"{PREFIX}{kind.name} of protocol version {version}, which has no definition")
+            raise DecodeError(f"{PREFIX}{kind.name} has no definition for protocol version {version}")
         try:
             message = read(Bits(data))
         except DecodeError as error:

@@ -47,7 +47,7 @@ class Bits:
         """The same number, after checking that a message of this length can contain that number of elements."""
         self._elements -= count
         if self._elements < 0:
-            raise DecodeError("it claims more elements than its length allows")
+            raise DecodeError("it announces more elements than its length allows")
         return count
 
     def lengths(self) -> Iterator[int]:
@@ -61,7 +61,7 @@ class Bits:
                 return
             pieces = self.take(6)
             if not 1 <= pieces <= 4:
-                raise DecodeError(f"a length in {pieces} pieces; 1 to 4 are allowed")
+                raise DecodeError(f"a length must have 1 to 4 fragments; got {pieces}")
             yield pieces * _FRAGMENT
 
     def blob(self) -> bytes:
@@ -79,7 +79,7 @@ class Bits:
     def _number(self) -> bytes:
         octets = self.blob()
         if len(octets) > _LONGEST:
-            raise DecodeError(f"a number of {len(octets)} bytes; the maximum is {_LONGEST}")
+            raise DecodeError(f"a number must have at most {_LONGEST} bytes; got {len(octets)}")
         return octets
 
     def small(self) -> int:

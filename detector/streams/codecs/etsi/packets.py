@@ -53,10 +53,10 @@ _NESTED = 4
 def message_in(payload: bytes) -> bytes:
     """The message without its outer layers. Raises DecodeError if there is none, or if it cannot be read."""
     if len(payload) > MAXIMUM:
-        raise DecodeError(f"{len(payload)} bytes; an ITS packet has at most {MAXIMUM}")
+        raise DecodeError(f"an ITS packet must have at most {MAXIMUM} bytes; got {len(payload)}")
     for _ in range(_NESTED):
         if len(payload) < 6:
-            raise DecodeError(f"{len(payload)} bytes: an ITS message has more than 6")
+            raise DecodeError(f"an ITS message must have more than 6 bytes; got {len(payload)}")
         if _is_geonetworking(payload):
             return _from_geonetworking(payload)
         if _is_btp(payload):
@@ -64,7 +64,7 @@ def message_in(payload: bytes) -> bytes:
         if not _is_secured(payload):
             return payload
         payload = _from_secured(payload)
-    raise DecodeError(f"a message in {_NESTED} nested envelopes; fewer are allowed")
+    raise DecodeError(f"the message must be in fewer than {_NESTED} nested envelopes")
 
 
 def _is_geonetworking(packet: bytes) -> bool:
@@ -84,21 +84,21 @@ def _from_geonetworking(packet: bytes) -> bytes:
     if packet[0] & 15 == _SECURED:
         inner = _from_secured(inner)
     if len(inner) < _COMMON_LENGTH:
-        raise DecodeError(f"a GeoNetworking packet that ends in its headers ({len(packet)} bytes)")
+        raise DecodeError(f"the GeoNetworking packet ends within its headers ({len(packet)} bytes)")
     kind = inner[1] >> 4
     if kind in _WITHOUT_MESSAGE:
-        raise DecodeError(f"{_WITHOUT_MESSAGE[kind]} of GeoNetworking, which carries no message")
+        raise DecodeError(f"{_WITHOUT_MESSAGE[kind]} of GeoNetworking contains no message")
     extended = _EXTENDED.get(kind)
     if extended is None:
-        raise DecodeError(f"a GeoNetworking packet of the unknown header type {kind}")
+        raise DecodeError(f"the GeoNetworking packet has the unknown header type {kind}")
     transport = inner[0] >> 4
     if transport not in (_BTP_A, _BTP_B):
-        raise DecodeError(f"a GeoNetworking packet with next header {transport}: only BTP carries ITS messages")
+        raise DecodeError(f"the GeoNetworking packet has next header {transport}: only BTP carries ITS messages")
     start = _COMMON_LENGTH + extended
     length = int.from_bytes(inner[4:6], "big")
     body = inner[start : start + length]
     if len(body) < length or length < _BTP_LENGTH:
-        raise DecodeError(f"a GeoNetworking packet that claims {length} bytes of payload and has {len(body)}")
+        raise DecodeError(f"the GeoNetworking packet announces {length} bytes of payload, but has {len(body)}")
     return body[_BTP_LENGTH:]
 
 
@@ -106,10 +106,10 @@ def _from_secured(data: bytes) -> bytes:
     """The payload of IEEE 1609.2 data (canonical OER), at any depth."""
     for _ in range(_NESTED):
         if len(data) < 4:
-            raise DecodeError("a secured packet that ends in its headers")
+            raise DecodeError("the secured packet ends within its headers")
         if data[0] != _SECURITY:
             raise DecodeError(
-                f"a secured packet of version {data[0]}; only {_SECURITY} (TS 103 097 v1.3 and later) is supported"
+                f"the secured packet has version {data[0]}; only {_SECURITY} (TS 103 097 v1.3 and later) is supported"
             )
         tag = data[1]
         if tag == _UNSECURED:
@@ -117,12 +117,12 @@ def _from_secured(data: bytes) -> bytes:
         if tag == _ENCRYPTED:
             raise DecodeError("the packet is encrypted for its receiver")
         if tag != _SIGNED:
-            raise DecodeError(f"a secured packet without data (alternative {tag & 63})")
+            raise DecodeError(f"the secured packet has no data (alternative {tag & 63})")
         preamble = data[3]  # after the hash algorithm
         if not preamble & _DATA_PRESENT:
-            raise DecodeError("a signed packet with only the hash of its data")
+            raise DecodeError("the signed packet has only the hash of its data")
         data = data[4:]
-    raise DecodeError(f"a secured packet in {_NESTED} nested envelopes; fewer are allowed")
+    raise DecodeError(f"the secured packet must be in fewer than {_NESTED} nested envelopes")
 
 
 def _octets(data: bytes, start: int) -> bytes:
@@ -133,5 +133,5 @@ def _octets(data: bytes, start: int) -> bytes:
         length, start = int.from_bytes(data[start : start + size], "big"), start + size
     found = data[start : start + length]
     if len(found) < length:
-        raise DecodeError(f"a secured packet that claims {length} bytes of payload and has {len(found)}")
+        raise DecodeError(f"the secured packet announces {length} bytes of payload, but has {len(found)}")
     return found

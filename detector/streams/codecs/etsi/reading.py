@@ -162,7 +162,7 @@ class Readers:
                 return {name: reader(inner)}
             index = bits.take(width)
             if index >= len(root):
-                raise DecodeError(f"alternative {index} of a CHOICE with {len(root)} alternatives")
+                raise DecodeError(f"a CHOICE with {len(root)} alternatives has no alternative {index}")
             name, reader = root[index]
             return {name: reader(bits)}
 
@@ -183,7 +183,7 @@ def _integer(kind: asn1.Integer) -> Read:
     def read(bits: Bits) -> Any:
         offset = bits.take(width)
         if offset > span:
-            raise DecodeError(f"{kind.name or 'a number'} is {low + offset}, not within {low} and {high}")
+            raise DecodeError(f"{kind.name or 'a number'} must be between {low} and {high}; got {low + offset}")
         return plain(low + offset)
 
     if not kind.extensible:
@@ -203,7 +203,7 @@ def _enumerated(kind: asn1.Enumerated) -> Read:
             return additions[index] if index < len(additions) else None  # None: of a later version of the definition
         index = bits.take(width)
         if index >= len(root):
-            raise DecodeError(f"value {index} of an ENUMERATED with {len(root)} values")
+            raise DecodeError(f"an ENUMERATED with {len(root)} values has no value {index}")
         return root[index]
 
     return read
@@ -234,7 +234,7 @@ def _text(kind: asn1.Text) -> Read:
         if identity:
             return "".join(map(chr, codes))
         if codes and max(codes) >= len(alphabet):
-            raise DecodeError(f"a character outside the alphabet of {len(alphabet)}")
+            raise DecodeError(f"a character is not in the alphabet of {len(alphabet)} characters")
         return "".join(alphabet[code] for code in codes)
 
     return _counted(kind.size, characters, "".join)
@@ -256,7 +256,7 @@ def _counted(size: asn1.Size, take: Callable[[Bits, int], Any], join: Callable[[
         def bounded(bits: Bits) -> Any:
             offset = bits.take(width)
             if offset > span:
-                raise DecodeError(f"a length of {low + offset}, not within {low} and {high}")
+                raise DecodeError(f"a length must be between {low} and {high}; got {low + offset}")
             return take(bits, low + offset)
 
     if not size.extensible:
