@@ -55,7 +55,7 @@ def parse_subject(text: str) -> tuple[tuple[str, ...], str | None]:
     return clients, element
 
 
-def did_you_mean(name: str, known: Iterable[str]) -> str:
+def did_you_mean(name: str, known: Iterable[str], quote: str = "") -> str:
     """The remedy for a name that is not known: a question with the most similar one; empty where none is similar."""
     close = difflib.get_close_matches(name, list(known), n=1)
-    return f"did you mean {close[0]}?" if close else ""
+    return f"did you mean {quote}{close[0]}{quote}?" if close else ""

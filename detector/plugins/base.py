@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from abc import ABC, abstractmethod
 from typing import Annotated, ClassVar, Generic, NamedTuple, TypeVar
 
@@ -11,6 +10,7 @@ from pydantic import AfterValidator, Field, ValidationInfo
 from detector.engine.queries.queries import Queries
 from wayside.api.base import Model
 from wayside.expressions import Value
+from wayside.names import did_you_mean
 
 P = TypeVar("P", bound="PluginParameters")
 """The model of a plugin's parameters."""
@@ -24,8 +24,7 @@ def _known_stream(name: str, info: ValidationInfo) -> str:
     streams: list[str] | None = (info.context or {}).get("streams")
     if streams is None or name in streams:
         return name
-    close = difflib.get_close_matches(name, streams, n=1)
-    hint = f"did you mean {close[0]}?" if close else f"its streams are {', '.join(streams)}"
+    hint = did_you_mean(name, streams) or f"its streams are {', '.join(streams)}"
     raise ValueError(f"the Detector has no stream {name}; {hint}")
 
 

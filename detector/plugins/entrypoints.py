@@ -6,7 +6,6 @@ reported with its field: an unknown name, a module that does not load, invalid p
 
 from __future__ import annotations
 
-import difflib
 import inspect
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from typing import Any, Generic, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from wayside.api.wording import FieldPath, messages
+from wayside.names import did_you_mean
 
 T = TypeVar("T")
 """The base class of the provided classes."""
@@ -91,8 +91,7 @@ def _load(offers: Offers[T], name: str) -> type[T]:
     entry = entries.get(name)
     what = f"{offers.noun} {name}"
     if entry is None:
-        close = difflib.get_close_matches(name, entries, n=1)
-        hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(entries) or 'none'}"
+        hint = did_you_mean(name, entries) or f"there are {', '.join(entries) or 'none'}"
         raise LookupError(f"no {what} is installed; {hint} ({offers.guide})")
     try:
         offered: Any = entry.load()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import difflib
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,6 +14,7 @@ from pydantic import ValidationError
 from wayside.api import Detector, EventRule
 from wayside.api.wording import messages
 from wayside.inputerror import InputError
+from wayside.names import did_you_mean
 
 _MOST = 100
 """Maximum number of variants."""
@@ -114,8 +114,7 @@ def _parts(option: str, text: str, rules: Mapping[str, EventRule]) -> tuple[str,
 def _known(option: str, text: str, rule: str, rules: Mapping[str, EventRule]) -> str:
     """The name, if that rule exists."""
     if rule not in rules:
-        close = difflib.get_close_matches(rule, rules, n=1)
-        hint = f"did you mean {close[0]}?" if close else f"the rules are {', '.join(sorted(rules)) or 'none'}"
+        hint = did_you_mean(rule, rules) or f"the rules are {', '.join(sorted(rules)) or 'none'}"
         raise VariantError(f"{option} {text}: there is no rule {rule}; {hint}")
     return rule
 

@@ -5,7 +5,6 @@ And its errors of a failed evaluation into messages in the words of the document
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Collection
 from typing import Final
@@ -14,6 +13,7 @@ from wayside.expressions.errors import ExpressionError
 from wayside.expressions.functions import FUNCTIONS
 from wayside.expressions.lexer import TokenKind, tokens
 from wayside.expressions.numbers import DIGITS, Doubled
+from wayside.names import did_you_mean
 
 _ENTRY = re.compile(r"^(?:[A-Z_]+: )?ERROR: <input>:(-?\d+):(-?\d+): (.*)$", re.MULTILINE)
 _UNDECLARED = re.compile(r"undeclared reference to '([^']*)'")
@@ -92,14 +92,12 @@ def _undeclared(name: str, source: str, at: int, names: Collection[str]) -> tupl
     if _is_call(source, at, name):
         if name in FUNCTIONS:
             return f"wrong number of arguments for `{name}`", _takes(name)
-        near = difflib.get_close_matches(name, FUNCTIONS, n=1)
-        return f"there is no function `{name}`", f"did you mean `{near[0]}`?" if near else None
+        return f"there is no function `{name}`", did_you_mean(name, FUNCTIONS, "`") or None
     message = f"`{name}` is not declared here"
     if name in _WORDS:
         return message, _WORDS[name]
-    close = difflib.get_close_matches(name, names, n=1)
-    if close:
-        return message, f"did you mean `{close[0]}`?"
+    if similar := did_you_mean(name, names, "`"):
+        return message, similar
     known = ", ".join(f"`{each}`" for each in sorted(names)[:12]) or "nothing"
     return message, f"declared: {known}; a text needs its own quotes inside those of YAML: '\"{name}\"'"
 

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
-import difflib
 import enum
 from collections.abc import Iterable, Mapping
 from typing import Final, cast
@@ -26,6 +25,7 @@ from wayside.expressions.errors import EvaluationError
 from wayside.expressions.handles import hand
 from wayside.expressions.numbers import MAX_EXACT
 from wayside.expressions.syntax import Path, Step
+from wayside.names import did_you_mean
 
 _ABSENT: Final = object()
 
@@ -87,8 +87,8 @@ def missing_path(paths: Iterable[Path], values: Mapping[str, object]) -> str | N
                 break
             if step not in at:
                 written = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in path[: depth + 1])
-                close = difflib.get_close_matches(str(step), [str(key) for key in at], n=1)
-                return f"there is no `{written[1:]}`" + (f"; did you mean `{close[0]}`?" if close else "")
+                similar = did_you_mean(str(step), map(str, at), "`")
+                return f"there is no `{written[1:]}`{similar and '; '}{similar}"
             at = at[step]
     return None
 

@@ -9,7 +9,6 @@ these parameters only the names are looked at.
 
 from __future__ import annotations
 
-import difflib
 import json
 from collections.abc import Iterable, Iterator, Sequence
 
@@ -26,6 +25,7 @@ from wayside.api import ApplicationTemplate, Detector, EventRule
 from wayside.api.actions.deploy import Deploy
 from wayside.api.operation import Operation
 from wayside.findings import Finding, ignored_by
+from wayside.names import did_you_mean
 from wayside.rules import (
     RuleError,
     RuleProblem,
@@ -148,8 +148,8 @@ def deploy_remarks(
         where = f"spec.actions[{index}].deploy"
         template = known.get(action.deploy.template_name)
         if template is None:
-            close = difflib.get_close_matches(action.deploy.template_name, [*known, *others], n=1)
-            remedy = f"did you mean {close[0]}?" if close else "create it, or tasks of this rule are refused"
+            similar = did_you_mean(action.deploy.template_name, [*known, *others])
+            remedy = similar or "create it, or tasks of this rule are refused"
             missing = (
                 f"there is no ApplicationTemplate {action.deploy.template_name} in namespace {rule.namespace}: {remedy}"
             )
