@@ -18,6 +18,7 @@ from wayside.kubernetes.repeating import repeatedly
 from wayside.kubernetes.resources import Resource
 
 _REVIEWS = Resource("authorization.k8s.io/v1", "SelfSubjectAccessReview", "selfsubjectaccessreviews", namespaced=False)
+LOOK_EVERY = 5.0  # s between two questions about a namespace, while something is to be written there
 _SHOWN = 10  # of rights that lack, in one message
 
 log = logging.getLogger(__name__)
@@ -74,9 +75,6 @@ async def may(client: Client, right: Right, verb: str, namespace: str | None) ->
         },
     )
     return bool(answer["status"]["allowed"])
-
-
-LOOK_EVERY = 5.0  # s between two questions about a namespace, while something is to be written there
 
 
 class Grants:

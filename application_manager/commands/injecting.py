@@ -37,8 +37,10 @@ def print_injected(files: Sequence[str], namespace: str, detector_image: str | N
     name none. Raises ConfigurationError where a file cannot be read, or a Detector not be looked up.
     """
     documents = [each for file in files for each in _read(file)]
-    known = _Known({each.name: each for each in map(_detector, documents) if each is not None}, namespace)
-    injector = _Injector(asyncio.run(_looked_up(documents, known)), namespace, detector_image)
+    given = {each.name: each for each in map(_detector, documents) if each is not None}
+    wanted = {each for raw in documents for each in _wanted(raw, namespace) if each[1] not in given}
+    found = asyncio.run(_looked_up(wanted)) if wanted else {}
+    injector = _Injector(given, found, namespace, detector_image)
     sys.stdout.write(to_yaml([injector.manifest(each) for each in documents if not _is_detector(each)]))
     for line in injector.refusals:
         typer.echo(line, err=True)
@@ -47,20 +49,11 @@ def print_injected(files: Sequence[str], namespace: str, detector_image: str | N
 
 
 @dataclass(slots=True)
-class _Known:
-    """Detectors: of the files by name, those of the cluster by namespace and name."""
+class _Injector:
+    """Injects Detectors: those given by name, those of the cluster by namespace and name."""
 
     given: dict[str, Detector]
-    namespace: str
-    found: dict[tuple[str, str], Detector] = field(default_factory=dict)
-
-    def get(self, namespace: str, name: str) -> Detector | None:
-        return self.given.get(name) or self.found.get((namespace, name))
-
-
-@dataclass(slots=True)
-class _Injector:
-    known: _Known
+    found: dict[tuple[str, str], Detector]
     namespace: str
     image: str | None
     refusals: list[str] = field(default_factory=list)
@@ -77,7 +70,7 @@ class _Injector:
         if name is None or has_sidecar(spec):
             return pod
         namespace = _namespace(raw, self.namespace)
-        detector = self.known.get(namespace, name)
+        detector = self.given.get(name) or self.found.get((namespace, name))
         image = self.image
         if detector is not None and image is None:
             image = detector.spec.pod.image if detector.spec.pod is not None else None
@@ -89,13 +82,8 @@ class _Injector:
         return pod if found.addition is None else pod | {"spec": added(spec, found.addition)}
 
 
-async def _looked_up(documents: list[Manifest], known: _Known) -> _Known:
-    """Look up in the cluster what the files do not have."""
-    wanted = {
-        each for raw in documents for each in _wanted(raw, known.namespace) if known.get(*each) is None
-    }  # fmt: skip
-    if not wanted:
-        return known
+async def _looked_up(wanted: set[tuple[str, str]]) -> dict[tuple[str, str], Detector]:
+    """Look up in the cluster what the files do not have. Raises ConfigurationError."""
     listed = ", ".join(sorted(name for _, name in wanted))
     otherwise = "give its file with -f, or use the kubeconfig of a cluster that has it"
     try:
@@ -105,15 +93,12 @@ async def _looked_up(documents: list[Manifest], known: _Known) -> _Known:
             f"Detector {listed} is in none of the files, and cannot be read from the cluster: {error}: {otherwise}"
         ) from error
     try:
-        for namespace, name in sorted(wanted):
-            raw = await client.get(DETECTORS, namespace, name)
-            if raw is not None and (found := _detector(raw)) is not None:
-                known.found[namespace, name] = found
+        raws = {each: await client.get(DETECTORS, *each) for each in sorted(wanted)}
     except RequestError as error:
         raise ConfigurationError(f"Detector {listed} cannot be read from the cluster: {error}: {otherwise}") from error
     finally:
         await client.close()
-    return known
+    return {each: found for each, raw in raws.items() if raw is not None and (found := _detector(raw)) is not None}
 
 
 def _wanted(raw: Manifest, default: str) -> Iterator[tuple[str, str]]:

@@ -25,7 +25,7 @@ from application_manager.running.options import Options
 from application_manager.watching.router import Router
 from application_manager.work.applying import Applier
 from application_manager.work.configurations import ConfigurationWork
-from application_manager.work.detectors import DetectorWork, SidecarEvents
+from application_manager.work.detectors import DetectorWork
 from application_manager.work.instances import InstanceWork
 from application_manager.work.instancestatus import InstanceStatusWork
 from application_manager.work.judging import RuleKey, RuleWork, TemplateWork
@@ -108,7 +108,7 @@ class Assembly:
             client,
             self.detector_index,
             lambda name: self._rules.add((DETECTOR, name)),
-            SidecarEvents(self.cache, self.detector_index, self.recorder),
+            self.recorder,
         )
         self.detectors = queue("detector", self._where_active(detectors.reconcile), 1)
         queues = (instances, self._statuses, self._tasks, self._templates, self._rules, self.detectors)

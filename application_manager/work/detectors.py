@@ -54,40 +54,6 @@ class _Posted:
 
 
 @dataclass(frozen=True, slots=True)
-class SidecarEvents:
-    """Posts them, once a pod and cause."""
-
-    cache: ClusterCache
-    index: DetectorIndex
-    recorder: Recorder
-    _posted: dict[Name, dict[str, _Posted]] = field(default_factory=dict)  # by Detector, then the pod's uid
-
-    def report(self, name: Name) -> None:
-        """Post Events about the pods that request the Detector of this namespace and name."""
-        entry, detector = self.cache.store.get(DETECTOR, name), self.cache.detector(name)
-        version = entry.version if entry is not None else 0
-        before, posted, now = self._posted.pop(name, {}), dict[str, _Posted](), time.time()
-        for pod in self.index.requesting.get(name, []):
-            metadata, spec = pod["metadata"], pod["spec"]
-            age = now - parse_seconds(metadata["creationTimestamp"])
-            if has_sidecar(spec) or metadata.get("deletionTimestamp") or age >= NEW:
-                continue
-            uid, last = metadata["uid"], before.get(metadata["uid"])
-            if last is not None and last.version == version:
-                posted[uid] = last
-                continue
-            why = injection(metadata, spec, name[0], detector, self.index.defaults).why_not or _NOBODY
-            posted[uid] = _Posted(version, why)
-            if last is None or last.why != why:
-                about = Metadata(name=metadata["name"], namespace=name[0], uid=uid)
-                note = f"it runs without a detector: {why}. Recreate the pod once this is corrected"
-                regarding = Kind(api_version="v1", kind="Pod", metadata=about)
-                self.recorder.event(regarding, EventReason.NOT_INJECTED, note, now, once=True)
-        if posted:
-            self._posted[name] = posted
-
-
-@dataclass(frozen=True, slots=True)
 class DetectorWork:
     """Makes, changes and removes a detector's objects; `judge` enqueues the Detector's status."""
 
@@ -95,13 +61,14 @@ class DetectorWork:
     client: Client
     index: DetectorIndex
     judge: Callable[[Name], None]
-    sidecars: SidecarEvents
+    recorder: Recorder
+    _posted: dict[Name, dict[str, _Posted]] = field(default_factory=dict)  # by Detector, then the pod's uid
     _applied: dict[str, tuple[str, str]] = field(default_factory=dict)  # uid → what was applied, and our fields since
 
     async def reconcile(self, name: Name) -> None:
         """Make the Detector's objects, and note whether it runs. Raises RequestError for what may pass."""
         entry = self.cache.store.get(DETECTOR, name)
-        self.sidecars.report(name)
+        self._report(name)
         if entry is None:
             self.index.running.pop(name, None)
             return
@@ -129,10 +96,8 @@ class DetectorWork:
         there = self.index.owned(detector.metadata.uid).get("Deployment")
         if detector_findings(detector).problems:
             return NOT_ACCEPTED if there is None else running(there, self.index.troubles(name))
-        for manifest in detector_objects(detector, self.index.defaults):
-            problem = await self._apply(name, detector, manifest)
-            if problem is not None:
-                return problem
+        if (problem := await self._apply(name, detector, detector_objects(detector, self.index.defaults))) is not None:
+            return problem
         return running(self.index.owned(detector.metadata.uid).get("Deployment"), self.index.troubles(name))
 
     async def _make_rights(self, name: Name, detector: Detector, defaults: PodDefaults) -> Aspect:
@@ -143,17 +108,22 @@ class DetectorWork:
         manifests = detector_objects(detector, defaults)
         kinds = {each["kind"] for each in manifests}
         await self._remove(name, detector.metadata.uid, set(self.index.owned(detector.metadata.uid)) - kinds)
-        for manifest in manifests:
-            problem = await self._apply(name, detector, manifest)
-            if problem is not None:
-                return problem
+        if (problem := await self._apply(name, detector, manifests)) is not None:
+            return problem
         requesting = self.index.requesting.get(name, [])
         if detector_findings(detector).problems and not any(has_sidecar(each["spec"]) for each in requesting):
             return NOT_ACCEPTED
         return carried(detector, requesting)
 
-    async def _apply(self, name: Name, detector: Detector, manifest: Manifest) -> Aspect | None:
-        """Apply one object; what prevents it, if anything."""
+    async def _apply(self, name: Name, detector: Detector, manifests: Iterable[Manifest]) -> Aspect | None:
+        """Apply the objects, up to the first that something prevents; what that is, if anything."""
+        for manifest in manifests:
+            problem = await self._apply_one(name, detector, manifest)
+            if problem is not None:
+                return problem
+        return None
+
+    async def _apply_one(self, name: Name, detector: Detector, manifest: Manifest) -> Aspect | None:
         kind, called = manifest["kind"], manifest["metadata"]["name"]
         known = self.index.owned(detector.metadata.uid)
         live = known.get(kind) or await self.client.get(_RESOURCES[kind], name[0], called)
@@ -187,3 +157,27 @@ class DetectorWork:
             self.index.owned(uid).pop(kind, None)
             self._applied.pop(raw["metadata"]["uid"], None)
             log.info("detector %s/%s: removed %s %s", *name, kind, raw["metadata"]["name"])
+
+    def _report(self, name: Name) -> None:
+        """Post Events about the pods that request the Detector and run without it, once a pod and cause."""
+        entry, detector = self.cache.store.get(DETECTOR, name), self.cache.detector(name)
+        version = entry.version if entry is not None else 0
+        before, posted, now = self._posted.pop(name, {}), dict[str, _Posted](), time.time()
+        for pod in self.index.requesting.get(name, []):
+            metadata, spec = pod["metadata"], pod["spec"]
+            age = now - parse_seconds(metadata["creationTimestamp"])
+            if has_sidecar(spec) or metadata.get("deletionTimestamp") or age >= NEW:
+                continue
+            uid, last = metadata["uid"], before.get(metadata["uid"])
+            if last is not None and last.version == version:
+                posted[uid] = last
+                continue
+            why = injection(metadata, spec, name[0], detector, self.index.defaults).why_not or _NOBODY
+            posted[uid] = _Posted(version, why)
+            if last is None or last.why != why:
+                about = Metadata(name=metadata["name"], namespace=name[0], uid=uid)
+                note = f"it runs without a detector: {why}. Recreate the pod once this is corrected"
+                regarding = Kind(api_version="v1", kind="Pod", metadata=about)
+                self.recorder.event(regarding, EventReason.NOT_INJECTED, note, now, once=True)
+        if posted:
+            self._posted[name] = posted
