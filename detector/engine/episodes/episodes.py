@@ -49,6 +49,15 @@ class Observation:
     when: Truth
     until: Truth
 
+    @property
+    def code(self) -> int:
+        """The same in one byte."""
+        may = both(both(self.in_scope, self.near), both(self.when, negation(self.until)))
+        start = TRUE if may is True else FALSE if may is False else UNSURE
+        if self.in_scope is False:
+            return start | OUTSIDE
+        return start | (UNTIL if self.until is True else UNTIL_UNSURE if self.until is UNKNOWN else 0)
+
 
 class Started(NamedTuple):
     """An episode started; the condition has held since `onset`."""
@@ -172,48 +181,7 @@ class SubjectState:
 
     def step(self, now: int, timing: Timing, seen: Observation) -> Started | Ended | None:
         """Advance to the tick `now`; returns what happened."""
-        return self._open_step(now, timing, seen) if self.is_open else self._idle_step(now, timing, seen)
-
-    def _open_step(self, now: int, timing: Timing, seen: Observation) -> Ended | None:
-        reason = None
-        if seen.in_scope is False:
-            reason = Ending.OUT_OF_SCOPE
-        elif seen.until is True:
-            reason = Ending.UNTIL
-        elif seen.until is UNKNOWN:
-            if self.unknown_since is None:
-                self.unknown_since = now
-            if now - self.unknown_since >= timing.unknown_timeout:
-                reason = Ending.UNKNOWN
-        else:
-            self.unknown_since = None
-        if reason is None:
-            return None
-        self.end(now, timing)
-        return Ended(reason)
-
-    def _idle_step(self, now: int, timing: Timing, seen: Observation) -> Started | None:
-        condition = both(both(seen.in_scope, seen.near), both(seen.when, negation(seen.until)))
-        if condition is False:
-            self.onset = self.unknown_since = None
-            return None
-        if condition is UNKNOWN:
-            if self.onset is not None:
-                if self.unknown_since is None:
-                    self.unknown_since = now
-                if now - self.unknown_since > timing.hold:
-                    self.onset = self.unknown_since = None
-            return None
-        self.unknown_since = None
-        if self.onset is None:
-            if now < self.rests_until:
-                return None
-            self.onset = now
-        if now - self.onset < timing.hold:
-            return None
-        onset, self.onset = self.onset, None
-        self.is_open = True
-        return Started(onset)
+        return self.run((now,), 0, 1, timing, seen.code)[1]
 
 
 def negation(value: Truth) -> Truth:
