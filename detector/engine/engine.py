@@ -174,7 +174,7 @@ class Engine:
         self._plugins.configure(rules, kept)
         self.schedule.set_rules([run.rule for run in self._runs.values()])
         self._executor.set_rules(self._runs)
-        self._deploying = [run for run in self._runs.values() if run.has_deploys]
+        self._deploying = [run for run in self._runs.values() if run.rule.deploys]
         self._rules_version += 1
         return events
 

@@ -316,7 +316,7 @@ class Executor:
         """Rules or time changed: evaluate every subject at the next tick."""
         for run in self._runs.values():
             if run.rule.on_sample is not None:
-                self._wake(run, time, run.subjects)
+                self._wake(run, time, run.states)
 
     def gap(self, time: int, backwards: bool) -> None:
         """Continue at this time without the ticks between; `backwards`: it may be earlier. Nanoseconds."""

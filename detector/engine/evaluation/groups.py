@@ -15,7 +15,7 @@ from detector.engine.columns.fleets import FleetBlock, FleetGroup
 from detector.engine.columns.group import ClientGroup
 from detector.engine.columns.table import Integers, Truths
 from detector.engine.columns.verdicts import Codes
-from detector.engine.episodes.episodes import NO_WAKE, TRUE, UNSEEN, UNTIL, UNTIL_UNSURE
+from detector.engine.episodes.episodes import NO_WAKE, TRUE, UNSEEN, UNTIL, UNTIL_UNSURE, SubjectState
 from detector.engine.episodes.events import Happened
 from detector.engine.episodes.subjects import Subject
 from detector.engine.evaluation.observing import Observer
@@ -70,8 +70,8 @@ class RuleGroup:
         self._budgeted = [run for run in runs if run.rule.maximum_per_hour is not None]
         self._measures = any(signal.episode for run in runs for signal in run.rule.derived)
         """Whether some rule has statistics of its episodes."""
-        self._deploying = [(row, run) for row, run in enumerate(self._of) if run.has_deploys]
-        self._timed = [run.has_deploys or run.timing.hold > 0 or run.timing.cooldown > 0 for run in self._of]
+        self._deploying = [(row, run) for row, run in enumerate(self._of) if run.rule.deploys]
+        self._timed = [bool(run.rule.deploys or run.timing.hold or run.timing.cooldown) for run in self._of]
         """The tracks for which it matters how long an observation stays the same."""
         self._plain = [isinstance(run.rule.subject, ClientSubject) and not run.rule.has_actions for run in self._of]
         """Rules whose events contain only signals, and that render nothing."""
@@ -116,7 +116,7 @@ class RuleGroup:
             self._wakes[rows, places] = wakes
         last = ticks[-1]
         for run in self._budgeted:
-            run.tidy_starts(last)
+            run.budget.expire(last)
         return happened
 
     def _looked(self, clients: Sequence[str], only: Mapping[str, Only]) -> Truths | None:
@@ -164,7 +164,7 @@ class RuleGroup:
     def _watched_numbers(self, row: int) -> list[int]:
         """The numbers of a track's subjects that have a state."""
         element = self.columns.tracks[row].element.name
-        return [self.columns.number(each) for each in self._of[row].subjects if each.element == element]
+        return [self.columns.number(each) for each in self._of[row].states if each.element == element]
 
     def _changed(
         self, block: Block | FleetBlock, codes: Codes, looked: Truths | None
@@ -219,17 +219,17 @@ class RuleGroup:
         """
         run, track = self._of[row], self.columns.tracks[row]
         subject = track.subject(block.clients[at])
-        state = run.state(subject) or run.new_state(subject)
+        state = run.states.get(subject) or run.states.setdefault(subject, SubjectState())
         ticks, timing, count = block.ticks, run.timing, len(block.ticks)
         begins, codes = changes
-        deploys, timed = run.has_deploys, self._timed[row]
+        deploys, timed = run.rule.deploys, self._timed[row]
         wake: int | None = None
         for code, begin, end in zip(codes, begins, (*begins[1:], count), strict=True):
             first = begin
             if not timed and (code == TRUE or code >= UNTIL):
                 end = begin + 1  # noqa: PLW2901  the later ticks have no effect
             while first < end:
-                one_by_one = deploys and state.is_open and run.needs_every_tick(subject)
+                one_by_one = bool(deploys) and state.is_open and run.needs_every_tick(subject)
                 happened_at, what, wake = state.run(ticks, first, first + 1 if one_by_one else end, timing, code)
                 if what is not None:
                     if self._measures:
@@ -245,7 +245,7 @@ class RuleGroup:
                 first = happened_at
         idle = state.idle_at(ticks[-1])
         if idle:
-            run.drop_state(subject)
+            del run.states[subject]
         return not idle, NO_WAKE if wake is None else wake
 
     def _candidate(self, block: Block | FleetBlock, track: Track, subject: Subject, point: int) -> Candidate:

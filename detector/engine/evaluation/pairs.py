@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from detector.engine.columns.block import Block, Context, Track
 from detector.engine.columns.pairs import PairBlock, PairColumns
 from detector.engine.columns.table import Integers, Truths, find_rows
-from detector.engine.episodes.episodes import NO_WAKE, TRUE, UNSEEN
+from detector.engine.episodes.episodes import NO_WAKE, TRUE, UNSEEN, SubjectState
 from detector.engine.episodes.events import Happened
 from detector.engine.episodes.subjects import Subject
 from detector.engine.evaluation.observing import Observer
@@ -83,7 +83,7 @@ class PairGroup:
         """Evaluate these ticks; returns what happened. Such a rule evaluates all pairs."""
         assert only is None  # noqa: S101  it is not evaluated with samples
         happened = [each for tick in ticks for each in self._tick(tick, clients, floor)]
-        self._run.tidy_starts(ticks[-1])
+        self._run.budget.expire(ticks[-1])
         return happened
 
     def _tick(self, tick: int, clients: Sequence[str], floor: int | None) -> Iterator[Happened]:
@@ -111,7 +111,7 @@ class PairGroup:
         stale[seen] = changed[rows]
         over = ~seen & ~watched.in_progress & (watched.wakes <= tick)
         for key in watched.keys[over].tolist():
-            self._run.drop_state(self._subject(key))
+            del self._run.states[self._subject(key)]
         if these.measured:
             self._measure(tick, these, index)
         kept: list[Entry] = []
@@ -146,10 +146,8 @@ class PairGroup:
             return
         self._version, run.disturbed = tables.version, False
         found = []
-        for subject in run.subjects:
+        for subject, state in run.states.items():
             a, b = (tables.number(client) for client in subject.clients)
-            state = run.state(subject)
-            assert state is not None  # noqa: S101  it has one
             in_progress = state.is_open or state.onset is not None
             wake = 0 if in_progress else state.rests_until
             found.append((a << _SHIFT | b, UNSEEN, wake, in_progress, _ENDS if state.is_open else _STARTS))
@@ -166,7 +164,7 @@ class PairGroup:
     def _followed(self, these: PairBlock, rows: Integers, in_progress: Truths) -> Truths:
         """Which of these pairs have demands that an evaluation may change although the observation is the same."""
         run = self._run
-        if not run.has_deploys or not run.open_episodes:
+        if not run.rule.deploys or not run.open_episodes:
             return np.zeros(len(rows), bool)
         needed = [
             progress and run.needs_every_tick(self._subject(self._key(these, row)))
@@ -178,7 +176,7 @@ class PairGroup:
         """Advance one pair's state, and add it to the kept ones if it is still needed."""
         run, key, code = self._run, self._key(these, row), these.codes.item(row)
         subject = self._subject(key)
-        state = run.state(subject) or run.new_state(subject)
+        state = run.states.get(subject) or run.states.setdefault(subject, SubjectState())
         stays = state.is_open and run.needs_every_tick(subject)
         _, what, wakes = state.run((tick,), 0, 1, run.timing, code)
         if what is not None or stays:
@@ -190,7 +188,7 @@ class PairGroup:
             elif (event := run.happened(tick, what, candidate)) is not None:
                 yield Happened(tick, self._order, event)
         if state.idle_at(tick):
-            run.drop_state(subject)
+            del run.states[subject]
             return
         in_progress = state.is_open or state.onset is not None
         wake = wakes if in_progress else state.rests_until

@@ -52,7 +52,7 @@ class RuleRun:
         """By condition, the signals and streams that it reads, as a text for errors."""
         self.counters = counters
         self._identity = identity
-        self._timing = Timing(rule.for_ns, rule.cooldown_ns, rule.unknown_timeout_ns)
+        self.timing = Timing(rule.for_ns, rule.cooldown_ns, rule.unknown_timeout_ns)
         self._follows = any(deploy.follow for deploy in rule.deploys)
         self.past = Past()
         """Earlier values for signals over other signals."""
@@ -60,11 +60,13 @@ class RuleRun:
         """If set, called with each evaluation. It influences no result."""
         self.version = 0
         """Changes whenever the demands do."""
-        self._states: dict[Subject, SubjectState] = {}
+        self.states: dict[Subject, SubjectState] = {}
+        """The states of the subjects that have one. The rule's group changes them too."""
         self._open: dict[Subject, EpisodeState] = {}
         self._muted: set[Subject] = set()
         """Subjects with an episode beyond the budget: the episode continues, without events."""
-        self._budget = Budget()
+        self.budget = Budget()
+        """The starts of the last hour."""
         self._answers: list[OnDemandResult] | None = None
         self.looked_at: list[Subject] = []
         """The subjects whose states may have changed since the last evaluation with samples began."""
@@ -112,7 +114,7 @@ class RuleRun:
     def forget_pending(self) -> None:
         """The rule is paused: keep open episodes, discard pending ones."""
         self.disturbed = True
-        for state in self._states.values():
+        for state in self.states.values():
             state.gap()
 
     @property
@@ -120,21 +122,16 @@ class RuleRun:
         """Whether an observer needs each evaluation separately."""
         return self.witness is not None or self.counters.notes is not None
 
-    @property
-    def subjects(self) -> Iterable[Subject]:
-        """The subjects that have a state."""
-        return self._states
-
     def wakes(self, now: int, subjects: Iterable[Subject]) -> Iterator[tuple[Subject, int | None]]:
         """When each of the subjects must be evaluated again; nanoseconds after `now`, None: never."""
         for subject in subjects:
-            state = self._states.get(subject)
-            yield subject, None if state is None else state.wake(now, self._timing)
+            state = self.states.get(subject)
+            yield subject, None if state is None else state.wake(now, self.timing)
 
     def tidy(self, now: int) -> None:
         """Forget subjects whose state equals a new one, and starts that are over an hour old."""
-        self._states = {subject: state for subject, state in self._states.items() if not state.idle_at(now)}
-        self._budget.expire(now)
+        self.states = {subject: state for subject, state in self.states.items() if not state.idle_at(now)}
+        self.budget.expire(now)
 
     @property
     def open_episodes(self) -> int:
@@ -144,15 +141,15 @@ class RuleRun:
     @property
     def pending(self) -> int:
         """Subjects whose condition holds, but for less than `for`."""
-        return sum(state.onset is not None for state in self._states.values())
+        return sum(state.onset is not None for state in self.states.values())
 
     def gap(self, time: int) -> None:
         """Time moved on (or back) without ticks: keep open episodes, discard pending ones, reset windows."""
         self.disturbed = True
         self.past.clear()
-        for state in self._states.values():
+        for state in self.states.values():
             state.gap()
-            state.rests_until = min(state.rests_until, time + self._timing.cooldown)
+            state.rests_until = min(state.rests_until, time + self.timing.cooldown)
 
     def can_restore(self, record: EpisodeRecord) -> bool:
         """Whether the episode belongs to this rule in its current version."""
@@ -172,7 +169,7 @@ class RuleRun:
         self.disturbed = True
         record, subject = episode.record, episode.record.about
         deploys = {deploy.action: deploy.fixed for deploy in self.rule.deploys}
-        self._states[subject] = SubjectState(is_open=True)
+        self.states[subject] = SubjectState(is_open=True)
         state = self._open[subject] = EpisodeState(
             msgspec.structs.replace(record, classification=self.rule.classification),
             None,
@@ -197,7 +194,7 @@ class RuleRun:
         gone = changed - {deploy.action for deploy in rule.deploys}
         self.disturbed = True
         self.rule = rule
-        self._timing = Timing(rule.for_ns, rule.cooldown_ns, rule.unknown_timeout_ns)
+        self.timing = Timing(rule.for_ns, rule.cooldown_ns, rule.unknown_timeout_ns)
         self._follows = any(deploy.follow for deploy in rule.deploys)
         for episode in self._open.values():
             episode.change(rule, changed, gone)
@@ -208,7 +205,7 @@ class RuleRun:
         self.disturbed = True
         for subject in sorted(self._open, key=lambda each: each.text):
             yield self._cut_off(now, self._open.pop(subject), reason)
-        self._states.clear()
+        self.states.clear()
         self._muted.clear()
 
     def demands(self) -> Iterator[Demand]:
@@ -223,13 +220,13 @@ class RuleRun:
             yield self._open[subject].started(self.rule, self._identity)
 
     def _in_progress(self) -> Iterator[Subject]:
-        return (subject for subject, state in self._states.items() if state.is_open or state.onset is not None)
+        return (subject for subject, state in self.states.items() if state.is_open or state.onset is not None)
 
     def _lost(self, now: int, clients: Clients) -> Iterator[Event]:
-        for subject in [s for s in self._states if any(client not in clients for client in s.clients)]:
-            state = self._states[subject]
+        for subject in [s for s in self.states if any(client not in clients for client in s.clients)]:
+            state = self.states[subject]
             if state.is_open:
-                state.end(now, self._timing)
+                state.end(now, self.timing)
                 if subject in self._muted:
                     self._muted.discard(subject)
                 else:
@@ -260,10 +257,10 @@ class RuleRun:
         return candidate._replace(variables={**candidate.variables, **found})
 
     def _subject(self, now: int, candidate: Candidate) -> Iterator[Event]:
-        state = self._states.get(candidate.subject) or self.new_state(candidate.subject)
+        state = self.states.get(candidate.subject) or self.states.setdefault(candidate.subject, SubjectState())
         when = self._truth("when", self.rule.when, candidate)
         until = negation(when) if self.rule.until is None else self._truth("until", self.rule.until, candidate)
-        happened = state.step(now, self._timing, Observation(candidate.in_scope, candidate.near, when, until))
+        happened = state.step(now, self.timing, Observation(candidate.in_scope, candidate.near, when, until))
         if happened is None:
             self.stays(now, candidate)
         elif (event := self.happened(now, happened, candidate)) is not None:
@@ -272,33 +269,6 @@ class RuleRun:
             self.witness(Evaluated(now, candidate, when, until, state.is_open, state.onset))
         if self._answers is not None:
             self._answers.append(self._answer(candidate, when))
-
-    def state(self, subject: Subject) -> SubjectState | None:
-        """The subject's state, if it has one."""
-        return self._states.get(subject)
-
-    def new_state(self, subject: Subject) -> SubjectState:
-        """A new state for the subject."""
-        state = self._states[subject] = SubjectState()
-        return state
-
-    def drop_state(self, subject: Subject) -> None:
-        """Forget a state that equals a new one."""
-        del self._states[subject]
-
-    def tidy_starts(self, now: int) -> None:
-        """Forget starts that are over an hour old."""
-        self._budget.expire(now)
-
-    @property
-    def has_deploys(self) -> bool:
-        """Whether the rule's episodes have demands."""
-        return len(self.rule.deploys) > 0
-
-    @property
-    def timing(self) -> Timing:
-        """The rule's times."""
-        return self._timing
 
     def needs_every_tick(self, subject: Subject) -> bool:
         """Whether the subject needs an evaluation although its observation is the same, because its demands may
@@ -317,7 +287,7 @@ class RuleRun:
             candidate = self._measured(now, ended.statistics, candidate)
             return self._ended(now, ended, what.reason, snapshot(self.rule, candidate), candidate.variables)
         limit = self.rule.maximum_per_hour
-        if limit is None or self._budget.takes(subject.clients, now, limit):
+        if limit is None or self.budget.takes(subject.clients, now, limit):
             return self._started(now, what.onset, candidate)
         self.counters.suppressed += 1
         self._muted.add(subject)

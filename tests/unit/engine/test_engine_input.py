@@ -228,7 +228,7 @@ def test_the_states_of_subjects_that_are_gone_are_forgotten() -> None:
     for n in range(30):
         drive.take(arrival(n + 0.5, f"car{n}", {"v": 20}), until=n + 1)
     run: Any = drive.engine.rules["r"]
-    assert len(run._states) < 10
+    assert len(run.states) < 10
     signals: Any = drive.engine._known.signals
     assert len(signals._extracted) < 5
     assert len(drive.events) > 50
