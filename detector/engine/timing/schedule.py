@@ -134,10 +134,6 @@ class Schedule:
             del self._wakes[rule.name][subject]
         return Only(_NOBODY if thinned else clients, due), thinned
 
-    def has_wakes(self, rule: str) -> bool:
-        """Whether any of the rule's subjects must be evaluated without a sample."""
-        return bool(self._wakes.get(rule))
-
     def forget(self, rule: str) -> None:
         """The rule was removed or has changed its meaning: remove the wakes of its subjects."""
         self._wakes.pop(rule, None)
