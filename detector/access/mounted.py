@@ -71,13 +71,7 @@ def login(access: Access, field: str) -> Login | None:
     if given is not None:
         if given.password_file is not None:
             return Login(given.username, _text(Path(given.password_file), f"{field}.credentials.passwordFile"))
-        variable = given.password_variable or ""
-        password = os.environ.get(variable)
-        if password is None:
-            raise AccessError(
-                f"{field}.credentials.passwordVariable: the environment variable {variable} is not set: set it"
-            )
-        return Login(given.username, password)
+        return Login(given.username, variable_text(given.password_variable, f"{field}.credentials.passwordVariable"))
     if access.credentials_secret_name is None:
         return None
     at = f"{field}.credentialsSecretName"
@@ -90,17 +84,21 @@ def secret_text(name: str, key: str, field: str) -> str:
     return _text(_secret(name, field) / key, field)
 
 
+def variable_text(name: str | None, field: str) -> str:
+    """The value of an environment variable, which `field` names. Raises AccessError."""
+    value = os.environ.get(name or "")
+    if value is None:
+        raise AccessError(f"{field}: the environment variable {name} is not set: set it")
+    return value
+
+
 def database_uri(database: DatabaseConnection, field: str) -> str:
     """The connection string of a database; `field` is the place of `database`. Raises AccessError."""
     if database.uri_file is not None:
         return _text(Path(database.uri_file), f"{field}.uriFile")
     if database.uri_secret_name is not None:
         return secret_text(database.uri_secret_name, "uri", f"{field}.uriSecretName")
-    variable = database.uri_variable or ""
-    uri = os.environ.get(variable)
-    if uri is None:
-        raise AccessError(f"{field}.uriVariable: the environment variable {variable} is not set: set it")
-    return uri
+    return variable_text(database.uri_variable, f"{field}.uriVariable")
 
 
 def _secret(name: str, field: str) -> Path:

@@ -18,8 +18,7 @@ class Episode(EpisodeRecord, frozen=True, gc=False, kw_only=True):
     """The record of an episode, with what one action needs beside it. Times are nanoseconds since the epoch."""
 
     rendered: Mapping[str, JsonValue]
-    """The action's templates, rendered at the start, or see `rendered_again`; those that could not be rendered are
-    missing."""
+    """The action's templates, rendered at the start (or see `rendered_again`), as far as they could be rendered."""
     unrendered: Mapping[str, str]
     """The action's templates that could not be rendered, each with the reason."""
     started: Mapping[str, Any]

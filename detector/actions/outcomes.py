@@ -11,7 +11,7 @@ import json
 import threading
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 from detector.actions.episode import Episode, Outcome, OutcomeState
@@ -127,7 +127,9 @@ class Outcomes:
     def tallies(self) -> dict[Which, ActionTally]:
         """A copy of the counts of each action."""
         with self._lock:
-            return {which: _copied(tally) for which, tally in sorted(self._tallies.items())}
+            return {
+                which: replace(tally, current=dict(tally.current)) for which, tally in sorted(self._tallies.items())
+            }
 
     def lost(self) -> list[_Lost]:
         """All losses."""
@@ -182,10 +184,3 @@ def _count(tally: ActionTally, outcome: Outcome) -> None:
     else:
         tally.failed += 1
         tally.last_failure = outcome.message
-
-
-def _copied(tally: ActionTally) -> ActionTally:
-    return ActionTally(
-        tally.kind, tally.running, tally.done, tally.failed, tally.samples, tally.bytes, tally.missing, tally.files,
-        tally.last_failure, tally.last_file, dict(tally.current),
-    )  # fmt: skip

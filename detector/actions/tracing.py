@@ -68,8 +68,7 @@ class EpisodeTraces:
         return task.model_copy(update={"metadata": task.metadata.model_copy(update={"annotations": annotations})})
 
     def created(self, demand: Demand, began: int) -> None:
-        """The demand's task was created; `began` is when the request started, in nanoseconds since the epoch: export
-        its span."""
+        """Export the span of a task that was created; `began`: start of the request, nanoseconds since the epoch."""
         self.tracing.emit(
             Span(
                 f"create task {demand.action}",

@@ -13,7 +13,7 @@ from wayside.process.beginning import importing
 from wayside.process.commandline import refuse, table_console
 
 if TYPE_CHECKING:
-    from detector.actions.trigger.requests import RecordingReport, RecordingRequest
+    from detector.actions.trigger.requests import RecordingRequest
 
 app = typer.Typer(help="Request recordings of running detectors that permit it (spec.recordings.onRequest).")
 
@@ -47,7 +47,7 @@ def start(
     )
     if detector is None and name is None:
         refuse("no detector given to record: give --name NAME or --detector FILE")
-    _print(_request_reports(request, detector, name, connect, timeout), as_json)
+    _send(request, detector, name, connect, timeout, as_json)
 
 
 @app.command()
@@ -63,7 +63,7 @@ def stop(
     """End a recording."""
     if detector is None and name is None:
         refuse("no detector given to stop: give --name NAME or --detector FILE")
-    _print(_request_reports(_request(do="stop", id=identity, after=after), detector, name, connect, timeout), as_json)
+    _send(_request(do="stop", id=identity, after=after), detector, name, connect, timeout, as_json)
 
 
 @app.command("status")
@@ -76,7 +76,7 @@ def recordings_status(
     timeout: Timeout = 3.0,
 ) -> None:
     """List the recordings on request, running and finished."""
-    _print(_request_reports(_request(id=identity), detector, name, connect, timeout), as_json)
+    _send(_request(id=identity), detector, name, connect, timeout, as_json)
 
 
 def _request(**given: object) -> RecordingRequest:
@@ -93,24 +93,20 @@ def _request(**given: object) -> RecordingRequest:
         refuse(f"{'.'.join(map(str, path))}: {text}")
 
 
-def _request_reports(
+def _send(
     request: RecordingRequest,
     detector: DetectorFile,
     name: str | None,
     connect: list[str] | None,
     timeout: float,
-) -> list[tuple[str, RecordingReport]]:
-    """The reports, each with the name of the detector that sent it."""
+    as_json: bool,
+) -> None:
+    """Print the reports, each with the detector that sent it. Exits with 1 if a recording was refused or has failed."""
+    from detector.actions.trigger.orders import Progress
     from detector.actions.trigger.requests import RECORDINGS, read_reports, write_request
 
     answers = query_selected(RECORDINGS, {}, detector, name, connect, timeout, write_request(request))
-    return [(answer.key.split("/")[2], report) for answer in answers for report in read_reports(answer.payload)]
-
-
-def _print(reports: list[tuple[str, RecordingReport]], as_json: bool) -> None:
-    """Exits with 1 if a recording was refused or has failed."""
-    from detector.actions.trigger.orders import Progress
-
+    reports = [(answer.holder, report) for answer in answers for report in read_reports(answer.payload)]
     if as_json:
         import msgspec
 

@@ -1,5 +1,4 @@
-"""The implementations of `detector replay` and `detector check --recording`: recordings in, events, tasks and doubts
-out."""
+"""Implements `detector replay` and `detector check --recording`: recordings in, events, tasks and doubts out."""
 
 from __future__ import annotations
 

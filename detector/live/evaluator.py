@@ -176,8 +176,7 @@ class Evaluator:
         self._thread.start()
 
     def call(self, work: Callable[[], Result]) -> Future[Result]:
-        """Run a function on the thread of the evaluation, between two cycles; thread-safe. The future has its
-        result."""
+        """Run a function on the evaluation's thread, between two cycles; thread-safe. The future has its result."""
         future: Future[Result] = Future()
         with self._wake:
             if self._ended:
@@ -188,8 +187,7 @@ class Evaluator:
         return future
 
     def ask(self, rule: str) -> Future[list[OnDemandResult]]:
-        """Evaluate a rule with onDemand now; thread-safe. The future has its result for each subject, or
-        NoAnswerError."""
+        """Evaluate a rule with onDemand now; thread-safe. The future has a result by subject, or NoAnswerError."""
         return self.call(lambda: self._evaluate_on_demand(rule))
 
     def pause_rule(self, rule: str, paused: bool) -> Future[None]:

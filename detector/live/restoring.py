@@ -1,5 +1,4 @@
-"""The episodes that were open when the detector stopped: first those of its own live tasks, then those of its state
-volume."""
+"""The episodes that were open when the detector stopped: those of its live tasks, then those of its state volume."""
 
 from __future__ import annotations
 

@@ -38,8 +38,7 @@ class PluginError(ValueError):
 
 @dataclass(frozen=True)
 class Offers(Generic[T]):
-    """The classes of one kind that packages provide. Loading runs their code: only named ones are loaded, and only
-    once."""
+    """The classes of one kind that packages provide. Loading runs their code: only named ones are loaded, once."""
 
     group: str
     """The group of the entry points, e.g. wayside.signals."""

@@ -36,8 +36,7 @@ class BagParameters(Model):
 
 
 class BagSource(Source[BagParameters]):
-    """Plays recordings as if they happened now: with clock Wall, the receive time of a message is the time at which it
-    is played."""
+    """Plays recordings as if they happened now: with clock Wall, a message is received when it is played."""
 
     Parameters: ClassVar[type[BaseModel]] = BagParameters
 

@@ -15,8 +15,7 @@ MAXIMUM_MESSAGES = 4096
 MAXIMUM_BYTES = 8 << 20
 """Maximum bytes of payload in a batch, exceeded by at most one message."""
 _ONE_BY_ONE = 256
-"""Maximum number of messages in a batch of a reader that returns single messages: live playback waits while a batch is
-read."""
+"""Maximum number of messages in a batch of a reader of single messages: live playback waits while a batch is read."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

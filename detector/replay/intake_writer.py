@@ -94,8 +94,7 @@ class IntakeWriter:
         self._append(Control(time, dict(document)))
 
     def close(self) -> None:
-        """Writes the queued data and completes the file; without this call, the file can be read up to about the last
-        second."""
+        """Writes the queued data and completes the file; otherwise it can be read up to about the last second."""
         with self._changed:
             self._mark_lost()
             self._closing = True
@@ -185,8 +184,7 @@ class _Mcap:
         self._writer.flush()  # type: ignore[no-untyped-call]
 
     def follow(self, streams: Iterable[Stream], types: RosTypes) -> None:
-        """The following messages belong to these streams: those of a stream whose format changed go into new
-        channels."""
+        """The following messages belong to these streams; a stream whose format changed goes into new channels."""
         old, self._readings = self._readings, {stream.name: _reading(stream, types) for stream in streams}
         same = {name for name, reading in self._readings.items() if old.get(name) == reading}
         self._channels = {place: channel for place, channel in self._channels.items() if place[0] in same}

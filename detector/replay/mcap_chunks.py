@@ -158,8 +158,7 @@ class Chunks:
         return _Waiting(index.chunk_start_offset, rows, data)
 
     def _begins(self, index: ChunkIndex, size: int) -> NDArray[np.uint64] | None:
-        """The offsets of the messages in a chunk of `size` bytes, in order, from its message indexes; None without
-        indexes."""
+        """The offsets of the messages in a chunk of `size` bytes, in order, from its message indexes, if any."""
         length = index.message_index_length
         begin = index.chunk_start_offset + index.chunk_length
         most = size + _INDEX.size * _CHANNELS  # each message is longer than its entry

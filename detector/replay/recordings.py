@@ -64,8 +64,7 @@ def span_of(path: Path) -> tuple[int, int] | None:
 
 
 def quick_span_of(paths: Sequence[Path]) -> tuple[int, int] | None:
-    """The approximate times of the first and the last message of one recording; None if this requires reading all of
-    it."""
+    """The approximate times of the first and last message of one recording; None if only reading it all tells."""
     quick: dict[_Read, Callable[[Path], tuple[int, int] | None]] = {
         read_mcap: mcap_span,
         read_rosbag1: rosbag1_span,

@@ -129,8 +129,7 @@ def _recorded_types(connections: Iterable[Connection]) -> list[RecordedType]:
 
 
 def _as_ros2(connection: Connection) -> str:
-    """The definition of the connection's type for ROS 2; unchanged if it cannot be read, because it may not be
-    needed."""
+    """The definition of the connection's type for ROS 2; unchanged if it cannot be read: it may not be needed."""
     try:
         return _types([connection]).generate_msgdef(connection.msgtype, ros_version=2)[0]
     except TypesysError:

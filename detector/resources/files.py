@@ -125,8 +125,7 @@ _log = logging.getLogger(__name__)
 
 
 def hangups() -> asyncio.Event:
-    """An event that every SIGHUP sets from now on. Call it before the files are first read, so that no signal is
-    lost."""
+    """An event that every SIGHUP sets from now on. Call it before the files are first read, or a signal may be lost."""
     changed = asyncio.Event()
     asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, changed.set)
     return changed

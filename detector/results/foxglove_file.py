@@ -30,8 +30,7 @@ from detector.results.scene import FRAME, Scene
 from detector.results.series import SeriesKind, SubjectTrace
 
 MOST = 200_000
-"""Approximate maximum number of messages with values: longer series are reduced to minimum and maximum of equal
-periods."""
+"""Approximate maximum number of messages with values: longer series are reduced to minima and maxima of periods."""
 
 
 def write_mcap(path: Path, result: Result) -> None:

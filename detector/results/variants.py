@@ -73,8 +73,7 @@ class Comparison:
 
     @property
     def agreement(self) -> float | None:
-        """The time in which both had an episode of a subject, divided by the time in which either had; None if there
-        are no episodes."""
+        """The time in which both had an episode of a subject, by that in which either had; None without episodes."""
         shared = sum(first.shared(second) for first, second in self.both)
         spans = [*self.only_first, *self.only_second, *(span for pair in self.both for span in pair)]
         either = sum(span.end - span.start for span in spans) - shared

@@ -21,8 +21,7 @@ Put = Callable[[Sequence[tuple[str, bytes]]], None]
 
 
 class Putter(Protocol):
-    """Returns the function that receives the messages of some streams: each message goes to all of them, with the same
-    time."""
+    """Returns the function that receives the messages of some streams: each goes to all of them, with the same time."""
 
     def __call__(self, *streams: str) -> Put:
         """`streams` are their names."""
@@ -100,8 +99,7 @@ class Feed:
         self._stop.set()
 
     def _route(self, key: str) -> Put | None:
-        """Find the function that receives the messages of the key, and cache it; None if the key belongs to no
-        stream."""
+        """Find and cache the function that receives the messages of the key; None if the key belongs to no stream."""
         streams = [each.spec.name for each in self.streams if each.pattern.match(key) is not None]
         if len(self._routes) >= _MAXIMUM_KEYS:
             self._routes.clear()

@@ -128,8 +128,7 @@ class MqttSource(Source[MqttParameters]):
 
 
 def topic_filter(expression: str) -> str:
-    """A key expression as an MQTT topic filter that matches at least the same keys; the stream's key makes the final
-    decision."""
+    """A key expression as an MQTT topic filter for at least the same keys; the stream's key has the final say."""
     chunks = expression.split("/")
     if "**" in chunks:
         chunks = [*chunks[: chunks.index("**")], "#"]

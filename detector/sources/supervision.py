@@ -122,8 +122,7 @@ class Sources:
     """The sources of a Detector, which may change."""
 
     def __init__(self, putter: Putter, tally: Tally, *, timeout: float = 2.0) -> None:
-        """`putter` returns the function that receives the messages of streams; `timeout`: seconds that sources have to
-        stop."""
+        """`putter` returns the function that receives messages of streams; sources have `timeout` seconds to stop."""
         self._putter = putter
         self._tally = tally
         self._timeout = timeout

@@ -46,8 +46,7 @@ class Watching:
         run.counters.notes = []
 
     def is_over(self) -> bool:
-        """Whether the rule was evaluated in the meantime, was removed, or nobody waits any more; then the future is
-        set."""
+        """Whether the rule was evaluated since, was removed, or nobody waits any more; then the future is set."""
         gone = self._engine.rules.get(self._run.rule.name) is not self._run
         if self._run.counters.ticks == self._ticks and not gone and not self.future.cancelled():
             return False

@@ -81,8 +81,7 @@ class StatusKeeper:
         self._looked: dict[str, int] = {}
         """The tick at which a rule's latency was last measured: samples up to there are counted."""
         self._ticks: dict[str, int] = {}
-        """By rule, its number of ticks at the last measurement. Kept after the removal of a rule, like the engine's
-        counters."""
+        """By rule, its number of ticks at the last measurement. Kept after its removal, like the engine's counters."""
         self._counts: deque[tuple[int, dict[str, int]]] = deque(maxlen=_RATES_OVER + 1)
         self._stream_latencies: dict[str, _Latencies] = {}
         self._rule_latencies: dict[str, _Latencies] = {}

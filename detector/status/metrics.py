@@ -12,69 +12,50 @@ from prometheus_client.registry import Collector
 from detector.status.model import ActionStatus, Histogram, RuleState, RuleStatus, Status, StreamStatus
 
 _PREFIX = "wayside_detector_"
+_GAUGE, _COUNTER = GaugeMetricFamily, CounterMetricFamily
 
 DETECTOR: tuple[tuple[str, type, str, Callable[[Status], float | None]], ...] = (
-    ("connected", GaugeMetricFamily, "1 if a Zenoh router, peer or client is connected", lambda s: s.connected),
-    (
-        "start_time_seconds",
-        GaugeMetricFamily,
-        "Start time of the detector, in seconds since the epoch",
-        lambda s: s.started,
-    ),
-    ("status_time_seconds", GaugeMetricFamily, "Time of this status, in seconds since the epoch", lambda s: s.taken),
+    ("connected", _GAUGE, "1 if a Zenoh router, peer or client is connected", lambda s: s.connected),
+    ("start_time_seconds", _GAUGE, "Start time of the detector, in seconds since the epoch", lambda s: s.started),
+    ("status_time_seconds", _GAUGE, "Time of this status, in seconds since the epoch", lambda s: s.taken),
     (
         "evaluated_time_seconds",
-        GaugeMetricFamily,
+        _GAUGE,
         "Time axis position up to which all ticks were evaluated, in seconds since the epoch",
         lambda s: s.now,
     ),
-    (
-        "generation",
-        GaugeMetricFamily,
-        "Generation of the Detector in use; 0 if it is from a file",
-        lambda s: s.generation,
-    ),
-    ("clients", GaugeMetricFamily, "Number of known clients", lambda s: s.client_count),
-    ("gaps", CounterMetricFamily, "Number of gaps at which missed ticks were skipped", lambda s: s.gaps),
-    ("buffer_bytes", GaugeMetricFamily, "Size of the buffer in bytes, overhead included", lambda s: s.buffered_bytes),
-    (
-        "buffer_limit_bytes",
-        GaugeMetricFamily,
-        "Maximum size of the buffer in bytes, over all streams",
-        lambda s: s.maximum_bytes,
-    ),
-    ("demands", GaugeMetricFamily, "Number of tasks that are currently demanded", lambda s: s.demand_count),
-    ("clients_missing", GaugeMetricFamily, "Number of expected clients that send nothing", lambda s: s.missing_count),
+    ("generation", _GAUGE, "Generation of the Detector in use; 0 if it is from a file", lambda s: s.generation),
+    ("clients", _GAUGE, "Number of known clients", lambda s: s.client_count),
+    ("gaps", _COUNTER, "Number of gaps at which missed ticks were skipped", lambda s: s.gaps),
+    ("buffer_bytes", _GAUGE, "Size of the buffer in bytes, overhead included", lambda s: s.buffered_bytes),
+    ("buffer_limit_bytes", _GAUGE, "Maximum size of the buffer in bytes, over all streams", lambda s: s.maximum_bytes),
+    ("demands", _GAUGE, "Number of tasks that are currently demanded", lambda s: s.demand_count),
+    ("clients_missing", _GAUGE, "Number of expected clients that send nothing", lambda s: s.missing_count),
     (
         "certificate_expiry_time_seconds",
-        GaugeMetricFamily,
+        _GAUGE,
         "Expiry of the certificate in use, in seconds since the epoch; absent without a certificate",
         lambda s: s.certificate.expires,
     ),
     (
         "certificate_refused",
-        GaugeMetricFamily,
+        _GAUGE,
         "1 if the new certificates in the files cannot be used",
         lambda s: bool(s.certificate.problem),
     ),
-    ("certificate_renewals", CounterMetricFamily, "Number of certificate renewals", lambda s: s.certificate.renewals),
+    ("certificate_renewals", _COUNTER, "Number of certificate renewals", lambda s: s.certificate.renewals),
 )
 """Without labels: name, kind, help text, and value; None: absent."""
 
 STREAM: tuple[tuple[str, type, str, Callable[[StreamStatus], float | None]], ...] = (
-    ("stream_samples", CounterMetricFamily, "Number of samples added to the buffer", lambda s: s.samples),
-    (
-        "stream_samples_per_second",
-        GaugeMetricFamily,
-        "Samples per second, averaged over about ten seconds",
-        lambda s: s.rate,
-    ),
-    ("stream_clients", GaugeMetricFamily, "Number of clients with buffered samples", lambda s: s.clients),
-    ("stream_age_seconds", GaugeMetricFamily, "Age of the newest sample in seconds, on the time axis", lambda s: s.age),
-    ("stream_buffered_samples", GaugeMetricFamily, "Number of samples in the buffer", lambda s: s.buffered_samples),
+    ("stream_samples", _COUNTER, "Number of samples added to the buffer", lambda s: s.samples),
+    ("stream_samples_per_second", _GAUGE, "Samples per second, averaged over about ten seconds", lambda s: s.rate),
+    ("stream_clients", _GAUGE, "Number of clients with buffered samples", lambda s: s.clients),
+    ("stream_age_seconds", _GAUGE, "Age of the newest sample in seconds, on the time axis", lambda s: s.age),
+    ("stream_buffered_samples", _GAUGE, "Number of samples in the buffer", lambda s: s.buffered_samples),
     (
         "stream_buffered_bytes",
-        GaugeMetricFamily,
+        _GAUGE,
         "Bytes of these samples in the buffer, overhead included",
         lambda s: s.buffered_bytes,
     ),
@@ -82,50 +63,28 @@ STREAM: tuple[tuple[str, type, str, Callable[[StreamStatus], float | None]], ...
 """By stream."""
 
 RULE: tuple[tuple[str, type, str, Callable[[RuleStatus], float | None]], ...] = (
-    ("rule_evaluations", CounterMetricFamily, "Number of subjects evaluated", lambda r: r.evaluations),
-    (
-        "rule_ticks",
-        CounterMetricFamily,
-        "Number of ticks at which the rule was evaluated, for all subjects",
-        lambda r: r.ticks,
-    ),
-    ("rule_evaluation_seconds", CounterMetricFamily, "Time spent on evaluations, in seconds", lambda r: r.time),
-    ("rule_unknowns", CounterMetricFamily, "Number of values that were unknown when needed", lambda r: r.unknowns),
-    (
-        "rule_errors",
-        CounterMetricFamily,
-        "Number of expressions that failed although their values were known",
-        lambda r: r.errors,
-    ),
-    ("rule_episodes_started", CounterMetricFamily, "Number of episodes that started", lambda r: r.started),
-    ("rule_episodes_ended", CounterMetricFamily, "Number of episodes that ended", lambda r: r.ended),
-    ("rule_episodes_open", GaugeMetricFamily, "Number of open episodes", lambda r: r.open),
-    (
-        "rule_subjects_pending",
-        GaugeMetricFamily,
-        "Number of subjects whose `for` is running",
-        lambda r: r.pending,
-    ),
+    ("rule_evaluations", _COUNTER, "Number of subjects evaluated", lambda r: r.evaluations),
+    ("rule_ticks", _COUNTER, "Number of ticks at which the rule was evaluated, for all subjects", lambda r: r.ticks),
+    ("rule_evaluation_seconds", _COUNTER, "Time spent on evaluations, in seconds", lambda r: r.time),
+    ("rule_unknowns", _COUNTER, "Number of values that were unknown when needed", lambda r: r.unknowns),
+    ("rule_errors", _COUNTER, "Number of expressions that failed although their values were known", lambda r: r.errors),
+    ("rule_episodes_started", _COUNTER, "Number of episodes that started", lambda r: r.started),
+    ("rule_episodes_ended", _COUNTER, "Number of episodes that ended", lambda r: r.ended),
+    ("rule_episodes_open", _GAUGE, "Number of open episodes", lambda r: r.open),
+    ("rule_subjects_pending", _GAUGE, "Number of subjects whose `for` is running", lambda r: r.pending),
 )
 """By rule."""
 
 ACTION: tuple[tuple[str, type, str, Callable[[ActionStatus], float | None]], ...] = (
-    ("action_running", GaugeMetricFamily, "Number of episodes that the action is working on", lambda a: a.running),
-    ("action_done", CounterMetricFamily, "Number of episodes that the action completed", lambda a: a.done),
-    ("action_failed", CounterMetricFamily, "Number of episodes for which the action failed", lambda a: a.failed),
-    ("action_samples", CounterMetricFamily, "Number of samples recorded or stored", lambda a: a.samples),
-    ("action_bytes", CounterMetricFamily, "Number of bytes recorded, stored or sent", lambda a: a.bytes),
-    ("action_files", CounterMetricFamily, "Number of files written", lambda a: a.files),
-    (
-        "action_missing",
-        CounterMetricFamily,
-        "Number of samples, messages or similar that the action lost",
-        lambda a: a.missing,
-    ),
+    ("action_running", _GAUGE, "Number of episodes that the action is working on", lambda a: a.running),
+    ("action_done", _COUNTER, "Number of episodes that the action completed", lambda a: a.done),
+    ("action_failed", _COUNTER, "Number of episodes for which the action failed", lambda a: a.failed),
+    ("action_samples", _COUNTER, "Number of samples recorded or stored", lambda a: a.samples),
+    ("action_bytes", _COUNTER, "Number of bytes recorded, stored or sent", lambda a: a.bytes),
+    ("action_files", _COUNTER, "Number of files written", lambda a: a.files),
+    ("action_missing", _COUNTER, "Number of samples, messages or similar that the action lost", lambda a: a.missing),
 )
 """By rule, action and kind."""
-
-Family = GaugeMetricFamily | CounterMetricFamily
 
 
 class Metrics(Collector):
@@ -181,7 +140,7 @@ def _families(
     items: Sequence[tuple[tuple[str, ...], Any]],
 ) -> Iterator[Metric]:
     for name, kind, text, value_of in table:
-        family: Family = kind(f"{_PREFIX}{name}", text, labels=labels)
+        family: GaugeMetricFamily | CounterMetricFamily = kind(f"{_PREFIX}{name}", text, labels=labels)
         for values, item in items:
             value = value_of(item)
             if value is not None:

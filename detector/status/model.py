@@ -24,8 +24,7 @@ class Histogram(msgspec.Struct, frozen=True, rename="camel"):
         return sum(self.counts)
 
     def quantile(self, share: float) -> float | None:
-        """Seconds: the bound below which that share of the times lies; infinite beyond the last, None if there are
-        none."""
+        """Seconds: the bound below which that share of the times lies; infinite beyond the last, None without times."""
         seen, wanted = 0, share * self.count
         for bound, count in zip((*self.bounds, float("inf")), self.counts, strict=True):
             seen += count

@@ -68,10 +68,7 @@ def _sums(total: Total) -> Iterator[RenderableType]:
     yield from _acting(total.actions)
     yield from _lost(total.drops)
     if total.shared_clients:
-        more = total.shared_client_count - _CLIENTS
-        yield f"known to several: {', '.join(total.shared_clients[:_CLIENTS])}" + (
-            f" and {more} more" if more > 0 else ""
-        )
+        yield f"known to several: {_listed(total.shared_clients, total.shared_client_count)}"
     if total.missing_count:
         yield f"missing: {total.missing_count} expected clients"
 
@@ -98,19 +95,16 @@ def _parts(status: Status) -> Iterator[RenderableType]:
     of_rules = {rule.name for rule in status.rules}
     yield from _acting([each for each in status.actions if each.rule in of_rules or status.explanation is None])
     if status.explanation is None and status.demand_count:
-        more = status.demand_count - _DEMANDS
-        yield f"demands: {', '.join(status.demands[:_DEMANDS])}" + (f" and {more} more" if more > 0 else "")
+        yield f"demands: {_listed(status.demands, status.demand_count, _DEMANDS)}"
     if status.explanation is not None:
         yield from _explained(status.explanation)
         return
     yield from _lost(status.drops)
     if status.clients:
-        shown = ", ".join(f"{client.name} ({_ago(client.age)})" for client in status.clients[:_CLIENTS])
-        more = status.client_count - _CLIENTS
-        yield f"clients: {shown}" + (f" and {more} more" if more > 0 else "")
+        known = [f"{client.name} ({_ago(client.age)})" for client in status.clients]
+        yield f"clients: {_listed(known, status.client_count)}"
     if status.missing:
-        more = status.missing_count - _CLIENTS
-        yield f"missing: {', '.join(status.missing[:_CLIENTS])}" + (f" and {more} more" if more > 0 else "")
+        yield f"missing: {_listed(status.missing, status.missing_count)}"
 
 
 def _proving(status: Status) -> Iterator[RenderableType]:
@@ -214,6 +208,11 @@ def _explained(explanation: RuleExplanation) -> Iterator[RenderableType]:
             yield f"    {name} is unknown: {why}"
     for note in explanation.notes:
         yield f"in this evaluation: {note}"
+
+
+def _listed(names: Sequence[str], count: int, most: int = _CLIENTS) -> str:
+    """The first `most` of `count` names."""
+    return ", ".join(names[:most]) + (f" and {count - most} more" if count > most else "")
 
 
 def _truth(value: bool | None) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import msgspec
 
@@ -119,7 +119,7 @@ def _share(status: Status) -> DetectorShare:
     )
 
 
-_Item = TypeVar("_Item")
+_Item = TypeVar("_Item", bound=msgspec.Struct)
 _Key = TypeVar("_Key")
 
 
@@ -135,18 +135,21 @@ def _joined(
     return [add(found) for found in by_key.values()]
 
 
+def _summed(items: Sequence[_Item], **given: Any) -> _Item:
+    """The first item with the sums of all its numbers, and with the given fields."""
+    first = items[0]
+    sums = {
+        name: sum(getattr(each, name) for each in items)
+        for name in first.__struct_fields__
+        if name not in given and isinstance(getattr(first, name), int | float)
+    }
+    return msgspec.structs.replace(first, **sums, **given)
+
+
 def _stream(found: Sequence[tuple[str, StreamStatus]]) -> StreamStatus:
     streams = [stream for _, stream in found]
-    return StreamStatus(
-        name=streams[0].name,
-        samples=sum(each.samples for each in streams),
-        rate=sum(each.rate for each in streams),
-        clients=sum(each.clients for each in streams),
-        age=min((each.age for each in streams if each.age is not None), default=None),
-        buffered_samples=sum(each.buffered_samples for each in streams),
-        buffered_bytes=sum(each.buffered_bytes for each in streams),
-        latency=_histogram([each.latency for each in streams]),
-    )
+    age = min((each.age for each in streams if each.age is not None), default=None)
+    return _summed(streams, age=age, latency=_histogram([each.latency for each in streams]))
 
 
 def _rule(found: Sequence[tuple[str, RuleStatus]]) -> RuleStatus:
@@ -160,54 +163,28 @@ def _rule(found: Sequence[tuple[str, RuleStatus]]) -> RuleStatus:
     for each in rules:
         absences.update(each.absences)
     timed = [each.latency for each in rules if each.latency is not None]
-    return RuleStatus(
-        name=rules[0].name,
+    return _summed(
+        rules,
         state=state,
         message="" if state is RuleState.ACCEPTED else ": ".join([f"{state.value} at {where}", *reasons]),
-        evaluations=sum(each.evaluations for each in rules),
-        ticks=sum(each.ticks for each in rules),
-        time=sum(each.time for each in rules),
-        unknowns=sum(each.unknowns for each in rules),
         absences=dict(absences),
-        errors=sum(each.errors for each in rules),
         last_error=_named((holder, each.last_error) for holder, each in found),
-        started=sum(each.started for each in rules),
-        ended=sum(each.ended for each in rules),
-        open=sum(each.open for each in rules),
-        pending=sum(each.pending for each in rules),
         latency=_histogram(timed) if timed else None,
     )
 
 
 def _action(found: Sequence[tuple[str, ActionStatus]]) -> ActionStatus:
     """Without `current`: the messages of running episodes belong to one detector."""
-    actions = [action for _, action in found]
-    return ActionStatus(
-        rule=actions[0].rule,
-        action=actions[0].action,
-        kind=actions[0].kind,
-        running=sum(each.running for each in actions),
-        done=sum(each.done for each in actions),
-        failed=sum(each.failed for each in actions),
-        samples=sum(each.samples for each in actions),
-        missing=sum(each.missing for each in actions),
-        bytes=sum(each.bytes for each in actions),
-        files=sum(each.files for each in actions),
+    return _summed(
+        [action for _, action in found],
+        current={},
         last_file=_named((holder, each.last_file) for holder, each in found),
         last_failure=_named((holder, each.last_failure) for holder, each in found),
     )
 
 
 def _drops(found: Sequence[tuple[str, Drops]]) -> Drops:
-    first = found[0][1]
-    return Drops(
-        cause=first.cause,
-        what=first.what,
-        count=sum(each.count for _, each in found),
-        stream=first.stream,
-        rule=first.rule,
-        last=_named((holder, each.last) for holder, each in found),
-    )
+    return _summed([drops for _, drops in found], last=_named((holder, each.last) for holder, each in found))
 
 
 def _named(texts: Iterable[tuple[str, str]]) -> str:

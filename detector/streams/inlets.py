@@ -23,8 +23,7 @@ from detector.streams.bursts import LONGEST
 from detector.streams.subscribing import Subscription
 
 MAXIMUM_NOTED = 1_000_000
-"""Maximum number of noted samples, and of queued samples, for one stream; beyond it, the sessions are exchanged at
-once."""
+"""Maximum number of noted and of queued samples for one stream; beyond it, the sessions are exchanged at once."""
 
 _MAXIMUM_KEYS = 200_000
 

@@ -26,8 +26,7 @@ _PATIENCE = 10.0
 
 
 class Membership:
-    """Subscribed to all streams and to the clients' tokens. Samples are queued in `subscriptions`, in the streams'
-    order."""
+    """Subscribed to all streams and to the clients' tokens. `subscriptions` queue samples, in the streams' order."""
 
     def __init__(
         self, session: zenoh.Session, material: Material, streams: Sequence[Stream], tokens: str | None, tally: Tally

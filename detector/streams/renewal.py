@@ -31,8 +31,7 @@ LOOK_EVERY = 10.0
 """Seconds between two checks of the files; a kubelet takes about a minute to change them."""
 
 _AT_LEAST, _AT_MOST = 1.0, 10.0
-"""Minimum and maximum seconds for which both sessions are subscribed, so that the new subscription is known and both
-have delivered the same samples."""
+"""Minimum and maximum seconds of two subscribed sessions, so that both have delivered the same samples."""
 
 _LOOK_AT_BOTH = 0.01
 
@@ -176,8 +175,7 @@ class Renewal:
         first.retire()
 
     def _run_both(self, first: Membership, second: Membership) -> None:
-        """Run both until they have delivered the same samples. Raises NetworkError if the second one receives
-        nothing."""
+        """Run both until they have delivered the same samples. Raises NetworkError if the second receives nothing."""
         if first.connections.any and not second.await_connection(self._stop, _AT_MOST):
             raise NetworkError(
                 f"zenoh: cannot connect to {[*self._config.connect]} with the new certificates or password"

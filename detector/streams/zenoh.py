@@ -37,8 +37,7 @@ EVENT_ENCODING = "application/cloudevents+json"
 
 
 class Network:
-    """Subscriptions to all streams, and the publisher of events: over one session, replaced by another for new
-    certificates."""
+    """Subscriptions to all streams, and the publisher of events: over one session, which new certificates replace."""
 
     def __init__(
         self,

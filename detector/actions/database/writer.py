@@ -28,8 +28,7 @@ _log = logging.getLogger(__name__)
 _FIRST, _LONGEST = 0.1, 5.0
 """Seconds between two attempts."""
 _SUSPECT = 3
-"""Number of connections lost during one request, while the server responds otherwise, after which the request is the
-suspect."""
+"""Number of connections lost during one request, while the server responds otherwise, that make it the suspect."""
 
 _PATIENCE = 10
 """Tenths of a second that a producer waits for room before the disk is used."""

@@ -95,8 +95,7 @@ class KubernetesTaskStore:
             return _stored(await self._client.patch(TASKS, self._namespace, metadata.name, metadata.uid, [add]))
 
     def _own(self, obj: Object) -> StoredTask | None:
-        """The task if it belongs to the holder and can be read; a task of a newer version is ignored, and logged
-        once."""
+        """The task if it belongs to the holder and can be read; one of a newer version is ignored, and logged once."""
         try:
             stored = _stored(obj)
         except ValidationError as error:

@@ -106,8 +106,7 @@ class HolderLease:
         self._backoff = Backoff(0.2, duration / 3)
         self._stopping = asyncio.Event()
         self.held = asyncio.Event()
-        """Set while this process may emit tasks. An outage of the API server does not clear it: no other process can
-        have taken over."""
+        """Set while this process may emit tasks. No outage of the API server clears it: nobody takes over then."""
         self.attempts = 0
         """Number of attempts to renew or acquire it."""
         self.failures = 0

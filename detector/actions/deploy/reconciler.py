@@ -55,8 +55,7 @@ class DeployCounts:
 
 
 class DemandReconciler:
-    """Keeps the tasks of one holder equal to its demands. `update` may be called from any thread, all else in one event
-    loop."""
+    """Keeps the tasks of one holder equal to its demands. Any thread may call `update`, one event loop all else."""
 
     def __init__(
         self,

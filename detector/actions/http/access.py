@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from detector.access.mounted import AccessError, TlsFiles, login, secret_text, tls_files
+from detector.access.mounted import AccessError, TlsFiles, login, secret_text, tls_files, variable_text
 from wayside.api.actions.http import HttpAccess, HttpHeader
 
 
@@ -56,10 +56,7 @@ def _value(header: HttpHeader, at: str) -> str:
     if header.secret_key_ref is not None:
         return secret_text(header.secret_key_ref.name, header.secret_key_ref.key, f"{at}.secretKeyRef")
     if header.variable is not None:
-        value = os.environ.get(header.variable)
-        if value is None:
-            raise AccessError(f"{at}.variable: the environment variable {header.variable} is not set: set it")
-        return value
+        return variable_text(header.variable, f"{at}.variable")
     return header.value or ""
 
 

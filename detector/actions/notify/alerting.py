@@ -77,8 +77,7 @@ class AlertQueue:
                 self._report(alert, OutcomeState.RUNNING, text)
 
     def drain(self) -> None:
-        """Remove all alerts at the end. Undelivered ones are lost; firing ones expire, or continue after the next
-        start."""
+        """Remove all alerts at the end: undelivered ones are lost; firing ones expire, or continue after a restart."""
         for alert in self._alerts.drain():
             if alert.delivered and alert.ends_at is None:
                 self._report(

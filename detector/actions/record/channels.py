@@ -107,8 +107,7 @@ class FileChannels:
 
 
 class Owners:
-    """For streams that share a key, decides whose samples are recorded: each message is received once and written
-    once."""
+    """For streams that share a key, decides whose samples are recorded: each message is received and written once."""
 
     def __init__(self, streams: Mapping[str, Stream]) -> None:
         """The streams of the window, in the Detector's order."""

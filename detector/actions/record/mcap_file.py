@@ -177,8 +177,7 @@ class McapFile:
         self.contents.metadata.append(index)
 
     def drop_last_chunk(self) -> bool:
-        """Remove the last chunk and everything after it, to make room for completing the file. False if there is
-        none."""
+        """Remove the last chunk and all after it, to make room for completing the file. False if there is none."""
         if not self.contents.chunks:
             return False
         self.end = self.contents.chunks.pop().chunk_start_offset

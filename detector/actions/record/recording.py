@@ -113,8 +113,7 @@ class Recording:
             self._take(sample)
 
     def began_with(self, samples: Sequence[EpisodeSample]) -> int | None:
-        """The start of the recording if these samples follow, except for latched ones; nanoseconds. None: unknown so
-        far."""
+        """The start of the recording if these samples follow, latched ones aside; nanoseconds. None: not known yet."""
         if self._began is None:
             return min((sample.time for sample in samples if sample.stream not in self._topics), default=None)
         return self._began

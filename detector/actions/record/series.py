@@ -25,8 +25,7 @@ class RecordedSeries:
     """Receives the samples of an episode, and tracks what became of them."""
 
     def __init__(self, begin: Begin, description: Description, *, start: int | None, renew_after: int | None) -> None:
-        """`start` is the start of the window, `renew_after` is in nanoseconds. Raises NoRoomError, OSError without
-        `renew_after`."""
+        """`start` of the window; `renew_after` in nanoseconds. Raises NoRoomError, OSError without `renew_after`."""
         self.description = description
         self._begin = begin
         self._renew_after = renew_after

@@ -50,8 +50,7 @@ class Course:
     """One recording elsewhere."""
 
     def __init__(self, order: Order, limits: Timeouts, now: float, onset: float, *, resumed: bool = False) -> None:
-        """`onset` is when the condition began to hold; `resumed`: an earlier run of the detector may have requested
-        it."""
+        """`onset`: when the condition began; `resumed`: an earlier run of the detector may have requested it."""
         self.order = order
         self._limits = limits
         self.onset = onset

@@ -43,8 +43,7 @@ class RecordingRequest(Model):
     after: Duration = Duration("0s")
     """For a stop: the duration after `ago` that is still recorded."""
     ago: Duration = Duration("0s")
-    """For a start: how long ago the cause began. For a stop: how long ago it ended. Relative, since clocks of two
-    machines rarely agree."""
+    """How long ago the cause of a start began, or that of a stop ended. Relative: clocks of machines differ."""
     maximum_duration: PositiveDuration = PositiveDuration("10m")
     """For a start: the maximum duration."""
     event: dict[str, JsonValue] = Field(default_factory=dict)

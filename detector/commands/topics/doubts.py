@@ -1,5 +1,4 @@
-"""Doubts that a recording raises about Detectors and rules before anything runs: misspelt fields, streams that match
-nothing."""
+"""Doubts that a recording raises about Detectors and rules before anything runs: misspelt fields, unmatched streams."""
 
 from __future__ import annotations
 
@@ -72,8 +71,7 @@ def _topics_of(stream: Stream, topics: Sequence[Topic]) -> list[Topic]:
 
 
 def fields_of(found: Sequence[Proposal]) -> dict[str, Fields]:
-    """By stream, the fields of JSON and CBOR messages found in the samples; without streams whose messages are not
-    maps."""
+    """By stream, the fields of JSON and CBOR messages found in the samples, as far as the messages are maps."""
     named = {each.name: _seen(each.encoding, each.topics) for each in found}
     return {name: fields for name, fields in named.items() if fields is not None}
 

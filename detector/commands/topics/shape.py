@@ -51,8 +51,7 @@ class MessageShape:
 
     @property
     def known_fields(self) -> Fields | None:
-        """The fields for checking paths; None if the values are not maps or lists of maps, or if there are too many
-        names."""
+        """The fields for checking paths; None if values are neither maps nor lists of maps, or have too many names."""
         if self.items is not None and self.kinds <= {"list", "null"}:
             known = self.items.known_fields
             return None if known is None or isinstance(known, ItemFields) else ItemFields(known)

@@ -88,8 +88,7 @@ class Requested:
         return report
 
     def _begin(self, entry: RequestedRecording, request: RecordingRequest) -> None:
-        """Runs on the evaluation thread. A recording that was stopped in the meantime is so short that its end is
-        known."""
+        """Runs on the evaluation thread. The end of a recording that was stopped by now is known: it is so short."""
         engine = self._engine
         begin_recording(
             engine.consequences,

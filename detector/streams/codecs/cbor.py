@@ -19,8 +19,7 @@ from detector.engine.samples.sample import DecodeError
 from detector.streams.codecs.doubles import as_double
 
 MAX_DEPTH = 64
-"""Maximum nesting of maps, lists and tags: no real message comes near it, and a hostile one must not exhaust the
-stack."""
+"""Maximum nesting of maps, lists and tags, far from real messages: a hostile one must not exhaust the stack."""
 
 
 class CborDecoder:

@@ -218,8 +218,7 @@ def _tree(paths: Sequence[Path]) -> Tree:
 
 
 class _Texts(dict[bytes, str]):
-    """A cache of texts by their bytes with the terminator: most texts repeat. Raises ValueError for those that rosbags
-    rejects."""
+    """A cache of texts by their bytes with the terminator, as most repeat. Raises ValueError where rosbags does."""
 
     _MOST, _LONGEST = 4096, 256
 

@@ -45,8 +45,7 @@ class JsonDecoder:
         return None
 
     def field_reader(self, paths: Sequence[Path]) -> FieldReader | None:
-        """A reader of only these paths; None for an index at the beginning of a path, and for names with control
-        characters, quotes or backslashes."""
+        """A reader of only these paths; None if one begins with an index or has a control character, quote or \\."""
         return json_fields(paths, self.decode, lambda value: _with_doubles(value, MAX_DEPTH), MAX_DEPTH)
 
 
@@ -83,8 +82,7 @@ _PLAIN = frozenset((float, str, bool, type(None), type(MISSING)))
 
 _SHAPE = bytes.maketrans(b"0123456789E", b"0000000000e")
 _LARGE = b"0e000"
-"""Any exponent of three digits, after replacing digits by zeros; a number without one needs many digits to be too
-large."""
+"""Any exponent of three digits, after replacing digits by zeros; without one, a large number needs many digits."""
 _MANY = b"0" * 200
 
 _BRACKETS = bytes.maketrans(b"{}", b"[]")

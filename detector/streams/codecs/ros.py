@@ -115,8 +115,7 @@ class RosTypes:
         )
 
     def definition(self, name: str) -> str:
-        """The definition of the type and all types that it refers to as ros2msg text, as in recordings. Raises
-        UnknownTypeError."""
+        """The definition of the type and those it refers to, as in recordings (ros2msg). Raises UnknownTypeError."""
         if not self.known(name):
             raise UnknownTypeError(name, self)
         return self.store.generate_msgdef(name, ros_version=2)[0]

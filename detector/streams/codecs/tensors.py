@@ -1,5 +1,4 @@
-"""Camera images and point clouds as arrays, directly from the bytes of a message, without a list of a million
-numbers."""
+"""Camera images and point clouds as arrays, directly from a message's bytes, without a list of a million numbers."""
 
 from __future__ import annotations
 

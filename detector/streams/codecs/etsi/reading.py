@@ -113,8 +113,7 @@ class Readers:
         return lambda bits: {name: read(bits)}
 
     def _fields(self, fields: tuple[asn1.Field, ...]) -> Read:
-        """Reads components without an extension marker: first which optional ones are present, then all present
-        ones."""
+        """Reads components without an extension marker: which optional ones are present, then all present ones."""
         readers: list[tuple[str, Read, int, Any]] = []
         opens: list[tuple[str, str, dict[int, Read]]] = []
         optional = sum(field.optional for field in fields)
