@@ -14,8 +14,7 @@ from detector.engine.samples.sample import Decoder
 from detector.engine.scoping.plugins import PluginHost
 from detector.engine.timing.timeline import ORDER
 from detector.onnx.binding import bind_models
-from detector.plugins.instances import LocalHost
-from detector.plugins.registry import plugin_problems
+from detector.plugins.instances import LocalHost, plugin_problems
 from detector.streams.codecs import DefinitionError, UnknownTypeError, codec_for
 from detector.streams.codecs.definitions import Definition, DefinitionsError
 from detector.streams.codecs.etsi import EtsiDecoder, OwnDefinitions, own_definitions, read_module

@@ -22,9 +22,9 @@ from detector.findings.checks import CUT_RECORDING
 from detector.plugins.outages import Outages
 from detector.plugins.processes import REPLAY_PATIENCE, ProcessHost
 from detector.replay.clips import Clips
-from detector.replay.errors import RecordingError
 from detector.replay.gathering import Recording, intake_file_of, recording_name, recordings_of
 from detector.replay.intake_file import read_intake, recorded_outages
+from detector.replay.message import RecordingError
 from detector.replay.playing import Played, play
 from detector.replay.progress import ProgressLine
 from detector.replay.recordings import quick_span_of

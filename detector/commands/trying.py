@@ -14,8 +14,8 @@ from detector.assembly import inlets
 from detector.commands.topics.doubts import fields_of
 from detector.commands.topics.proposal import Proposal, detector_document, proposals
 from detector.commands.topics.survey import survey
-from detector.replay.errors import RecordingError
 from detector.replay.gathering import recordings_of
+from detector.replay.message import RecordingError
 from detector.replay.playing import play
 from detector.replay.recorded_types import with_recorded_types
 from detector.results.series import Series, SeriesKind, Trace

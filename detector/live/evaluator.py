@@ -28,7 +28,7 @@ from detector.engine.samples.sample import Arrival
 from detector.engine.timing.timeline import ORDER
 from detector.findings.losses import Losses
 from detector.live.overload import LONG, Overload
-from detector.live.restoring import Restored
+from detector.live.state import Restored
 from detector.plugins.outages import Outages
 from detector.resources.selection import RuleSet
 from detector.status.keeping import StatusKeeper

@@ -15,9 +15,8 @@ from detector.actions.deploy.lease import HolderLease
 from detector.actions.deploy.reconciler import DemandReconciler
 from detector.actions.deploy.stores import TaskStore
 from detector.actions.tracing import EpisodeTraces
-from detector.live.restoring import what_was_open
 from detector.live.running import Running, View
-from detector.live.state import state_file
+from detector.live.state import state_file, what_was_open
 from detector.resources.kubernetes import PROGRAM, ClusterRules
 from detector.status.server import PagesAddress
 from wayside.kubernetes.connection import connect

@@ -24,12 +24,10 @@ from detector.live.answers import Answers
 from detector.live.evaluator import Evaluator, LiveObserver
 from detector.live.outlet import EventLog, LiveOutlet
 from detector.live.requested import Requested
-from detector.live.restoring import Restored
-from detector.live.state import StateFile
+from detector.live.state import Restored, StateFile
 from detector.plugins.processes import ProcessHost
 from detector.resources.selection import RuleSet
-from detector.sources.registry import source_plugin_problems
-from detector.sources.supervision import Sources
+from detector.sources.supervision import Sources, source_plugin_problems
 from detector.status.server import PagesAddress, StatusServer
 from detector.streams.answering import Answering
 from detector.streams.tally import Tally

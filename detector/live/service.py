@@ -18,9 +18,8 @@ from detector.actions.deploy.reconciler import DemandReconciler
 from detector.actions.tracing import EpisodeTraces, episode_traces
 from detector.assembly import detector_problems
 from detector.assembly.memory import tune_garbage_collection
-from detector.live.restoring import what_was_open
 from detector.live.running import Running, View
-from detector.live.state import state_file
+from detector.live.state import state_file, what_was_open
 from detector.resources.files import follow_files, hangups, load_rules
 from detector.status.server import PagesAddress
 

@@ -3,6 +3,8 @@
 A separate thread replaces the file atomically, so the evaluation never waits for the disk and no reader sees half a
 file. Only the latest set of episodes is queued: a slow disk writes less often, and a kill loses what happened since the
 last write. An episode that ended in that time is open again after the restart, and ends again with the same id.
+
+A detector restores the open episodes of its own live tasks first, then those of its state volume.
 """
 
 from __future__ import annotations
@@ -11,9 +13,13 @@ import json
 import logging
 import threading
 from collections.abc import Sequence
+from contextlib import aclosing
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from detector.actions.deploy.stores import Snapshot, TaskStore, live_demands
+from detector.engine.episodes.demands import Demand
 from detector.engine.episodes.open_episodes import OpenEpisode, from_document
 from wayside.api import Detector
 from wayside.names import encode
@@ -170,3 +176,30 @@ class StateFile:
         text = json.dumps(document, separators=(",", ":"), allow_nan=False)
         replace_file(self.path, text, draft=self._draft, durable=True)
         sync_folder(self.path.parent)
+
+
+@dataclass(frozen=True, slots=True)
+class Restored:
+    """The input of the engine's restore."""
+
+    demands: Sequence[Demand] = ()
+    """Of live tasks, oldest first."""
+    episodes: Sequence[OpenEpisode] = ()
+    """Of the state volume, except those whose task has ended: the detector ended it and was killed before it wrote."""
+
+
+async def what_was_open(store: TaskStore, state: StateFile | None) -> Restored:
+    """Read both. Waits while the store is unavailable; cancel it to give up."""
+    async with aclosing(store.follow()) as changes:
+        async for change in changes:
+            if isinstance(change, Snapshot):
+                episodes = [] if state is None else state.load()
+                over = _ended(change)
+                return Restored(live_demands(change), [each for each in episodes if each.record.id not in over])
+    raise AssertionError("the stream of a store's changes ended")
+
+
+def _ended(snapshot: Snapshot) -> set[str]:
+    """The ids of the episodes whose tasks have ended."""
+    specs = (stored.task.spec for stored in snapshot.tasks.values() if not stored.live)
+    return {spec.event.id for spec in specs if spec.event is not None}

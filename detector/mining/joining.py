@@ -18,8 +18,8 @@ from detector.engine.evaluation.rule import RuleRun
 from detector.engine.scoping.scopes import Candidate
 from detector.mining.pieces import LOST, Observed, Values
 from detector.mining.work import Mined, MiningJob, RuleCount, in_their_order, job_holder
+from detector.replay.batches import PAUSE
 from detector.replay.gathering import Recording
-from detector.replay.parts import PAUSE
 from detector.replay.recorded_types import with_recorded_types
 from detector.results.episodes import episodes_of
 from detector.results.quality import Arrivals

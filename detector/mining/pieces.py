@@ -23,10 +23,9 @@ from detector.engine.episodes.episodes import OUTSIDE, TRUE, UNTIL
 from detector.engine.samples.sample import Arrival
 from detector.mining.cutting import END, PieceTimes
 from detector.mining.work import tuned
-from detector.replay.batches import merged_batches
+from detector.replay.batches import PAUSE, merged_batches, parts_of
 from detector.replay.mcap_file import read_mcap
 from detector.replay.message import Cut
-from detector.replay.parts import PAUSE, parts_of
 from detector.replay.recorded_types import with_recorded_types
 from detector.replay.replaying import Replay, Replayed
 from detector.replay.routing import MessageRouter

@@ -14,8 +14,8 @@ from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 from urllib.parse import urlsplit
 
-from detector.replay.errors import RecordingError
 from detector.replay.gathering import BINARY, TEXT, Recording, recording_name, recordings_of
+from detector.replay.message import RecordingError
 from detector.results.kinds import check_package
 
 _BLOCK = 1 << 20

@@ -19,7 +19,7 @@ from detector.mining.keys import with_dependencies
 from detector.mining.pieces import Observed, PieceJob, observe
 from detector.mining.work import MiningJob, mine_recording
 from detector.mining.workers import Lost, RemoteCall, Workers
-from detector.replay.errors import RecordingError
+from detector.replay.message import RecordingError
 
 _PER_WORKER = 2
 """Minimum number of calls per worker when a recording is cut."""

@@ -1,17 +1,53 @@
-"""The objects of one plugin signal, one per subject; and a host that calls them in the detector's process."""
+"""The class of a plugin, its objects for one signal, one per subject, and a host that calls them in this process."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from importlib.metadata import EntryPoint
 from typing import Any
 
 from detector.engine.queries.queries import Queries
 from detector.engine.scoping.plugins import PluginCall, PluginFailedError
-from detector.plugins.base import Plugin, PluginSubject
-from detector.plugins.registry import prepare_plugin
+from detector.plugins.base import Plugin, PluginParameters, PluginSubject
+from detector.plugins.entrypoints import Offers, PluginError
+from wayside.api import Detector, EventRule
 from wayside.expressions import Reason, Value
-from wayside.rules import CompiledPlugin, CompiledRule
+from wayside.rules import CompiledPlugin, CompiledRule, RuleProblem
+
+_GROUP = "wayside.signals"
+
+OFFERS = Offers[Plugin[Any]](
+    group=_GROUP,
+    noun="plugin",
+    base=Plugin,
+    model=PluginParameters,
+    guide="docs/plugins.md",
+    shipped=(EntryPoint("unmatched-objects", "detector.plugins.unmatched:UnmatchedObjects", _GROUP),),
+)
+
+
+def prepare_plugin(
+    name: str, parameters: Mapping[str, Any], streams: list[str] | None = None
+) -> tuple[type[Plugin[Any]], PluginParameters]:
+    """The plugin and its parameters; `streams` are those that parameters may name.
+
+    Raises PluginError; the paths begin at the signal's `plugin`.
+    """
+    plugin = OFFERS.load(name, ("name",))
+    return plugin, OFFERS.parameters(plugin, parameters, ("parameters",), {"streams": streams})
+
+
+def plugin_problems(rule: EventRule, detector: Detector) -> Iterator[RuleProblem]:
+    """The problems of the plugins in a rule's signals."""
+    streams = [stream.name for stream in detector.spec.streams]
+    for index, signal in enumerate(rule.spec.signals):
+        if signal.plugin is not None:
+            try:
+                prepare_plugin(signal.plugin.name, signal.plugin.parameters, streams)
+            except PluginError as error:
+                for path, text in error.problems:
+                    yield RuleProblem(("spec", "signals", index, "plugin", *path), text)
 
 
 class Instances:

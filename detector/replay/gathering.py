@@ -18,8 +18,8 @@ from typing import NamedTuple
 import yaml
 
 from detector.actions.record.description import DESCRIPTION
-from detector.replay.errors import RecordingError
 from detector.replay.intake_file import is_intake_file
+from detector.replay.message import RecordingError
 from detector.replay.recordings import check_exists, span_of
 
 Recording = tuple[Path, ...]

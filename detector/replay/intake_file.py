@@ -24,7 +24,7 @@ from mcap.stream_reader import StreamReader
 
 from detector.engine.samples.sample import Arrival
 from detector.plugins.outages import KIND as OUTAGE
-from detector.replay.errors import DAMAGE, RecordingError
+from detector.replay.message import DAMAGE, RecordingError
 from wayside.rules import CompiledRule, PairSubject
 
 LIBRARY = "wayside intake 1"

@@ -9,8 +9,7 @@ from typing import NamedTuple
 import msgspec
 
 from detector.replay.batches import Batch, Channel
-from detector.replay.errors import RecordingError
-from detector.replay.message import Cut, OnCut, Wanted, topic_key
+from detector.replay.message import Cut, OnCut, RecordingError, Wanted, topic_key
 
 EXAMPLE = '{"t": 1700000000000000000, "key": "vehicles/car7/pose", "value": {"x": 1.5}}'
 

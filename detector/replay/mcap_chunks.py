@@ -23,8 +23,7 @@ from mcap.summary import Summary
 from numpy.typing import NDArray
 
 from detector.replay.batches import MAXIMUM_BYTES, MAXIMUM_MESSAGES, Batch, Channel
-from detector.replay.errors import DAMAGE
-from detector.replay.message import Wanted, topic_key
+from detector.replay.message import DAMAGE, Wanted, topic_key
 
 Left = Callable[[McapChannel], Callable[[int], bool] | None]
 """For a channel, the function that returns whether the message with a sequence number is left out; None if none is.

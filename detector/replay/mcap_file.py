@@ -16,10 +16,20 @@ from mcap.records import Schema
 from mcap.summary import Summary
 
 from detector.replay.batches import Batch, Channel, batched
-from detector.replay.errors import DAMAGE, RecordingError
 from detector.replay.mcap_chunks import Chunks, Left
 from detector.replay.mcap_cut import MAGIC, ChunkLocation, UnindexedMcap, messages_at, scan_mcap
-from detector.replay.message import Cut, Message, OnCut, Piece, RecordedType, Wanted, messages_in_order, topic_key
+from detector.replay.message import (
+    DAMAGE,
+    Cut,
+    Message,
+    OnCut,
+    Piece,
+    RecordedType,
+    RecordingError,
+    Wanted,
+    messages_in_order,
+    topic_key,
+)
 from detector.replay.protobuf import ENCODING as PROTOBUF
 from detector.replay.protobuf import Decoders
 

@@ -3,9 +3,32 @@
 from __future__ import annotations
 
 import heapq
+import struct
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
+
+from wayside.inputerror import InputError
+
+
+class RecordingError(InputError, ValueError):
+    """A recording that cannot be read or does not fit the Detector; the text names the place and the remedy."""
+
+
+DAMAGE = (
+    AssertionError,
+    LookupError,
+    MemoryError,
+    OSError,
+    OverflowError,
+    RuntimeError,  # what lz4 raises
+    TypeError,
+    ValueError,
+    struct.error,
+)
+"""Exceptions of parsers of binary files for unexpected bytes, beside their own. Caught only around the reading of a
+file, in which any byte may be damaged."""
+
 
 Wanted = Callable[[str], bool]
 """Whether messages on that key are wanted: others are skipped without being read, if the format allows."""

@@ -15,8 +15,7 @@ from typing import NamedTuple
 
 from detector.engine.samples.sample import DecodeError
 from detector.replay.batches import Batch, batched
-from detector.replay.errors import RecordingError
-from detector.replay.message import Cut, Message, OnCut, Wanted
+from detector.replay.message import Cut, Message, OnCut, RecordingError, Wanted
 from detector.streams.codecs.etsi.messages import BY_NUMBER, PREFIX
 from detector.streams.codecs.etsi.packets import ETHERTYPE, message_in
 

@@ -21,9 +21,8 @@ from detector.engine.buffering.latched import Topic
 from detector.engine.samples.sample import Arrival
 from detector.engine.scoping.plugins import PluginHost
 from detector.replay.clips import Clips
-from detector.replay.errors import RecordingError
 from detector.replay.gathering import Recording, recording_name
-from detector.replay.message import Cut, OnCut, ignore
+from detector.replay.message import Cut, OnCut, RecordingError, ignore
 from detector.replay.recorded_types import with_recorded_types
 from detector.replay.recordings import open_recordings
 from detector.replay.replaying import Replayed, ReplayObserver, replay_arrivals

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from mcap.exceptions import McapError
 from mcap.records import Schema
 
-from detector.replay.errors import RecordingError
+from detector.replay.message import RecordingError
 
 if TYPE_CHECKING:
     from google.protobuf.descriptor import FieldDescriptor

@@ -10,8 +10,7 @@ from rosbags.interfaces.typing import FieldDesc, Typesdict
 from rosbags.typesys.store import Typestore
 
 from detector.assembly import message_types
-from detector.replay.errors import RecordingError
-from detector.replay.message import RecordedType
+from detector.replay.message import RecordedType, RecordingError
 from detector.replay.recordings import types_of
 from detector.streams.codecs.definitions import Definition, DefinitionsError, from_idl, parsed
 from detector.streams.codecs.ros import RosTypes, standard

@@ -6,11 +6,10 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from detector.replay.batches import Batch, merged_batches
-from detector.replay.errors import RecordingError
 from detector.replay.json_lines import json_lines_span, read_json_lines
 from detector.replay.mcap_file import MAGIC as MCAP_MAGIC
 from detector.replay.mcap_file import mcap_span, mcap_types, read_mcap
-from detector.replay.message import OnCut, RecordedType, Wanted, ignore
+from detector.replay.message import OnCut, RecordedType, RecordingError, Wanted, ignore
 from detector.replay.pcap import MAGICS as PCAP_MAGICS
 from detector.replay.pcap import read_pcap
 from detector.replay.rosbag1 import ROSBAG1_MAGIC, read_rosbag1, rosbag1_span, rosbag1_types
@@ -64,7 +63,7 @@ def span_of(path: Path) -> tuple[int, int] | None:
 
 
 def quick_span_of(paths: Sequence[Path]) -> tuple[int, int] | None:
-    """The approximate times of the first and last message of one recording; None if only reading it all tells."""
+    """The approximate times of the first and last message of one recording; None if only reading it all shows it."""
     quick: dict[_Read, Callable[[Path], tuple[int, int] | None]] = {
         read_mcap: mcap_span,
         read_rosbag1: rosbag1_span,

@@ -23,11 +23,10 @@ from detector.engine.samples.sample import Arrival
 from detector.engine.scoping.plugins import PluginHost
 from detector.engine.timing.timeline import ORDER
 from detector.findings.losses import Losses
+from detector.replay.batches import PAUSE, parts_of
 from detector.replay.clips import Clips, Recorders
-from detector.replay.errors import RecordingError
 from detector.replay.intake_file import Control, detector_as_of, rule_as_of
-from detector.replay.message import Cut
-from detector.replay.parts import PAUSE, parts_of
+from detector.replay.message import Cut, RecordingError
 from wayside.api import ApplicationTask, Detector, EventRule
 from wayside.findings import Finding
 from wayside.times import format_time

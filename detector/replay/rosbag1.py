@@ -18,8 +18,18 @@ from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typest
 from rosbags.typesys.store import Typestore
 
 from detector.replay.batches import Batch, batched
-from detector.replay.errors import DAMAGE, RecordingError
-from detector.replay.message import Cut, Message, OnCut, Piece, RecordedType, Wanted, messages_in_order, topic_key
+from detector.replay.message import (
+    DAMAGE,
+    Cut,
+    Message,
+    OnCut,
+    Piece,
+    RecordedType,
+    RecordingError,
+    Wanted,
+    messages_in_order,
+    topic_key,
+)
 from detector.replay.rosbag1_cut import Chunk, UnindexedBag, chunk_messages, scan_bag
 
 ROSBAG1_MAGIC = b"#ROSBAG V2.0\n"

@@ -19,9 +19,8 @@ from rosbags.rosbag2 import Reader, ReaderError
 
 from detector.actions.record.description import DESCRIPTION, FORMAT
 from detector.replay.batches import Batch, batched, merged_batches
-from detector.replay.errors import DAMAGE, RecordingError
 from detector.replay.mcap_file import is_cut, mcap_types, read_mcap
-from detector.replay.message import Message, OnCut, RecordedType, Wanted, topic_key
+from detector.replay.message import DAMAGE, Message, OnCut, RecordedType, RecordingError, Wanted, topic_key
 
 SQLITE_MAGIC = b"SQLite format 3\0"
 

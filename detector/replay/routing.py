@@ -11,7 +11,7 @@ import msgspec
 from detector.assembly import DetectorError
 from detector.engine.samples.sample import Arrival
 from detector.replay.batches import Batch, Channel
-from detector.replay.errors import RecordingError
+from detector.replay.message import RecordingError
 from wayside.api.stream import Encoding, Stream
 from wayside.keys import KeyPattern
 from wayside.rules import stream_problems

@@ -26,8 +26,7 @@ from foxglove.messages import (
 
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.record import EpisodeRecord
-from detector.results.places import polygons_of
-from detector.results.result import Result
+from detector.results.result import Result, polygons_of
 from detector.results.series import Doubles
 
 FRAME = "map"

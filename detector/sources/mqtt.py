@@ -128,7 +128,7 @@ class MqttSource(Source[MqttParameters]):
 
 
 def topic_filter(expression: str) -> str:
-    """A key expression as an MQTT topic filter for at least the same keys; the stream's key has the final say."""
+    """A key expression as an MQTT topic filter for at least the same keys: the key of the stream decides."""
     chunks = expression.split("/")
     if "**" in chunks:
         chunks = [*chunks[: chunks.index("**")], "#"]

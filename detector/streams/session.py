@@ -10,8 +10,7 @@ import time
 
 import zenoh
 
-from detector.access.credentials import Material, read_material
-from detector.access.mounted import AccessError
+from detector.access.mounted import AccessError, Material, read_material
 from wayside.api.zenoh import Zenoh, ZenohMode
 from wayside.inputerror import InputError
 from wayside.process.backoff import Backoff, retry

@@ -15,14 +15,13 @@ from collections.abc import Callable, Iterable
 
 import zenoh
 
-from detector.access.credentials import Material
+from detector.access.mounted import Material
 from detector.engine.samples.liveliness import LIVELINESS
 from detector.streams.answering import Answering
 from detector.streams.bursts import Put
 from detector.streams.inlets import Inlet
 from detector.streams.liveliness import TokenWatch
-from detector.streams.membership import Membership
-from detector.streams.renewal import LOOK_EVERY, CertificateState, Renewal
+from detector.streams.renewal import LOOK_EVERY, CertificateState, Membership, Renewal
 from detector.streams.session import NetworkError, await_session, material_of, open_session
 from detector.streams.subscribing import Pump, pump_for
 from detector.streams.tally import Tally

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from detector.assembly import DetectorError
-from detector.replay.errors import RecordingError
+from detector.replay.message import RecordingError
 from detector.testing import RefusedError
 from examples.running.cases import Ran, folder_of, run, scenario_of, use_cases
 from examples.running.recording import write_recording

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from detector.engine.samples.sample import Arrival
-from detector.replay.errors import RecordingError
 from detector.replay.intake_file import read_intake
+from detector.replay.message import RecordingError
 from tests import programs
 from tests.cluster.chain import (
     BETWEEN,

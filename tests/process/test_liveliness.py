@@ -13,8 +13,8 @@ from detector.assembly import DetectorError, inlets
 from detector.engine.samples import liveliness
 from detector.engine.samples.liveliness import LIVELINESS, TokenState
 from detector.engine.samples.sample import Arrival
-from detector.live.restoring import Restored
 from detector.live.running import Running
+from detector.live.state import Restored
 from detector.replay.intake_file import read_intake
 from detector.replay.replaying import replay_intake
 from detector.resources.selection import RuleSet

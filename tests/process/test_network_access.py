@@ -16,8 +16,8 @@ from detector.access.mounted import AccessError, Login, login, tls_files
 from detector.actions.deploy.file_store import FileTaskStore
 from detector.actions.deploy.reconciler import DemandReconciler
 from detector.engine.samples.liveliness import LIVELINESS, TokenState
-from detector.live.restoring import Restored
 from detector.live.running import Running
+from detector.live.state import Restored
 from detector.resources.selection import RuleSet
 from detector.streams.session import NetworkError, open_session
 from detector.streams.zenoh import Network

@@ -19,7 +19,7 @@ from detector.engine.episodes.events import Event
 from detector.engine.episodes.open_episodes import OpenEpisode
 from detector.engine.samples.intake import Intake
 from detector.live.evaluator import Evaluator
-from detector.live.restoring import Restored
+from detector.live.state import Restored
 from detector.plugins.outages import Outages
 from detector.plugins.processes import ProcessHost
 from detector.replay.intake_file import read_intake, recorded_outages

@@ -15,13 +15,12 @@ from detector.actions.deploy.file_store import FileTaskStore
 from detector.actions.deploy.reconciler import DemandReconciler
 from detector.assembly import DetectorError, inlets
 from detector.engine.samples.intake import Intake
-from detector.live.restoring import Restored
 from detector.live.running import Running
+from detector.live.state import Restored
 from detector.plugins import entrypoints
 from detector.resources.selection import RuleSet
 from detector.sources import Feed, Source
-from detector.sources.registry import OFFERS, source_plugin_problems
-from detector.sources.supervision import Sources, SourceState, SourceThread
+from detector.sources.supervision import OFFERS, Sources, SourceState, SourceThread, source_plugin_problems
 from detector.streams.tally import Cause, Tally
 from tests.driving import a_detector, a_stream
 from tests.networks import PATIENCE, Arrivals, stream, wait_for

@@ -23,8 +23,7 @@ from detector.engine.episodes.demands import to_task
 from detector.engine.episodes.open_episodes import OpenEpisode, from_document
 from detector.engine.episodes.record import EpisodeRecord
 from detector.engine.episodes.subjects import Subject
-from detector.live.restoring import what_was_open
-from detector.live.state import StateFile, state_file
+from detector.live.state import StateFile, state_file, what_was_open
 from detector.streams.zenoh import open_session
 from tests import programs
 from tests.driving import Drive, a_deploy, a_detector, a_rule, arrival, at

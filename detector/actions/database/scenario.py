@@ -15,8 +15,8 @@ from typing import Any
 from bson import Int64
 from bson.datetime_ms import DatetimeMS
 
+from detector.actions.database.documents import bson_values
 from detector.actions.database.queue import Write
-from detector.actions.database.values import bson_values
 from detector.actions.episode import Completion, Episode
 from wayside.api import Detector, EventRule
 from wayside.api.base import JsonValue

@@ -18,8 +18,7 @@ from pydantic import BaseModel
 
 from detector.actions.base import Action, Setting
 from detector.actions.episode import Completion, Episode
-from detector.actions.notify.alerting import AlertQueue, AlertTarget
-from detector.actions.notify.alerts import AlertBatch
+from detector.actions.notify.alerts import AlertBatch, AlertQueue, AlertTarget
 from detector.actions.notify.events import EventQueue
 from detector.actions.notify.keeping import Keeping
 from detector.actions.notify.notice import Notice, NoticeTexts, texts

@@ -2,7 +2,7 @@
 
 `action` has a `recording` for each open episode. Its `folder` is hidden until it is complete, its disk space comes from
 the `destination` that all rules share, and its samples go through an `mcap_file`. `recovery` completes the recordings
-of a killed process. `description`, `channels` and `bag` describe recordings.
+of a killed process. `description` and `channels` describe recordings.
 """
 
 from detector.actions.record.action import Record

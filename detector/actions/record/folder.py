@@ -14,8 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from detector.actions.record.bag import BagFile, metadata_yaml
-from detector.actions.record.description import DESCRIPTION, as_text
+from detector.actions.record.description import DESCRIPTION, BagFile, as_text, metadata_yaml
 from detector.actions.record.destination import PARTIAL, Destination, Kept, hidden_path
 from wayside.process.files import replace_file, sync_folder
 

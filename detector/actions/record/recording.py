@@ -12,14 +12,13 @@ from typing import Any, NamedTuple
 
 from detector.actions.base import Surroundings
 from detector.actions.episode import EpisodeSample
-from detector.actions.record.bag import BagFile
 from detector.actions.record.channels import ChannelFormat, FileChannels, Owners, Place, channel_format
-from detector.actions.record.compressing import compressor
 from detector.actions.record.description import (
     METADATA,
     METADATA_CUT,
     METADATA_END,
     METADATA_USER,
+    BagFile,
     as_text,
     beginning,
     ending,
@@ -27,7 +26,7 @@ from detector.actions.record.description import (
 )
 from detector.actions.record.destination import Kept, NoRoomError
 from detector.actions.record.folder import RecordingFolder
-from detector.actions.record.mcap_file import McapFile, SyncError
+from detector.actions.record.mcap_file import McapFile, SyncError, compressor
 from detector.engine.buffering.lanes import latched_topics
 from detector.engine.samples.sample import DecodeError, NearDecoder
 from wayside.api.actions.record import RecordAction

@@ -22,13 +22,20 @@ from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
 from mcap.records import Channel, Chunk, ChunkIndex, Header, Metadata, MetadataIndex, Schema
 
-from detector.actions.record.bag import BagFile
-from detector.actions.record.compressing import compressor, decompress
-from detector.actions.record.description import METADATA_CUT, METADATA_END, ending, with_ending
+from detector.actions.record.description import METADATA_CUT, METADATA_END, BagFile, ending, with_ending
 from detector.actions.record.destination import DROPPED, PARTIAL, Destination, Kept, hidden
 from detector.actions.record.folder import RecordingFolder
-from detector.actions.record.mcap_contents import LIBRARY, MAGIC, Contents, packed_message_indexes
-from detector.actions.record.mcap_file import Claim, McapFile, write_at
+from detector.actions.record.mcap_file import (
+    LIBRARY,
+    MAGIC,
+    Claim,
+    Contents,
+    McapFile,
+    compressor,
+    decompress,
+    packed_message_indexes,
+    write_at,
+)
 from wayside.api.actions.record import Compression
 
 log = logging.getLogger(__name__)

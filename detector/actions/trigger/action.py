@@ -17,8 +17,7 @@ from detector.actions.base import Action, ActionError, Setting
 from detector.actions.episode import Completion, Episode, Outcome, OutcomeState
 from detector.actions.journal import Journal
 from detector.actions.trigger.course import FOREVER, Course, CourseStep, Timeouts
-from detector.actions.trigger.detectors import OtherDetector
-from detector.actions.trigger.endpoints import HttpEndpoint
+from detector.actions.trigger.endpoints import HttpEndpoint, OtherDetector
 from detector.actions.trigger.orders import Order, Report, System, order_from
 from detector.actions.trigger.ros2 import Ros2Services, call_problems
 from wayside.api import Detector

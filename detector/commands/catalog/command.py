@@ -83,7 +83,7 @@ def _read_cluster(namespace: str | None) -> Read:
 def _text(found: Catalog, form: Format, *, into_file: bool) -> str:
     """The catalog in this format; the width of a table depends on the destination."""
     from detector.commands.catalog import views
-    from detector.commands.catalog.page import page
+    from detector.commands.catalog.views import page
 
     match form:
         case Format.MARKDOWN:

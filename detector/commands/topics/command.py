@@ -13,10 +13,9 @@ import zenoh
 
 from detector.assembly import DetectorError, inlets
 from detector.commands.topics.proposal import Proposal, detector_document, proposals
-from detector.commands.topics.shape import message_paths
-from detector.commands.topics.survey import Survey, Topic, survey, topic_shape
-from detector.replay.errors import RecordingError
+from detector.commands.topics.survey import Survey, Topic, message_paths, survey, topic_shape
 from detector.replay.gathering import Recording, intake_file_of, recordings_of
+from detector.replay.message import RecordingError
 from detector.replay.recorded_types import with_recorded_types
 from detector.streams.rmw_zenoh import MisfitError, split
 from detector.streams.session import open_session

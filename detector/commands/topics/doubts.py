@@ -6,8 +6,7 @@ from collections.abc import Iterator, Sequence
 
 from detector.assembly import DetectorError, inlets
 from detector.commands.topics.proposal import Proposal
-from detector.commands.topics.shape import MessageShape
-from detector.commands.topics.survey import Topic, topic_shape
+from detector.commands.topics.survey import MessageShape, Topic, topic_shape
 from detector.findings.checks import FIELD_NOT_RECORDED, UNMATCHED_STREAM
 from detector.resources.selection import select
 from wayside.api import Detector, EventRule

@@ -1,6 +1,5 @@
 """Recordings requested over Zenoh."""
 
-from detector.live.requested.running import with_requested
-from detector.live.requested.serving import Requested
+from detector.live.requested.serving import Requested, with_requested
 
 __all__ = ["Requested", "with_requested"]

@@ -16,8 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from detector.actions.database.attachments import detach, pcd, png
-from detector.actions.database.documents import LARGEST, Documents
-from detector.actions.database.values import UnfitError, bson_bytes
+from detector.actions.database.documents import LARGEST, Documents, UnfitError, bson_bytes
 from detector.actions.episode import EpisodeSample
 from detector.streams.codecs import codec_for
 from tests.driving import START

@@ -12,8 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from detector.commands.catalog.catalog import Catalog, CatalogEntry, ChoiceError, catalog, choose
-from detector.commands.catalog.page import page
-from detector.commands.catalog.views import markdown_view
+from detector.commands.catalog.views import markdown_view, page
 from detector.commands.cli import app
 from wayside.api.classification import SCHEME, Classification
 from wayside.api.documents import DocumentError

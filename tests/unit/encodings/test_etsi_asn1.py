@@ -15,8 +15,7 @@ from detector.assembly import DetectorError, inlets
 from detector.engine.samples.sample import DecodeError
 from detector.streams.codecs.etsi import EtsiDecoder, OwnDefinitions
 from detector.streams.codecs.etsi.bits import Bits
-from detector.streams.codecs.etsi.bounds import span_constraints
-from detector.streams.codecs.etsi.own import parsed_modules
+from detector.streams.codecs.etsi.own import parsed_modules, span_constraints
 from detector.streams.codecs.etsi.reading import Readers
 from tests.driving import a_detector
 from tests.unit.encodings.its_messages import a_cam

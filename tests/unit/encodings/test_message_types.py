@@ -23,8 +23,8 @@ from detector.assembly import DetectorError, inlets
 from detector.assembly.checking import findings
 from detector.commands.cli import app
 from detector.engine.samples.sample import Arrival
-from detector.replay.errors import RecordingError
 from detector.replay.intake_writer import IntakeWriter
+from detector.replay.message import RecordingError
 from detector.replay.recorded_types import with_recorded_types
 from detector.streams.codecs import CdrDecoder
 from detector.streams.codecs.definitions import Definition, DefinitionsError

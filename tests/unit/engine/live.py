@@ -10,7 +10,7 @@ from detector.engine.episodes.events import Event
 from detector.engine.samples.intake import Intake
 from detector.engine.samples.sample import Arrival
 from detector.live.evaluator import Evaluator
-from detector.live.restoring import Restored
+from detector.live.state import Restored
 from detector.replay.intake_file import Control
 from detector.resources.selection import RuleSet
 from tests.driving import START

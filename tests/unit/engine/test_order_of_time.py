@@ -15,7 +15,7 @@ from msgspec.structs import replace
 
 from detector.engine.episodes.events import Event
 from detector.engine.samples.sample import Arrival
-from detector.replay import parts, replaying
+from detector.replay import batches, replaying
 from detector.replay.intake_file import Control
 from detector.replay.playing import recorded_arrivals
 from detector.replay.replaying import Replayed, replay_arrivals, replay_intake
@@ -131,8 +131,8 @@ def test_what_has_one_time_is_taken_in_together_however_much_it_is(
     monkeypatch: pytest.MonkeyPatch, by_intake: bool
 ) -> None:
     monkeypatch.setattr(replaying, "_BATCH", 4)
-    monkeypatch.setattr(parts, "_ARRIVALS", 4)
-    monkeypatch.setattr(parts, "_STEP", 4)
+    monkeypatch.setattr(batches, "_ARRIVALS", 4)
+    monkeypatch.setattr(batches, "_STEP", 4)
     count = {"name": "n", "stream": "speed", "aggregate": "Count", "over": "1s"}
     rule = a_rule(signals=[count], when="n >= 1", evaluation={"onSample": "speed"})
     arrivals = [arrival(0.9 + n // 10, "car", {"n": n}) for n in range(20)]

@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 
 from detector.engine.samples.sample import Arrival
 from detector.plugins.entrypoints import PluginError
-from detector.plugins.instances import LocalHost
-from detector.plugins.registry import prepare_plugin
-from detector.plugins.tracking import Tracks, assigned
+from detector.plugins.instances import LocalHost, prepare_plugin
+from detector.plugins.unmatched import Tracks, assigned
 from tests.driving import a_detector, a_rule, a_stream, arrival, at
 from tests.plugins.rules import PluginDrive
 from tests.ros_messages import cdr, header, make, pose

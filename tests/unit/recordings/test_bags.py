@@ -10,8 +10,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from detector.assembly import inlets
-from detector.replay.errors import RecordingError
-from detector.replay.message import Cut
+from detector.replay.message import Cut, RecordingError
 from detector.replay.recorded_types import with_recorded_types
 from detector.sources.supervision import SourceState, SourceThread
 from detector.streams.codecs import CdrDecoder

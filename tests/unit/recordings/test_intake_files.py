@@ -15,9 +15,9 @@ from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 
 from detector.engine.samples.sample import Arrival
-from detector.replay.errors import RecordingError
 from detector.replay.intake_file import Control, is_intake_file, read_intake
 from detector.replay.intake_writer import IntakeWriter
+from detector.replay.message import RecordingError
 from detector.streams.codecs.ros import standard
 from tests.ros_messages import cdr, pose_stamped
 from wayside.api.stream import Encoding, Stream

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from detector.replay.errors import RecordingError
-from detector.replay.message import Cut, Message
+from detector.replay.message import Cut, Message, RecordingError
 from detector.streams.codecs.etsi.quantities import its_ms
 from tests.driving import a_detector, a_rule, a_stream
 from tests.recorded import messages_in

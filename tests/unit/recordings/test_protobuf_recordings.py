@@ -13,7 +13,7 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, ti
 from mcap.writer import Writer as PlainWriter
 from mcap_protobuf.writer import Writer
 
-from detector.replay.errors import RecordingError
+from detector.replay.message import RecordingError
 from detector.replay.routing import MessageRouter
 from detector.testing import run
 from tests.driving import a_detector, a_rule, a_stream, at

@@ -19,7 +19,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 from zstandard import ZstdError
 
 from detector.engine.samples.sample import Arrival
-from detector.replay import json_lines, mcap_chunks, parts
+from detector.replay import batches, json_lines, mcap_chunks
 from detector.replay.batches import (
     MAXIMUM_BYTES,
     MAXIMUM_MESSAGES,
@@ -29,8 +29,7 @@ from detector.replay.batches import (
     merged_batches,
     messages_of,
 )
-from detector.replay.errors import DAMAGE, RecordingError
-from detector.replay.message import Cut, Message
+from detector.replay.message import DAMAGE, Cut, Message, RecordingError
 from detector.replay.recordings import open_recordings
 from detector.replay.routing import MessageRouter
 from tests.recorded import arrivals_of, messages_in
@@ -280,7 +279,7 @@ def arrivals_into(found: list[Arrival], router: MessageRouter, messages: Iterabl
 
 @settings(max_examples=150, deadline=None)
 @given(
-    steps=st.lists(st.sampled_from([0, 0, 0, 1, parts.PAUSE, parts.PAUSE + 1]), max_size=60),
+    steps=st.lists(st.sampled_from([0, 0, 0, 1, batches.PAUSE, batches.PAUSE + 1]), max_size=60),
     cuts=st.sets(st.integers(0, 60)),
     most=st.integers(1, 8),
     step=st.integers(1, 5),
@@ -290,13 +289,13 @@ def test_a_recording_is_cut_at_pauses_and_where_time_continues(
 ) -> None:
     arrivals = [Arrival(sum(steps[: at + 1]), "s", "k", b"") for at in range(len(steps))]
     places = sorted({0, len(arrivals), *(cut for cut in cuts if cut < len(arrivals))})
-    batches = [arrivals[begin:end] for begin, end in pairwise(places)]
-    with mock.patch.object(parts, "_ARRIVALS", most), mock.patch.object(parts, "_STEP", step):
-        found = list(parts.parts_of(batches))
+    pieces = [arrivals[begin:end] for begin, end in pairwise(places)]
+    with mock.patch.object(batches, "_ARRIVALS", most), mock.patch.object(batches, "_STEP", step):
+        found = list(batches.parts_of(pieces))
     assert [arrival for part in found for arrival in part] == arrivals
     assert all(found)
     for part in found:
-        assert all(after.received - before.received <= parts.PAUSE for before, after in pairwise(part))
+        assert all(after.received - before.received <= batches.PAUSE for before, after in pairwise(part))
         assert len({arrival.received for arrival in part[: -most - step]}) <= 1  # longer only by what has one time
     for before, after in pairwise(found):
         assert before[-1].received < after[0].received
@@ -305,6 +304,6 @@ def test_a_recording_is_cut_at_pauses_and_where_time_continues(
 def test_a_part_has_bytes_within_bounds() -> None:
     payload = bytes(1 << 20)
     arrivals = [Arrival(number, "image", "k", payload) for number in range(200)]
-    found = list(parts.parts_of(arrivals[at : at + 8] for at in range(0, 200, 8)))
+    found = list(batches.parts_of(arrivals[at : at + 8] for at in range(0, 200, 8)))
     assert sum(map(len, found)) == 200
     assert max(map(len, found)) <= 72

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from detector.assembly.checking import findings
-from detector.replay.errors import RecordingError
+from detector.replay.message import RecordingError
 from detector.replay.recordings import types_of
 from detector.testing import run
 from tests.driving import a_detector, a_rule, a_stream, at

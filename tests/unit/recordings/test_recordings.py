@@ -10,10 +10,9 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as BagWriter
 
 from detector.engine.samples.sample import Arrival
-from detector.replay.errors import RecordingError
 from detector.replay.gathering import recordings_of
 from detector.replay.intake_writer import IntakeWriter
-from detector.replay.message import Cut, Message
+from detector.replay.message import Cut, Message, RecordingError
 from detector.replay.routing import MessageRouter
 from detector.streams.codecs.ros import standard
 from tests.recorded import arrivals_of, messages_in

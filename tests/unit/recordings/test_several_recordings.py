@@ -10,9 +10,9 @@ import yaml
 
 from detector.engine.samples.sample import Arrival
 from detector.engine.timing.timeline import ORDER
-from detector.replay.errors import RecordingError
 from detector.replay.gathering import recordings_of
 from detector.replay.intake_writer import IntakeWriter
+from detector.replay.message import RecordingError
 from detector.replay.recordings import span_of
 from detector.replay.rosbag1 import ROSBAG1_MAGIC
 from tests.driving import a_deploy, a_detector, a_rule, a_stream, at

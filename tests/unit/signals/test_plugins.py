@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from detector.assembly.checking import findings
-from detector.plugins.instances import LocalHost, plain_value
-from detector.plugins.registry import OFFERS
+from detector.plugins.instances import OFFERS, LocalHost, plain_value
 from tests.driving import POSITION, START, a_detector, a_stream, arrival, at
 from tests.plugins.rules import PluginDrive, plugin_rule, plugins
 from wayside.api import EventRule

@@ -14,9 +14,8 @@ from cryptography.x509.oid import NameOID
 from hypothesis import given
 from hypothesis import strategies as st
 
-from detector.access import credentials
-from detector.access.credentials import Material, expiry, read_material
-from detector.access.mounted import AccessError
+from detector.access import mounted as mounted_files
+from detector.access.mounted import AccessError, Material, expiry, read_material
 from tests.certificates import Authority
 from wayside.api.access import Access
 
@@ -59,7 +58,7 @@ def test_files_that_change_while_they_are_read_are_read_again(tmp_path: Path, mo
     """The kubelet exchanges the folder just after the certificate was read, before the key was."""
     authority, mounted = Authority(tmp_path), tmp_path / "own"
     authority.mount(mounted, "first")
-    read, content = [], credentials._content
+    read, content = [], mounted_files._content
 
     def exchanged(path: Path | None) -> bytes | None:
         found = content(path)
@@ -68,7 +67,7 @@ def test_files_that_change_while_they_are_read_are_read_again(tmp_path: Path, mo
             authority.mount(mounted, "second")
         return found
 
-    monkeypatch.setattr(credentials, "_content", exchanged)
+    monkeypatch.setattr(mounted_files, "_content", exchanged)
     material = read_material(access(mounted), "spec.zenoh")
     assert material.certificate == (mounted / "tls.crt").read_bytes()
     assert material.key == (mounted / "tls.key").read_bytes()
@@ -78,7 +77,7 @@ def test_files_that_never_hold_still_are_reported(tmp_path: Path, monkeypatch: p
     authority, mounted = Authority(tmp_path), tmp_path / "own"
     authority.mount(mounted, "first")
     count = iter(range(1000))
-    monkeypatch.setattr(credentials, "_content", lambda path: str(next(count)).encode())
+    monkeypatch.setattr(mounted_files, "_content", lambda path: str(next(count)).encode())
     with pytest.raises(AccessError, match=r"spec\.zenoh: .*tls\.crt keeps changing"):
         read_material(access(mounted), "spec.zenoh")
 

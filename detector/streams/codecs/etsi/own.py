@@ -2,6 +2,9 @@
 
 asn1tools provides the types. It lacks the types of open types, which are looked up in the text: `{Type IDENTIFIED BY
 value}` of an information object set gives them.
+
+It also uses only the first of several ranges: `(unknown | passengerCar..tram)` would be one number without any bit. So
+before it resolves them, `span_constraints` replaces several ranges by the one that spans them (X.691 10.3.21).
 """
 
 from __future__ import annotations
@@ -13,7 +16,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from detector.streams.codecs.etsi import asn1, bounds
+from detector.streams.codecs.etsi import asn1
 from detector.streams.codecs.etsi.packaged import ALPHABETS, REMEDY
 from detector.streams.codecs.etsi.quantities import UNITS
 from wayside.api.stream import Asn1Module
@@ -40,7 +43,7 @@ class OwnDefinitions:
         for text in texts:
             self._trees.update(copy.deepcopy(parsed_modules(text)))
             self._rows.update(_object_sets(text))
-        bounds.span_constraints(self._trees)
+        span_constraints(self._trees)
         self._types = _compiled(self._trees)
         self._done: dict[int, tuple[Any, asn1.Type]] = {}
 
@@ -68,11 +71,9 @@ class OwnDefinitions:
                 return asn1.Null()
             case "Integer":
                 extensible = bool(found.has_extension_marker)
-                names = bounds.aliases(name, self._trees)
+                names = aliases(name, self._trees)
                 unit = next((each for each in names if each in UNITS), name)
-                return asn1.Integer(
-                    unit, found.minimum, found.maximum, extensible, bounds.named_numbers(names, self._trees)
-                )
+                return asn1.Integer(unit, found.minimum, found.maximum, extensible, named_numbers(names, self._trees))
             case "Enumerated":
                 additions = found.additions_index_to_data
                 return asn1.Enumerated(
@@ -126,7 +127,7 @@ class OwnDefinitions:
     def _open_types(self, name: str) -> dict[str, asn1.Type]:
         """The open types of a SEQUENCE, by component; the type of each depends on another component."""
         opened: dict[str, asn1.Type] = {}
-        for member in bounds.type_tree(name, self._trees).get("members", ()):
+        for member in type_tree(name, self._trees).get("members", ()):
             if not isinstance(member, dict) or not str(member.get("type")).endswith(".&Type"):
                 continue
             match member.get("table"):
@@ -137,7 +138,7 @@ class OwnDefinitions:
     def _table(self, object_set: str) -> dict[int, asn1.Type]:
         table: dict[int, asn1.Type] = {}
         for type_name, value in self._rows.get(object_set, ()):
-            number = int(value) if value.isdigit() else bounds.named_number(value, self._trees)
+            number = int(value) if value.isdigit() else named_number(value, self._trees)
             kind = self.type([type_name])
             if number is not None and kind is not None:
                 table[number] = kind
@@ -223,3 +224,81 @@ def _object_sets(text: str) -> Iterator[tuple[str, list[tuple[str, str]]]]:
         rows = _ROW.findall(text[found.end() : end])
         if rows:
             yield found[1], rows
+
+
+_MARKER = None
+"""How asn1tools represents `...`."""
+
+
+def span_constraints(trees: Mapping[str, Any]) -> None:
+    """Replaces constraints of several ranges by one, in modules parsed by asn1tools."""
+    for tree in trees.values():
+        _visit(tree["types"], trees)
+
+
+def _visit(node: Any, trees: Mapping[str, Any]) -> None:
+    if isinstance(node, dict):
+        for name in ("restricted-to", "size"):
+            ranges = node.get(name)
+            if isinstance(ranges, list) and len(_root(ranges)) > 1:
+                spanned = _span(_root(ranges), node, trees)
+                if spanned is not None:
+                    node[name] = [spanned, _MARKER] if _MARKER in ranges else [spanned]
+        for value in node.values():
+            _visit(value, trees)
+    elif isinstance(node, list):
+        for value in node:
+            _visit(value, trees)
+
+
+def _root(ranges: list[Any]) -> list[Any]:
+    """The part before the extension marker."""
+    return ranges[: ranges.index(_MARKER)] if _MARKER in ranges else ranges
+
+
+def _span(ranges: list[Any], node: Mapping[str, Any], trees: Mapping[str, Any]) -> tuple[int, int] | None:
+    """From the lowest to the highest; None if a bound is unknown, which asn1tools reports."""
+    ends = [end for each in ranges for end in (each if isinstance(each, tuple) else (each,))]
+    numbers = [_number(end, node, trees) for end in ends]
+    known = [number for number in numbers if number is not None]
+    return (min(known), max(known)) if len(known) == len(numbers) else None
+
+
+def _number(end: Any, node: Mapping[str, Any], trees: Mapping[str, Any]) -> int | None:
+    if isinstance(end, int):
+        return end
+    if not isinstance(end, str):
+        return None
+    if end.lstrip("-").isdigit():
+        return int(end)
+    named = named_numbers(aliases(str(node.get("type", "")), trees), trees) | dict(node.get("named-numbers", {}))
+    return named[end] if end in named else named_number(end, trees)
+
+
+def type_tree(name: str, trees: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The definition of the type, in any of the modules; empty if there is none."""
+    return next((tree["types"][name] for tree in trees.values() if name in tree["types"]), {})
+
+
+def aliases(name: str, trees: Mapping[str, Any]) -> list[str]:
+    """The name of the type, and its aliases."""
+    names: list[str] = []
+    while name and name not in names:
+        names.append(name)
+        name = str(type_tree(name, trees).get("type", ""))
+    return names
+
+
+def named_numbers(names: list[str], trees: Mapping[str, Any]) -> dict[str, int]:
+    """The named numbers of the first of these INTEGER types that has any."""
+    found = (type_tree(name, trees) for name in names)
+    return next((dict(tree["named-numbers"]) for tree in found if "named-numbers" in tree), {})
+
+
+def named_number(name: str, trees: Mapping[str, Any]) -> int | None:
+    """The number with that name in the modules."""
+    for tree in trees.values():
+        found = tree["values"].get(name)
+        if found is not None and isinstance(found["value"], int):
+            return int(found["value"])
+    return None
