@@ -154,7 +154,8 @@ class Consequences:
             self._excerpts.distribute()
             for run, excerpt in list(self._running.items()):
                 if excerpt is not None:
-                    self._sample(run, excerpt, now)
+                    if samples := excerpt.take(now):
+                        self._noted.append(Sampled(run, samples))
                     if excerpt.until is not None and now >= excerpt.until:
                         self._complete(run, "")
         if self._complete_ones:
@@ -203,8 +204,3 @@ class Consequences:
         elif excerpt is not None:
             self._excerpts.stop(excerpt)
         self._noted.append(Completed(run, cut))
-
-    def _sample(self, run: Run, excerpt: Excerpt, now: int) -> None:
-        samples = excerpt.take(now)
-        if samples:
-            self._noted.append(Sampled(run, samples))

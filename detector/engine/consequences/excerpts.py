@@ -9,7 +9,7 @@ then it is certain that the episode had not ended before.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from operator import attrgetter
 from typing import NamedTuple
@@ -102,7 +102,9 @@ class Excerpts:
         self.distribute()
         excerpt = Excerpt(window, clients, begin)
         self._excerpts.append(excerpt)
-        for lane in self._candidates(excerpt):
+        # There may be many clients, and an episode is about one or two of them.
+        every = clients is None or window.shared
+        for lane in self._buffer if every else self._buffer.of(sorted(clients or ())):
             if excerpt.wants(lane):
                 self._watch(lane, excerpt)
                 excerpt.waiting.extend((lane, sample) for sample in lane.samples)
@@ -116,12 +118,6 @@ class Excerpts:
             if not self._watchers[lane]:
                 del self._watchers[lane]
                 lane.record(None)
-
-    def _candidates(self, excerpt: Excerpt) -> Iterable[Lane]:
-        """The lanes that may belong to it: there may be many clients, and an episode is about one or two of them."""
-        if excerpt.clients is None or excerpt.window.shared:
-            return self._buffer
-        return self._buffer.of(sorted(excerpt.clients))
 
     def _added(self, lane: Lane) -> None:
         """Add a lane that is new in the buffer."""

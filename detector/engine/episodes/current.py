@@ -170,12 +170,7 @@ class EpisodeState(msgspec.Struct, eq=False):
             values=values,
             end_time=end,
             reason=reason,
-            models=_models(rule) if rule.models else {},
+            models={model.name: model.runner.sha256 for model in rule.models if model.runner is not None},
             dry_run=rule.dry_run,
             rendered=rendered,
         )
-
-
-def _models(rule: CompiledRule) -> dict[str, str]:
-    """The digests of the rule's models, by name."""
-    return {model.name: model.runner.sha256 for model in rule.models if model.runner is not None}

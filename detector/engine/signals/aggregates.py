@@ -141,26 +141,21 @@ def _quantile(window: Sequence[Timed], quantile: float) -> Number:
 
 
 def _delta(window: Sequence[Timed]) -> Number | Unknown:
-    if len(window) < 2:
-        return UNKNOWN
-    return _difference(window[-1][1], window[0][1])
+    return UNKNOWN if len(window) < 2 else _difference(window, Fraction(1))
 
 
 def _rate(window: Sequence[Timed]) -> Number | Unknown:
     """Per second. Unknown if all samples have the same time, which is only possible for stamps."""
     if len(window) < 2 or window[-1][0] == window[0][0]:
         return UNKNOWN
+    return _difference(window, Fraction(window[-1][0] - window[0][0], _SECOND))
+
+
+def _difference(window: Sequence[Timed], divisor: Fraction) -> float:
     first, last = window[0][1], window[-1][1]
-    between = Fraction(window[-1][0] - window[0][0], _SECOND)
     if math.isinf(first) or math.isinf(last):
         return float(last) - float(first)
-    return _double((Fraction(last) - Fraction(first)) / between)
-
-
-def _difference(last: Number, first: Number) -> float:
-    if math.isinf(first) or math.isinf(last):
-        return float(last) - float(first)
-    return _double(Fraction(last) - Fraction(first))
+    return _double((Fraction(last) - Fraction(first)) / divisor)
 
 
 def _double(exact: Fraction) -> float:
