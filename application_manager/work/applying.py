@@ -239,5 +239,5 @@ def _readable(message: str) -> str:
         return message
     plain = re.sub(r"&value\.valueUnstructured\{Value:(.*)\}", r"\1", typed[1], flags=re.DOTALL)
     if "expected string, got" in plain:
-        plain += " (a value inside other text becomes text; alone, it keeps its type)"
+        plain += " (a value inside other text becomes a string; alone, it keeps its type)"
     return f"{plain}: correct the template"

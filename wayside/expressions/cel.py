@@ -60,7 +60,7 @@ class CelType(enum.Enum):
 
     DYN = "any value"
     DOUBLE = "a number"
-    STRING = "a text"
+    STRING = "a string"
     BOOL = "a boolean"
     MAP = "a map"
     LIST = "a list"
@@ -332,7 +332,7 @@ def _check_patterns(node: Node, source: str) -> None:
         pattern = call.arguments[-1] if call.arguments else None
         literal = pattern.value if isinstance(pattern, Scalar) else None
         if not isinstance(literal, str):
-            message, hint = "the pattern of `matches` is not a literal text", _LITERAL
+            message, hint = "the pattern of `matches` must be a literal string", _LITERAL
         elif (size := pattern_size(literal)) > LARGEST_PATTERN:
             cut = literal if len(literal) <= 80 else f"{literal[:79]}…"
             message = f"the pattern {cut!r} takes {size} steps, more than the {LARGEST_PATTERN} of `matches`"
@@ -378,5 +378,5 @@ def _plain(value: object) -> Value:
 def _describe(value: object) -> str:
     if value is None:
         return "null"
-    names = {bool: "a boolean", float: "a number", int: "a number", str: "a text", list: "a list", dict: "a map"}
+    names = {bool: "a boolean", float: "a number", int: "a number", str: "a string", list: "a list", dict: "a map"}
     return names.get(type(value), f"a value of type {type(value).__name__}")

@@ -99,7 +99,7 @@ def _undeclared(name: str, source: str, at: int, names: Collection[str]) -> tupl
     if similar := did_you_mean(name, names, "`"):
         return message, similar
     known = ", ".join(f"`{each}`" for each in sorted(names)[:12]) or "nothing"
-    return message, f"declared: {known}; a text needs its own quotes inside those of YAML: '\"{name}\"'"
+    return message, f"declared: {known}; a string needs its own quotes inside those of YAML: '\"{name}\"'"
 
 
 def _overload(function: str, arguments: str) -> tuple[str, str | None]:
@@ -168,7 +168,7 @@ _CLEANING: Final = (
 )
 _TYPES: Final = {
     "double": "number",
-    "string": "text",
+    "string": "string",
     "bool": "boolean",
     "int64": "integer beyond 2^53",
     "uint64": "list, map or bytes",  # a handle

@@ -136,7 +136,7 @@ class _Expansion:
         (first, last) = arguments[1]
         given = self._tokens[first]
         if last - first != 1 or given.kind is not TokenKind.STRING or given.text[0] not in "\"'":
-            self._refuse(first, "the name of a place must be a text in quotes", 'write it out, as in "crossing"')
+            self._refuse(first, "the name of a place must be a string in quotes", 'write it out, as in "crossing"')
         name = given.text[1:-1]
         shape = self._places.shapes.get(name)
         if shape is None:

@@ -94,7 +94,7 @@ class CompiledTemplate:
         """The fields with the values filled in; None where the whole was dropped.
 
         With `integers`, integral doubles become integers throughout, as manifests need them. Raises
-        InterpolationError where an expression fails, is null inside a text, or yields what JSON cannot represent.
+        InterpolationError where an expression fails, is null inside a string, or yields what JSON cannot represent.
         """
         result = _render(self.root, values, integers)
         return None if isinstance(result, _Dropped) else result
@@ -246,7 +246,7 @@ def _text(embedded: Embedded, values: Mapping[str, object]) -> str:
     value = _json(embedded, values)
     if value is None:
         hint = 'give a value for that case, as in `x == null ? "" : x`'
-        raise embedded.error(f"`{embedded.expression.source.strip()}` is null inside a text", hint)
+        raise embedded.error(f"`{embedded.expression.source.strip()}` is null inside a string", hint)
     if isinstance(value, str):
         return value
     return json.dumps(_numbers(value, integers=True), ensure_ascii=False, separators=(",", ":"))

@@ -92,7 +92,7 @@ class Configuration:
                 kind = "a map" if isinstance(value, dict) else "a list"
                 problems.append(
                     f"{_path(name)}: is {kind}, but the file name gives no format: end the name with .yaml "
-                    "or .json, or give a text"
+                    "or .json, or give a string"
                 )
             else:
                 files[name] = text

@@ -151,7 +151,7 @@ def test_an_expression_that_fails_on_what_is_there_is_an_error_and_what_is_missi
     )
     counters = drive.engine.counters.rules["r"]
     assert counters.errors == 1
-    assert "`+` does not take a text and a number" in counters.last_error
+    assert "`+` does not take a string and a number" in counters.last_error
     assert counters.unknowns >= 1
     assert [event.episode.subject for event in drive.events] == ["good"]
 

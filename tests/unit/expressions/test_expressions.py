@@ -99,9 +99,9 @@ def test_maps_come_back_sorted_in_every_process() -> None:
         ("a.regoin", "there is no `a.regoin`; did you mean `region`?"),
         ("l[3]", "no index 3 in the list$"),
         ("speed + a.region", "there is no `speed`"),
-        ("a.region > 3", "`>` compares a text with a number$"),
-        ("-a.region", "`-` does not take a text$"),
-        ("a.region + l[0]", r"`\+` does not take a text and a number$"),
+        ("a.region > 3", "`>` compares a string with a number$"),
+        ("-a.region", "`-` does not take a string$"),
+        ("a.region + l[0]", r"`\+` does not take a string and a number$"),
         ("a.region.hdr.id > 3", "`a.region` is 'north', which has no field `hdr`: correct the path$"),
         ("a.none.id", "`a.none` is null, which has no field `id`: "),
         ("msg.x > 3", "`msg` is a block of 2 bytes, which has no field `x`: read it with numberAt or utf8"),
@@ -209,10 +209,10 @@ def test_a_variable_must_be_one_that_an_expression_can_name(name: str) -> None:
     ("source", "result", "message"),
     [
         ("distance", CelType.BOOL, "must be a boolean; got a number"),
-        ("  'a'", CelType.BOOL, "must be a boolean; got a text"),
+        ("  'a'", CelType.BOOL, "must be a boolean; got a string"),
         ("[1]", CelType.MAP, r"must be a map; got list\(double\)"),
         ("null", CelType.DOUBLE, "must be a number; got null"),
-        ("b", CelType.STRING, "must be a text; got a boolean"),
+        ("b", CelType.STRING, "must be a string; got a boolean"),
     ],
 )
 def test_a_result_of_the_wrong_type_is_refused_when_compiled(source: str, result: CelType, message: str) -> None:

@@ -112,7 +112,7 @@ def test_a_wrong_call_does_not_compile(source: str, column: int, message: str, h
         ("sqrt(x)", {"x": -1.0}, Reason.ERROR, "give 0 or a positive number"),
         ("yaw(msg.q)", {"msg": {"q": {"x": 0, "y": 0, "z": 0, "w": 0}}}, Reason.ERROR, "not a rotation"),
         ("numberAt(msg, 2, 'u16le')", {"msg": b"\0\1\2"}, Reason.ABSENT, "bytes 2 to 3: there are 3"),
-        ("numberAt(msg, 2, 'u24')", {"msg": b"\0\1\2"}, Reason.ERROR, "'u24' is none of u8"),
+        ("numberAt(msg, 2, 'u24')", {"msg": b"\0\1\2"}, Reason.ERROR, "format must be one of u8"),
         ("utf8(msg)", {"msg": b"\xff"}, Reason.ERROR, "not valid UTF-8"),
         ("allZero(msg)", {"msg": [0.0]}, Reason.ERROR, "data must be bytes"),
         ("wgs84Distance(91, 0, 0, 0)", {}, Reason.ERROR, "latitude 91 is beyond"),

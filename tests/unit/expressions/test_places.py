@@ -179,7 +179,7 @@ DETECTOR = a_detector(
         ("speed", 'at(position, "stop").across', "stream speed has no position (give position in the stream of the"),
         ("gnss", "positionBefore.altitude", "the position of stream gnss has no altitude (it has latitude, longitude)"),
         ("late", "positionBefore.x", "positionBefore of stream late is not known, since its position reads sample"),
-        ("pose", "1 + at(position, msg.name).inside", "column 18: the name of a place must be a text in quotes"),
+        ("pose", "1 + at(position, msg.name).inside", "column 18: the name of a place must be a string in quotes"),
         ("pose", "seenFrom(msg, msg).ahead", "seenFrom is about two clients (use it in a rule with scope pairs)"),
         ("pose", 'at(position, "crossing").inside + 1', "does not take (bool, double)"),
     ],

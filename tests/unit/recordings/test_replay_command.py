@@ -79,7 +79,7 @@ def test_an_error_of_a_fleet_condition_names_the_signals_that_it_reads(desk: Des
         a_rule("r", scope={"fleet": {"members": "true"}}, signals=FAST["signals"], when="members.exists(c, c.v > 10)"),
     )
     ran = desk.replay(desk.drive("drive.jsonl", (0.5, {"v": "fast"}), (2.0, {"v": "fast"})))
-    assert "the last: when of ~fleet (v of stream speed): `>` compares a text with a number" in ran.logged
+    assert "the last: when of ~fleet (v of stream speed): `>` compares a string with a number" in ran.logged
 
 
 @pytest.mark.parametrize(

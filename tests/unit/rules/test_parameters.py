@@ -158,14 +158,14 @@ def test_a_parameter_that_is_not_there_or_does_not_fit_is_reported_where_it_is_u
     [
         ({"near": 1}, {"neer": 1}, "neer", ["EventRule too-fast has no parameter neer", "did you mean near?"]),
         ({}, {"n": 1}, "n", ["has no parameter n", "it has none"]),
-        ({"m": 1}, {"m": "1"}, "m", ["m of EventRule too-fast is a number, but the value is a text: '1'"]),
+        ({"m": 1}, {"m": "1"}, "m", ["m of EventRule too-fast is a number, but the value is a string: '1'"]),
         ({"m": True}, {"m": 1}, "m", ["is a boolean, but the value is a number"]),
         ({"m": SQUARE}, {"m": {"x": 1}}, "m", ["is a list, but the value is a map"]),
         (
             {"m": SQUARE},
             {"m": [[0, 0], [1, "1"]]},
             "m",
-            ["m[1][1] of EventRule too-fast is a number, but the value is a text"],
+            ["m[1][1] of EventRule too-fast is a number, but the value is a string"],
         ),
         ({"m": {"a": {"b": 1}}}, {"m": {"a": {"b": []}}}, "m", ["m.a.b", "is a number, but the value is a list"]),
     ],

@@ -75,7 +75,7 @@ def test_another_configuration_changes_its_config_map_alone() -> None:
 def test_a_list_in_a_file_without_a_format_is_refused_with_the_remedy() -> None:
     assert refusal({"sources.txt": "${parameters.sources}"}, sources=["a"]) == (
         "spec.configuration.sources.txt: is a list, but the file name gives no format: end the name with .yaml or "
-        ".json, or give a text"
+        ".json, or give a string"
     )
 
 

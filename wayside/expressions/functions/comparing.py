@@ -50,20 +50,20 @@ FUNCTIONS = (
         Yields.LIST,
         "the indices of those items that have none of the others within the distance in metres",
         (unmatched, "items:list others:list within"),
-        (unmatched, "items:list others:list within path:text"),
+        (unmatched, "items:list others:list within path:string"),
     ),
     function(
         "countUnmatched",
         Yields.NUMBER,
         "the number of such items",
         (count_unmatched, "items:list others:list within"),
-        (count_unmatched, "items:list others:list within path:text"),
+        (count_unmatched, "items:list others:list within path:string"),
     ),
     function(
         "nearest",
         Yields.NUMBER,
         "metres from (x, y) to the nearest item of a list; infinite if the list is empty",
         (nearest, "items:list x y"),
-        (nearest, "items:list x y path:text"),
+        (nearest, "items:list x y path:string"),
     ),
 )

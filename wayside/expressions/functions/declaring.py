@@ -23,7 +23,7 @@ class Takes(enum.Enum):
     """The type of a parameter, as errors name it."""
 
     NUMBER = "number"
-    TEXT = "text"
+    TEXT = "string"
     BYTES = "bytes"
     LIST = "list"
     MAP = "map"
@@ -34,7 +34,7 @@ class Yields(enum.Enum):
 
     NUMBER = "number"
     BOOLEAN = "boolean"
-    TEXT = "text"
+    TEXT = "string"
     LIST = "list"
 
 

@@ -39,7 +39,7 @@ def number_at(data: bytes, offset: float, form: str) -> float:
     """The number that begins at a byte: format u8, i8, u16le, i32be, f32le, …"""
     known = _FORMATS.get(form)
     if known is None:
-        raise ValueError(f"format {form!r} is none of {', '.join(_FORMATS)}")
+        raise ValueError(f"format must be one of {', '.join(_FORMATS)}; got {form!r}")
     if offset != int(offset) or not 0 <= offset <= len(data) - known.size:
         raise ValueError(f"no value for bytes {offset:g} to {offset + known.size - 1:g}: there are {len(data)}")
     return float(known.unpack_from(data, int(offset))[0])
@@ -61,7 +61,7 @@ FUNCTIONS = (
         "numberAt",
         Yields.NUMBER,
         "the number that begins at a byte (from 0 on): u8, i8, and u16, i16, u32, i32, f32, f64 followed by le or be",
-        (number_at, "data:bytes offset format:text"),
+        (number_at, "data:bytes offset format:string"),
     ),
-    function("utf8", Yields.TEXT, "the bytes as UTF-8 text", (utf8, "data:bytes")),
+    function("utf8", Yields.TEXT, "the bytes as a UTF-8 string", (utf8, "data:bytes")),
 )

@@ -107,6 +107,6 @@ FUNCTIONS = (
         Yields.NUMBER,
         "how many objects of a list lie inside the polygon or on its edge",
         (count_inside, "items:list polygon:list"),
-        (count_inside, "items:list polygon:list path:text"),
+        (count_inside, "items:list polygon:list path:string"),
     ),
 )

@@ -14,7 +14,7 @@ from wayside.expressions.numbers import DIGITS, MAX_EXACT
 def _bounded(arguments: Arguments) -> object:
     (text,) = arguments
     if isinstance(text, str) and len(text) * 4 > LONGEST_INPUT and (size := len(text.encode())) > LONGEST_INPUT:
-        raise ValueError(f"matches takes texts of at most {LONGEST_INPUT} bytes; got {size}")
+        raise ValueError(f"matches takes strings of at most {LONGEST_INPUT} bytes; got {size}")
     return text
 
 

@@ -14,11 +14,11 @@ from wayside.expressions.functions.declaring import Yields, function
 from wayside.geo import geodesy
 
 OF_PLACES: Final = {
-    "at_inside": "u v place:text",
-    "at_distance": "u v place:text",
-    "at_along": "u v place:text",
-    "at_across": "u v place:text",
-    "at_heading": "u v heading place:text",
+    "at_inside": "u v place:string",
+    "at_distance": "u v place:string",
+    "at_along": "u v place:string",
+    "at_across": "u v place:string",
+    "at_heading": "u v heading place:string",
 }
 """The parameters of the functions that `positions` calculates, by name."""
 
