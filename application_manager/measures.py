@@ -50,8 +50,10 @@ class Measures:
         self._reconciled = self._histogram("reconcile_seconds", "Time that reconciling one object took", _WORK, "queue")
         self._failures = self._counter("reconcile_failures", "Reconciliations that failed and are retried", "queue")
         self._refusals = self._counter("refusals", "Refusals of tasks; each new reason counts again", "reason")
-        self._requests = self._histogram("api_request_seconds", "Time to the API server's answer", _WORK, "method")
-        self._errors = self._counter("api_errors", "Requests that the API server refused or did not answer", "code")
+        self._requests = self._histogram("api_request_seconds", "Response time of the API server", _WORK, "method")
+        self._errors = self._counter(
+            "api_errors", "Requests that the API server refused, or did not respond to", "code"
+        )
         self._events = self._counter("kubernetes_events", "Kubernetes Events that were posted", "reason")
         self._unposted = self._counter("kubernetes_events_dropped", "Kubernetes Events that were not posted", "cause")
         self._reviews = self._counter("reviews", "Admission reviews of the API server", "kind", "answer")

@@ -64,7 +64,7 @@ class KeyPattern:
                 raise KeyPatternError(text, offset, f"{name} is captured twice: names must be unique")
             inner = [_chunk(text, start + at, chunk) for at, chunk in _split(pattern)]
             if name == "client" and (len(inner) > 1 or inner[0].many):
-                raise KeyPatternError(text, offset, "a client's name is one chunk: write ${client:*}")
+                raise KeyPatternError(text, offset, "a client's name must be one chunk: write ${client:*}")
             many = all(element.many for element in inner)
             regex = _CHUNKS if many else _joined(inner)
             elements.append(_Element(f"(?P<{name}>{regex})", many))
@@ -124,7 +124,7 @@ def _split(pattern: str) -> Iterator[tuple[int, str]]:
 def _capture(text: str, offset: int, part: str) -> tuple[str, int, str]:
     """The name of the capture that the part is, the offset of its pattern in the text, and its pattern."""
     if not part.startswith("${") or part.find("}") != len(part) - 1:
-        raise KeyPatternError(text, offset, f"a capture covers whole chunks: put slashes around ${{…}} in {part!r}")
+        raise KeyPatternError(text, offset, f"a capture must cover whole chunks: put slashes around ${{…}} in {part!r}")
     name, colon, pattern = part[2:-1].partition(":")
     if not _NAME.fullmatch(name):
         raise KeyPatternError(

@@ -151,7 +151,7 @@ class Admission:
         try:
             return await self.pool.run(namespace, job)
         except ExceededError as error:
-            return Findings((f"spec: its review {error}",))
+            return Findings((f"spec: the review {error}",))
 
     async def _look_up(self, resource: Resource, namespace: str, fields: str = "") -> None:
         for raw in (await self.client.list(resource, namespace, fields=fields))[0]:
@@ -190,7 +190,7 @@ class Admission:
                 problem = f"spec.pod: {error.message}"
         except (Unreachable, TimeoutError) as error:
             log.warning(
-                "Detector %s/%s: cannot check its pod by a dry run: %s", detector.namespace, detector.name, error
+                "Detector %s/%s: cannot check its pod with a dry run: %s", detector.namespace, detector.name, error
             )
         return problem
 

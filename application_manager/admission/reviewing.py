@@ -82,7 +82,7 @@ class ReviewHandler:
             self._measures.reviewed("", "failed")
             raise
         except Exception as error:  # a defect of ours keeps nobody from anything
-            log.exception("a review failed")
+            log.exception("cannot review an object")
             return self._none(500, f"{type(error).__name__}: {error}")
         finally:
             self._in_progress -= 1

@@ -118,7 +118,7 @@ class HelmRunner:
         if code != 0:
             output = errors.decode(errors="replace")
             raise HelmError(
-                _cleaned(output) or f"helm {arguments[0]} ended with code {code}; it may have reached a resource limit"
+                _cleaned(output) or f"helm {arguments[0]} exited with code {code}; it may have reached a resource limit"
             )
         return written
 

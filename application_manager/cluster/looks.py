@@ -61,7 +61,7 @@ class FailedPodsLook:
         self._look = _Look(
             client,
             EVENTS,
-            "cannot list Events (%s): statuses do not give the reason why pods of a StatefulSet cannot be created",
+            "cannot list Events (%s): statuses do not report why pods of a StatefulSet cannot be created",
         )
 
     async def events(self, namespace: str, uid: str) -> list[Object]:

@@ -75,7 +75,7 @@ class InstanceStatusWork:
         elif not await self.statuses.write(INSTANCES, instance, instance.status, new, now):
             return
         elif old.release_time is None and new.release_time is not None:
-            note = f"no demand is left; the instance is released at {new.release_time} unless a demand arrives"
+            note = f"no demand is left; the instance will be released at {new.release_time} unless a demand arrives"
             self.statuses.recorder.event(instance, EventReason.LINGERING, note, now)
         # How many pods are ready stays with the instance: it changes often, and the tasks may be many.
         why_not = "" if applied.aspect.holds else applied.aspect.message

@@ -114,7 +114,9 @@ class ActionHost:
                 _log.error(
                     "action %s of EventRule %s did not stop within %g s; abandoning its thread", action, rule, grace
                 )
-                self.outcomes.lose(worker.which, "times the action did not stop in time and was abandoned", 1, "")
+                self.outcomes.lose(
+                    worker.which, "times the action did not stop in time, so that its thread was abandoned", 1, ""
+                )
 
     def _dismiss(self) -> None:
         """Close workers that have no work left."""

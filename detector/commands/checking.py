@@ -57,4 +57,4 @@ def check_files(files: Sequence[Path], recordings: Sequence[Path], ignore: Seque
     if found.problems or unread or (strict and warnings):
         raise typer.Exit(1)
     count = f", {len(warnings)} warning{'s' if len(warnings) > 1 else ''}" if warnings else ""
-    typer.echo(f"{checked_summary(documents)}: nothing wrong{count}", err=True)
+    typer.echo(f"{checked_summary(documents)}: no errors{count}", err=True)

@@ -129,7 +129,7 @@ def _view(address: str | None) -> View | None:
         return None
     host, _, port = address.rpartition(":")
     if not port.isdecimal() or int(port) > 65535:
-        refuse(f"--foxglove {address}: give a port, e.g. 8765, or host and port, e.g. 0.0.0.0:8765")
+        refuse(f"--foxglove must be a port, e.g. 8765, or host and port, e.g. 0.0.0.0:8765; got {address}")
     with importing():
         from detector.results.kinds import check_package
 
@@ -149,7 +149,7 @@ def _holder_in_pod(name: str) -> str:
         return TypeAdapter(Holder).validate_python(f"{name}.{pod}" if pod else "")
     except ValidationError:
         refuse(
-            f"--as-pod: {name}.{pod} is not a valid holder: set POD_NAME by the downward API "
+            f"--as-pod: {name}.{pod} is not a valid holder: set POD_NAME with the downward API "
             "(metadata.name); both names together may have 252 characters"
         )
 

@@ -68,7 +68,7 @@ def mine_recordings(
     for warning in loaded.warnings:
         typer.echo(warning, err=True)
     if not loaded.rule_set.rules:
-        refuse("the Detector selects none of the rules: give --rules FILE")
+        refuse("the Detector selects none of the rules: correct spec.ruleSelector, or give other --rules")
     sources = sources_of(given)
     if sample is not None:
         sources = sampled(sources, sample)
@@ -140,7 +140,7 @@ def _workers(processes: int | None, dask: str | None) -> Workers:
 def _share(text: str) -> WorkShare:
     found = re.fullmatch(r"(\d+)/(\d+)", text)
     if found is None or int(found[1]) >= int(found[2]):
-        refuse(f"--share {text}: give NUMBER/OF, counted from 0, e.g. 0/8 to 7/8")
+        refuse(f"--share must be NUMBER/OF, counted from 0, e.g. 0/8 to 7/8; got {text}")
     return WorkShare(int(found[1]), int(found[2]))
 
 

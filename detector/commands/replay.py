@@ -132,7 +132,7 @@ def _lines(outcome: Replayed, where: str) -> Iterator[str]:
     yield from (f"warning: {where}{doubt}" for doubt in outcome.doubts)
     yield from (f"{where}{note}" for note in outcome.notes)
     if outcome.cut:
-        yield "the intake file ends in the middle: its detector was killed"
+        yield "the intake file is incomplete: its detector was killed"
     if outcome.lost:
         yield f"{outcome.lost} samples are missing in the intake file, since the disk was too slow: events may differ"
 

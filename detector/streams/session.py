@@ -113,7 +113,7 @@ class Connections:
                 self.departures += 1
             if not self._others and not self._closing:
                 self._alone = True
-                log.warning("zenoh: lost the connection to %s %s, and no other is left; reconnecting", role, other)
+                log.warning("zenoh: lost the last connection, to %s %s; reconnecting", role, other)
 
 
 def _settings(config: Zenoh, material: Material) -> zenoh.Config:

@@ -162,7 +162,7 @@ def test_admission_refuses_a_template_that_takes_too_long_with_its_own_defaults(
     }
     made = template("bomb", parameters=parameters, manifests=[config({"n": f"n=${{{BOMB}}}"}, name="n")])
     del made["spec"]["key"]
-    logged = r"spec: its review took more than 0\.5 s of CPU time and was stopped"
+    logged = r"spec: the review took more than 0\.5 s of CPU time and was stopped"
     with webhook.requested(), pytest.raises(ApiError, match=logged):
         api.apply(made, dry_run=dry_run)
     assert api.find("ApplicationTemplate", "bomb") is None

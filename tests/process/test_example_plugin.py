@@ -65,7 +65,7 @@ def test_the_commands_find_it_and_give_the_same_events(
             check=True,
         )
 
-    assert "nothing wrong" in detector("check", DETECTOR, RULES).stderr
+    assert "no errors" in detector("check", DETECTOR, RULES).stderr
     detector("replay", DRIVE, "--detector", DETECTOR, "--rules", RULES, "--output", tmp_path)
     monkeypatch.syspath_prepend(site)
     events = (tmp_path / "events.jsonl").read_text().splitlines()

@@ -216,7 +216,7 @@ def test_a_killed_router_is_reported_and_so_is_its_return(
             wait_for(lambda: running.connected)
             arrivals.wait_for(lambda seen: (LIVELINESS, "alive/car1", TokenState.DECLARED.value) in seen)
         wait_for(lambda: not running.connected)
-        wait_for(lambda: "and no other is left" in caplog.text)
+        wait_for(lambda: "lost the last connection" in caplog.text)
         arrivals.wait_for(lambda seen: (LIVELINESS, "alive/car1", TokenState.UNSURE.value) in seen)
         arrivals.seen.clear()
         with router_process(endpoint):

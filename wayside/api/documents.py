@@ -33,7 +33,7 @@ MAXIMUM_BYTES = 256 * 1024
 
 _BOUNDED = ("ApplicationTemplate", "Detector", "EventRule")  # tasks and instances have bounds for their parameters
 
-_TOO_DEEP = f"is nested more than {_DEEPEST} levels deep: an alias may refer to itself"
+_TOO_DEEP = f"is nested more than {_DEEPEST} levels deep: flatten it; a YAML alias may refer to itself"
 
 _YAML_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
@@ -240,7 +240,11 @@ def _value(node: yaml.Node, path: FieldPath, marks: dict[FieldPath, tuple[int, i
     if len(path) > _DEEPEST:
         raise _TagError(path[:3], mark, _TOO_DEEP)
     if len(marks) > _MOST_FIELDS:
-        raise _TagError(path[:3], mark, f"the object has more than {_MOST_FIELDS} fields: aliases may multiply them")
+        raise _TagError(
+            path[:3],
+            mark,
+            f"the object has more than {_MOST_FIELDS} fields: remove YAML aliases, which multiply fields",
+        )
     if node.tag.startswith("!"):
         written = f"{node.tag} {node.value}".strip() if isinstance(node, yaml.ScalarNode) else node.tag
         raise _TagError(path, mark, f"YAML reads {node.tag} as a tag: quote the expression, '{written}'")

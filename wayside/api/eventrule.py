@@ -263,7 +263,7 @@ class Evaluation(Model):
     @model_validator(mode="after")
     def _consistent(self) -> Evaluation:
         if self.every is not None and self.every.ns < 10_000_000:
-            raise ValueError(f"every: {self.every} is too short: give 10ms or more")
+            raise ValueError(f"every: must be 10ms or more; got {self.every}")
         if self.on_demand is False:
             raise ValueError("onDemand: write true, or leave it out")
         return self

@@ -65,7 +65,9 @@ def _unknown(name: str, fields: Collection[str]) -> str:
     """The message for a field that does not exist: with the name of one that does, if one is similar."""
     stem = name.lower().rstrip("s")
     similar = [*(each for each in fields if each.lower().startswith(stem)), *difflib.get_close_matches(name, fields, 1)]
-    return f"unknown field: did you mean {similar[0]}?" if similar else "unknown field: check its spelling and position"
+    return (
+        f"unknown field: did you mean {similar[0]}?" if similar else "unknown field: check its spelling and indentation"
+    )
 
 
 def _message(item: ErrorDetails) -> str:

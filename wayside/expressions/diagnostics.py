@@ -114,7 +114,7 @@ def _overload(function: str, arguments: str) -> tuple[str, str | None]:
     if operator in ("&&", "||", "!"):
         return message, "it takes booleans"
     if operator == "?:":
-        return message, "it takes a boolean, and two values of one type"
+        return message, "it takes a boolean and two values of the same type"
     return message, None
 
 

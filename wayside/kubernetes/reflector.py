@@ -108,7 +108,7 @@ class Reflector:
     def _recovered(self) -> None:
         self.lists += 1
         if self._backoff.failures:
-            _log.info("reading the %s of namespace %s again", self.resource.plural, self.namespace)
+            _log.info("the API server responds: reading the %s of namespace %s", self.resource.plural, self.namespace)
         self._backoff.succeed()
 
     def _failed(self, error: RequestError) -> float:

@@ -104,7 +104,7 @@ _KINDS: Final = {
 
 
 def _kind(value: object) -> str:
-    kinds = {bool: "boolean", int: "number", float: "number", str: "text", list: "list", dict: "map"}
+    kinds = {bool: "boolean", int: "number", float: "number", str: "string", list: "list", dict: "map"}
     return kinds.get(type(value), type(value).__name__)
 
 

@@ -161,6 +161,6 @@ def aspects(
                 f", and its fallback, template {turns.template}, cannot serve: {next(iter(turns.refused.values()))}"
             )
         timed_out = READY_TIMEOUT, message
-    yield from from_first(conditions, TIMED_OUT, timed_out, ("InTime", "it is ready, or within its readyTimeout"))
+    yield from from_first(conditions, TIMED_OUT, timed_out, ("InTime", "it is ready, or still within its readyTimeout"))
     stands_in = ("Fallback", f"it serves the tasks of {others}, which is not ready") if others else None
     yield from from_first(conditions, "StandsIn", stands_in, ("NoFallback", "it serves only its own tasks"))

@@ -21,8 +21,8 @@ from wayside.api.pod import DetectorMode
 
 _MIRROR = "kubernetes.io/config.mirror"
 _NO_IMAGE = (
-    "the manager runs no detectors: start it with --detector-image, and with the permissions that "
-    "`application-manager rbac --detectors` prints"
+    "the manager runs no detectors: start it with --detector-image, and apply the roles that `application-manager "
+    "rbac --detectors` prints"
 )
 
 
@@ -91,7 +91,7 @@ def _why_not(name: str, metadata: Mapping[str, Any], spec: Mapping[str, Any], de
         listed = f"only {', '.join(names)}" if names else "none"
         return f"spec.serviceAccountName: serviceAccountNames of Detector {name} has {listed}, not {account}: add it"
     if detector_findings(detector).problems:
-        return f"Detector {name} is not accepted: its condition Accepted gives the reason"
+        return f"Detector {name} is not accepted: its condition Accepted reports why"
     if _MIRROR in (metadata.get("annotations") or {}):
         return "a static pod has no service account: create the pod through the API server"
     return None

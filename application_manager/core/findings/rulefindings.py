@@ -149,7 +149,7 @@ def deploy_remarks(
         template = known.get(action.deploy.template_name)
         if template is None:
             similar = did_you_mean(action.deploy.template_name, [*known, *others])
-            remedy = similar or "create it, or tasks of this rule are refused"
+            remedy = similar or "create it; until then, tasks of this rule are refused"
             missing = (
                 f"there is no ApplicationTemplate {action.deploy.template_name} in namespace {rule.namespace}: {remedy}"
             )

@@ -51,7 +51,7 @@ def misplaced(live: Mapping[str, Any], nodes: Nodes) -> Trouble | None:
     if unmet:
         words = "; ".join(f"{each.words}{_instead(each.key, nodes)}" for each in unmet)
     else:
-        words = f"no node meets all requirements: {'; '.join(each.wanted for each in required)}"
+        words = f"no node meets all requirements together: {'; '.join(each.wanted for each in required)}"
     what = f"{live['kind']} {live['metadata']['name']}"
     message = f"{what} fits no node: {words}. Correct the value, or label a node"
     return Trouble(TroubleReason.UNSCHEDULABLE, message)

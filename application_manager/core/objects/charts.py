@@ -121,13 +121,13 @@ def _problems(file: str, manifest: Any) -> Iterator[str]:
     annotations = metadata.get("annotations") if isinstance(metadata, dict) else None
     if isinstance(annotations, dict) and _HOOK in annotations:
         yield (
-            f"{what} is a hook ({annotations[_HOOK]}), and hooks are not supported: disable it by the chart's "
-            "values, or do its work in the application"
+            f"{what} is a hook ({annotations[_HOOK]}), and hooks are not supported: disable it in the chart's values, "
+            "or do its work in the application"
         )
     elif manifest["kind"] == "CustomResourceDefinition":
         yield (
-            f"{what} is a CRD, which is cluster-wide: let the administrator install it, and disable it by the "
-            "chart's values, or use the chart without its folder crds/"
+            f"{what} is a CRD, which is cluster-wide: let the administrator install it, and disable it in the chart's "
+            "values, or use the chart without its folder crds/"
         )
 
 

@@ -163,7 +163,7 @@ class Renderer:
             for where, manifest in self._chart_manifests(spec.helm, self._values, instance, variables, charts):
                 found = [f"{where}: {field}: {problem}" for field, problem in self._problems(manifest, instance)]
                 if kind_problem := self._policy.kind_problem(manifest["apiVersion"], manifest["kind"]):
-                    found.append(f"{where}: {kind_problem}; or disable it by the chart's values")
+                    found.append(f"{where}: {kind_problem}; or disable it in the chart's values")
                 problems += found
                 if not found:
                     manifests.append(labelled(self._policy.completed(manifest), instance))

@@ -146,7 +146,7 @@ def _own() -> Iterator[Right]:
     yield Right(_GROUP, "eventrules", _LOOKING, "rules and detectors have no status", vital=True)
     for plural in ("applicationinstances", "applicationtasks", "applicationtemplates", "detectors", "eventrules"):
         yield Right(_GROUP, f"{plural}/status", ("patch",), "their statuses are not written")
-    yield Right(_LEASES, "leases", ("get", *_LOOKING), "lost holders are not noticed", vital=True)
+    yield Right(_LEASES, "leases", ("get", *_LOOKING), "lost holders are not detected", vital=True)
     yield Right("events.k8s.io", "events", ("create", "patch"), "no Kubernetes Events are posted")
 
 
@@ -160,7 +160,7 @@ def _running_detectors() -> Iterator[Right]:
         ("apps", "deployments"),
     ):
         yield Right(group, resource, ("get", "list", "create", "patch", "delete"), no_detector)
-    yield Right("", "pods", ("list",), "statuses do not give the reason why a detector does not run")
+    yield Right("", "pods", ("list",), "statuses do not report why a detector does not run")
     for each in (*detector_rights(""), *sidecar_rights("")):
         yield Right(each.group, each.resource, each.verbs, no_detector)
 
@@ -179,10 +179,10 @@ def _children(plurals: Mapping[KindKey, str]) -> Iterator[Right]:
             "events.k8s.io",
             "events",
             ("list",),
-            "statuses do not give the reason why pods of workloads other than Deployments are refused",
+            "statuses do not report why pods of workloads other than Deployments are refused",
         )
     if ("v1", "Pod") not in plurals:
-        yield Right("", "pods", _LOOKING, "statuses do not give the reason why workloads do not run", vital=True)
+        yield Right("", "pods", _LOOKING, "statuses do not report why workloads do not run", vital=True)
         yield Right("", "pods", ("patch",), "running applications get a changed configuration late")
 
 

@@ -35,8 +35,8 @@ NOT_RUN = Aspect(
     RUNNING,
     False,
     "NotRun",
-    "the manager runs no detectors: start it with --detector-image, and with the permissions that "
-    "`application-manager rbac --detectors` prints; or remove spec.mode and run the detector yourself",
+    "the manager runs no detectors: start it with --detector-image, and apply the roles that `application-manager "
+    "rbac --detectors` prints; or remove spec.mode and run the detector yourself",
 )
 """The condition where the manager has no image."""
 
@@ -129,7 +129,7 @@ def carried(detector: Detector, pods: Sequence[Mapping[str, Any]]) -> Aspect:
     if troubles:
         return Aspect(RUNNING, False, troubles[0].reason.value, f"it runs in {running} {of}: {troubles[0].text}")
     missing = len(pods) - len(sidecars)
-    but = f"; {missing} were created without it: their Events give the reason" if missing else ""
+    but = f"; {missing} were created without it: their Events report why" if missing else ""
     return Aspect(RUNNING, True, "InPods", f"it runs in {running} {of}{but}")
 
 

@@ -181,8 +181,8 @@ class HolderLease:
         elif holder != self._refused_by:
             _log.warning(
                 (
-                    "the Lease %s is held by %s: either another detector with the same name is running (stop "
-                    "or rename one of them), or the process has just been killed. This process (%s) creates "
+                    "the Lease %s is held by %s: either another detector with the same name is running (stop or "
+                    "rename one of them), or a previous process was just killed. This process (%s) creates "
                     "no tasks until the Lease expires, %g s after its last renewal"
                 ),
                 self.name,

@@ -75,7 +75,9 @@ class Trigger(Action[api.TriggerAction]):
     def started(self, episode: Episode) -> None:
         """Request a recording, or its continuation."""
         if len(self._courses) >= _MOST:
-            raise ActionError(f"{_MOST} recordings on other systems are already in progress: this one is not requested")
+            raise ActionError(
+                f"{_MOST} recordings on other systems are already in progress, the maximum: this one is not requested"
+            )
         identity = f"{self._prefix}.{encode(episode.id)}"
         left = self._left.pop(identity, None)
         order = Order(identity, self._rendered(episode) if left is None else left.rendered, episode.started)

@@ -238,7 +238,7 @@ def test_one_that_hangs_at_the_end_is_left_behind() -> None:
     one_episode(site)
     site.host.close(grace=0.05)
     assert [each.what for each in site.host.outcomes.lost()] == [
-        "times the action did not stop in time and was abandoned"
+        "times the action did not stop in time, so that its thread was abandoned"
     ]
 
 

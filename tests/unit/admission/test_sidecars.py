@@ -324,7 +324,7 @@ def test_the_condition_reports_in_how_many_pods_it_runs_and_what_keeps_it_from_r
     logged = carried(of, [runs, pod()])
     assert (logged.holds, logged.message) == (
         True,
-        "it runs in 1 of 2 pods with its label; 1 were created without it: their Events give the reason",
+        "it runs in 1 of 2 pods with its label; 1 were created without it: their Events report why",
     )
     waiting = {"waiting": {"reason": "ErrImagePull", "message": "not found"}}
     logged = carried(of, [runs, state(injected(pod(), of), state=waiting)])

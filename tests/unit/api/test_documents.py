@@ -54,7 +54,7 @@ def problems(tmp_path: Path, text: str | bytes) -> list[str]:
         (
             "  when: &a [*a]",
             "f.yaml:5:9: spec.when[0]: is nested more than 100 levels deep",
-            ["an alias may refer to itself"],
+            ["a YAML alias may refer to itself"],
         ),
         ("  when: {a: 1}", "f.yaml:5:9: spec.when: must be a string; got {'a': 1}", ["quote it as a whole"]),
         ("  when: true", "f.yaml:5:9: spec.when: must be a string; got true", ["in quotes, e.g. 'true'"]),

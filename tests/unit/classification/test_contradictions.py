@@ -128,7 +128,7 @@ WAYS = [
         "rule: spec.signals[1].model is a learnt model: add LearningBased", "RuleBased LearningBased",
         signals=[SPEED, a_model()], when="risk > 0.5"),
     way("detectionAlgorithm", "LearningBased", "[0]: LearningBased (an algorithm learnt from data detects the "
-        "event) contradicts the rule: no signal that decides comes from a model or a plugin: write RuleBased",
+        "event) contradicts the rule: the conditions use no signal of a model or plugin: write RuleBased",
         "RuleBased"),
     way("typeOfAction", "Notification", ": spec.actions[0].deploy launches software: add Deployment (the action "
         "starts software that was not running)", "Deployment Notification", actions=act(DEPLOY)),
@@ -313,6 +313,6 @@ def test_check_reports_where_it_is_and_only_strict_fails(tmp_path: Path, capsys:
     assert lines[1].startswith(
         f"{rules}:8:7: warning: spec.classification.typeOfAction: spec.actions[0].deploy launches"
     )
-    assert lines[2:] == ["1 Detector, 1 EventRule: nothing wrong, 2 warnings"]
+    assert lines[2:] == ["1 Detector, 1 EventRule: no errors, 2 warnings"]
     assert check(tmp_path, "--strict") == 1
     assert capsys.readouterr().err.splitlines()[:2] == lines[:2]

@@ -250,7 +250,7 @@ def test_the_replay_of_pauses_questions_and_left_out_evaluations_gives_the_same_
     [
         ({"every": "1s", "onSample": "speed"}, "at most one of every, onSample and onDemand"),
         ({"onDemand": False}, "onDemand: write true"),
-        ({"every": "1ms"}, "every: 1ms is too short"),
+        ({"every": "1ms"}, "every: must be 10ms or more; got 1ms"),
     ],
 )
 def test_what_an_evaluation_cannot_be(evaluation: Any, message: str) -> None:

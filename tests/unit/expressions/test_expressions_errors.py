@@ -67,7 +67,7 @@ def test_the_place_is_that_in_the_authors_text(source: str, line: int, column: i
         ("distance < 5s", "remove the unit"),
         ("distance % 2 == 0", "double(int(a) % int(b))"),
         ("int(distance) % 2 == 0", "double(int(x))"),
-        ("braking ? 1 : 'a'", "two values of one type"),
+        ("braking ? 1 : 'a'", "two values of the same type"),
         ("braking && distance", "takes booleans"),
     ],
 )

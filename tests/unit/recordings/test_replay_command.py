@@ -282,7 +282,7 @@ def test_warnings_are_ignored_by_option_and_by_annotation_and_errors_never(desk:
     desk.write(a_detector(a_stream("speed"), a_stream("unused")), rule)
     assert desk.run(*strict).logged == unmatched.logged
     both = desk.run(*strict, "--ignore", "unmatched-stream")
-    assert (both.code, both.logged) == (0, "1 Detector, 1 EventRule: nothing wrong\n")
+    assert (both.code, both.logged) == (0, "1 Detector, 1 EventRule: no errors\n")
     misspelt = desk.run("check", "detector.yaml", "--ignore", "old-sample")
     assert (misspelt.code, "there is no such finding; did you mean old-samples?" in misspelt.logged) == (2, True)
     error = desk.run("check", "detector.yaml", "--ignore", "invalid-rule")

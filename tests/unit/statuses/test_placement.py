@@ -35,7 +35,7 @@ def expression(key: str, operator: str, *values: str) -> dict[str, Any]:
         ({"nodeSelector": {"zone": "a"}}, "no node has the label zone=a (no node has a label with this key)"),
         (
             {"nodeSelector": {"site": "south", "gpus": "2"}},
-            "fits no node: no node meets all requirements: nodeSelector gpus=2; nodeSelector site=south.",
+            "fits no node: no node meets all requirements together: nodeSelector gpus=2; nodeSelector site=south.",
         ),
         (affinity([expression("site", "In", "west", "east")]), "no node has the label site=west or east (there are"),
         (affinity([expression("gpus", "Gt", "2")]), "no node has the label gpus Gt 2 (there is 2)"),

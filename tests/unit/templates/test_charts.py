@@ -77,7 +77,7 @@ def test_a_hook_is_refused_with_its_file_and_a_remedy() -> None:
     hook = SERVICE.replace("{name: app}", '{name: app, annotations: {"helm.sh/hook": pre-install}}')
     assert refusal(SERVICE + hook) == (
         "spec.helm: chart app 1.0.0 of https://charts.example.com: Service app in templates/service.yaml is a hook "
-        "(pre-install), and hooks are not supported: disable it by the chart's values, or do its work in the "
+        "(pre-install), and hooks are not supported: disable it in the chart's values, or do its work in the "
         "application"
     )
 
@@ -121,7 +121,7 @@ def test_what_a_manifest_may_not_be_a_charts_object_may_not_be() -> None:
         )
     account, elsewhere = caught.value.problems
     assert account.startswith("spec.helm: templates/service.yaml of chart app: v1/ServiceAccount is not a kind")
-    assert account.endswith("or disable it by the chart's values")
+    assert account.endswith("or disable it in the chart's values")
     assert "'x' is not the template's own namespace" in elsewhere
 
 

@@ -200,7 +200,7 @@ def deploying(of: str = "app", operation: str = "Deploy", **parameters: Any) -> 
     ("requested", "parts"),
     [
         (deploying("ap", region="x"), ["spec.actions[0].deploy.templateName: there is no", "mean app?"]),
-        (deploying("other", region="x"), ["create it, or tasks of this rule are refused"]),
+        (deploying("other", region="x"), ["create it; until then, tasks of this rule are refused"]),
         (deploying(regoin="x", region="${client}"), ["deploy.parameters.regoin", "did you mean region?"]),
         (deploying(regoin="${client}", region="x"), ["deploy.parameters.regoin", "did you mean region?"]),
         (deploying(region="x", rate=99), ["deploy.parameters.rate: 99 is above the maximum of 50"]),

@@ -121,8 +121,8 @@ def test_a_listed_account_keeps_its_token() -> None:
         ("metadata.namespace", "elsewhere", ["metadata.namespace: 'elsewhere' is not the template's own", "remove"]),
         ("kind", "ServiceAccount", ["spec.manifests[0].kind", "apps/v1/ServiceAccount", "allowed are"]),
         ("apiVersion", "apps/v1beta1", ["apps/v1beta1/Deployment", "write apps/v1/Deployment"]),
-        ("metadata.name", 7, ["metadata.name: 7 is not a name"]),
-        ("metadata.name", None, ["metadata.name", "is not a name"]),
+        ("metadata.name", 7, ["metadata.name: must be a string"]),
+        ("metadata.name", None, ["metadata.name", "must be a string"]),
         ("metadata.ownerReferences", [], ["metadata.ownerReferences", "remove it"]),
         ("metadata.finalizers", ["x/y"], ["metadata.finalizers", "remove it"]),
         (
@@ -246,5 +246,5 @@ def test_some_kinds_cannot_be_allowed(kind: str) -> None:
 
 
 def test_a_kind_without_a_version_is_no_kind() -> None:
-    with pytest.raises(ValueError, match="write apiVersion/Kind"):
+    with pytest.raises(ValueError, match="must be apiVersion/Kind"):
         Policy.parse(["Deployment"], None)

@@ -82,6 +82,6 @@ FUNCTIONS = (
     function("yaw", Yields.NUMBER, "rotation about z, radians in [-π, π]", *((yaw, way) for way in _WAYS)),
     function("pitch", Yields.NUMBER, "rotation about y, radians in [-π/2, π/2]", *((pitch, way) for way in _WAYS)),
     function("roll", Yields.NUMBER, "rotation about x, radians in [-π, π]", *((roll, way) for way in _WAYS)),
-    function("degrees", Yields.NUMBER, "radians as degrees", (math.degrees, "radians")),
-    function("radians", Yields.NUMBER, "degrees as radians", (math.radians, "degrees")),
+    function("degrees", Yields.NUMBER, "radians converted to degrees", (math.degrees, "radians")),
+    function("radians", Yields.NUMBER, "degrees converted to radians", (math.radians, "degrees")),
 )

@@ -48,7 +48,7 @@ FUNCTIONS = (
     function(
         "unmatched",
         Yields.LIST,
-        "the indices of those items that have none of the others within the distance in metres",
+        "the indices of the items that have none of the others within this distance, metres",
         (unmatched, "items:list others:list within"),
         (unmatched, "items:list others:list within path:string"),
     ),

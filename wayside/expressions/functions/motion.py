@@ -21,7 +21,7 @@ def time_to_contact(dx: float, dy: float, vx: float, vy: float, radius: float) -
     |d + v t| = radius, in the form that does not cancel.
     """
     if radius < 0:
-        raise ValueError(f"radius {radius:g} is negative")
+        raise ValueError(f"radius must be 0 or more; got {radius:g}")
     if not all(map(math.isfinite, (dx, dy, vx, vy, radius))):
         raise ValueError("an argument of timeToCollision is infinite")
     apart = math.hypot(dx, dy)

@@ -29,7 +29,7 @@ def of_list(calculate: Callable[[list[float]], float]) -> Callable[[object], flo
 def square_root(x: float) -> float:
     """Of a number that is not negative."""
     if x < 0:
-        raise ValueError(f"sqrt of {x:g}: give 0 or a positive number")
+        raise ValueError(f"sqrt needs a number of 0 or more; got {x:g}")
     return math.sqrt(x)
 
 
@@ -45,7 +45,7 @@ def _mean(values: list[float]) -> float:
 
 
 FUNCTIONS = (
-    function("abs", Yields.NUMBER, "the number without its sign", (abs, "x")),
+    function("abs", Yields.NUMBER, "the absolute value", (abs, "x")),
     function("sqrt", Yields.NUMBER, "the square root; x ≥ 0", (square_root, "x")),
     function("hypot", Yields.NUMBER, "√(x² + y²), √(x² + y² + z²)", (math.hypot, "x y"), (math.hypot, "x y z")),
     function("sin", Yields.NUMBER, "the sine", (math.sin, "radians")),

@@ -60,7 +60,8 @@ FUNCTIONS = (
     function(
         "numberAt",
         Yields.NUMBER,
-        "the number that begins at a byte (from 0 on): u8, i8, and u16, i16, u32, i32, f32, f64 followed by le or be",
+        "the number that begins at byte offset (counted from 0), as u8, i8, or u16, i16, u32, i32, f32, f64 followed "
+        "by le or be",
         (number_at, "data:bytes offset format:string"),
     ),
     function("utf8", Yields.TEXT, "the bytes as a UTF-8 string", (utf8, "data:bytes")),

@@ -72,9 +72,9 @@ def _corners(polygon: object, names: tuple[str, str]) -> list[Point]:
 
 def _check(latitude: float, longitude: float) -> None:
     if not -90 <= latitude <= 90:
-        raise ValueError(f"latitude {latitude:g} is beyond ±90 degrees")
+        raise ValueError(f"latitude must be between -90 and 90 degrees; got {latitude:g}")
     if not -360 <= longitude <= 360:
-        raise ValueError(f"longitude {longitude:g} is beyond ±360 degrees")
+        raise ValueError(f"longitude must be between -360 and 360 degrees; got {longitude:g}")
 
 
 FUNCTIONS = (

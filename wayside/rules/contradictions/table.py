@@ -159,8 +159,8 @@ def _algorithm(case: Case) -> Iterator[RuleProblem]:
     if case.only(DetectionAlgorithm.LEARNING_BASED) and not models and not plugins:
         yield case.against(
             DetectionAlgorithm.LEARNING_BASED,
-            "no signal that decides comes from a model or a plugin: write RuleBased, or both if the rule's input "
-            "comes from a learnt algorithm",
+            "the conditions use no signal of a model or plugin: write RuleBased, or both if the rule's input comes "
+            "from a learnt algorithm",
         )
 
 
