@@ -23,7 +23,7 @@ from urllib.parse import urlsplit
 from application_manager.core.objects.charts import ChartRequest, ChartSource
 from wayside.api.applicationtemplate import OCI
 
-PULL_TIME = 60.0  # s
+PULL_TIME = 60.0  # s until a run is stopped
 TEMPLATE_TIME = 20.0  # s; a chart takes a tenth of one
 MEMORY = 1 << 30  # bytes of data
 FILE_SIZE = 64 << 20  # bytes
@@ -51,13 +51,10 @@ class HelmRunner:
     Attributes:
         program: a path, or a name on PATH.
         kube_version: of the cluster, as charts see it in `.Capabilities`; None: Helm's own idea.
-        pull_time, template_time: seconds until a run is stopped.
     """
 
     program: str = "helm"
     kube_version: str | None = None
-    pull_time: float = PULL_TIME
-    template_time: float = TEMPLATE_TIME
 
     async def pull(self, source: ChartSource, folder: Path) -> Path:
         """Fetch the chart's archive into the folder, which is empty. Raises HelmError."""
@@ -67,7 +64,7 @@ class HelmRunner:
         if source.chart.startswith(OCI) and _is_loopback(source.chart):
             arguments.append("--plain-http")  # as container tools do: nobody can listen in between
         environment = {name: os.environ[name] for name in _OF_PULLS if name in os.environ}
-        await self._run(arguments, self.pull_time, environment)
+        await self._run(arguments, PULL_TIME, environment)
         archives = [folder / name for name in os.listdir(folder) if name.endswith(".tgz")]
         if len(archives) != 1:
             raise HelmError(f"helm pull returned {len(archives)} archives, not one")
@@ -81,7 +78,7 @@ class HelmRunner:
             arguments = ["template", request.release, str(chart), "--namespace", request.namespace]
             arguments += ["--values", str(values), "--include-crds", "--skip-tests"]
             arguments += ["--kube-version", self.kube_version] if self.kube_version else []
-            written = await self._run(arguments, self.template_time, {})
+            written = await self._run(arguments, TEMPLATE_TIME, {})
         try:
             return written.decode()
         except UnicodeDecodeError:

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
-
 from kubernetes.aio.client import Configuration
 
 from application_manager.core.objects.ownership import FIELD_MANAGER
@@ -20,7 +17,6 @@ def manager_client(
     *,
     pacing: Pacing | None = None,
     timeout: float = 15.0,
-    may_act: Callable[[], float] = lambda: math.inf,
 ) -> Client:
     """A paced client that writes as the manager; `timeout`: seconds in which a request must be answered."""
     return Client(
@@ -31,5 +27,4 @@ def manager_client(
         measure=measures.requested if measures else None,
         pacing=pacing or Pacing(),
         timeout=timeout,
-        may_act=may_act,
     )

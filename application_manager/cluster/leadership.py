@@ -85,12 +85,12 @@ def own_identity() -> str:
 class Leadership:
     """Seeks the Lease, holds it and gives it back."""
 
-    def __init__(self, client: Client, key: LeaseKey, measures: Measures, identity: str | None = None) -> None:
+    def __init__(self, client: Client, key: LeaseKey, measures: Measures) -> None:
         """`client`: for the Lease alone."""
         self._client = client
         self._key = key
         self._measures = measures
-        self._candidate = LeaseCandidate(identity or own_identity(), DURATION, DEADLINE)
+        self._candidate = LeaseCandidate(own_identity(), DURATION, DEADLINE)
         self._changed = asyncio.Event()
         self._logged = ""
         self._was_active = False

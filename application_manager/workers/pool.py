@@ -59,11 +59,10 @@ class Pool:
     What waits is bounded by who waits: each object of the cluster, and each question of the API server, has one job.
     """
 
-    def __init__(self, measures: Measures, cpu_time: float = CPU_TIME, processes: int = PROCESSES) -> None:
+    def __init__(self, measures: Measures, cpu_time: float = CPU_TIME) -> None:
         """`cpu_time`: seconds that a job may take."""
         self.cpu_time = cpu_time
         self._measures = measures
-        self._processes = processes
         self._waiting: dict[str, deque[_Ticket]] = {}
         self._running: Counter[str] = Counter()
         self._used: dict[str, tuple[float, float]] = {}  # by namespace: seconds of CPU time, and as of when
@@ -104,7 +103,7 @@ class Pool:
 
     def _dispatch(self) -> None:
         """Begin what may begin."""
-        while not self._closed and len(self._workers) < self._processes:
+        while not self._closed and len(self._workers) < PROCESSES:
             ticket = self._next()
             if ticket is None:
                 return
