@@ -66,21 +66,15 @@ class CelType(enum.Enum):
     LIST = "a list"
 
 
-_TYPES: Final = {
-    CelType.DYN: cel.Type.DYN,
-    CelType.DOUBLE: cel.Type.DOUBLE,
-    CelType.STRING: cel.Type.STRING,
-    CelType.BOOL: cel.Type.BOOL,
-    CelType.MAP: cel.Type.Map(cel.Type.STRING, cel.Type.DYN),
-    CelType.LIST: cel.Type.List(cel.Type.DYN),
+_TYPES: Final[Mapping[CelType, tuple[cel.Type, type | tuple[type, ...]]]] = {
+    CelType.DYN: (cel.Type.DYN, object),
+    CelType.DOUBLE: (cel.Type.DOUBLE, (float, int)),
+    CelType.STRING: (cel.Type.STRING, str),
+    CelType.BOOL: (cel.Type.BOOL, bool),
+    CelType.MAP: (cel.Type.Map(cel.Type.STRING, cel.Type.DYN), dict),
+    CelType.LIST: (cel.Type.List(cel.Type.DYN), list),
 }
-_PYTHON: Final[Mapping[CelType, type | tuple[type, ...]]] = {
-    CelType.DOUBLE: (float, int),
-    CelType.STRING: str,
-    CelType.BOOL: bool,
-    CelType.MAP: dict,
-    CelType.LIST: list,
-}
+"""In CEL and in Python."""
 _NAMED_KINDS: Final = {
     "BOOL": CelType.BOOL,
     "DOUBLE": CelType.DOUBLE,
@@ -183,7 +177,7 @@ class Environment:
 @lru_cache(maxsize=_SHARED)
 def _cel_environment(variables: tuple[tuple[str, CelType], ...]) -> cel.Env:
     """Rules with equal variables share one: making it costs as much as compiling an expression."""
-    return cel.NewEnv(variables={name: _TYPES[kind] for name, kind in variables}, functions=list(DECLARATIONS))
+    return cel.NewEnv(variables={name: _TYPES[kind][0] for name, kind in variables}, functions=list(DECLARATIONS))
 
 
 @lru_cache(maxsize=_SHARED)
@@ -308,7 +302,7 @@ class Expression:
         return result
 
     def _check(self, value: Value) -> None:
-        wanted = _PYTHON[self.result]
+        wanted = _TYPES[self.result][1]
         if isinstance(value, wanted) and not (isinstance(value, bool) and self.result is CelType.DOUBLE):
             return
         raise EvaluationError(f"must be {self.result.value}; got {_describe(value)}", absent=value is None)

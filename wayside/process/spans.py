@@ -68,13 +68,17 @@ class _Exporter(SpanExporter):
 class _Bounded(SpanProcessor):
     """Before the SDK's queue: what finds it full is dropped and counted, instead of what waits the longest."""
 
-    def __init__(self, exporter: _Exporter) -> None:
-        self._exporter = exporter
-        self._queue = BatchSpanProcessor(exporter)
+    def __init__(self) -> None:
+        self._exporter = _Exporter()
+        self._queue = BatchSpanProcessor(self._exporter)
         self._capacity = _capacity()
         self._lock = threading.Lock()
         self._queued = 0
         self.dropped = 0
+
+    @property
+    def failed(self) -> int:
+        return self._exporter.failed
 
     def on_end(self, span: ReadableSpan) -> None:
         if span.context is None or not span.context.trace_flags.sampled:
@@ -100,11 +104,8 @@ class Tracing:
         own = {} if _names_service() else {"service.name": service}
         self._ids = _Ids()
         self._provider = TracerProvider(resource=Resource.create(own), shutdown_on_exit=False, id_generator=self._ids)
-        self._bounded: _Bounded | None = None
-        self._exporter: _Exporter | None = None
-        if export:
-            self._exporter = _Exporter()
-            self._bounded = _Bounded(self._exporter)
+        self._bounded = _Bounded() if export else None
+        if self._bounded is not None:
             self._provider.add_span_processor(self._bounded)
         self._tracer = self._provider.get_tracer("wayside")
 
@@ -116,7 +117,7 @@ class Tracing:
     @property
     def failed(self) -> int:
         """Spans that the endpoint did not take."""
-        return self._exporter.failed if self._exporter is not None else 0
+        return self._bounded.failed if self._bounded is not None else 0
 
     @property
     def endpoint(self) -> str:
