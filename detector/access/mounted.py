@@ -35,6 +35,14 @@ class TlsFiles:
     key: Path | None
     verify_name: bool
 
+    def context(self) -> ssl.SSLContext:
+        """Of a client with these files. Raises ssl.SSLError or OSError if one is not in PEM format."""
+        context = ssl.create_default_context(cafile=self.ca)
+        context.check_hostname = self.verify_name
+        if self.certificate is not None:
+            context.load_cert_chain(self.certificate, self.key)
+        return context
+
 
 @dataclass(frozen=True, slots=True)
 class Login:

@@ -45,14 +45,16 @@ def check_exists(path: Path) -> None:
         raise RecordingError(f"{path}: no such file or folder")
 
 
+_Span = Callable[[Path], tuple[int, int] | None]
+
+_SPANS: dict[_Read, _Span] = {read_mcap: mcap_span, read_rosbag1: rosbag1_span}
+"""By reader, the times of the first and the last message according to an index."""
+
+
 def span_of(path: Path) -> tuple[int, int] | None:
     """The times of the first and the last message; None if there are no messages. Raises RecordingError."""
-    by_index: dict[_Read, Callable[[Path], tuple[int, int] | None]] = {
-        read_mcap: mcap_span,
-        read_rosbag1: rosbag1_span,
-    }
     read = _reader(path)
-    span = by_index[read](path) if read in by_index else None
+    span = _SPANS[read](path) if read in _SPANS else None
     if span is not None:
         return span
     first = last = None
@@ -64,11 +66,7 @@ def span_of(path: Path) -> tuple[int, int] | None:
 
 def quick_span_of(paths: Sequence[Path]) -> tuple[int, int] | None:
     """The approximate times of the first and last message of one recording; None if only reading it all shows it."""
-    quick: dict[_Read, Callable[[Path], tuple[int, int] | None]] = {
-        read_mcap: mcap_span,
-        read_rosbag1: rosbag1_span,
-        read_json_lines: json_lines_span,
-    }
+    quick = {**_SPANS, read_json_lines: json_lines_span}
     spans: list[tuple[int, int]] = []
     for path in paths:
         try:

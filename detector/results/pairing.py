@@ -15,18 +15,17 @@ from detector.engine.episodes.subjects import Subject
 from detector.results.reasons import of_stream
 from detector.results.series import (
     AWAY,
-    FALSE,
-    TRUE,
     UNKNOWN,
     Bytes,
     Doubles,
     Integers,
     Series,
     SeriesKind,
-    Steps,
     SubjectTrace,
     Wanted,
     Way,
+    codes_of,
+    steps_of,
 )
 from wayside.expressions.columns.values import Column, Tag
 from wayside.rules import PairSubject
@@ -59,7 +58,7 @@ class PairLog:
         outside = these.codes & OUTSIDE == OUTSIDE
         for field, parts in self._codes.items():
             verdict = these.verdicts[field]
-            codes = np.where(verdict.true, np.uint8(TRUE), np.where(verdict.false, np.uint8(FALSE), np.uint8(UNKNOWN)))
+            codes = codes_of(verdict.true, verdict.false)
             codes[outside] = AWAY
             parts.append(codes)
             self._note_unsure(field, time, these, keys, codes)
@@ -114,12 +113,9 @@ class PairLog:
             for name, column in values.items():
                 kind = self._kinds.get(name, SeriesKind.NUMBER)
                 subject.signals[name] = Series(*_changes(ticks, ordinals[own], column[own], left, np.nan), kind)
-            for field, codes_of in by_field.items():
-                times, codes = _changes(ticks, ordinals[own], codes_of[own].astype(float), left, AWAY)
-                reasons = self._reasons[field]
-                found = {at: reasons.get((key, int(times[at]))) for at in np.flatnonzero(codes == UNKNOWN).tolist()}
-                why = {at: each for at, each in found.items() if each is not None}
-                subject.conditions[field] = Steps(times, codes.astype(np.uint8), why)
+            for field, evaluated in by_field.items():
+                times, codes = _changes(ticks, ordinals[own], evaluated[own].astype(float), left, AWAY)
+                subject.conditions[field] = steps_of(times, codes.astype(np.uint8), self._reasons[field], key)
             yield subject
 
     def _note_unsure(self, field: str, time: int, these: PairBlock, keys: Integers, codes: Bytes) -> None:

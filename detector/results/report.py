@@ -72,13 +72,9 @@ def _windows(result: Result) -> Iterator[Deed]:
                 continue
             window = action.window
             begin = episode.onset_time - window.before_ns
-            end = _after(episode, window.after_ns)
+            end = None if episode.end_time is None else episode.end_time + window.after_ns
             about = ", ".join(sorted(window.streams))
             yield Deed(rule.name, action.name, episode.subject, kind, about, begin, end)
-
-
-def _after(episode: EpisodeRow, after: int) -> int | None:
-    return None if episode.end_time is None else episode.end_time + after
 
 
 MOST = 140_000

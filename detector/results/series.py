@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,11 +45,7 @@ class Series:
 
     def at(self, times: Integers) -> Doubles:
         """The values at these times; NaN before the first."""
-        where = np.searchsorted(self.times, times, "right") - 1
-        if not len(self.times):
-            return np.full(len(times), np.nan)
-        found: Doubles = np.where(where < 0, np.nan, self.values[np.maximum(where, 0)])
-        return found
+        return _valid_at(times, self.times, self.values, np.nan)
 
     def plain(self, value: float) -> float | bool | str | None:
         """A value of the series in JSON's form; None: unknown."""
@@ -75,11 +72,29 @@ class Steps:
 
     def at(self, times: Integers) -> Bytes:
         """The values at these times; AWAY before the first."""
-        where = np.searchsorted(self.times, times, "right") - 1
-        if not len(self.times):
-            return np.full(len(times), AWAY, np.uint8)
-        found: Bytes = np.where(where < 0, np.uint8(AWAY), self.codes[np.maximum(where, 0)])
-        return found
+        return _valid_at(times, self.times, self.codes, AWAY)
+
+
+_Number = TypeVar("_Number", bound=np.generic)
+
+
+def _valid_at(wanted: Integers, times: Integers, values: NDArray[_Number], before: float) -> NDArray[_Number]:
+    """The values that are valid at the wanted times; `before` ahead of the first one."""
+    found = np.full(len(wanted), before, values.dtype)
+    where = np.searchsorted(times, wanted, "right") - 1
+    found[where >= 0] = values[where[where >= 0]]
+    return found
+
+
+def codes_of(true: NDArray[np.bool_], false: NDArray[np.bool_]) -> Bytes:
+    """The codes of conditions in Kleene's logic, in the same shape."""
+    return np.where(true, np.uint8(TRUE), np.where(false, np.uint8(FALSE), np.uint8(UNKNOWN)))
+
+
+def steps_of(times: Integers, codes: Bytes, reasons: Mapping[tuple[int, int], str], key: int) -> Steps:
+    """A condition's values; `reasons`: why it is unknown, by a key and a time."""
+    found = ((at, reasons.get((key, int(times[at])))) for at in np.flatnonzero(codes == UNKNOWN).tolist())
+    return Steps(times, codes, {at: why for at, why in found if why is not None})
 
 
 @dataclass(slots=True)

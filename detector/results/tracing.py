@@ -22,8 +22,6 @@ from detector.results.pairing import PairLog, WayLog
 from detector.results.reasons import of_variables, why_unknown
 from detector.results.series import (
     AWAY,
-    FALSE,
-    TRUE,
     UNKNOWN,
     Bytes,
     Doubles,
@@ -34,6 +32,8 @@ from detector.results.series import (
     SubjectTrace,
     Trace,
     Wanted,
+    codes_of,
+    steps_of,
     ways_of,
 )
 from detector.results.witnessing import Witnessed
@@ -171,8 +171,7 @@ class Tracer:
             for field, verdict in verdicts.items():
                 name = track.rule.name, track.element.name, field
                 reasons = self._reasons.setdefault(name, {})
-                states = np.where(verdict.true, float(TRUE), np.where(verdict.false, float(FALSE), float(UNKNOWN)))
-                codes = states.reshape(1, -1)
+                codes = codes_of(verdict.true, verdict.false).astype(float).reshape(1, -1)
                 conditions = self._conditions.setdefault(name, Changes())
                 found = conditions.add(numbers, block.times, codes, np.zeros(codes.shape, np.uint8), None)
                 expression = track.rule.when if field == "when" else track.rule.until
@@ -311,7 +310,7 @@ class Tracer:
     ) -> None:
         shape = block.shape
         true, false = (each[row].reshape(shape)[chosen] for each in block.verdicts[field])
-        states = np.where(true, float(TRUE), np.where(false, float(FALSE), float(UNKNOWN)))
+        states = codes_of(true, false).astype(float)
         states[codes[row][chosen] & OUTSIDE == OUTSIDE] = AWAY
         if not len(states):
             return
@@ -373,10 +372,7 @@ def _key(track: Track, name: str) -> tuple[str, str, str]:
 def _steps(times: Integers, codes: Bytes, reasons: Mapping[tuple[int, int], str], client: int) -> Steps:
     kept = np.ones(len(codes), bool)
     kept[1:] = codes[1:] != codes[:-1]
-    times, codes = times[kept], codes[kept]
-    unknown = np.flatnonzero(codes == UNKNOWN).tolist()
-    found = {at: reasons.get((client, int(times[at]))) for at in unknown}
-    return Steps(times, codes, {at: why for at, why in found.items() if why is not None})
+    return steps_of(times[kept], codes[kept], reasons, client)
 
 
 def series_of(times: Integers, values: Doubles, tags: Bytes, texts: Sequence[str]) -> Series:

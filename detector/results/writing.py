@@ -11,7 +11,7 @@ from rich.table import Table
 
 from detector.engine.samples.sample import Arrival
 from detector.replay.replaying import Replayed
-from detector.results.episodes import EpisodeRow, write_csv, write_parquet
+from detector.results.episodes import write_csv, write_parquet
 from detector.results.kinds import ResultKind, check_package
 from detector.results.nearest import NearMoment, nearest_by_rule, show_moments
 from detector.results.nearest import write_moments as write_nearest
@@ -100,7 +100,7 @@ def show_summary(console: Console, results: Sequence[Result]) -> None:
             rule,
             str(len(own)),
             str(len({(episode.recording, episode.subject) for episode in own})),
-            str(sum(_is_open(episode) for episode in own)),
+            str(sum(episode.end_time is None for episode in own)),
             f"{sum(lasting):.1f} s",
             f"{max(lasting, default=0):.1f} s",
             f"{unknown} of {evaluations}" if unknown else "0",
@@ -114,7 +114,3 @@ def show_summary(console: Console, results: Sequence[Result]) -> None:
 def _nearest(results: Sequence[Result]) -> list[NearMoment]:
     """The near misses of all recordings, rule by rule."""
     return nearest_by_rule(each for result in results for each in result.nearest)
-
-
-def _is_open(episode: EpisodeRow) -> bool:
-    return episode.end_time is None

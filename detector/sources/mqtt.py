@@ -117,13 +117,9 @@ class MqttSource(Source[MqttParameters]):
         files = tls_files(parameters, "parameters")
         if files is not None:
             try:
-                context = ssl.create_default_context(cafile=files.ca)
-                context.check_hostname = files.verify_name
-                if files.certificate is not None:
-                    context.load_cert_chain(files.certificate, files.key)
+                client.tls_set_context(files.context())
             except (ssl.SSLError, OSError) as error:
                 raise SourceError(f"parameters.tls: cannot use a certificate or key: {error}") from error
-            client.tls_set_context(context)
         return client
 
 

@@ -85,11 +85,7 @@ def _context(files: TlsFiles | None, field: str) -> ssl.SSLContext:
     if files is None:
         return ssl.create_default_context()
     try:
-        context = ssl.create_default_context(cafile=None if files.ca is None else str(files.ca))
-        context.check_hostname = files.verify_name
-        if files.certificate is not None and files.key is not None:
-            context.load_cert_chain(str(files.certificate), str(files.key))
+        return files.context()
     except (ssl.SSLError, OSError) as error:
         places = ", ".join(str(path) for path in (files.ca, files.certificate, files.key) if isinstance(path, Path))
         raise AccessError(f"{field}: cannot read certificates from {places}: give files in PEM format") from error
-    return context

@@ -15,7 +15,7 @@ from typing import Any
 
 from detector.actions.base import Setting
 from detector.actions.episode import Episode, Outcome, OutcomeState
-from detector.actions.notify.events import FULL, UNDELIVERED
+from detector.actions.notify.events import FULL, UNDELIVERED, remarked
 from detector.actions.notify.keeping import Keeping
 from detector.actions.notify.notice import Notice, NoticeTexts
 from detector.actions.notify.outbox import FIRST, LONGEST, LONGEST_RETRY_AFTER, Delivery, Fate
@@ -178,13 +178,16 @@ class AlertQueue:
         if not self._alerts.fire(alert):
             self._lose(alert, FULL)
 
-    def over(self, episode: Episode) -> None:
-        """Resolve the alert of the episode."""
+    def over(self, episode: Episode, texts: NoticeTexts) -> None:
+        """Resolve the alert of the episode; its texts stay those of the start."""
         if episode.id in self._episodes:
             self._episodes[episode.id] = episode, self._episodes[episode.id][1]
             now = time.time_ns()
             end = now if episode.end_time is None else min(episode.end_time, now)
             self._alerts.over(episode.id, end, time.monotonic())
+
+    def completed(self, episode: Episode) -> None:
+        """Nothing to do: an alert is resolved when its episode ends."""
 
     def take(self, now: float) -> AlertBatch | None:
         """The alerts to send now."""
@@ -213,7 +216,7 @@ class AlertQueue:
                 text = "fires" if delivery.fate is Fate.DELIVERED else f"not delivered yet: {delivery.why}"
                 self._report(alert, OutcomeState.RUNNING, text)
 
-    def drain(self) -> None:
+    def drain(self, keep: bool) -> None:
         """Remove all alerts at the end: undelivered ones are lost; firing ones expire, or continue after a restart."""
         for alert in self._alerts.drain():
             if alert.delivered and alert.ends_at is None:
@@ -250,9 +253,7 @@ class AlertQueue:
 
     def _report(self, alert: Alert, state: OutcomeState, message: str) -> None:
         episode, _ = self._episodes[alert.episode]
-        remark = "; ".join(f"{name}: {why}" for name, why in sorted(episode.unrendered.items()))
-        text = f"{message} ({remark})" if message and remark else message or remark
-        self._setting.report(episode, Outcome(state, text, details={"attempts": alert.attempts}))
+        self._setting.report(episode, Outcome(state, remarked(message, episode), details={"attempts": alert.attempts}))
 
 
 class AlertTarget:

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 from detector.actions.base import Setting
 from detector.actions.episode import Episode, Outcome, OutcomeState
 from detector.actions.notify.keeping import Keeping
-from detector.actions.notify.notice import Notice, event_of, event_of_group
+from detector.actions.notify.notice import Notice, NoticeTexts, event_of, event_of_group
 from detector.actions.notify.outbox import Delivery, Fate, Outbox, OutboxMessage, RateLimit
 from detector.actions.notify.targets import event_json
-from wayside.api.actions.notify import NotifyAction
+from wayside.api.actions.notify import Moment, NotifyAction
 
 
 @dataclass(slots=True)
@@ -25,7 +26,12 @@ class _Entry:
     attempts: int = 0
     bytes: int = 0
     failures: list[str] = field(default_factory=list)
-    remark: str = ""
+
+
+def remarked(message: str, episode: Episode) -> str:
+    """The message, with the reasons why templates of the episode could not be rendered."""
+    remark = "; ".join(f"{name}: {why}" for name, why in sorted(episode.unrendered.items()))
+    return f"{message} ({remark})" if message and remark else message or remark
 
 
 class DeliveryLedger:
@@ -39,8 +45,6 @@ class DeliveryLedger:
         """Register the episode."""
         entry = self._entry(episode.id)
         entry.episode, entry.open = episode, True
-        if episode.unrendered:
-            entry.remark = "; ".join(f"{name}: {why}" for name, why in sorted(episode.unrendered.items()))
 
     def close(self, episode: str) -> None:
         """No further messages of the episode will follow."""
@@ -100,7 +104,7 @@ class DeliveryLedger:
     def _report_entry(self, entry: _Entry, state: OutcomeState, message: str) -> None:
         if entry.episode is None:
             return
-        text = f"{message} ({entry.remark})" if message and entry.remark else message or entry.remark
+        text = remarked(message, entry.episode)
         details = {"messages": entry.delivered, "attempts": entry.attempts}
         lost = len(entry.failures)
         self._report(entry.episode, Outcome(state, text, bytes=entry.bytes, missing=lost, details=details))
@@ -111,7 +115,7 @@ FULL = "the queue is full (waiting)"
 
 
 class EventQueue:
-    """The events of one action, from `add` to delivery. Guarded by the lock of the sender."""
+    """The events of one action, up to their delivery. Guarded by the lock of the sender."""
 
     def __init__(self, notify: NotifyAction, setting: Setting, keeping: Keeping) -> None:
         rate, grouping = notify.rate, notify.grouping
@@ -120,16 +124,33 @@ class EventQueue:
         self._grouping = grouping
         self._groups = None if grouping is None else Groups(grouping.by, grouping.wait.seconds)
         self._action = setting.action
+        self._moments = notify.moments
         self._keeping = keeping
         self._hurrying = False
         self.ledger = DeliveryLedger(setting.report)
         for notice in keeping.waiting():
             self._admit(notice, time.monotonic())
 
-    def add(self, notice: Notice, now: float) -> None:
-        """Enqueue an event."""
-        self._keeping.keep(notice)
-        self._admit(notice, now)
+    def opened(self, episode: Episode, rendered: NoticeTexts) -> None:
+        """Register the episode, and enqueue its start."""
+        self.ledger.open(episode)
+        if not episode.resumed:
+            self._add(Moment.STARTED, episode, episode.started, rendered)
+
+    def over(self, episode: Episode, rendered: NoticeTexts) -> None:
+        """Enqueue the end of the episode."""
+        if episode.ended is not None:
+            self._add(Moment.ENDED, episode, episode.ended, rendered)
+
+    def completed(self, episode: Episode) -> None:
+        """No further events of the episode follow."""
+        self.ledger.close(episode.id)
+
+    def _add(self, moment: Moment, episode: Episode, event: Mapping[str, Any], rendered: NoticeTexts) -> None:
+        if moment in self._moments:
+            notice = Notice(episode.id, event, rendered, time.time())
+            self._keeping.keep(notice)
+            self._admit(notice, time.monotonic())
 
     def _admit(self, notice: Notice, now: float) -> None:
         self.ledger.expect(notice.episode)
@@ -198,10 +219,6 @@ class EventQueue:
         self._keeping.lose(message.notices, why, message.attempts)
         for notice in message.notices:
             self.ledger.failed(notice.episode, why)
-
-    def opened(self, episode: Episode) -> None:
-        """Register the episode."""
-        self.ledger.open(episode)
 
 
 MOST = 10_000
