@@ -15,6 +15,7 @@ from yarl import URL
 
 from detector.actions.base import ActionError, Messenger
 from detector.actions.http import Disposition, HttpClient, HttpError, judge
+from detector.actions.http.client import origin
 from detector.actions.trigger.orders import Order, Progress, Report, nested_value
 from detector.actions.trigger.requests import (
     MAXIMUM_CLIENTS,
@@ -54,8 +55,7 @@ class HttpEndpoint:
 
     def place(self, order: Order) -> str:
         """Scheme, host and port of the first request."""
-        url = URL(next(iter(self._wanted.calls.values())).url, encoded=True)
-        return f"{url.scheme}://{url.host}:{url.port}"
+        return origin(URL(next(iter(self._wanted.calls.values())).url, encoded=True))
 
     def start(self, order: Order, ago: float, *, again: bool) -> Report:
         """Send `start`."""
