@@ -202,7 +202,7 @@ class Expression:
         leaves: Mapping[Path, Leaf],
         result: CelType,
         variables: Mapping[str, CelType],
-        places: tuple[Shape, ...] = (),
+        places: tuple[Shape, ...],
     ) -> None:
         self.source = source
         self.places = places

@@ -45,9 +45,8 @@ Tree = Mapping[Step, "Tree | Leaf | None"]
 _FIELD_NAMES: Final[dict[type, frozenset[str]]] = {}
 
 
-def tree(paths: Iterable[Path], leaves: Mapping[Path, Leaf] | None = None) -> Tree:
+def tree(paths: Iterable[Path], leaves: Mapping[Path, Leaf]) -> Tree:
     """The tree of the given paths; a path replaces all longer ones. `leaves` defines how some are read."""
-    leaves = leaves or {}
     root: dict[Step, Tree | Leaf | None] = {}
     for path in sorted(paths, key=len):  # the shorter first: it swallows the longer
         node = root

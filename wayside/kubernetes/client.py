@@ -90,7 +90,6 @@ class Client:
         measure: Callable[[str, float, str], None] | None = None,
         pacing: Pacing | None = None,
         timeout: float = _TIMEOUT,
-        may_act: Callable[[], float] = lambda: math.inf,
     ) -> None:
         """Prepare; nothing is sent yet.
 
@@ -102,10 +101,9 @@ class Client:
             measure: gets the method of each request, its seconds and the code of the answer, or NO_ANSWER.
             pacing: lets requests begin; None: each begins at once, and is not sent again.
             timeout: seconds in which a request must be answered.
-            may_act: see above.
         """
         self.configuration = configuration
-        self.may_act = may_act
+        self.may_act: Callable[[], float] = lambda: math.inf
         self.may_write: Callable[[str], Awaitable[bool]] | None = None
         self.open_until = 0.0
         self._program = program

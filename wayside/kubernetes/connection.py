@@ -160,9 +160,9 @@ def use_pod_account(configuration: Configuration, folder: Path = FOLDER) -> None
     settings.refresh_api_key_hook = refresh
 
 
-def pod_namespace(folder: Path = FOLDER) -> str:
+def pod_namespace() -> str:
     """The namespace of the pod; empty outside a pod."""
-    file = folder / "namespace"
+    file = FOLDER / "namespace"
     return file.read_text().strip() if file.is_file() else ""
 
 

@@ -69,14 +69,14 @@ def is_taken(name: str) -> bool:
 
 
 @lru_cache(maxsize=256)
-def client_environment(signals: tuple[str, ...] = (), element: str | None = None) -> Environment:
+def client_environment(signals: tuple[str, ...], element: str | None) -> Environment:
     """For one client: client, labels, streams (those that are not stale), the signals and the element of `each`."""
     fixed = {"client": CelType.STRING, "labels": CelType.MAP, "streams": CelType.LIST, "parameters": CelType.MAP}
     return Environment(_with_element({**dict.fromkeys(signals, CelType.DYN), **fixed}, element))
 
 
 @lru_cache(maxsize=256)
-def pairs_environment(element: str | None = None) -> Environment:
+def pairs_environment(element: str | None) -> Environment:
     """For a pair: a and b (maps of what a client scope has, and position), distance in metres, closingSpeed in m/s."""
     numbers = {"distance": CelType.DOUBLE, "closingSpeed": CelType.DOUBLE}
     return Environment(
@@ -85,7 +85,7 @@ def pairs_environment(element: str | None = None) -> Environment:
 
 
 @lru_cache(maxsize=256)
-def fleet_environment(element: str | None = None) -> Environment:
+def fleet_environment(element: str | None) -> Environment:
     """For the fleet: members (a list of maps of what a client scope has)."""
     return Environment(_with_element({"members": CelType.LIST, "parameters": CelType.MAP}, element))
 

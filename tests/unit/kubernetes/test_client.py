@@ -23,7 +23,9 @@ BODY = {"metadata": {"namespace": "n", "name": "x", "resourceVersion": "1"}}
 
 
 @asynccontextmanager
-async def serving(handle: Handler, **arguments: object) -> AsyncIterator[Client]:
+async def serving(
+    handle: Handler, may_act: Callable[[], float] | None = None, **arguments: object
+) -> AsyncIterator[Client]:
     application = web.Application()
     application.router.add_route("*", "/{rest:.*}", handle)
     runner = web.AppRunner(application, handle_signals=False, shutdown_timeout=0.1)
@@ -31,6 +33,7 @@ async def serving(handle: Handler, **arguments: object) -> AsyncIterator[Client]
     await web.TCPSite(runner, "127.0.0.1", 0).start()
     configuration = Configuration(host=f"http://127.0.0.1:{runner.addresses[0][1]}")
     client = manager_client(configuration, **arguments)  # type: ignore[arg-type]
+    client.may_act = may_act or client.may_act
     try:
         yield client
     finally:
