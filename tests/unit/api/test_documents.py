@@ -71,7 +71,7 @@ def problems(tmp_path: Path, text: str | bytes) -> list[str]:
         ),
         ("  when: a\n  for: 2", "f.yaml:6:8: spec.for: must be a string; got 2", []),
         ("  when: a\n  for: 2 s", "f.yaml:6:8: spec.for: must be a duration with units", ["such as 500ms, 10s"]),
-        ("  when: a\n  evaluation: {every: 0s}", "f.yaml:6:15: spec.evaluation: every: must be 10ms or more; got 0s", []),
+        ("  when: a\n  evaluation: {every: 0s}", "f.yaml:6:15: spec.evaluation: every: must be 10ms or more", []),
         ("  when: a\n  enabled: maybe", "f.yaml:6:12: spec.enabled: must be true or false; got 'maybe'", []),
         (
             "  when: a\n  classification: {incidence: [Rare, Never]}",
@@ -103,7 +103,7 @@ def problems(tmp_path: Path, text: str | bytes) -> list[str]:
             "f.yaml:6:10: spec.scope: give exactly one of client, pairs and fleet",
             [],
         ),
-        ("  when: a\n  evaluation: {every: 5ms}", "f.yaml:6:15: spec.evaluation: every: must be 10ms or more; got 5ms", []),
+        ("  when: a\n  evaluation: {every: 5ms}", "f.yaml:6:15: spec.evaluation: every: must be 10ms or more", []),
         ("  - when", "f.yaml:5:3: spec: must be an object; got ['when']", []),
     ],
 )
