@@ -130,7 +130,8 @@ class Answers:
             return to_json(status)
         rules = [each for each in status.rules if each.name == rule]
         if not rules:
-            raise ValueError(f"detector {status.holder} has no rule {rule}; it has {_listed(status)}")
+            known = ", ".join(each.name for each in status.rules) or "none"
+            raise ValueError(f"detector {status.holder} has no rule {rule}; it has {known}")
         explanation = self._explanation(rule, given.get("subject"), given.get("wait", "1"))
         return to_json(msgspec.structs.replace(status, rules=rules, explanation=explanation))
 
@@ -184,7 +185,3 @@ def _rule(given: Mapping[str, str]) -> str:
     if not rule:
         raise ValueError("rule is missing: give ?rule=NAME")
     return rule
-
-
-def _listed(status: Status) -> str:
-    return ", ".join(rule.name for rule in status.rules) or "none"

@@ -13,7 +13,7 @@ from detector.plugins.base import Plugin, PluginParameters, PluginSubject
 from detector.plugins.entrypoints import Offers, PluginError
 from wayside.api import Detector, EventRule
 from wayside.expressions import Reason, Value
-from wayside.rules import CompiledPlugin, CompiledRule, RuleProblem
+from wayside.rules import CompiledRule, RuleProblem
 
 _GROUP = "wayside.signals"
 
@@ -99,7 +99,9 @@ class LocalHost:
     def configure(self, rules: Sequence[CompiledRule], kept: Collection[str]) -> None:
         """See PluginHost."""
         self._signals = {
-            place: self._signals[place] if place in self._signals and rule.name in kept else _instances(plugin)
+            place: self._signals[place]
+            if place in self._signals and rule.name in kept
+            else Instances(plugin.plugin, plugin.parameters)
             for rule in rules
             for plugin in rule.plugins
             if (place := (rule.name, plugin.name))
@@ -124,10 +126,6 @@ class LocalHost:
         """See PluginHost."""
         for instances in self._signals.values():
             instances.reset()
-
-
-def _instances(plugin: CompiledPlugin) -> Instances:
-    return Instances(plugin.plugin, plugin.parameters)
 
 
 _DEEPEST = 32

@@ -198,7 +198,7 @@ class DemandReconciler:
                 # Possibly only because our copy is outdated: ended, deleted or recreated in the meantime.
                 current = await self._store.get(name)
                 self._ledger.put(name, current)
-                if self._ledger.next(name) is step and _same(current, stored):
+                if self._ledger.next(name) is step and current is not None and current.version == stored.version:
                     raise
 
     async def _create(self, name: str, demand: Demand) -> None:
@@ -258,7 +258,3 @@ class DemandReconciler:
                 name,
                 error,
             )
-
-
-def _same(one: StoredTask | None, other: StoredTask) -> bool:
-    return one is not None and one.version == other.version
