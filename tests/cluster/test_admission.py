@@ -83,7 +83,7 @@ WRONG: list[tuple[Object, Object, list[str]]] = [
     (
         template("misnamed"),
         {"manifests": [config({}, name="${instance.name}_A")]},
-        ["spec.manifests[0].metadata.name", "is not a name for an object"],
+        ["spec.manifests[0].metadata.name", "must have at most 253 lower-case letters"],
     ),
     (
         template("the-same"),

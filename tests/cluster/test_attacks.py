@@ -69,7 +69,7 @@ def named(name: str, **metadata: Any) -> Object:
 
 RBAC = "rbac.authorization.k8s.io/v1"
 NOT_ALLOWED = "is not a kind that the administrator allows"
-NO_NAME = "is not a name for an object"
+NO_NAME = "must have at most 253 lower-case letters"
 JOB = {"template": {"spec": {"serviceAccountName": "admin", "containers": [{"name": "a", "image": "a"}]}}}
 BY_TEMPLATE: dict[str, tuple[Object, str]] = {
     "namespace": (named("${instance.name}", namespace="kube-system"), "is not the template's own namespace"),

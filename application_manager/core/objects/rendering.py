@@ -210,8 +210,8 @@ class Renderer:
         elif len(name) > _LONGEST_NAME or not _NAME.fullmatch(name):
             yield (
                 "metadata.name",
-                f"{values.shown(name)} is not a name for an object: use at most {_LONGEST_NAME} lower-case "
-                "letters, digits, - and ., with a letter or digit at both ends",
+                f"must have at most {_LONGEST_NAME} lower-case letters, digits, - and ., with a letter or digit at "
+                f"both ends; got {values.shown(name)}",
             )
         elif self._keyed and instance.name not in name:
             yield (

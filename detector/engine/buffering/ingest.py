@@ -293,7 +293,7 @@ class Ingest:
     def _unnamed(self, stream: str, key: str) -> None:
         self._counters.unnamed[stream] += 1
         self._counters.last_unnamed[stream] = (
-            f"{key}: client: the captured text is not a name: use 1 to 63 of A-Z a-z 0-9 . _ : -"
+            f"{key}: client: the captured name must have 1 to 63 of A-Z a-z 0-9 . _ : -"
         )
 
     def _read_message(self, stream: str, key: str, payload: bytes) -> str | None:

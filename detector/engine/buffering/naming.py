@@ -88,7 +88,7 @@ class MessageClients:
         if name is None or not CLIENT_NAME.fullmatch(name):
             self._unnamed(
                 stream,
-                f"{key}: client: {name!r} is not a name: use 1 to 63 of A-Z a-z 0-9 . _ : -, not dots alone",
+                f"{key}: client: must have 1 to 63 of A-Z a-z 0-9 . _ : -, not dots alone; got {name!r}",
             )
             return None
         return name

@@ -52,9 +52,9 @@ def test_messages_without_a_valid_name_are_dropped_and_counted_with_the_reason(c
     for index, (text, reason) in enumerate(
         [
             ('{"v": 50}', "all/speeds: client: "),
-            ('{"id": "a b", "v": 50}', "all/speeds: client: 'a b' is not a name: use 1 to 63 of A-Z a-z 0-9 . _ : -"),
-            ('{"id": "", "v": 50}', "all/speeds: client: '' is not a name"),
-            ('{"id": {"x": 1}, "v": 50}', "is not a name"),
+            ('{"id": "a b", "v": 50}', "client: must have 1 to 63 of A-Z a-z 0-9 . _ : -, not dots alone; got 'a b'"),
+            ('{"id": "", "v": 50}', "all/speeds: client: must have 1 to 63"),
+            ('{"id": {"x": 1}, "v": 50}', "client: must have 1 to 63"),
         ]
     ):
         assert drive.take(sent(index + 0.5, text), until=index + 1) == []

@@ -120,7 +120,7 @@ def test_a_template_of_the_guide_has_nothing_wrong() -> None:
         ({"key": "${parameters.region + 1}"}, ["spec.key", "`+` does not take"]),
         ({"key": "${parameters.region}", "manifests": [{**DEPLOYMENT, "metadata": {"name": "fixed"}}]},
          ["spec.manifests[0].metadata.name: 'fixed'", "must contain ${instance.name}"]),
-        ({"manifests": [{**DEPLOYMENT, "metadata": {"name": "${instance.name}_A"}}]}, ["app_A", "not a name for"]),
+        ({"manifests": [{**DEPLOYMENT, "metadata": {"name": "${instance.name}_A"}}]}, ["app_A", "at most 253"]),
         ({"manifests": [{**DEPLOYMENT, "metadata": {"name": "a", "namespace": "kube-system"}}]},
          ["spec.manifests[0].metadata.namespace: 'kube-system'", "remove the field"]),
         ({"manifests": [{**DEPLOYMENT, "apiVersion": "rbac.authorization.k8s.io/v1", "kind": "Role"}]},
