@@ -15,7 +15,7 @@ from detector.findings.checks import (
     UNKNOWN_RULE,
 )
 from detector.onnx.binding import bind_models
-from detector.sources.supervision import source_plugin_problems
+from detector.sources.registry import source_plugin_problems
 from wayside.api import Detector, EventRule
 from wayside.api.detector import Clock
 from wayside.api.documents import Document, Problem

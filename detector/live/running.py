@@ -27,7 +27,8 @@ from detector.live.requested import Requested
 from detector.live.state import Restored, StateFile
 from detector.plugins.processes import ProcessHost
 from detector.resources.selection import RuleSet
-from detector.sources.supervision import Sources, source_plugin_problems
+from detector.sources.registry import source_plugin_problems
+from detector.sources.supervision import Sources
 from detector.status.server import PagesAddress, StatusServer
 from detector.streams.answering import Answering
 from detector.streams.tally import Tally

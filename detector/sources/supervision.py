@@ -1,55 +1,21 @@
-"""Finds the classes of sources, and runs each on a separate thread.
-
-A source is restarted when it fails, and abandoned if it does not stop.
-"""
+"""Runs sources: each on a separate thread, restarted when it fails, and abandoned if it does not stop."""
 
 from __future__ import annotations
 
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from enum import StrEnum
 from typing import Any
 
-from pydantic import BaseModel
-
-from detector.plugins.entrypoints import Offers, PluginError
-from detector.sources.base import Feed, Putter, Source
+from detector.sources.base import Feed, Putter
+from detector.sources.registry import Make, prepare_source
 from detector.streams.tally import Cause, Tally
 from wayside.api import Detector
 from wayside.api.plugin import DataSource
 from wayside.api.stream import Stream
 from wayside.process.backoff import Backoff, retry
-from wayside.rules import RuleProblem
-
-OFFERS = Offers[Source[Any]](
-    group="wayside.sources", noun="plugin", base=Source, model=BaseModel, guide="docs/sources.md"
-)
-
-Make = Callable[[], Source[Any]]
-"""Creates a source for one run."""
-
-
-def prepare_source(source: DataSource) -> Make:
-    """Loads the plugin and checks its parameters.
-
-    Raises PluginError; the paths begin at the entry in `spec.sources`.
-    """
-    plugin = OFFERS.load(source.plugin, ("plugin",))
-    parameters = OFFERS.parameters(plugin, source.parameters, ("parameters",))
-    return lambda: plugin(parameters)
-
-
-def source_plugin_problems(detector: Detector) -> Iterator[RuleProblem]:
-    """The problems of the Detector's sources, as far as their plugins can check here."""
-    for index, source in enumerate(detector.spec.sources):
-        try:
-            prepare_source(source)
-        except PluginError as error:
-            for path, text in error.problems:
-                yield RuleProblem(("spec", "sources", index, *path), text)
-
 
 log = logging.getLogger(__name__)
 

@@ -20,7 +20,8 @@ from detector.live.state import Restored
 from detector.plugins import entrypoints
 from detector.resources.selection import RuleSet
 from detector.sources import Feed, Source
-from detector.sources.supervision import OFFERS, Sources, SourceState, SourceThread, source_plugin_problems
+from detector.sources.registry import OFFERS, source_plugin_problems
+from detector.sources.supervision import Sources, SourceState, SourceThread
 from detector.streams.tally import Cause, Tally
 from tests.driving import a_detector, a_stream
 from tests.networks import PATIENCE, Arrivals, stream, wait_for

@@ -6,7 +6,7 @@ import pytest
 import yaml
 
 from detector.assembly import inlets
-from detector.sources.supervision import source_plugin_problems
+from detector.sources.registry import source_plugin_problems
 from tests.driving import a_detector
 from tests.guides import guide, yaml_blocks
 
