@@ -15,7 +15,7 @@ from detector.engine.columns.fleets import FleetBlock, FleetGroup
 from detector.engine.columns.group import ClientGroup
 from detector.engine.columns.table import Integers, Truths
 from detector.engine.columns.verdicts import Codes
-from detector.engine.episodes.episodes import NO_WAKE, TRUE, UNSEEN, UNTIL, UNTIL_UNSURE, SubjectState
+from detector.engine.episodes.episodes import NO_WAKE, TRUE, UNSEEN, UNTIL, UNTIL_UNSURE
 from detector.engine.episodes.events import Happened
 from detector.engine.episodes.subjects import Subject
 from detector.engine.evaluation.observing import Observer
@@ -219,7 +219,7 @@ class RuleGroup:
         """
         run, track = self._of[row], self.columns.tracks[row]
         subject = track.subject(block.clients[at])
-        state = run.states.get(subject) or run.states.setdefault(subject, SubjectState())
+        state = run.state(subject)
         ticks, timing, count = block.ticks, run.timing, len(block.ticks)
         begins, codes = changes
         deploys, timed = run.rule.deploys, self._timed[row]

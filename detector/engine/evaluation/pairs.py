@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from detector.engine.columns.block import Block, Context, Track
 from detector.engine.columns.pairs import PairBlock, PairColumns
 from detector.engine.columns.table import Integers, Truths, find_rows
-from detector.engine.episodes.episodes import NO_WAKE, TRUE, UNSEEN, SubjectState
+from detector.engine.episodes.episodes import NO_WAKE, TRUE, UNSEEN
 from detector.engine.episodes.events import Happened
 from detector.engine.episodes.subjects import Subject
 from detector.engine.evaluation.observing import Observer
@@ -176,7 +176,7 @@ class PairGroup:
         """Advance one pair's state, and add it to the kept ones if it is still needed."""
         run, key, code = self._run, self._key(these, row), these.codes.item(row)
         subject = self._subject(key)
-        state = run.states.get(subject) or run.states.setdefault(subject, SubjectState())
+        state = run.state(subject)
         stays = state.is_open and run.needs_every_tick(subject)
         _, what, wakes = state.run((tick,), 0, 1, run.timing, code)
         if what is not None or stays:

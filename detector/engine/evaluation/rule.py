@@ -257,7 +257,7 @@ class RuleRun:
         return candidate._replace(variables={**candidate.variables, **found})
 
     def _subject(self, now: int, candidate: Candidate) -> Iterator[Event]:
-        state = self.states.get(candidate.subject) or self.states.setdefault(candidate.subject, SubjectState())
+        state = self.state(candidate.subject)
         when = self._truth("when", self.rule.when, candidate)
         until = negation(when) if self.rule.until is None else self._truth("until", self.rule.until, candidate)
         happened = state.step(now, self.timing, Observation(candidate.in_scope, candidate.near, when, until))
@@ -269,6 +269,13 @@ class RuleRun:
             self.witness(Evaluated(now, candidate, when, until, state.is_open, state.onset))
         if self._answers is not None:
             self._answers.append(self._answer(candidate, when))
+
+    def state(self, subject: Subject) -> SubjectState:
+        """The subject's state; a new one if it had none."""
+        state = self.states.get(subject)
+        if state is None:
+            state = self.states[subject] = SubjectState()
+        return state
 
     def needs_every_tick(self, subject: Subject) -> bool:
         """Whether the subject needs an evaluation although its observation is the same, because its demands may
