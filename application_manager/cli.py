@@ -29,7 +29,7 @@ from application_manager.commands.options import (
 from application_manager.commands.printing import detector_rbac, inject, rbac, webhooks
 from wayside.inputerror import InputError
 from wayside.process import commandline
-from wayside.process.beginning import importing
+from wayside.process.startup import importing
 
 app = typer.Typer(
     add_completion=False,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from wayside.process.beginning import end_on_sigterm, importing
+from wayside.process.startup import end_on_sigterm, importing
 
 
 def main() -> None:

@@ -22,10 +22,18 @@ import numpy as np
 import pymongo
 from msgspec.structs import replace
 
-from detector.actions import Completion, Episode, EpisodeSample, Outcome, OutcomeState, Setting, Surroundings
+from detector.actions import (
+    ActionContext,
+    Completion,
+    DetectorConfiguration,
+    Episode,
+    EpisodeSample,
+    Outcome,
+    OutcomeState,
+)
 from detector.actions.database import Database
 from detector.actions.database.documents import Documents
-from detector.assembly import inlets
+from detector.assembly import stream_readers
 from detector.streams.codecs.ros import standard
 from tests.mongodb import MongoServer, running
 from wayside.api import Detector, EventRule
@@ -81,8 +89,8 @@ def with_the_action(detector: Detector, samples: list[EpisodeSample], name: str)
     rule = EventRule.model_validate(
         {"kind": "EventRule", "metadata": {"name": "bench"}, "spec": {"when": "true", "actions": []}}
     )
-    entries = inlets(detector)
-    around = Surroundings(detector, entries.decoders, entries.types)
+    entries = stream_readers(detector)
+    around = DetectorConfiguration(detector, entries.decoders, entries.types)
     done = threading.Event()
     reported: list[Outcome] = []
 
@@ -94,8 +102,8 @@ def with_the_action(detector: Detector, samples: list[EpisodeSample], name: str)
     def lose(what: str, count: int, why: str) -> None:
         raise AssertionError(f"{count} {what} lost: {why}")
 
-    setting = Setting(rule, "keep", "h", lambda: around, Nobody(), report, lose, threading.Event())
-    action = Database(DatabaseAction(database=name), setting)
+    context = ActionContext(rule, "keep", "h", lambda: around, Nobody(), report, lose, threading.Event())
+    action = Database(DatabaseAction(database=name), context)
     action.wake()
     episode = Episode(
         "e", "bench", "car1", ("car1",), None, START, START, {}, None, rendered={}, unrendered={}, started={}
@@ -130,7 +138,7 @@ def run(server: MongoServer, count: int, rounds: int) -> float:
     spec = {"streams": list(STREAMS), "database": {"uriVariable": "WAYSIDE_BENCH_URI"}}
     detector = Detector.model_validate({"kind": "Detector", "metadata": {"name": "d"}, "spec": spec})
     samples = the_samples(count)
-    entries = inlets(detector)
+    entries = stream_readers(detector)
     maker = Documents("e.keep", "", {stream.name: stream for stream in detector.spec.streams}, entries.decoders, None)
     documents: dict[str, list[dict[str, Any]]] = {}
     for sample in samples:

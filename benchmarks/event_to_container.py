@@ -34,7 +34,7 @@ from tests.e2e.wayside_in_cluster import EXAMPLE, apply_example, run_town
 
 sys.path.insert(0, str(EXAMPLE))
 
-from cooperative_recording.standing import Standing
+from cooperative_recording.parked import ParkedVehicles
 from cooperative_recording.vehicles import LIDAR_VEHICLES
 
 TARGET = 1.2  # the most that an event may take in the middle, as a multiple of kubectl apply
@@ -81,7 +81,7 @@ def measure(node: Node, api: Api, rounds: int) -> Seconds:
     port = run_town(api, WAYSIDE_IMAGE)
     taken: Seconds = {EVENT: [], KUBECTL: [], REQUEST: []}
     made: Object = {}
-    with Standing([f"tcp/{node.address}:{port}"], wait_s=PATIENCE) as vehicles:
+    with ParkedVehicles([f"tcp/{node.address}:{port}"], wait_s=PATIENCE) as vehicles:
         vehicles.put(first, 0)
 
         def by_event() -> float:

@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
-from detector.engine.episodes.current import EpisodeState, Identity, new_record
+from detector.engine.episodes.current import DetectorIdentity, EpisodeState, new_record
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.subjects import Subject
 from wayside.api import Detector, EventRule
@@ -28,7 +28,7 @@ START = 1_767_225_600_000_000_000
 STEP = 100_000_000
 """Nanoseconds from one event to the next: ten of them share a second."""
 CLIENTS = 100
-IDENTITY = Identity("bench", "bench", "default")
+IDENTITY = DetectorIdentity("bench", "bench", "default")
 CLASSIFICATION = {"overarchingPurpose": ["Safety"], "timeSensitivity": ["Immediate"]}
 
 

@@ -18,11 +18,11 @@ from detector.commands import cli
 from detector.engine.buffering.ingest import Ingest
 from detector.engine.engine import Engine
 from detector.engine.evaluation.blocks import Blocks
-from detector.engine.evaluation.knowledge import Knowledge
+from detector.engine.evaluation.inputs import RuleInputs
 from detector.engine.samples.intake import Intake
 from detector.engine.samples.sample import Arrival
 from detector.findings.losses import Losses
-from detector.streams.inlets import Inlet
+from detector.streams.stream_input import StreamInput
 
 spent: Counter[str] = Counter()
 """By stage, CPU time in nanoseconds."""
@@ -66,10 +66,10 @@ def clock_all() -> None:
         seen["events"] += len(happened)
         return happened
 
-    bursts = Inlet.bursts
+    bursts = StreamInput.bursts
 
-    def clocked_bursts(inlet: Inlet) -> Iterator[Any]:
-        take = clocked("receive", "stream", bursts(inlet).__next__)
+    def clocked_bursts(stream_input: StreamInput) -> Iterator[Any]:
+        take = clocked("receive", "stream", bursts(stream_input).__next__)
         while True:
             seen["bursts"] += 1
             yield take()
@@ -107,10 +107,10 @@ def clock_all() -> None:
     Intake.putter = clocked_putter  # type: ignore[method-assign]
     Intake.drain = clocked("drain", "evaluator", Intake.drain)  # type: ignore[method-assign]
     Ingest.insert = clocked("insert", "evaluator", clocked_insert)  # type: ignore[method-assign]
-    Knowledge.settle = clocked("tables", "evaluator", Knowledge.settle)  # type: ignore[method-assign]
+    RuleInputs.settle = clocked("tables", "evaluator", RuleInputs.settle)  # type: ignore[method-assign]
     Blocks.run = clocked("evaluation", "evaluator", clocked_run)  # type: ignore[method-assign]
     Engine.advance = clocked("advance", "evaluator", Engine.advance)  # type: ignore[method-assign]
-    Inlet.bursts = clocked_bursts  # type: ignore[method-assign]
+    StreamInput.bursts = clocked_bursts  # type: ignore[method-assign]
     Losses.sum_up = sum_up  # type: ignore[method-assign]
 
 

@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from detector.assembly import Inlets, inlets, make_engine
+from detector.assembly import StreamReaders, make_engine, stream_readers
 from detector.assembly.memory import tune_garbage_collection
 from detector.engine.samples.sample import Arrival
 from wayside.api import API_VERSION, Detector, EventRule
@@ -57,7 +57,7 @@ def main() -> int:
     parser.add_argument("--cdr", action="store_true", help="as CDR")
     options = parser.parse_args()
     detector = a_detector("cdr" if options.cdr else "json")
-    entries, rules = inlets(detector), ten_rules()
+    entries, rules = stream_readers(detector), ten_rules()
     encode = cdr(entries) if options.cdr else as_json
     arrivals = [*sent(options.objects, options.hz, options.seconds, encode)]
     size = len(arrivals[0].payload)
@@ -82,7 +82,7 @@ def main() -> int:
 
 
 def run(
-    detector: Detector, entries: Inlets, rules: Sequence[EventRule], arrivals: Sequence[Arrival]
+    detector: Detector, entries: StreamReaders, rules: Sequence[EventRule], arrivals: Sequence[Arrival]
 ) -> tuple[int, float]:
     """The number of events, and the CPU time of the calls in which no tick was due."""
     engine = make_engine(detector, entries, holder="h", start=START)
@@ -161,7 +161,7 @@ def as_json(now: float, found: list[tuple[int, float, float, float]]) -> bytes:
     return json.dumps({"header": {"stamp": now, "frame_id": "map"}, "objects": objects}).encode()
 
 
-def cdr(entries: Inlets) -> Callable[[float, list[Any]], bytes]:
+def cdr(entries: StreamReaders) -> Callable[[float, list[Any]], bytes]:
     """Encodes the same as the message of ROS 2."""
     store = entries.types.store
     types = store.types

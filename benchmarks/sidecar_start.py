@@ -21,7 +21,7 @@ from pathlib import Path
 
 from tests.cluster.api import Api, Object
 from tests.cluster.crds import CRDS
-from tests.cluster.managed_world import condition
+from tests.cluster.expected_objects import condition
 from tests.cluster.namespaces import fresh_namespace
 from tests.e2e.images import WAYSIDE_IMAGE, wayside_archive
 from tests.e2e.node import Node

@@ -23,7 +23,7 @@ from application_manager.core.claims.claims import instance_name
 from tests.cluster.api import Api, ApiError
 from tests.cluster.controlplane import ControlPlane
 from tests.cluster.crds import CRDS
-from tests.cluster.managed_world import start_manager, task, template
+from tests.cluster.expected_objects import start_manager, task, template
 from tests.cluster.namespaces import fresh_namespace
 from tests.cluster.processes import Processes
 

@@ -9,7 +9,7 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from detector.assembly import inlets, make_engine
+from detector.assembly import make_engine, stream_readers
 from detector.engine.engine import Engine
 from detector.engine.episodes.events import Event
 from detector.engine.samples.sample import Arrival
@@ -80,7 +80,7 @@ def compiled(detector: Detector, *rules: EventRule) -> list[CompiledRule]:
 
 
 def an_engine(detector: Detector, *rules: EventRule, start: float = 0.0) -> Engine:
-    engine = make_engine(detector, inlets(detector), holder="h", start=at(start))
+    engine = make_engine(detector, stream_readers(detector), holder="h", start=at(start))
     engine.set_rules(compiled(detector, *rules))
     return engine
 

@@ -6,9 +6,9 @@ import pickle
 from typing import TypeVar
 
 from application_manager.core.claims.claims import TemplateState
-from application_manager.core.conditions import Aspect
+from application_manager.core.conditions import ConditionState
 from application_manager.core.demand import drafting
-from application_manager.core.objects.ownership import Obstacle
+from application_manager.core.objects.ownership import ApplyProblem
 from application_manager.core.objects.policy import Policy
 from application_manager.core.objects.rendering import Rendering
 from application_manager.workers.jobs import render_instance
@@ -26,12 +26,12 @@ class InProcess:
         return job()
 
 
-def objects(wanted: ApplicationInstance, template: TemplateState) -> Rendering | Aspect | None:
+def objects(wanted: ApplicationInstance, template: TemplateState) -> Rendering | ConditionState | None:
     """The instance's objects, or why it has none."""
     if not isinstance(template, ApplicationTemplate):
         return drafting.without_template(wanted, template)
     found = render_instance(pickle.dumps(template), Policy(), wanted)
-    if isinstance(found, Obstacle):
+    if isinstance(found, ApplyProblem):
         return drafting.problem(template, found.reason, found.message)
     assert isinstance(found, Rendering)
     return found

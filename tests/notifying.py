@@ -11,7 +11,7 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from detector.actions import Completion, Episode, Outcome, OutcomeState, Setting, Surroundings
+from detector.actions import ActionContext, Completion, DetectorConfiguration, Episode, Outcome, OutcomeState
 from detector.actions.notify import Notify
 from detector.streams.codecs.ros import standard
 from tests.driving import SECOND, START, a_detector, a_rule
@@ -32,7 +32,7 @@ class Silent:
 
 
 @dataclass
-class Desk:
+class Harness:
     """A notify action, and all its reports."""
 
     action: Notify
@@ -64,37 +64,37 @@ class Desk:
         self.action.close()
 
 
-def a_desk(notify: Mapping[str, Any], *, state: Path | None = None, messenger: Any = None) -> Desk:
+def a_harness(notify: Mapping[str, Any], *, state: Path | None = None, messenger: Any = None) -> Harness:
     parameters = Parameters.model_validate(notify)
     rule = a_rule("braking", when="true", actions=[{"name": "notify", "notify": dict(notify)}])
     detector = a_detector(**({} if state is None else {"state": {"path": str(state)}}))
-    desk = Desk.__new__(Desk)
+    harness = Harness.__new__(Harness)
 
     def report(episode: Episode, outcome: Outcome) -> None:
-        with desk.changed:
-            desk.outcomes.append((episode.id, outcome))
-            desk.changed.notify_all()
+        with harness.changed:
+            harness.outcomes.append((episode.id, outcome))
+            harness.changed.notify_all()
 
     def lose(what: str, count: int, why: str) -> None:
-        with desk.changed:
-            desk.lost[what] += count
-            desk.reasons.append(why)
-            desk.changed.notify_all()
+        with harness.changed:
+            harness.lost[what] += count
+            harness.reasons.append(why)
+            harness.changed.notify_all()
 
-    desk.closing, desk.outcomes, desk.lost, desk.reasons = threading.Event(), [], Counter(), []
-    desk.changed = threading.Condition()
-    setting = Setting(
+    harness.closing, harness.outcomes, harness.lost, harness.reasons = threading.Event(), [], Counter(), []
+    harness.changed = threading.Condition()
+    context = ActionContext(
         rule=rule,
         action="notify",
         holder="h",
-        surroundings=lambda: Surroundings(detector, {}, standard()),
+        configuration=lambda: DetectorConfiguration(detector, {}, standard()),
         messenger=messenger or Silent(),
         report=report,
         lose=lose,
-        closing=desk.closing,
+        closing=harness.closing,
     )
-    desk.action = Notify(parameters, setting)
-    return desk
+    harness.action = Notify(parameters, context)
+    return harness
 
 
 def an_episode(

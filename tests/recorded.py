@@ -10,7 +10,7 @@ from typing import Any
 
 from detector.engine.samples.sample import Arrival
 from detector.replay.batches import batched, messages_of
-from detector.replay.message import Cut, Message, ignore
+from detector.replay.message import Message, Truncation, ignore
 from detector.replay.recordings import open_recordings
 from detector.replay.routing import MessageRouter
 
@@ -18,7 +18,7 @@ from detector.replay.routing import MessageRouter
 def messages_in(
     paths: Sequence[Path],
     wanted: Callable[[str], bool] = lambda key: True,
-    on_cut: Callable[[Cut], None] = ignore,
+    on_cut: Callable[[Truncation], None] = ignore,
 ) -> Iterator[Message]:
     """The messages of the recordings. Raises RecordingError at once where one is missing or of no known kind."""
     return messages_of(open_recordings(paths, wanted, on_cut))

@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 from mcap.reader import SeekingReader
 from rosbags.rosbag2 import Reader
 
-from detector.actions.base import Setting, Surroundings
+from detector.actions.base import ActionContext, DetectorConfiguration
 from detector.actions.episode import Completion, Episode, EpisodeSample, Outcome, OutcomeState
 from detector.actions.record import Record
-from detector.assembly import inlets
+from detector.assembly import stream_readers
 from tests.driving import SECOND, a_detector, a_rule, a_stream, at
 from tests.ros_messages import cdr, make, pose_stamped
 from wayside.api import Detector
@@ -34,26 +34,26 @@ class Bench:
 
     def __init__(self, path: Path, *streams: dict[str, Any], rule: str = "r", **parameters: Any) -> None:
         self.detector = recording_detector(path, *streams)
-        self._known: Surroundings | None = None
+        self._known: DetectorConfiguration | None = None
         self.reports: list[tuple[str, Outcome]] = []
         self.lost: list[tuple[str, int, str]] = []
-        setting = Setting(
+        context = ActionContext(
             rule=a_rule(rule, when="true"),
             action="bag",
             holder="h",
-            surroundings=self._surroundings,
+            configuration=self._surroundings,
             messenger=_Silent(),
             report=lambda episode, outcome: self.reports.append((episode.id, outcome)),
             lose=lambda what, count, why: self.lost.append((what, count, why)),
             closing=threading.Event(),
         )
-        self.action = Record(Parameters.model_validate(parameters), setting)
+        self.action = Record(Parameters.model_validate(parameters), context)
         self.path = path
         self._streams = streams
 
-    def _surroundings(self) -> Surroundings:
+    def _surroundings(self) -> DetectorConfiguration:
         if self._known is None or self._known.detector is not self.detector:
-            self._known = surroundings(self.detector)
+            self._known = configuration(self.detector)
         return self._known
 
     def limit(self, **recordings: Any) -> None:
@@ -91,9 +91,9 @@ def recording_detector(path: Path, *streams: dict[str, Any], **recordings: Any) 
     return a_detector(*(streams or STREAMS), recordings={"path": str(path), "reserve": "0", **recordings})
 
 
-def surroundings(detector: Detector) -> Surroundings:
-    entries = inlets(detector)
-    return Surroundings(detector, entries.decoders, entries.types)
+def configuration(detector: Detector) -> DetectorConfiguration:
+    entries = stream_readers(detector)
+    return DetectorConfiguration(detector, entries.decoders, entries.types)
 
 
 def an_episode(

@@ -23,7 +23,7 @@ from application_manager.cache.cluster_cache import (
     EVENT_RULES,
     TEMPLATES,
     ClusterCache,
-    surroundings,
+    rule_context,
 )
 from application_manager.core.findings.checks import BROKEN_RULE, INVALID_RULE
 from application_manager.core.findings.findings import Findings
@@ -144,7 +144,7 @@ class Admission:
         return await self._judged(rule)
 
     async def _judged(self, rule: EventRule) -> Findings:
-        return await self._run(rule.namespace, partial(surroundings(self.cache, rule).findings, rule))
+        return await self._run(rule.namespace, partial(rule_context(self.cache, rule).findings, rule))
 
     async def _run(self, namespace: str, job: Job[Findings]) -> Findings:
         """What a worker process finds; that it takes too much is a problem as well."""

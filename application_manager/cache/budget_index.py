@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from bisect import bisect_left, insort
 
-from application_manager.core.claims.operations import Standing, Verdict
+from application_manager.core.claims.operations import Verdict, VerdictKind
 from application_manager.core.demand.placing import LIMIT_REACHED
 from application_manager.core.holders.policies import TaskPolicy
 from application_manager.core.objects.policy import Name
@@ -97,7 +97,7 @@ class BudgetIndex:
             f"{whose} has reached the limit of {limit} unfinished tasks: this task waits until an older task ends; "
             "end some tasks, or have the administrator raise the limit"
         )
-        return Verdict(Standing.WAITING, LIMIT_REACHED, message)
+        return Verdict(VerdictKind.WAITING, LIMIT_REACHED, message)
 
     def _take(self, age: _Age) -> set[Name]:
         budget = self._of_namespace(age[1][0])

@@ -10,8 +10,8 @@ from dataclasses import replace
 
 from application_manager.cache.budget_index import BudgetIndex
 from application_manager.cache.store import Entry, MembersByGroup
-from application_manager.core.claims.claims import Claim, Refused, TemplateState, all_instances, template_of_all
-from application_manager.core.claims.operations import Standing, Verdict
+from application_manager.core.claims.claims import Claim, RefusalReason, TemplateState, all_instances, template_of_all
+from application_manager.core.claims.operations import Verdict, VerdictKind
 from application_manager.core.demand.demand import claim_or_verdict, finished
 from application_manager.core.holders.leases import HolderKey
 from application_manager.core.holders.policies import TaskPolicy
@@ -76,14 +76,12 @@ class ClaimIndex:
         self._resolve(name, claimed)
         if not isinstance(task, ApplicationTask):
             problem = f"{entry.problem}: correct the task, or delete it and create another"
-            self._verdicts[name] = Verdict(Standing.REFUSED, Refused.INVALID_TASK, problem)
+            self._verdicts[name] = Verdict(VerdictKind.REFUSED, RefusalReason.INVALID_TASK, problem)
             return touched
         self._file(name, task)
         if isinstance(claimed, Verdict):
             served = before is not None and template_of_all(before.instance) is None
-            if (
-                claimed.standing is Standing.FINISHED and before is not None and served
-            ):  # its status may not have it yet
+            if claimed.kind is VerdictKind.FINISHED and before is not None and served:  # its status may not have it yet
                 claimed = replace(claimed, instance=before.instance)
             self._verdicts[name] = claimed
             return touched
@@ -99,7 +97,7 @@ class ClaimIndex:
         if over is not None:
             return over
         if entry.problem:
-            return Verdict(Standing.REFUSED, Refused.INVALID_PARAMETERS, entry.problem)
+            return Verdict(VerdictKind.REFUSED, RefusalReason.INVALID_PARAMETERS, entry.problem)
         return self._policy.refusal(task) or self._budgets.verdict((task.namespace, task.name))
 
     def _wait(self, name: Name, task: ApplicationTask, before: Claim | None) -> set[Name]:
@@ -116,7 +114,7 @@ class ClaimIndex:
 
     def _resolve(self, name: Name, found: Claim | Verdict | None) -> None:
         """Note that a task's claim is known; one that takes too much to work out is as unknown as before."""
-        still = isinstance(found, Verdict) and found.reason == Refused.EXPRESSION_LIMIT
+        still = isinstance(found, Verdict) and found.reason == RefusalReason.EXPRESSION_LIMIT
         for waiting in (self._pending,) if still else (self._pending, self._unsettled):
             for template in [each for each, names in waiting.items() if name in names]:
                 waiting[template].discard(name)

@@ -28,10 +28,10 @@ from application_manager.core.demand.placing import limits
 from application_manager.core.findings.findings import Findings
 from application_manager.core.holders.leases import HealthyTime, LeaseIndex, LeaseView
 from application_manager.core.holders.policies import TaskPolicy
-from application_manager.core.objects.ownership import Applied
+from application_manager.core.objects.ownership import ApplyResult
 from application_manager.core.objects.policy import KindKey, Name, Policy
 from application_manager.core.objects.trimming import without_objects
-from application_manager.core.statuses.status import Service
+from application_manager.core.statuses.status import InstanceProgress
 from application_manager.workers.jobs import RuleContext
 from wayside.api import (
     API_VERSION,
@@ -70,11 +70,11 @@ _Version = tuple[str, int, frozenset[str]]
 
 
 @dataclass(frozen=True, slots=True)
-class Served:
+class LastDecision:
     """What was last decided of an instance, and what it has given since."""
 
     decision: Decision
-    service: Service
+    service: InstanceProgress
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +89,7 @@ class WorkRecord:
 
     uid: str
     decision: Decision
-    applied: Applied
+    applied: ApplyResult
     digest: str | None
     since: float
 
@@ -118,7 +118,7 @@ class ClusterCache:
     pods: PodIndex = field(default_factory=PodIndex)
     leases: LeaseIndex = field(default_factory=LeaseIndex)
     healthy: HealthyTime = field(default_factory=HealthyTime)
-    served: dict[Name, Served] = field(default_factory=dict)
+    served: dict[Name, LastDecision] = field(default_factory=dict)
     records: dict[Name, WorkRecord] = field(default_factory=dict)
     deadlines: dict[Name, tuple[str, float | None]] = field(default_factory=dict)
     turns: FallbackIndex = field(default_factory=FallbackIndex)
@@ -345,7 +345,7 @@ def _version(template: ApplicationTemplate) -> _Version:
     return metadata.uid, metadata.generation, ignored_by(metadata.annotations)
 
 
-def surroundings(cache: ClusterCache, rule: EventRule) -> RuleContext:
+def rule_context(cache: ClusterCache, rule: EventRule) -> RuleContext:
     """As far as they matter to the rule: other rules where it names any, templates where it deploys."""
     namespace = rule.namespace
     deploys = any(each.deploy is not None for each in rule.spec.actions)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from application_manager.core.conditions import Aspect
+from application_manager.core.conditions import ConditionState
 from application_manager.core.health.pods import Trouble, summary, trouble
 from application_manager.core.objects.detectors import DETECTOR_LABEL
 from application_manager.core.objects.ownership import controller_of
@@ -30,7 +30,7 @@ class DetectorIndex:
 
     defaults: PodDefaults | None = None
     objects: dict[str, dict[str, Object]] = field(default_factory=dict)
-    running: dict[Name, Aspect] = field(default_factory=dict)
+    running: dict[Name, ConditionState] = field(default_factory=dict)
     requesting: dict[Name, list[Object]] = field(default_factory=dict)
     _troubles: dict[Name, list[Trouble]] = field(default_factory=dict)
 

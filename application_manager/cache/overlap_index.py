@@ -22,7 +22,7 @@ ANSWER = 5.0
 log = logging.getLogger(__name__)
 
 
-class Turn(Enum):
+class NamespaceRole(Enum):
     """What a manager may do in a namespace."""
 
     ACT = "act"
@@ -87,18 +87,18 @@ class OverlapIndex:
         elif namespace not in self._yielded:  # it may be gone
             self._yield(_Yielded(written, template, now))
 
-    def turn(self, template: Name, now: float) -> tuple[Turn, float]:
+    def turn(self, template: Name, now: float) -> tuple[NamespaceRole, float]:
         """What may be done about a template as of `now`, and when that changes, both in seconds since 1970."""
         state = self._yielded.get(template[0])
         if state is None:
-            return Turn.ACT, now
+            return NamespaceRole.ACT, now
         if state.template != template or now < state.until:
-            return Turn.WAIT, max(state.until, now + 1.0)
+            return NamespaceRole.WAIT, max(state.until, now + 1.0)
         if not state.tried:
             state.tried, state.until = True, now + ANSWER
-            return Turn.CHALLENGE, state.until
+            return NamespaceRole.CHALLENGE, state.until
         self._resume(template[0], f"the manager of the Lease {state.rival.lease} does not respond")
-        return Turn.ACT, now
+        return NamespaceRole.ACT, now
 
     def waits_for(self, namespace: str) -> str:
         """The Lease of the manager for which this one waits in the namespace."""

@@ -26,7 +26,7 @@ from application_manager.core.objects.charts import (
     ChartSource,
     parse_chart,
 )
-from application_manager.core.objects.ownership import Obstacle
+from application_manager.core.objects.ownership import ApplyProblem
 from application_manager.core.objects.policy import Name
 from wayside.process.backoff import pause_after
 
@@ -45,9 +45,9 @@ class _Pause:
 
     failures: int = 0
     until: float = 0.0
-    failure: Obstacle | None = None
+    failure: ApplyProblem | None = None
 
-    def fail(self, failure: Obstacle) -> None:
+    def fail(self, failure: ApplyProblem) -> None:
         self.failures += 1
         self.until = time.monotonic() + pause_after(self.failures, FIRST_PAUSE, LONGEST_PAUSE)
         self.failure = failure
@@ -97,7 +97,7 @@ class ChartRenderer:
         self._renderings.move_to_end(request)
         if known.work is None and not isinstance(known.outcome, ChartObjects) and known.pause.over:
             known.work = asyncio.create_task(self._do(request, known), name=f"chart of {request.release}")
-        if isinstance(known.outcome, Obstacle) and known.work is None:
+        if isinstance(known.outcome, ApplyProblem) and known.work is None:
             self._again((request.namespace, request.release), time.time() + known.pause.left)
         self._forget_some()
         return known.outcome
@@ -123,12 +123,12 @@ class ChartRenderer:
             outcome = await self._outcome(request)
         except Exception as error:  # a defect must not leave the instance waiting for ever
             log.exception("cannot render the chart of %s/%s", request.namespace, request.release)
-            outcome = Obstacle(FAILED, f"spec.helm: chart {request.source}: {type(error).__name__}: {error}")
+            outcome = ApplyProblem(FAILED, f"spec.helm: chart {request.source}: {type(error).__name__}: {error}")
         finally:
             known.work = None
         name = (request.namespace, request.release)
         known.outcome = outcome
-        if isinstance(outcome, Obstacle):
+        if isinstance(outcome, ApplyProblem):
             known.pause.fail(outcome)
         self._again(name, time.time())
 
@@ -163,7 +163,7 @@ async def rendered(helm: HelmRunner, request: ChartRequest, path: Path) -> Chart
     """
     text = await helm.template(request, path)
     if text != await helm.template(request, path):
-        return Obstacle(
+        return ApplyProblem(
             FAILED,
             f"spec.helm: chart {request.source} renders different objects each time (with functions such as "
             "randAlphaNum, genCA or now), which would restart the application: set these values in "
@@ -184,11 +184,11 @@ async def rendered_at_once(helm: HelmRunner, cache: ChartCache, request: ChartRe
         return failed(request.source, error)
 
 
-def unavailable(source: ChartSource, error: HelmError) -> Obstacle:
+def unavailable(source: ChartSource, error: HelmError) -> ApplyProblem:
     """The chart cannot be had."""
-    return Obstacle(UNAVAILABLE, f"spec.helm: cannot fetch chart {source}: {error}")
+    return ApplyProblem(UNAVAILABLE, f"spec.helm: cannot fetch chart {source}: {error}")
 
 
-def failed(source: ChartSource, error: HelmError) -> Obstacle:
+def failed(source: ChartSource, error: HelmError) -> ApplyProblem:
     """The chart cannot be rendered."""
-    return Obstacle(FAILED, f"spec.helm: chart {source}: {error}")
+    return ApplyProblem(FAILED, f"spec.helm: chart {source}: {error}")

@@ -23,7 +23,7 @@ def _lines(explanation: Explanation) -> Iterator[str]:
     yield f"template {template.name}" + (f": {template.problem}" if template.problem else "")
     if instance is None:
         task = explanation.task
-        of_all = task is not None and task.operation != "Deploy" and task.standing in ("Counts", "Waiting")
+        of_all = task is not None and task.operation != "Deploy" and task.verdict in ("Counts", "Waiting")
         yield "instances: all instances of the template" if of_all else "instance: none"
         return
     yield from _instance(instance, template.name)
@@ -70,8 +70,8 @@ def _task(task: ExplainedTask) -> Iterator[str]:
     else:
         yield "  created by a person: it never expires"
     yield f"  {task.operation}, priority {task.priority}, created {task.created or 'just now'}"
-    yield f"  {task.standing}, {task.reason}: {task.message}"
-    shown = ("Accepted", "Finished") if task.standing == "Finished" else ("Accepted",)  # by the line above
+    yield f"  {task.verdict}, {task.reason}: {task.message}"
+    shown = ("Accepted", "Finished") if task.verdict == "Finished" else ("Accepted",)  # by the line above
     yield from _conditions(task.conditions, but=shown)
     if task.not_looked_at:
         yield (
@@ -101,10 +101,10 @@ def _conditions(conditions: list[dict[str, object]], but: tuple[str, ...] = ()) 
 def _tasks(explanation: Explanation, instance: ExplainedInstance) -> Iterator[str]:
     yield f"tasks of instance {instance.name}" + ("" if explanation.tasks else ": none")
     # A finished task stays for an hour, and must not displace one that counts.
-    for task in sorted(explanation.tasks, key=lambda each: each.standing == "Finished")[:_TASKS_SHOWN]:
+    for task in sorted(explanation.tasks, key=lambda each: each.verdict == "Finished")[:_TASKS_SHOWN]:
         about = f"{task.rule} of {task.subject}" if task.rule else "by a person" if not task.holder else task.holder
-        why = "" if task.standing == "Counts" else f", {task.reason}: {task.message}"
-        yield f"  {task.name} ({about}, {task.operation}, priority {task.priority}) {task.standing}{why}"
+        why = "" if task.verdict == "Counts" else f", {task.reason}: {task.message}"
+        yield f"  {task.name} ({about}, {task.operation}, priority {task.priority}) {task.verdict}{why}"
     yield from _more(len(explanation.tasks) - _TASKS_SHOWN)
 
 

@@ -13,7 +13,7 @@ from application_manager.cache.cluster_cache import INSTANCES, TASKS, TEMPLATES
 from application_manager.cluster.client import manager_client
 from application_manager.core.claims.claims import InvalidTemplate
 from application_manager.core.objects.ownership import INSTANCE_LABEL
-from application_manager.core.statuses.explaining import Found, explanation_of, serving
+from application_manager.core.statuses.explaining import NamespaceSnapshot, explanation_of, serving
 from application_manager.core.statuses.explanation import Explanation
 from wayside.api import ApplicationInstance, ApplicationTask, ApplicationTemplate, Kind
 from wayside.api.documents import parse_object
@@ -77,7 +77,7 @@ async def _inquire(client: Client, subject: str, namespace: str) -> Explanation:
         )
     if task is not None and existing is not None:
         raise InquiryError(f"{name} is the name of a task and of an instance: write task/{name} or instance/{name}")
-    found = Found(
+    found = NamespaceSnapshot(
         await _templates(client, namespace),
         await _list(client, TASKS, ApplicationTask, namespace),
         await _list(client, INSTANCES, ApplicationInstance, namespace),

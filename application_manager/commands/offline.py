@@ -11,7 +11,7 @@ from typing import Any
 from application_manager.charts.chartcache import ChartCache, default_folder
 from application_manager.charts.chartrenderer import rendered_at_once
 from application_manager.charts.helm import HelmRunner
-from application_manager.core.claims.operations import Standing
+from application_manager.core.claims.operations import VerdictKind
 from application_manager.core.demand import drafting
 from application_manager.core.demand.decisions import Decision
 from application_manager.core.demand.demand import demand
@@ -59,9 +59,9 @@ def render_objects(
         outcome = demand(templates.values(), tasks, [], {}, now, limit)
         for name, verdict in sorted(outcome.verdicts.items()):
             line = f"ApplicationTask {namespace}/{name}: {verdict.reason}: {verdict.message}"
-            if verdict.standing is Standing.REFUSED:
+            if verdict.kind is VerdictKind.REFUSED:
                 result.refusals.append(line)
-            elif verdict.standing is Standing.WAITING:
+            elif verdict.kind is VerdictKind.WAITING:
                 result.notes.append(line)
         for decision in outcome.instances.values():
             _render(decision, templates[decision.template], policy, charts, result)

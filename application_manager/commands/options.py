@@ -16,7 +16,7 @@ import typer
 from wayside.process import commandline
 
 if TYPE_CHECKING:
-    from application_manager.admission.reviewing import Serving
+    from application_manager.admission.webhook import WebhookOptions
     from application_manager.cluster.leadership import LeaseKey
     from application_manager.core.holders.policies import TaskPolicy
     from application_manager.core.objects.poddefaults import PodDefaults
@@ -75,20 +75,22 @@ def tasks_of(most: int | None, holders: list[str] | None) -> TaskPolicy:
         return TaskPolicy(most, tuple(HolderPolicy.parse(each) for each in holders or ()))
 
 
-def serving_of(port: int | None, certificates: Path | None, service: str | None, webhooks: str) -> Serving | None:
+def serving_of(
+    port: int | None, certificates: Path | None, service: str | None, webhooks: str
+) -> WebhookOptions | None:
     """Where the webhook is served; None: nowhere."""
     if port is None and certificates is None and service is None:
         return None
-    from application_manager.admission.reviewing import FOLDER_OPTION, PORT_OPTION, Serving
+    from application_manager.admission.webhook import FOLDER_OPTION, PORT_OPTION, WebhookOptions
     from application_manager.core.findings.webhooks import certificate_secret
 
     if port is None or certificates is None:
         commandline.refuse(f"give both {PORT_OPTION} and {FOLDER_OPTION}, or neither")
     if service is None:
-        return Serving(port, certificates)
+        return WebhookOptions(port, certificates)
     with checking("--admission-service"):
         certificate_secret(service)
-    return Serving(port, certificates, service, webhooks)
+    return WebhookOptions(port, certificates, service, webhooks)
 
 
 def lease_of(given: str | None, namespaces: tuple[str, ...]) -> LeaseKey:

@@ -14,7 +14,7 @@ import typer
 
 from application_manager.commands.options import checking, lease_of, policy_of
 from wayside.process import commandline
-from wayside.process.beginning import importing
+from wayside.process.startup import importing
 
 
 def webhooks(
@@ -82,7 +82,7 @@ def webhooks(
 def _authority(given: Path | None, folder: Path | None, hosts: Sequence[str]) -> bytes | None:
     """The certificate of the CA, in the file or made in the folder. Raises ConfigurationError."""
     if folder is not None:
-        from application_manager.admission.issuing import make_certificates
+        from application_manager.admission.issuer import make_certificates
 
         return make_certificates(folder, hosts)
     if given is None:

@@ -18,7 +18,7 @@ MAXIMUM_MESSAGE = 4096  # characters, as the CRDs allow
 
 
 @dataclass(frozen=True, slots=True)
-class Aspect:
+class ConditionState:
     """What a condition should be now."""
 
     type: str
@@ -34,27 +34,27 @@ class Aspect:
 
 def updated(
     known: Iterable[Condition],
-    aspects: Iterable[Aspect],
+    states: Iterable[ConditionState],
     generation: int,
     now: float,
     *,
     only_while: Iterable[str] = (),
 ) -> list[Condition]:
-    """The conditions that the aspects make; one keeps its time of transition while its status stays.
+    """The updated conditions; one keeps its time of transition while its status stays.
 
     Conditions of other types are kept, but for those of the types `only_while`. `now` is in seconds since 1970.
     """
-    aspects = list(aspects)
-    gone = set(only_while) - {each.type for each in aspects}
+    states = list(states)
+    gone = set(only_while) - {each.type for each in states}
     by_type = {each.type: each for each in known if each.type not in gone}
-    for aspect in aspects:
-        old = by_type.get(aspect.type)
-        kept = old is not None and old.status == aspect.status
-        by_type[aspect.type] = Condition(
-            type=aspect.type,
-            status=aspect.status,
-            reason=aspect.reason,
-            message=cut(aspect.message),
+    for state in states:
+        old = by_type.get(state.type)
+        kept = old is not None and old.status == state.status
+        by_type[state.type] = Condition(
+            type=state.type,
+            status=state.status,
+            reason=state.reason,
+            message=cut(state.message),
             observed_generation=generation,
             last_transition_time=old.last_transition_time if old is not None and kept else format_seconds(now),
         )
@@ -80,15 +80,15 @@ def holds(conditions: Iterable[Condition], type_: str) -> bool:
 
 def from_first(
     known: Iterable[Condition], type_: str, now: tuple[str, str] | None, otherwise: tuple[str, str]
-) -> Iterator[Aspect]:
+) -> Iterator[ConditionState]:
     """A condition that is absent until it is True for the first time, and False afterwards.
 
     `now` and `otherwise`: its reason and message while it is True, None where it is not, and while it is False.
     """
     if now is not None:
-        yield Aspect(type_, True, *now)
+        yield ConditionState(type_, True, *now)
     elif find(known, type_) is not None:
-        yield Aspect(type_, False, *otherwise)
+        yield ConditionState(type_, False, *otherwise)
 
 
 def changed(old: Iterable[Condition], new: Iterable[Condition]) -> list[Condition]:
@@ -107,18 +107,23 @@ STALLED = "Stalled"
 
 
 def concluded(
-    known: Sequence[Condition], aspects: Sequence[Aspect], generation: int, now: float, *, stalled: Collection[str]
+    known: Sequence[Condition],
+    states: Sequence[ConditionState],
+    generation: int,
+    now: float,
+    *,
+    stalled: Collection[str],
 ) -> list[Condition]:
-    """The conditions that the aspects, at least one, make, with Ready and Stalled as follows from them.
+    """The conditions updated with at least one state, and Ready and Stalled, which follow from them.
 
-    The object is ready if all aspects hold. `now` in seconds since 1970; `stalled`: the reasons that somebody has to
+    The object is ready if all states hold. `now` in seconds since 1970; `stalled`: the reasons that somebody has to
     correct the object for.
     """
-    failing = next((each for each in aspects if not each.holds), None)
+    failing = next((each for each in states if not each.holds), None)
     if failing is None:
-        follow = [Aspect(READY, True, READY, aspects[-1].message)]
+        follow = [ConditionState(READY, True, READY, states[-1].message)]
     else:
-        follow = [Aspect(READY, False, failing.reason, failing.message)]
+        follow = [ConditionState(READY, False, failing.reason, failing.message)]
         if failing.reason in stalled:
-            follow.append(Aspect(STALLED, True, failing.reason, failing.message))
-    return updated(known, [*aspects, *follow], generation, now, only_while=(STALLED,))
+            follow.append(ConditionState(STALLED, True, failing.reason, failing.message))
+    return updated(known, [*states, *follow], generation, now, only_while=(STALLED,))

@@ -17,7 +17,7 @@ from prometheus_client.core import CounterMetricFamily, Metric
 from prometheus_client.registry import Collector
 
 from application_manager.cache.cluster_cache import ClusterCache, WorkRecord
-from application_manager.core.claims.operations import Standing
+from application_manager.core.claims.operations import VerdictKind
 from application_manager.core.conditions import changed, find, holds
 from application_manager.core.objects.policy import Name
 from application_manager.measures import PREFIX
@@ -113,15 +113,15 @@ class TaskTraces:
         served: dict[str, tuple[ApplicationTask, TraceContext]] = {}
         for task_name, verdict in record.decision.verdicts.items():
             task = self._cache.task((name[0], task_name))
-            if verdict.standing is Standing.COUNTS and task is not None and (context := _context(task)) is not None:
+            if verdict.kind is VerdictKind.COUNTS and task is not None and (context := _context(task)) is not None:
                 served[task_name] = (task, context)
         for task, context in served.values():
             # Unless it was applied before, or this failure was emitted.
             if task.status is not None and task.status.applied_time is not None:
                 continue
             known = self._remembered(task.metadata.uid)
-            aspect, took = record.applied.aspect, record.applied.took
-            failure = "" if aspect.holds else f"{aspect.reason}: {aspect.message}"
+            state, took = record.applied.state, record.applied.took
+            failure = "" if state.holds else f"{state.reason}: {state.message}"
             if known.applied or (failure and failure == known.failure):
                 continue
             about = {**_about(task), "wayside.instance": name[1]}
@@ -139,7 +139,7 @@ class TaskTraces:
             )
             if took is not None:
                 self._emit(Span("apply", *took, parent=known.reconcile, attributes=about, error=failure or None))
-            if aspect.holds:
+            if state.holds:
                 known.applied = ended
             if task.status is not None and holds(task.status.conditions, "Finished"):  # it ended during this work
                 if known.unserved:

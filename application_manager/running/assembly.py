@@ -14,7 +14,7 @@ from application_manager.cache.cluster_cache import DETECTOR, INSTANCE, ClusterC
 from application_manager.cache.detector_index import DetectorIndex
 from application_manager.charts.chartcache import ChartCache
 from application_manager.charts.chartrenderer import ChartRenderer
-from application_manager.cluster.looks import FailedPodsLook, NodeLook
+from application_manager.cluster.polls import FailedPodsPoll, NodePoll
 from application_manager.core.demand.decisions import Decision
 from application_manager.core.objects.policy import KindKey, Name
 from application_manager.measures import Measures
@@ -28,15 +28,15 @@ from application_manager.work.configurations import ConfigurationWork
 from application_manager.work.detectors import DetectorWork
 from application_manager.work.instances import InstanceWork
 from application_manager.work.instancestatus import InstanceStatusWork
-from application_manager.work.judging import RuleKey, RuleWork, TemplateWork
 from application_manager.work.publishing import Publisher
 from application_manager.work.recorder import Recorder
 from application_manager.work.rendering import Renderings
+from application_manager.work.scaling import WorkloadScaler
 from application_manager.work.statuses import StatusWriter
-from application_manager.work.suspending import Suspending
 from application_manager.work.tasks import TaskWork
+from application_manager.work.validating import RuleKey, RuleWork, TemplateWork
 from application_manager.workers.answers import AnswerCache
-from application_manager.workers.claiming import Claiming
+from application_manager.workers.claiming import ClaimEvaluator
 from application_manager.workers.pool import Pool
 from wayside.kubernetes.client import Client
 from wayside.kubernetes.resources import Resource
@@ -132,7 +132,7 @@ class Assembly:
             self._judge,
             self._configurations.add,
         )
-        self.cache.claims.claim_of = Claiming(self._answers, self.router.claimed)
+        self.cache.claims.claim_of = ClaimEvaluator(self._answers, self.router.claimed)
         self.cache.claims.settled = self.router.settled
         self.cache.claims.moved = self.router.claimed
         self.cache.overlap.every = options.resync
@@ -143,8 +143,8 @@ class Assembly:
             statuses=statuses,
             applier=applier,
             task_changed=self._tasks.add,
-            nodes=NodeLook(client),
-            failed_pods=FailedPodsLook(client),
+            nodes=NodePoll(client),
+            failed_pods=FailedPodsPoll(client),
             again=self._statuses.add_at,
         )
         charts = ChartCache(options.helm, options.chart_cache, options.chart_folder)
@@ -157,7 +157,7 @@ class Assembly:
             client=client,
             applier=applier,
             recorder=self.recorder,
-            suspending=Suspending(client, applier, self.router.observe),
+            suspending=WorkloadScaler(client, applier, self.router.observe),
             again=instances.add_at,
             enqueue=instances.add,
             done=self._statuses.add,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import zenoh
 
-from application_manager.admission.reviewing import Serving
+from application_manager.admission.webhook import WebhookOptions
 from application_manager.charts.chartcache import default_folder
 from application_manager.charts.helm import HelmRunner
 from application_manager.cluster.leadership import LeaseKey
@@ -42,7 +42,7 @@ class Options:
     helm: HelmRunner = field(default_factory=HelmRunner)
     chart_cache: Path = field(default_factory=default_folder)
     chart_folder: Path = Path("/charts")
-    admission: Serving | None = None
+    admission: WebhookOptions | None = None
     lease: LeaseKey = field(default_factory=lambda: LeaseKey("default"))
     stalled_after: float = STALLED_AFTER
     watch_timeout: float = 90.0  # the API server sends each watch a bookmark a minute

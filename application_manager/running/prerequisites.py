@@ -8,15 +8,15 @@ from collections.abc import Mapping
 from functools import partial
 
 from application_manager.cache.cluster_cache import OWN, POD, TASKS
-from application_manager.cluster.entitlement import missing_rights, report_missing
 from application_manager.cluster.leadership import LeaseKey
+from application_manager.cluster.permissions import missing_rights, report_missing
 from application_manager.core.objects.policy import KindKey, Policy, kind_text
 from application_manager.core.objects.rights import lease_rights, read_only, rights
 from wayside.kubernetes.client import Client
 from wayside.kubernetes.connection import ConfigurationError
 from wayside.kubernetes.errors import ApiError
-from wayside.kubernetes.repeating import until_answered
 from wayside.kubernetes.resources import Resource
+from wayside.kubernetes.retrying import until_answered
 
 log = logging.getLogger(__name__)
 

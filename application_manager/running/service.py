@@ -16,12 +16,12 @@ from functools import partial
 import kopf
 
 from application_manager.admission.admission import Admission
-from application_manager.admission.issuing import issuing
-from application_manager.admission.reviewing import ReviewHandler, webhook
+from application_manager.admission.issuer import issuing
+from application_manager.admission.webhook import ReviewHandler, webhook
 from application_manager.cache.cluster_cache import POD, TEMPLATES
 from application_manager.cluster.client import manager_client
-from application_manager.cluster.entitlement import Grants
 from application_manager.cluster.leadership import RENEWAL_TIMEOUT, Leadership
+from application_manager.cluster.permissions import NamespacePermissions
 from application_manager.core.findings.webhooks import INJECTION_PATH, PATH
 from application_manager.measures import Measures
 from application_manager.observability.pages import pages, stalled
@@ -31,14 +31,14 @@ from application_manager.running.prerequisites import discovered, entitled, rece
 from application_manager.running.watchdog import SILENT, watchdog
 from application_manager.watching.detectorwatch import DetectorWatch
 from application_manager.watching.leasewatch import LeaseWatch
-from application_manager.watching.listing import Listing
 from application_manager.watching.operator import watch
-from application_manager.watching.pulse import Pulse
-from application_manager.work.acting import acting, done_before, ended
+from application_manager.watching.resync import Resync
+from application_manager.watching.watch_health import WatchHealth
+from application_manager.work.active import acting, done_before, ended
 from wayside.kubernetes.connection import ConfigurationError, load_configuration
 from wayside.kubernetes.errors import ApiError
-from wayside.kubernetes.pacing import Pacing, Share
-from wayside.kubernetes.repeating import until_answered
+from wayside.kubernetes.pacing import CongestionWindow, Pacing
+from wayside.kubernetes.retrying import until_answered
 from wayside.process.tracing import tracing
 
 log = logging.getLogger(__name__)
@@ -52,7 +52,7 @@ async def serve(options: Options) -> None:
             or the port for metrics is taken.
     """
     measures, traced = Measures(), tracing("wayside-application-manager")
-    client = manager_client(await load_configuration(), measures, pacing=Pacing(share=Share()))
+    client = manager_client(await load_configuration(), measures, pacing=Pacing(share=CongestionWindow()))
     # A separate client: other requests do not delay renewals of the Lease.
     renewals = manager_client(await load_configuration(), measures, timeout=RENEWAL_TIMEOUT)
     leadership = Leadership(renewals, options.lease, measures)
@@ -88,7 +88,7 @@ class Manager:
         client, options, resources, measures = work.client, work.options, work.resources, work.measures
         # Pods always: those of workloads show why they do not run.
         children = [resources[kind] for kind in sorted({*options.policy.kinds, POD}) if kind in resources]
-        self._listing = Listing(
+        self._listing = Resync(
             cache=work.cache,
             client=client,
             router=work.router,
@@ -98,12 +98,12 @@ class Manager:
             measures=measures,
         )
         work.cache.overlap.own = lambda: leadership.lease
-        self._pulse = Pulse(options.watch_timeout, lambda: work.cache.healthy.elapsed)
+        self._pulse = WatchHealth(options.watch_timeout, lambda: work.cache.healthy.elapsed)
         measures.registry.register(self._pulse)
         self._detector_watch = DetectorWatch(
             work.cache, client, work.detector_index, options.namespaces, work.detectors.add
         )
-        self._grants = Grants(client, work.router.everything)
+        self._grants = NamespacePermissions(client, work.router.everything)
         if not options.namespaces:
             client.may_write = self._grants.may_write
         self._leases = LeaseWatch(work.cache, client, TEMPLATES, options.namespaces, work.router.look_at)

@@ -15,8 +15,8 @@ from application_manager.core.objects.detectors import KINDS, SELECTOR
 from application_manager.core.objects.policy import Name
 from application_manager.core.objects.sidecars import SIDECAR_LABEL
 from wayside.kubernetes.client import Client
-from wayside.kubernetes.repeating import repeatedly
 from wayside.kubernetes.resources import Object, Resource
+from wayside.kubernetes.retrying import repeatedly
 
 LOOK_EVERY = 3.0  # s
 _KINDS = tuple(Resource(*each) for each in KINDS)

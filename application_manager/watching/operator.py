@@ -22,7 +22,7 @@ from kopf._cogs.clients import fetching, watching
 
 from application_manager.cache.cluster_cache import OWN
 from application_manager.core.objects.ownership import INSTANCE_LABEL
-from application_manager.watching.pulse import NEVER, Pulse, pulsing
+from application_manager.watching.watch_health import NEVER, WatchHealth, pulsing
 from wayside.kubernetes.errors import RequestError
 from wayside.kubernetes.leases import HOLDER_LEASE_LABEL
 from wayside.kubernetes.resources import LEASES, Object, Resource
@@ -57,7 +57,7 @@ async def watch(
     connect: Callable[[], Awaitable[kopf.ConnectionInfo]],
     namespaces: Collection[str],
     ready: asyncio.Event,
-    pulse: Pulse,
+    pulse: WatchHealth,
 ) -> None:
     """Watch our own kinds, holders' Leases, and objects with an instance's label, until cancelled.
 

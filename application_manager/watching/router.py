@@ -27,7 +27,7 @@ from application_manager.core.objects.ownership import controller_of, instance_o
 from application_manager.core.objects.policy import Name
 from application_manager.core.objects.suspension import pods_left
 from application_manager.work.applying import Applier
-from application_manager.work.judging import RuleKey
+from application_manager.work.validating import RuleKey
 from wayside.api import ApplicationInstance
 from wayside.api.applicationtemplate import ApplicationTemplateStatus
 from wayside.kubernetes.leases import holder_of

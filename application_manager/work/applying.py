@@ -15,7 +15,7 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 
 from application_manager.cache.store import MembersByGroup, Store
-from application_manager.core.conditions import Aspect
+from application_manager.core.conditions import ConditionState
 from application_manager.core.health.refusals import (
     ADMISSION_REFUSED,
     APPLY_REFUSED,
@@ -24,11 +24,11 @@ from application_manager.core.health.refusals import (
     with_remedy,
 )
 from application_manager.core.objects.ownership import (
-    Applied,
-    Known,
+    ApplyProblem,
+    ApplyResult,
+    LastApplied,
     Manifest,
     ObjectKey,
-    Obstacle,
     controller_uid,
     foreign,
     object_key,
@@ -90,7 +90,7 @@ class Applier:
         self._drifted.discard(uid)
         self._controlled.drop(controller_uid(raw) or "", uid)
 
-    def pending(self, instance: ApplicationInstance, rendering: Rendering, known: Known) -> list[Manifest]:
+    def pending(self, instance: ApplicationInstance, rendering: Rendering, known: LastApplied) -> list[Manifest]:
         """The manifests that need applying: all of a new rendering, else those that are missing or have drifted."""
         if known.digest != rendering.digest:
             return list(rendering.manifests)
@@ -118,9 +118,9 @@ class Applier:
         instance: ApplicationInstance,
         rendering: Rendering,
         manifests: Sequence[Manifest],
-        known: Known,
+        known: LastApplied,
         looked: Mapping[ObjectKey, Object | None],
-    ) -> Applied:
+    ) -> ApplyResult:
         """Apply the manifests, which are all or some of the rendering, and prune what it has no more.
 
         `looked` is from `look`, for the same manifests. Raises ApiError or Unreachable for what may pass, once all
@@ -131,7 +131,7 @@ class Applier:
         recorded = dict(known.objects)
         supporting = [each for each in manifests if each["kind"] not in _WORKLOADS]
         workloads = [each for each in manifests if each["kind"] in _WORKLOADS]
-        results: list[Object | Obstacle | BaseException] = []
+        results: list[Object | ApplyProblem | BaseException] = []
         for phase in (supporting, workloads):
             results += await asyncio.gather(
                 *(self._apply_one(instance, each, recorded, looked) for each in phase), return_exceptions=True
@@ -143,18 +143,18 @@ class Applier:
         for result in results:
             if isinstance(result, dict):
                 uids[object_key(result)] = result["metadata"]["uid"]
-        problems = [result for result in results if isinstance(result, Obstacle)]
+        problems = [result for result in results if isinstance(result, ApplyProblem)]
         if problems:
             there = references({**dict.fromkeys(wanted), **uids})
-            return Applied(_refused(problems), there, complete=False, took=(began, time.time_ns()))
+            return ApplyResult(_refused(problems), there, complete=False, took=(began, time.time_ns()))
         # What has the instance as controller is its own, recorded or not.
         controlled = self._controlled.get(instance.metadata.uid, {})
         for key in (recorded.keys() | set(controlled.values())) - wanted:
             await self._prune(instance, key)
             uids.pop(key, None)
         matching = "1 object matches" if len(wanted) == 1 else f"{len(wanted)} objects match"
-        done = Aspect("Applied", True, "Applied", f"{matching} the template")
-        return Applied(done, references(uids), complete=True, took=(began, time.time_ns()))
+        done = ConditionState("Applied", True, "Applied", f"{matching} the template")
+        return ApplyResult(done, references(uids), complete=True, took=(began, time.time_ns()))
 
     async def _apply_one(
         self,
@@ -162,12 +162,12 @@ class Applier:
         manifest: Manifest,
         recorded: Mapping[ObjectKey, str | None],
         looked: Mapping[ObjectKey, Object | None],
-    ) -> Object | Obstacle:
+    ) -> Object | ApplyProblem:
         key = object_key(manifest)
         live = self.live(instance.namespace, key) or looked.get(key)
         body = owned(manifest, instance)
         raw = await apply_owned(self._client, await self.resource(key), body, instance, live, recorded.get(key))
-        if isinstance(raw, Obstacle):
+        if isinstance(raw, ApplyProblem):
             return raw
         uid = raw["metadata"]["uid"]
         self._fields[uid] = our_fields(raw)
@@ -204,7 +204,7 @@ async def apply_owned(
     owner: Kind,
     live: Object | None,
     recorded: str | None = None,
-) -> Object | Obstacle:
+) -> Object | ApplyProblem:
     """Apply an object with its owner as controller, unless it is somebody else's; the object, or what prevents it.
 
     `live`: the object as it is, None where there is none; its uid is a precondition. `recorded`: its uid, if the
@@ -220,16 +220,16 @@ async def apply_owned(
         return await client.apply(resource, manifest)
     except ApiError as error:
         if error.code == 409:  # deleted or replaced since the manager read it
-            return Obstacle("Waiting", f"{what} was deleted or replaced in the meantime; reading it again")
+            return ApplyProblem("Waiting", f"{what} was deleted or replaced in the meantime; reading it again")
         if not error.permanent or error.terminating:
             raise
         reason = reason_of(error.code, error.message)
-        return Obstacle(reason, with_remedy(reason, f"{what}: {_readable(error.message)}"))
+        return ApplyProblem(reason, with_remedy(reason, f"{what}: {_readable(error.message)}"))
 
 
-def _refused(problems: Sequence[Obstacle]) -> Aspect:
+def _refused(problems: Sequence[ApplyProblem]) -> ConditionState:
     worst = min(problems, key=lambda each: _WORST_FIRST.index(each.reason))
-    return Aspect("Applied", False, worst.reason, "; ".join(each.message for each in problems))
+    return ConditionState("Applied", False, worst.reason, "; ".join(each.message for each in problems))
 
 
 def _readable(message: str) -> str:

@@ -18,11 +18,11 @@ from dataclasses import dataclass, field
 
 from application_manager.cache.cluster_cache import DETECTOR, ClusterCache
 from application_manager.cache.detector_index import DetectorIndex
-from application_manager.core.conditions import Aspect
+from application_manager.core.conditions import ConditionState
 from application_manager.core.findings.injections import injection
 from application_manager.core.findings.rulefindings import detector_findings
 from application_manager.core.objects.detectors import KINDS, Manifest, detector_objects
-from application_manager.core.objects.ownership import Obstacle, controller_uid, our_fields
+from application_manager.core.objects.ownership import ApplyProblem, controller_uid, our_fields
 from application_manager.core.objects.poddefaults import PodDefaults
 from application_manager.core.objects.policy import Name
 from application_manager.core.objects.sidecars import has_sidecar
@@ -76,19 +76,19 @@ class DetectorWork:
             return  # what is there stays, until the Detector can be read again or is gone
         detector = entry.model
         if detector.spec.mode is None:
-            aspect = None
+            state = None
             await self._remove(name, entry.uid, self.index.owned(entry.uid))
         else:
-            aspect = await self._make(name, detector)
-        if self.index.running.get(name) == aspect:
+            state = await self._make(name, detector)
+        if self.index.running.get(name) == state:
             return
-        if aspect is None:
+        if state is None:
             del self.index.running[name]
         else:
-            self.index.running[name] = aspect
+            self.index.running[name] = state
         self.judge(name)
 
-    async def _make(self, name: Name, detector: Detector) -> Aspect:
+    async def _make(self, name: Name, detector: Detector) -> ConditionState:
         if self.index.defaults is None:
             return NOT_RUN
         if detector.spec.mode is DetectorMode.SIDECAR:
@@ -100,7 +100,7 @@ class DetectorWork:
             return problem
         return running(self.index.owned(detector.metadata.uid).get("Deployment"), self.index.troubles(name))
 
-    async def _make_rights(self, name: Name, detector: Detector, defaults: PodDefaults) -> Aspect:
+    async def _make_rights(self, name: Name, detector: Detector, defaults: PodDefaults) -> ConditionState:
         """Give the accounts of others' pods what the detector needs in them; by the webhook it comes into them.
 
         Also where the Detector is not accepted: an account that it names no more has no rights any more.
@@ -115,7 +115,7 @@ class DetectorWork:
             return NOT_ACCEPTED
         return carried(detector, requesting)
 
-    async def _apply(self, name: Name, detector: Detector, manifests: Iterable[Manifest]) -> Aspect | None:
+    async def _apply(self, name: Name, detector: Detector, manifests: Iterable[Manifest]) -> ConditionState | None:
         """Apply the objects, up to the first that something prevents; what that is, if anything."""
         for manifest in manifests:
             problem = await self._apply_one(name, detector, manifest)
@@ -123,7 +123,7 @@ class DetectorWork:
                 return problem
         return None
 
-    async def _apply_one(self, name: Name, detector: Detector, manifest: Manifest) -> Aspect | None:
+    async def _apply_one(self, name: Name, detector: Detector, manifest: Manifest) -> ConditionState | None:
         kind, called = manifest["kind"], manifest["metadata"]["name"]
         known = self.index.owned(detector.metadata.uid)
         live = known.get(kind) or await self.client.get(_RESOURCES[kind], name[0], called)
@@ -138,11 +138,11 @@ class DetectorWork:
         except ApiError as error:
             if not error.terminating:
                 raise
-            return Aspect(RUNNING, False, "Waiting", "the namespace is being deleted")
-        if isinstance(raw, Obstacle):
+            return ConditionState(RUNNING, False, "Waiting", "the namespace is being deleted")
+        if isinstance(raw, ApplyProblem):
             if raw.reason == "Waiting":
                 known.pop(kind, None)  # to be read again
-            return Aspect(RUNNING, False, raw.reason, raw.message)
+            return ConditionState(RUNNING, False, raw.reason, raw.message)
         if live is None:
             log.info("detector %s/%s: created %s %s", *name, kind, called)
         known[kind] = raw

@@ -16,18 +16,18 @@ from dataclasses import dataclass, field, replace
 from application_manager.cache.cluster_cache import INSTANCES, TASKS, ClusterCache, WorkRecord
 from application_manager.core.claims.claims import TemplateState
 from application_manager.core.claims.merging import TOO_LARGE
-from application_manager.core.conditions import Aspect, find
+from application_manager.core.conditions import ConditionState, find
 from application_manager.core.demand import drafting
 from application_manager.core.demand.decisions import Decision
 from application_manager.core.health.refusals import reason_of, with_remedy
 from application_manager.core.objects import trimming
 from application_manager.core.objects.configuration import config_map_key
-from application_manager.core.objects.ownership import Applied, Known, ObjectKey, object_key, references
+from application_manager.core.objects.ownership import ApplyResult, LastApplied, ObjectKey, object_key, references
 from application_manager.core.objects.policy import Name
 from application_manager.core.objects.rendering import Rendering
 from application_manager.work.applying import Applier
 from application_manager.work.recorder import EventReason, Recorder
-from application_manager.work.suspending import Suspending
+from application_manager.work.scaling import WorkloadScaler
 from wayside.api import ApplicationInstance
 from wayside.api.documents import parse_object
 from wayside.kubernetes.client import Client
@@ -59,19 +59,19 @@ class _Start:
         """The record, unless it is of a namesake."""
         return self.record if self.record is not None and self.record.uid == instance.metadata.uid else None
 
-    def known(self, instance: ApplicationInstance) -> Known:
+    def known(self, instance: ApplicationInstance) -> LastApplied:
         """What was applied until now: the record where there is one, since it is newer than the status."""
         if (record := self.record_of(instance)) is not None:
-            return Known.read(record.digest, record.applied.objects)
+            return LastApplied.read(record.digest, record.applied.objects)
         status = instance.status
-        return Known.read(status.spec_hash, status.objects) if status else Known()
+        return LastApplied.read(status.spec_hash, status.objects) if status else LastApplied()
 
-    def was_applied(self, instance: ApplicationInstance) -> Aspect | None:
+    def was_applied(self, instance: ApplicationInstance) -> ConditionState | None:
         """The condition Applied, where it is True."""
         if (record := self.record_of(instance)) is not None:
-            return record.applied.aspect if record.applied.aspect.holds else None
+            return record.applied.state if record.applied.state.holds else None
         kept = find(instance.status.conditions, "Applied") if instance.status else None
-        return Aspect("Applied", True, kept.reason, kept.message) if kept and kept.status == "True" else None
+        return ConditionState("Applied", True, kept.reason, kept.message) if kept and kept.status == "True" else None
 
 
 class Attempts:
@@ -116,14 +116,14 @@ class InstanceWork:
     client: Client
     applier: Applier
     recorder: Recorder
-    suspending: Suspending
+    suspending: WorkloadScaler
     again: Callable[[Name, float], None]
     enqueue: Callable[[Name], None]
     done: Callable[[Name], None]
     absent: Callable[[Name, Decision | None], None]
     observe: Callable[[Object], None]
     configured: Callable[[Name], None]
-    objects: Callable[[ApplicationInstance, TemplateState], Rendering | Aspect | None]
+    objects: Callable[[ApplicationInstance, TemplateState], Rendering | ConditionState | None]
     attempts: Attempts = field(default_factory=Attempts)
     not_made: Callable[[Name, Decision, str], None] = lambda *_: None
 
@@ -193,7 +193,7 @@ class InstanceWork:
             self.cache.places.being_made.discard(name)
 
     async def _apply_instance(
-        self, start: _Start, manifest: Object, rendering: Rendering | Aspect
+        self, start: _Start, manifest: Object, rendering: Rendering | ConditionState
     ) -> tuple[Object, dict[ObjectKey, Object | None]]:
         """Apply the instance itself, and look for its objects where it is new; what is to be looked for is known."""
         to_look = rendering.manifests if start.existing is None and isinstance(rendering, Rendering) else ()
@@ -214,21 +214,21 @@ class InstanceWork:
         self,
         start: _Start,
         instance: ApplicationInstance,
-        rendering: Rendering | Aspect,
+        rendering: Rendering | ConditionState,
         looked: Mapping[ObjectKey, Object | None],
     ) -> None:
         name, known, was_applied = start.name, start.known(instance), start.was_applied(instance)
         if not isinstance(rendering, Rendering):
             if rendering.reason == drafting.CHART_PENDING and was_applied is not None:
                 return  # what runs stays as it is, and nothing changes until the chart is rendered, or has failed
-            self._note(start, instance, Applied(rendering, references(known.objects), complete=False), known.digest)
+            self._note(start, instance, ApplyResult(rendering, references(known.objects), complete=False), known.digest)
             return
         await self.suspending.settle(instance, rendering)
         trying = (instance.metadata.uid, rendering.digest)
         until = self.attempts.waits_until(name, trying, time.time())
         pending = self.applier.pending(instance, rendering, known)
         if not pending and was_applied is not None:
-            self._note(start, instance, Applied(was_applied, references(known.objects), True), known.digest)
+            self._note(start, instance, ApplyResult(was_applied, references(known.objects), True), known.digest)
             return
         if until is not None and start.record is not None:
             self.again(name, until)
@@ -243,15 +243,17 @@ class InstanceWork:
         except ApiError as error:
             if not error.terminating:
                 message = f"the API server failed; retrying with backoff: {error.message}"
-                retrying = Aspect("Applied", False, "Retrying", message)
-                self._note(start, instance, Applied(retrying, references(known.objects), complete=False), known.digest)
+                retrying = ConditionState("Applied", False, "Retrying", message)
+                self._note(
+                    start, instance, ApplyResult(retrying, references(known.objects), complete=False), known.digest
+                )
             raise
         self._note(start, instance, applied, rendering.digest if applied.complete else known.digest)
         if any(object_key(each) == config_map_key(name[1]) for each in pending):
             self.configured(name)
         if applied.complete:
             self.attempts.forget(name)
-        elif applied.aspect.reason == "Waiting":
+        elif applied.state.reason == "Waiting":
             self.again(name, time.time() + _LOOK_AGAIN)
         else:
             self.again(name, self.attempts.refused(name, trying, time.time()))
@@ -268,14 +270,14 @@ class InstanceWork:
         """Note that the instance stays as it is, by a person's wish."""
         known = start.known(instance)
         message = "unchanged since the instance was paused"
-        aspect = (
-            Aspect("Applied", True, "Applied", message)
+        state = (
+            ConditionState("Applied", True, "Applied", message)
             if start.was_applied(instance) is not None
-            else Aspect("Applied", False, "Paused", "the instance was paused before all objects were applied")
+            else ConditionState("Applied", False, "Paused", "the instance was paused before all objects were applied")
         )
-        self._note(start, instance, Applied(aspect, references(known.objects), complete=False), known.digest)
+        self._note(start, instance, ApplyResult(state, references(known.objects), complete=False), known.digest)
 
-    async def _announce(self, instance: ApplicationInstance, known: Known, rendering: Rendering) -> None:
+    async def _announce(self, instance: ApplicationInstance, known: LastApplied, rendering: Rendering) -> None:
         """Write down what will belong to the instance, before any of it is applied.
 
         An instance that was just created does without: whatever has its label, and it as controller, is its own.
@@ -285,10 +287,10 @@ class InstanceWork:
         namespace, name, uid = instance.namespace, instance.name, instance.metadata.uid
         self.observe(await self.client.patch_status(INSTANCES, namespace, name, uid, status))
 
-    def _note(self, start: _Start, instance: ApplicationInstance, applied: Applied, digest: str | None) -> None:
+    def _note(self, start: _Start, instance: ApplicationInstance, applied: ApplyResult, digest: str | None) -> None:
         too_large = start.decision.too_large
-        if too_large and applied.aspect.holds:  # what it has is applied, and not what is demanded
-            applied = replace(applied, aspect=Aspect("Applied", False, TOO_LARGE, too_large))
+        if too_large and applied.state.holds:  # what it has is applied, and not what is demanded
+            applied = replace(applied, state=ConditionState("Applied", False, TOO_LARGE, too_large))
         before = start.record_of(instance)
         since = before.since if before is not None else time.time()
         self.cache.records[start.name] = WorkRecord(instance.metadata.uid, start.decision, applied, digest, since)

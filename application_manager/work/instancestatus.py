@@ -11,9 +11,9 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from application_manager.cache.cluster_cache import INSTANCES, ClusterCache, Served, WorkRecord
-from application_manager.cluster.looks import FailedPodsLook, NodeLook
-from application_manager.core.conditions import Aspect
+from application_manager.cache.cluster_cache import INSTANCES, ClusterCache, LastDecision, WorkRecord
+from application_manager.cluster.polls import FailedPodsPoll, NodePoll
+from application_manager.core.conditions import ConditionState
 from application_manager.core.demand.decisions import Decision
 from application_manager.core.demand.fallback import READY_TIMEOUT
 from application_manager.core.demand.lingering import PAUSE_ANNOTATION
@@ -21,9 +21,9 @@ from application_manager.core.health.placement import is_placed, misplaced
 from application_manager.core.health.pods import Trouble, summary
 from application_manager.core.health.readiness import is_unseen, not_ready
 from application_manager.core.health.refusals import lacks_pods, refused_by_events, refused_pods
-from application_manager.core.objects.ownership import Applied, ObjectKey, reference_key
+from application_manager.core.objects.ownership import ApplyResult, ObjectKey, reference_key
 from application_manager.core.objects.policy import Name
-from application_manager.core.statuses.status import Service, instance_status, suspension_aspect
+from application_manager.core.statuses.status import InstanceProgress, instance_status, suspended_condition
 from application_manager.work.applying import Applier
 from application_manager.work.recorder import EventReason
 from application_manager.work.statuses import StatusWriter
@@ -46,8 +46,8 @@ class InstanceStatusWork:
     statuses: StatusWriter
     applier: Applier
     task_changed: Callable[[Name], None]
-    nodes: NodeLook
-    failed_pods: FailedPodsLook
+    nodes: NodePoll
+    failed_pods: FailedPodsPoll
     again: Callable[[Name, float], None]
 
     async def reconcile(self, name: Name) -> None:
@@ -65,10 +65,10 @@ class InstanceStatusWork:
         live = self._live(instance, applied)
         until = _settles(instance, record, live.values())
         troubles = self._troubles(name, live, looked_up)
-        suspended = suspension_aspect(instance, record.decision, live.values())
-        ready = _overdue(self._ready(instance, applied.aspect, live, troubles), record.decision)
+        suspended = suspended_condition(instance, record.decision, live.values())
+        ready = _overdue(self._ready(instance, applied.state, live, troubles), record.decision)
         new = instance_status(
-            instance, record.decision, applied.aspect, ready, applied.objects, record.digest, now, suspended
+            instance, record.decision, applied.state, ready, applied.objects, record.digest, now, suspended
         )
         if until > now and instance.status != new:
             self.again(name, until)
@@ -78,19 +78,19 @@ class InstanceStatusWork:
             note = f"no demand is left; the instance will be released at {new.release_time} unless a demand arrives"
             self.statuses.recorder.event(instance, EventReason.LINGERING, note, now)
         # How many pods are ready stays with the instance: it changes often, and the tasks may be many.
-        why_not = "" if applied.aspect.holds else applied.aspect.message
+        why_not = "" if applied.state.holds else applied.state.message
         reason = ""
-        if applied.aspect.holds and suspended is not None and instance.spec.suspended:
+        if applied.state.holds and suspended is not None and instance.spec.suspended:
             why_not, reason = suspended.message, ready.reason
-        elif applied.aspect.holds and not ready.holds and troubles:
+        elif applied.state.holds and not ready.holds and troubles:
             why_not, reason = _text(troubles), ready.reason
         if record.decision.overdue and not ready.holds and not instance.spec.suspended:
             late = f"instance {name[1]} was not ready for {record.decision.overdue}"
             why_not, reason = ": ".join(filter(None, (late, why_not))), reason or READY_TIMEOUT
-        if record.decision.withheld and applied.aspect.holds:
+        if record.decision.withheld and applied.state.holds:
             why_not = f"instance {name[1]} is paused (annotation {PAUSE_ANNOTATION}): the task's values are not applied"
-        serves = applied.aspect.holds and not record.decision.withheld
-        service = Service(
+        serves = applied.state.holds and not record.decision.withheld
+        service = InstanceProgress(
             name[1],
             serves,
             serves and ready.holds,
@@ -103,9 +103,9 @@ class InstanceStatusWork:
 
     def report_not_made(self, name: Name, decision: Decision, problem: str) -> None:
         """Let the tasks know why the instance is not there that they demand."""
-        self.report(name, decision, Service(name[1], applied=False, ready=False, problem=problem))
+        self.report(name, decision, InstanceProgress(name[1], applied=False, ready=False, problem=problem))
 
-    def report(self, name: Name, decision: Decision | None, service: Service | None) -> None:
+    def report(self, name: Name, decision: Decision | None, service: InstanceProgress | None) -> None:
         """Let the tasks know whose verdict or service changed; the service is None where there is no instance."""
         old = self.cache.served.pop(name, None)
         verdicts = decision.verdicts if decision is not None else {}
@@ -114,7 +114,7 @@ class InstanceStatusWork:
             self.task_changed((name[0], task))  # one that means all instances may have others yet
         if decision is None:
             return
-        new = Served(decision, service or Service(name[1], applied=False, ready=False))
+        new = LastDecision(decision, service or InstanceProgress(name[1], applied=False, ready=False))
         self.cache.served[name] = new
         all_changed = old is None or (old.service, old.decision.fallback) != (new.service, decision.fallback)
         for task, verdict in verdicts.items():
@@ -128,7 +128,7 @@ class InstanceStatusWork:
         refused = [found for each in objects.values() if each is not None and (found := refused_pods(each)) is not None]
         return summary([*self.cache.pods.troubles(name), *refused, *looked_up])
 
-    async def _looked_up(self, instance: ApplicationInstance, applied: Applied) -> list[Trouble]:
+    async def _looked_up(self, instance: ApplicationInstance, applied: ApplyResult) -> list[Trouble]:
         """The troubles of what is not ready that no watch shows: no node is as required, pods are refused."""
         if instance.spec.suspended:
             return []
@@ -153,7 +153,7 @@ class InstanceStatusWork:
         ]
         return [each for each in troubles if each is not None]
 
-    def _live(self, instance: ApplicationInstance, applied: Applied) -> dict[ObjectKey, Object | None]:
+    def _live(self, instance: ApplicationInstance, applied: ApplyResult) -> dict[ObjectKey, Object | None]:
         """The instance's objects, as watched."""
         keys = map(reference_key, applied.objects)
         return {key: self.applier.live(instance.namespace, key) for key in keys}
@@ -161,27 +161,27 @@ class InstanceStatusWork:
     def _ready(
         self,
         instance: ApplicationInstance,
-        applied: Aspect,
+        applied: ConditionState,
         objects: Mapping[ObjectKey, Object | None],
         troubles: Sequence[Trouble],
-    ) -> Aspect:
+    ) -> ConditionState:
         missing = []
         for (_, kind, name), live in objects.items():
             problem = "does not exist" if live is None else not_ready(live)
             if problem is not None:
                 missing.append(f"{kind} {name} {problem}")
         if not objects:
-            return Aspect("Ready", False, "NotApplied", "nothing is applied yet")
+            return ConditionState("Ready", False, "NotApplied", "nothing is applied yet")
         if not applied.holds:  # the previous version may run, but it is not the wanted one
-            return Aspect("Ready", False, applied.reason, f"not applied: {applied.message}")
+            return ConditionState("Ready", False, applied.reason, f"not applied: {applied.message}")
         if instance.spec.suspended:
-            return Aspect("Ready", False, "Suspended", "the instance is suspended")
+            return ConditionState("Ready", False, "Suspended", "the instance is suspended")
         if missing:
             reason = troubles[0].reason.value if troubles else "NotReady"
             refused = [found for each in objects.values() if each is not None and (found := refused_pods(each))]
             others = [each for each in troubles if each not in refused]  # which the message of the workload has already
-            return Aspect("Ready", False, reason, ": ".join(filter(None, ("; ".join(missing), _text(others)))))
-        return Aspect("Ready", True, "Ready", "all workloads are ready")
+            return ConditionState("Ready", False, reason, ": ".join(filter(None, ("; ".join(missing), _text(others)))))
+        return ConditionState("Ready", True, "Ready", "all workloads are ready")
 
 
 def _settles(instance: ApplicationInstance, record: WorkRecord, live: Iterable[Object | None]) -> float:
@@ -190,17 +190,17 @@ def _settles(instance: ApplicationInstance, record: WorkRecord, live: Iterable[O
     Their controllers look at new objects within a moment; without the wait, two statuses follow each other.
     """
     known = instance.status is not None and instance.status.spec_hash is not None
-    if known or not record.applied.aspect.holds or not any(each is not None and is_unseen(each) for each in live):
+    if known or not record.applied.state.holds or not any(each is not None and is_unseen(each) for each in live):
         return 0.0
     return record.since + _SETTLING
 
 
-def _overdue(ready: Aspect, decision: Decision) -> Aspect:
+def _overdue(ready: ConditionState, decision: Decision) -> ConditionState:
     """The condition Ready of what is beyond its readyTimeout: the reason is that, unless there is a better one."""
     if ready.holds or not decision.overdue or ready.reason == "Suspended":
         return ready
     reason = READY_TIMEOUT if ready.reason in ("NotReady", "NotApplied") else ready.reason
-    return Aspect("Ready", False, reason, f"not ready for {decision.overdue}: {ready.message}")
+    return ConditionState("Ready", False, reason, f"not ready for {decision.overdue}: {ready.message}")
 
 
 def _text(troubles: Sequence[Trouble]) -> str:

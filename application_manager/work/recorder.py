@@ -28,7 +28,7 @@ from application_manager.measures import Measures
 from wayside.api.base import Condition, Kind
 from wayside.kubernetes.client import Client
 from wayside.kubernetes.errors import ApiError, Unreachable
-from wayside.kubernetes.pacing import Turns
+from wayside.kubernetes.pacing import FairQueue
 from wayside.kubernetes.resources import EVENTS
 from wayside.times import format_seconds
 
@@ -180,8 +180,8 @@ class Recorder:
     def __init__(self, client: Client, measures: Measures | None = None) -> None:
         self._client = client
         self._measures = measures or Measures()
-        self._allowance = Allowance()
-        self._waiting: Turns[_Event] = Turns()
+        self._allowance = TokenBuckets()
+        self._waiting: FairQueue[_Event] = FairQueue()
         self._wake = asyncio.Event()
         self._ending = False
         self._instance = f"{socket.gethostname()}-{os.getpid()}"[:128]
@@ -331,7 +331,7 @@ def _microseconds(seconds: float) -> str:
     return format_seconds(seconds).replace("Z", "000Z")
 
 
-class Allowance:
+class TokenBuckets:
     """Tokens for each object: `BURST` at first, one more each `REFILL` seconds."""
 
     def __init__(self) -> None:

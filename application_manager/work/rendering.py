@@ -14,10 +14,10 @@ from typing import TypeVar
 
 from application_manager.cache.cluster_cache import ClusterCache
 from application_manager.core.claims.claims import TemplateState
-from application_manager.core.conditions import Aspect
+from application_manager.core.conditions import ConditionState
 from application_manager.core.demand import drafting
 from application_manager.core.objects.charts import ChartOutcome, ChartRequest, Charts
-from application_manager.core.objects.ownership import Obstacle
+from application_manager.core.objects.ownership import ApplyProblem
 from application_manager.core.objects.policy import Name
 from application_manager.core.objects.rendering import Rendering
 from application_manager.workers.answers import AnswerCache, Exceeded
@@ -52,7 +52,7 @@ class Renderings:
         self._pickled: _OfTemplates[bytes] = OrderedDict()
         self._plain: _OfTemplates[bool] = OrderedDict()
 
-    def objects(self, wanted: ApplicationInstance, template: TemplateState) -> Rendering | Aspect | None:
+    def objects(self, wanted: ApplicationInstance, template: TemplateState) -> Rendering | ConditionState | None:
         """The instance's objects, or why it has none, as the condition Applied gives it; None: it is enqueued later."""
         problem = drafting.without_template(wanted, template)
         if problem is not None or not isinstance(template, ApplicationTemplate):
@@ -62,7 +62,7 @@ class Renderings:
             outcome = self._charts(found)
             if outcome is None:
                 return drafting.chart_pending(template, found)
-            if isinstance(outcome, Obstacle):
+            if isinstance(outcome, ApplyProblem):
                 return drafting.problem(template, outcome.reason, outcome.message)
             found = self._answer("chart", wanted, template, outcome)
         name = (wanted.namespace, wanted.name)
@@ -70,7 +70,7 @@ class Renderings:
         match found:
             case Rendering():
                 return found
-            case Obstacle(reason, message):
+            case ApplyProblem(reason, message):
                 return drafting.problem(template, reason, message)
             case Exceeded(message):
                 return drafting.problem(template, drafting.EXPRESSION_LIMIT, f"rendering this instance {message}")
@@ -81,7 +81,7 @@ class Renderings:
         for kind in ("rendering", "chart"):
             self._answers.forget((kind, *name))
         for template in [each for each, instances in self._cache.exceeded.items() if name in instances]:
-            self._note(name, template, Obstacle("", ""))
+            self._note(name, template, ApplyProblem("", ""))
 
     def _answer(
         self, kind: str, wanted: ApplicationInstance, template: ApplicationTemplate, chart: ChartOutcome | None

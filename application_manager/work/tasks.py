@@ -8,13 +8,13 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from application_manager.cache.cluster_cache import TASKS, TEMPLATES, ClusterCache
-from application_manager.core.claims.claims import Claim, Refused
-from application_manager.core.claims.operations import Standing, Verdict
+from application_manager.core.claims.claims import Claim, RefusalReason
+from application_manager.core.claims.operations import Verdict, VerdictKind
 from application_manager.core.conditions import changed
 from application_manager.core.demand.demand import finished, verdict_of
 from application_manager.core.objects import trimming
 from application_manager.core.objects.policy import Name
-from application_manager.core.statuses.status import Service, finished_since, task_status, together
+from application_manager.core.statuses.status import InstanceProgress, finished_since, task_status, together
 from application_manager.measures import Measures
 from application_manager.observability.tracing import TaskTraces
 from application_manager.work.statuses import StatusWriter
@@ -27,7 +27,7 @@ from wayside.kubernetes.resources import Object
 from wayside.times import parse_seconds
 
 _SHED = Verdict(
-    Standing.WAITING,
+    VerdictKind.WAITING,
     "ManagerOverloaded",
     "the application manager is near its memory limit and accepts no new tasks: this task is accepted once memory is "
     "free; end tasks, or raise the limit",
@@ -66,7 +66,9 @@ class TaskWork:
         if task is None or known is None or task.metadata.deletion_timestamp is not None:
             return
         verdict, service = known
-        if verdict.reason == Refused.TEMPLATE_NOT_FOUND and await self._has_template(name[0], task.spec.template_name):
+        if verdict.reason == RefusalReason.TEMPLATE_NOT_FOUND and await self._has_template(
+            name[0], task.spec.template_name
+        ):
             return  # the watch of templates was behind that of tasks; the template's event enqueues the task again
         await self._write(name, task, verdict, service)
 
@@ -80,7 +82,9 @@ class TaskWork:
         if isinstance(task, ApplicationTask):
             await self._write(name, task, finished(task) or _SHED, None)
 
-    async def _write(self, name: Name, task: ApplicationTask, verdict: Verdict, service: Service | None) -> None:
+    async def _write(
+        self, name: Name, task: ApplicationTask, verdict: Verdict, service: InstanceProgress | None
+    ) -> None:
         now = time.time()
         old = task.status or ApplicationTaskStatus()
         new = task_status(task, verdict, service, now)
@@ -90,7 +94,7 @@ class TaskWork:
             self._measure(task, old, new, now)
             if self.traces is not None:
                 self.traces.status_written(task, old, new)
-            if verdict.standing is Standing.FINISHED:
+            if verdict.kind is VerdictKind.FINISHED:
                 await self._expire(name)
         except ApiError as error:
             if not error.terminating:
@@ -117,7 +121,7 @@ class TaskWork:
             self.observe(found)
         return found is not None
 
-    def _verdict(self, name: Name) -> tuple[Verdict, Service | None] | None:
+    def _verdict(self, name: Name) -> tuple[Verdict, InstanceProgress | None] | None:
         """What became of the task; None where its instance was not looked at yet."""
         verdict = self.cache.claims.verdict(name)
         if verdict is not None:

@@ -10,8 +10,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
-from application_manager.core.claims.claims import Claim, Refusal, Refused, TemplateState, claim
-from application_manager.core.claims.operations import Standing, Verdict
+from application_manager.core.claims.claims import Claim, Refusal, RefusalReason, TemplateState, claim
+from application_manager.core.claims.operations import Verdict, VerdictKind
 from application_manager.core.demand.demand import claim_or_verdict, finished, refused
 from application_manager.core.objects.policy import Name
 from application_manager.core.objects.trimming import without_objects
@@ -20,7 +20,7 @@ from application_manager.workers.jobs import claims_are_plain
 from wayside.api import ApplicationTask, ApplicationTemplate
 
 
-class Claiming:
+class ClaimEvaluator:
     """Works out claims."""
 
     def __init__(self, answers: AnswerCache, done: Callable[[Name], None]) -> None:
@@ -51,5 +51,5 @@ class Claiming:
                 return refused(found)
             case Exceeded(message):
                 what = f"spec.parameters: checking them against template {template.name}"
-                return Verdict(Standing.REFUSED, Refused.EXPRESSION_LIMIT, f"{what} {message}")
+                return Verdict(VerdictKind.REFUSED, RefusalReason.EXPRESSION_LIMIT, f"{what} {message}")
         return None

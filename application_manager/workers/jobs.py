@@ -19,7 +19,7 @@ from typing import Any
 from application_manager.core.findings.findings import Findings
 from application_manager.core.findings.rulefindings import deploy_remarks, detector_findings, newly_wrong, rule_findings
 from application_manager.core.objects.charts import ChartOutcome, ChartRequest
-from application_manager.core.objects.ownership import Obstacle
+from application_manager.core.objects.ownership import ApplyProblem
 from application_manager.core.objects.policy import Policy
 from application_manager.core.objects.rendering import ChartPending, Renderer, RenderError, Rendering
 from application_manager.core.statuses.rulestatus import rule_status
@@ -35,28 +35,28 @@ _VALUES = 16 * 1024  # characters of the values: with the above, of 4 MB at most
 
 def render_instance(
     template: bytes, policy: Policy, instance: ApplicationInstance, chart: ChartOutcome | None = None
-) -> Rendering | Obstacle | ChartRequest:
+) -> Rendering | ApplyProblem | ChartRequest:
     """An instance's objects, or why there are none, or the chart that is to be rendered first.
 
     `template` is pickled; `chart` is what became of the instance's chart, where that was requested.
     """
     compiled = _compiled(template, policy)
-    if isinstance(compiled, Obstacle):
+    if isinstance(compiled, ApplyProblem):
         return compiled
     try:
         return compiled.render(instance, lambda _: chart)
     except ChartPending as pending:
         return pending.request
     except RenderError as error:
-        return Obstacle(error.reason, str(error))
+        return ApplyProblem(error.reason, str(error))
 
 
 @lru_cache(maxsize=_COMPILED)
-def _compiled(template: bytes, policy: Policy) -> Renderer | Obstacle:
+def _compiled(template: bytes, policy: Policy) -> Renderer | ApplyProblem:
     try:
         return Renderer(pickle.loads(template), policy)  # noqa: S301  from the manager
     except RenderError as error:
-        return Obstacle(error.reason, str(error))
+        return ApplyProblem(error.reason, str(error))
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 
-from detector.assembly import RuleIndex, inlets, make_engine
+from detector.assembly import RuleIndex, make_engine, stream_readers
 from detector.engine.episodes.events import Event
 from detector.engine.samples.sample import Arrival
 from detector.engine.scoping.scopes import Evaluated
@@ -29,7 +29,7 @@ class Live:
 
     def __init__(self, detector: Detector, rules: Sequence[EventRule], start: int) -> None:
         """`start`: nanoseconds since the epoch. Raises RefusedError."""
-        entries = inlets(detector)
+        entries = stream_readers(detector)
         compiled, refused = RuleIndex().compile(rules, detector, entries.fields)
         if refused:
             raise RefusedError(str(refused[0]))

@@ -39,7 +39,7 @@ from benchmarks.task_to_deployment import (
 )
 from benchmarks.workloads import crowd, speeds
 from detector.status.model import read_status
-from detector.streams.answering import query_detectors
+from detector.streams.query_handler import query_detectors
 from tests.cluster.api import Api
 from tests.cluster.controlplane import ControlPlane
 from tests.cluster.crds import CRDS

@@ -150,7 +150,7 @@ _ATTEMPTS = 5
 
 
 @dataclass(frozen=True, slots=True)
-class Material:
+class LoadedCredentials:
     """PEM texts and a login, read together. None if absent."""
 
     ca: bytes | None = field(default=None, repr=False)
@@ -166,11 +166,11 @@ class Material:
         return None if self.certificate is None else expiry(self.certificate)
 
 
-def read_material(access: Access, at: str) -> Material:
-    """The current material of `access`, which is in the field `at`. Raises AccessError if it cannot be used."""
+def read_material(access: Access, at: str) -> LoadedCredentials:
+    """The current credentials of `access`, which is in the field `at`. Raises AccessError if it cannot be used."""
     files, credentials = tls_files(access, at), login(access, at)
     if files is None:
-        return Material(login=credentials)
+        return LoadedCredentials(login=credentials)
     for _ in range(_ATTEMPTS):
         before = _read(files)
         problem = _problem(files)
@@ -179,7 +179,7 @@ def read_material(access: Access, at: str) -> Material:
         if problem is not None:
             raise AccessError(f"{at}: {problem}")
         ca, certificate, key = before
-        return Material(ca, certificate, key, files.verify_name, credentials, tls=True)
+        return LoadedCredentials(ca, certificate, key, files.verify_name, credentials, tls=True)
     raise AccessError(f"{at}: {files.certificate or files.ca} keeps changing while it is read; reading it again later")
 
 

@@ -3,19 +3,19 @@
 For packages that provide actions: `Action`, and the types that it receives.
 """
 
-from detector.actions.base import Action, ActionError, ActionParameters, Messenger, Setting, Surroundings
+from detector.actions.base import Action, ActionContext, ActionError, ActionParameters, DetectorConfiguration, Messenger
 from detector.actions.episode import Completion, Episode, EpisodeSample, Outcome, OutcomeState
 
 __all__ = [
     "Action",
+    "ActionContext",
     "ActionError",
     "ActionParameters",
     "Completion",
+    "DetectorConfiguration",
     "Episode",
     "EpisodeSample",
     "Messenger",
     "Outcome",
     "OutcomeState",
-    "Setting",
-    "Surroundings",
 ]

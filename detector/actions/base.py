@@ -19,7 +19,7 @@ from detector.engine.samples.sample import Decoder
 from detector.streams.codecs.ros import RosTypes
 from wayside.api import Detector, EventRule
 from wayside.api.base import Model
-from wayside.api.wording import FieldPath
+from wayside.api.validation_errors import FieldPath
 
 P = TypeVar("P", bound=BaseModel)
 """The model of an action's parameters."""
@@ -49,7 +49,7 @@ class Messenger(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Surroundings:
+class DetectorConfiguration:
     """The current configuration of the detector. It may differ after a change of the Detector."""
 
     detector: Detector
@@ -60,14 +60,14 @@ class Surroundings:
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
+class ActionContext:
     """The context of an action. All of it is thread-safe."""
 
     rule: EventRule
     action: str
     """The action's name in the rule."""
     holder: str
-    surroundings: Callable[[], Surroundings]
+    configuration: Callable[[], DetectorConfiguration]
     messenger: Messenger
     report: Callable[[Episode, Outcome], None]
     """Report the progress of an episode: it is published, counted and shown by `detector status`.
@@ -102,9 +102,9 @@ class Action(ABC, Generic[P]):
         """
         return ()
 
-    def __init__(self, parameters: P, setting: Setting) -> None:
+    def __init__(self, parameters: P, context: ActionContext) -> None:
         self.parameters = parameters
-        self.setting = setting
+        self.context = context
 
     def started(self, episode: Episode) -> None:
         """An episode began, or was restored after a restart (`episode.resumed`)."""

@@ -14,11 +14,11 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from detector.actions.base import Action, Messenger, Setting, Surroundings
-from detector.actions.outcomes import Outcomes, Which
+from detector.actions.base import Action, ActionContext, DetectorConfiguration, Messenger
+from detector.actions.outcomes import ActionKey, Outcomes
 from detector.actions.registry import DEPLOY, prepare_action
 from detector.actions.worker import MAXIMUM_BYTES, Worker
-from detector.engine.consequences.consequences import Begun, Consequence, Run
+from detector.engine.consequences.consequences import ActionRun, Consequence, RunStarted
 from wayside.api import EventRule
 from wayside.api.actions import action as api
 
@@ -57,19 +57,19 @@ class ActionHost:
         self._holder = holder
         self._messenger = messenger
         self._maximum = maximum_bytes
-        self._surroundings: Surroundings | None = None
+        self._surroundings: DetectorConfiguration | None = None
         self._closing = threading.Event()
-        self._assignments: dict[Which, _Assignment] = {}
-        self._at_work: dict[Run, Worker] = {}
+        self._assignments: dict[ActionKey, _Assignment] = {}
+        self._at_work: dict[ActionRun, Worker] = {}
         self._leaving: list[Worker] = []
         """Workers whose action was changed or removed; each ends when it has completed its runs."""
         self.outcomes = Outcomes(holder, messenger.publish, now)
 
-    def follow(self, rules: Iterable[EventRule], surroundings: Surroundings) -> None:
+    def follow(self, rules: Iterable[EventRule], configuration: DetectorConfiguration) -> None:
         """Use these rules from now on. Unchanged actions continue; others finish their running episodes."""
-        self._surroundings = surroundings
+        self._surroundings = configuration
         wanted = {
-            Which(rule.name, action.name): (rule, action)
+            ActionKey(rule.name, action.name): (rule, action)
             for rule in rules
             for action in rule.spec.actions
             if action.field != DEPLOY
@@ -88,8 +88,8 @@ class ActionHost:
     def dispatch(self, consequences: Sequence[Consequence]) -> None:
         """Pass on what happened, in order."""
         for each in consequences:
-            if isinstance(each, Begun):
-                assignment = self._assignments.get(Which(each.run.rule, each.run.action))
+            if isinstance(each, RunStarted):
+                assignment = self._assignments.get(ActionKey(each.run.rule, each.run.action))
                 if assignment is None:
                     continue
                 self._at_work[each.run] = assignment.worker
@@ -126,12 +126,12 @@ class ActionHost:
         self._leaving = [worker for worker in self._leaving if not worker.ended]
 
     def _maker(self, rule: EventRule, action: api.ActionSpec) -> Callable[[], Action[Any]]:
-        which = Which(rule.name, action.name)
-        setting = Setting(
+        which = ActionKey(rule.name, action.name)
+        context = ActionContext(
             rule=rule,
             action=action.name,
             holder=self._holder,
-            surroundings=self._around,
+            configuration=self._around,
             messenger=self._messenger,
             report=partial(self.outcomes.report, which),
             lose=partial(self.outcomes.lose, which),
@@ -140,11 +140,11 @@ class ActionHost:
 
         def make() -> Action[Any]:
             offered, parameters = prepare_action(action)
-            return offered(parameters, setting)
+            return offered(parameters, context)
 
         return make
 
-    def _around(self) -> Surroundings:
+    def _around(self) -> DetectorConfiguration:
         if self._surroundings is None:
             raise RuntimeError("no EventRule has been applied yet")
         return self._surroundings

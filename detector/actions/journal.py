@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-from detector.actions.base import Setting
+from detector.actions.base import ActionContext
 from detector.actions.store import DurableStore, StoreError, action_store
 from wayside.names import encode
 
@@ -25,19 +25,19 @@ T = TypeVar("T")
 class Journal:
     """JSON documents by key. Not thread-safe."""
 
-    def __init__(self, setting: Setting, folder: str, unkept: str, version: str = "") -> None:
+    def __init__(self, context: ActionContext, folder: str, unkept: str, version: str = "") -> None:
         """Open it with the documents of earlier runs.
 
         Args:
-            setting: of the action.
+            context: of the action.
             folder: in that of `spec.state`.
             unkept: what is counted for a document that cannot be stored.
             version: only documents of earlier runs with the same one are taken over.
         """
-        self._setting, self._unkept = setting, unkept
+        self._setting, self._unkept = context, unkept
         self._store: DurableStore | None = None
-        detector = setting.surroundings().detector
-        whose = (detector.namespace, setting.holder, setting.rule.name, setting.action)
+        detector = context.configuration().detector
+        whose = (detector.namespace, context.holder, context.rule.name, context.action)
         name = "_".join(map(encode, (*whose, version) if version else whose))
         self.path = None if detector.spec.state is None else Path(detector.spec.state.path) / folder / name
         """The path of its files, without a suffix; None without a state volume."""
@@ -45,13 +45,13 @@ class Journal:
             return
 
         def lose(count: int, why: str) -> None:
-            setting.lose(_UNREAD, count, why)
+            context.lose(_UNREAD, count, why)
 
         try:
             self._store = action_store(self.path.parent, self.path.name, lose)
         except StoreError as error:
-            _log.error("action %s of EventRule %s keeps no journal: %s", setting.action, setting.rule.name, error)
-            setting.lose(unkept, 1, str(error))
+            _log.error("action %s of EventRule %s keeps no journal: %s", context.action, context.rule.name, error)
+            context.lose(unkept, 1, str(error))
 
     @property
     def keeps(self) -> bool:

@@ -23,7 +23,7 @@ _MESSAGE_LIMIT = 2000
 _FILES_LIMIT = 100
 
 
-class Which(NamedTuple):
+class ActionKey(NamedTuple):
     """An action of a rule."""
 
     rule: str
@@ -31,7 +31,7 @@ class Which(NamedTuple):
 
 
 @dataclass(slots=True)
-class ActionTally:
+class ActionCounts:
     """The counts of an action since the detector's start, or since its kind last changed."""
 
     kind: str
@@ -53,7 +53,7 @@ class ActionTally:
 class _Lost:
     """What an action lost."""
 
-    which: Which
+    which: ActionKey
     what: str
     count: int
     last: str
@@ -68,67 +68,67 @@ class Outcomes:
         self._publish = publish
         self._now = now
         self._lock = threading.Lock()
-        self._tallies: dict[Which, ActionTally] = {}
-        self._reported: dict[tuple[Which, str], Outcome | None] = {}
+        self._counts: dict[ActionKey, ActionCounts] = {}
+        self._reported: dict[tuple[ActionKey, str], Outcome | None] = {}
         """The runs that are neither done nor failed, with their last outcome."""
-        self._lost: Counter[tuple[Which, str]] = Counter()
-        self._reasons: dict[tuple[Which, str], str] = {}
-        self.on_outcome: Callable[[Which, str, Outcome], None] = lambda which, episode, outcome: None
+        self._lost: Counter[tuple[ActionKey, str]] = Counter()
+        self._reasons: dict[tuple[ActionKey, str], str] = {}
+        self.on_outcome: Callable[[ActionKey, str, Outcome], None] = lambda which, episode, outcome: None
         """Called with each new outcome and the id of the episode, on the thread that reports it."""
 
-    def know(self, which: Which, kind: str) -> None:
+    def know(self, which: ActionKey, kind: str) -> None:
         """Register the action, whether or not it ever runs."""
         with self._lock:
-            if which not in self._tallies or self._tallies[which].kind != kind:
-                self._tallies[which] = ActionTally(kind)
+            if which not in self._counts or self._counts[which].kind != kind:
+                self._counts[which] = ActionCounts(kind)
 
-    def begin(self, which: Which, episode: Episode) -> None:
+    def begin(self, which: ActionKey, episode: Episode) -> None:
         """The action starts with the episode."""
         with self._lock:
             if (which, episode.id) not in self._reported:
                 self._reported[which, episode.id] = None
-                self._tallies[which].running += 1
+                self._counts[which].running += 1
 
-    def report(self, which: Which, episode: Episode, outcome: Outcome) -> None:
-        """See `Setting.report`. Reports after DONE or FAILED and repeated reports are ignored."""
+    def report(self, which: ActionKey, episode: Episode, outcome: Outcome) -> None:
+        """See `ActionContext.report`. Reports after DONE or FAILED and repeated reports are ignored."""
         with self._lock:
             known = (which, episode.id)
             if known not in self._reported or self._reported[known] == outcome:
                 return
-            tally = self._tallies[which]
+            counts = self._counts[which]
             if outcome.state is OutcomeState.RUNNING:
                 self._reported[known] = outcome
-                tally.current[episode.id] = outcome.message
+                counts.current[episode.id] = outcome.message
             else:
                 del self._reported[known]
-                tally.current.pop(episode.id, None)
-                _count(tally, outcome)
+                counts.current.pop(episode.id, None)
+                _count(counts, outcome)
         self.on_outcome(which, episode.id, outcome)
         document = follow_up(self._holder, which, episode, outcome, self._now())
         key = f"wayside/actions/{self._holder}/{which.rule}/{episode.id}/{which.action}"
         self._publish(key, json.dumps(document, separators=(",", ":"), allow_nan=False).encode(), ENCODING)
 
-    def is_open(self, which: Which, episode: str) -> bool:
+    def is_open(self, which: ActionKey, episode: str) -> bool:
         """Whether the run is neither done nor failed."""
         with self._lock:
             return (which, episode) in self._reported
 
-    def is_silent(self, which: Which, episode: str) -> bool:
+    def is_silent(self, which: ActionKey, episode: str) -> bool:
         """Whether nothing was reported about the run yet."""
         with self._lock:
             return (which, episode) in self._reported and self._reported[which, episode] is None
 
-    def lose(self, which: Which, what: str, count: int, last: str) -> None:
-        """See `Setting.lose`."""
+    def lose(self, which: ActionKey, what: str, count: int, last: str) -> None:
+        """See `ActionContext.lose`."""
         with self._lock:
             self._lost[which, what] += count
             self._reasons[which, what] = last
 
-    def tallies(self) -> dict[Which, ActionTally]:
+    def counts_by_action(self) -> dict[ActionKey, ActionCounts]:
         """A copy of the counts of each action."""
         with self._lock:
             return {
-                which: replace(tally, current=dict(tally.current)) for which, tally in sorted(self._tallies.items())
+                which: replace(counts, current=dict(counts.current)) for which, counts in sorted(self._counts.items())
             }
 
     def lost(self) -> list[_Lost]:
@@ -140,7 +140,7 @@ class Outcomes:
             ]
 
 
-def follow_up(holder: str, which: Which, episode: Episode, outcome: Outcome, now: int) -> dict[str, Any]:
+def follow_up(holder: str, which: ActionKey, episode: Episode, outcome: Outcome, now: int) -> dict[str, Any]:
     """The CloudEvent of an outcome; `now` is nanoseconds since the epoch."""
     data: dict[str, Any] = {
         "rule": which.rule,
@@ -171,16 +171,16 @@ def _given(name: str, value: Any) -> Mapping[str, Any]:
     return {name: value} if value else {}
 
 
-def _count(tally: ActionTally, outcome: Outcome) -> None:
-    tally.running -= 1
-    tally.samples += outcome.samples
-    tally.bytes += outcome.bytes
-    tally.missing += outcome.missing
-    tally.files += len(outcome.files)
+def _count(counts: ActionCounts, outcome: Outcome) -> None:
+    counts.running -= 1
+    counts.samples += outcome.samples
+    counts.bytes += outcome.bytes
+    counts.missing += outcome.missing
+    counts.files += len(outcome.files)
     if outcome.files:
-        tally.last_file = outcome.files[-1]
+        counts.last_file = outcome.files[-1]
     if outcome.state is OutcomeState.DONE:
-        tally.done += 1
+        counts.done += 1
     else:
-        tally.failed += 1
-        tally.last_failure = outcome.message
+        counts.failed += 1
+        counts.last_failure = outcome.message

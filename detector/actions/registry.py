@@ -15,12 +15,12 @@ from typing import Any
 from pydantic import BaseModel
 
 from detector.actions.base import Action
-from detector.plugins.entrypoints import Offers, PluginError
+from detector.plugins.entrypoints import PluginClasses, PluginError
 from wayside.api import Detector, EventRule
 from wayside.api.actions import action as api
 from wayside.rules import RuleProblem
 
-OFFERS = Offers[Action[Any]](
+OFFERS = PluginClasses[Action[Any]](
     group="wayside.actions", noun="action", base=Action, model=BaseModel, guide="docs/actions.md"
 )
 

@@ -138,8 +138,8 @@ class DurableStore:
             self._path.touch(0o600)
         self._db = sqlite3.connect(self._path, timeout=0, isolation_level=None, check_same_thread=False)
         try:
-            for setting in _SETTINGS:
-                self._db.execute(f"PRAGMA {setting}")
+            for context in _SETTINGS:
+                self._db.execute(f"PRAGMA {context}")
             self._db.execute(_TABLE)
             query = "SELECT count(*), coalesce(sum(length(record)), 0) FROM records"
             self.count, self.bytes = self._db.execute(query).fetchone()

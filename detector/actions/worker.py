@@ -17,8 +17,15 @@ from msgspec.structs import astuple, replace
 
 from detector.actions.base import Action, ActionError
 from detector.actions.episode import Completion, Episode, Outcome, OutcomeState
-from detector.actions.outcomes import Outcomes, Which
-from detector.engine.consequences.consequences import Begun, Completed, Consequence, Over, Run, Sampled
+from detector.actions.outcomes import ActionKey, Outcomes
+from detector.engine.consequences.consequences import (
+    ActionRun,
+    Consequence,
+    EpisodeOver,
+    RunCompleted,
+    RunSamples,
+    RunStarted,
+)
 from detector.engine.samples.sample import SAMPLE_OVERHEAD
 
 _log = logging.getLogger(__name__)
@@ -40,7 +47,7 @@ class Worker:
 
     def __init__(
         self,
-        which: Which,
+        which: ActionKey,
         make: Make,
         outcomes: Outcomes,
         maximum_bytes: int = MAXIMUM_BYTES,
@@ -56,14 +63,14 @@ class Worker:
         self._inbox: deque[tuple[Consequence, int]] = deque()
         """Each with the bytes of its samples."""
         self._waiting = 0
-        self._missing: dict[Run, int] = {}
+        self._missing: dict[ActionRun, int] = {}
         self._changed = threading.Condition()
         self._closing = False
-        self._episodes: dict[Run, Episode] = {}
+        self._episodes: dict[ActionRun, Episode] = {}
         """The episodes of the runs that the action receives."""
         self._completed: list[Episode] = []
         """Completed episodes about which the action has not reported anything yet."""
-        self.open: set[Run] = set()
+        self.open: set[ActionRun] = set()
         """The runs that are not completed, from the producer's point of view."""
         self._thread = threading.Thread(target=self._work, name=f"action {which.rule}/{which.action}", daemon=True)
         self._thread.start()
@@ -76,18 +83,18 @@ class Worker:
     def enqueue(self, consequence: Consequence) -> None:
         """Queue what happened."""
         match consequence:
-            case Begun(run=run):
+            case RunStarted(run=run):
                 self.open.add(run)
-            case Completed(run=run):
+            case RunCompleted(run=run):
                 self.open.discard(run)
         size = 0
-        if isinstance(consequence, Sampled):
+        if isinstance(consequence, RunSamples):
             size = sum(len(sample.payload) + SAMPLE_OVERHEAD for sample in consequence.samples)
         with self._changed:
             if self._patient:
                 self._changed.wait_for(lambda: not self._waiting or self._waiting + size <= self._maximum)
             elif size and self._waiting + size > self._maximum:
-                count = len(consequence.samples) if isinstance(consequence, Sampled) else 0
+                count = len(consequence.samples) if isinstance(consequence, RunSamples) else 0
                 self._missing[consequence.run] = self._missing.get(consequence.run, 0) + count
                 self._outcomes.lose(self.which, "samples left out because the action is too slow", count, "")
                 return
@@ -148,7 +155,7 @@ class Worker:
 
     def _pass_on(self, action: Action[Any] | None, problem: str, consequence: Consequence) -> None:
         run = consequence.run
-        if isinstance(consequence, Begun):
+        if isinstance(consequence, RunStarted):
             episode = _episode(consequence)
             self._episodes[run] = episode
             self._outcomes.begin(self.which, episode)
@@ -162,7 +169,7 @@ class Worker:
             if not isinstance(error, ActionError):
                 _log.debug("action %s of EventRule %s", self.which.action, self.which.rule, exc_info=error)
             self._fail(run, _text(error))
-        if isinstance(consequence, Completed):
+        if isinstance(consequence, RunCompleted):
             completed = self._episodes.pop(run, None)
             self._completed = [*self._silent(), *(() if completed is None else (completed,))]
 
@@ -173,23 +180,23 @@ class Worker:
         run = consequence.run
         episode = self._episodes[run]
         match consequence:
-            case Begun():
+            case RunStarted():
                 action.started(episode)
-            case Sampled(samples=samples):
+            case RunSamples(samples=samples):
                 action.samples(episode, samples)
-            case Over(event=event):
+            case EpisodeOver(event=event):
                 reason = None if event.reason is None else event.reason.value
                 ended = replace(episode, end_time=event.end_time, reason=reason, ended=event.cloud_event())
                 if (again := event.rendered.get(run.action)) is not None:
                     ended = replace(ended, rendered={**ended.rendered, **again.values}, rendered_again=True)
                 self._episodes[run] = ended
                 action.ended(ended)
-            case Completed(cut=cut):
+            case RunCompleted(cut=cut):
                 with self._changed:
                     missing = self._missing.pop(run, 0)
                 action.completed(episode, Completion(cut, missing))
 
-    def _fail(self, run: Run, why: str) -> None:
+    def _fail(self, run: ActionRun, why: str) -> None:
         """The action failed with the run, which receives no further calls."""
         episode = self._episodes.pop(run)
         if self._outcomes.is_open(self.which, episode.id):
@@ -220,7 +227,7 @@ def _text(error: Exception) -> str:
     return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
 
 
-def _episode(begun: Begun) -> Episode:
+def _episode(begun: RunStarted) -> Episode:
     return Episode(
         *astuple(begun.event.episode),
         rendered=begun.rendered.values,

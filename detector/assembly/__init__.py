@@ -46,7 +46,7 @@ class DetectorError(InputError, ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Inlets:
+class StreamReaders:
     """The inputs of a Detector's streams: how to read their payloads and keys, and the fields of their messages."""
 
     decoders: Mapping[str, Decoder]
@@ -71,7 +71,7 @@ class RefusedRule:
         return f"EventRule {self.rule.name} is refused{kept}: {'; '.join(map(str, self.problems))}"
 
 
-def inlets(detector: Detector) -> Inlets:
+def stream_readers(detector: Detector) -> StreamReaders:
     """Decoders and key readers for the Detector's streams.
 
     Raises:
@@ -121,13 +121,13 @@ def inlets(detector: Detector) -> Inlets:
         client = clients[stream] or captures["client"]
         return (client, captures) if CLIENT_NAME.fullmatch(client) else None
 
-    return Inlets(decoders, read_key, fields, types, places)
+    return StreamReaders(decoders, read_key, fields, types, places)
 
 
 def detector_problems(detector: Detector) -> tuple[RuleProblem, ...]:
     """The problems that keep the Detector from running; reads the files that it names."""
     try:
-        inlets(detector)
+        stream_readers(detector)
     except DetectorError as error:
         return error.problems
     return ()
@@ -231,7 +231,7 @@ def _compiled(
 
 def make_engine(
     detector: Detector,
-    entries: Inlets,
+    entries: StreamReaders,
     *,
     holder: str,
     start: int,

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
-from detector.assembly import DetectorError, Inlets, inlets, offer_problems
+from detector.assembly import DetectorError, StreamReaders, offer_problems, stream_readers
 from detector.findings.checks import (
     INVALID_RULE,
     MISSING_DETECTOR,
@@ -38,7 +38,7 @@ def findings(documents: Sequence[Document]) -> CheckResult:
     """The findings about the Detectors, and about the rules with each Detector that selects them."""
     problems: list[Problem] = []
     warnings: list[Problem] = []
-    detectors: list[tuple[Document, Detector, Inlets]] = []
+    detectors: list[tuple[Document, Detector, StreamReaders]] = []
     for document in documents:
         if isinstance(document.object, Detector):
             try:
@@ -46,7 +46,7 @@ def findings(documents: Sequence[Document]) -> CheckResult:
                     document.problem(each.path, each.message, INVALID_DETECTOR.name)
                     for each in source_plugin_problems(document.object)
                 ]
-                entries = inlets(document.object)
+                entries = stream_readers(document.object)
                 detectors.append((document, document.object, entries))
                 warnings += _unignored(document, _without_stamps(document, document.object, entries))
             except DetectorError as error:
@@ -74,7 +74,7 @@ def findings(documents: Sequence[Document]) -> CheckResult:
     return CheckResult(list(dict.fromkeys(problems)), list(dict.fromkeys(warnings)))
 
 
-def _without_stamps(document: Document, detector: Detector, entries: Inlets) -> Iterator[Problem]:
+def _without_stamps(document: Document, detector: Detector, entries: StreamReaders) -> Iterator[Problem]:
     """With clock Data, the streams without stamps beside others that have them."""
     streams = [] if detector.spec.clock is Clock.WALL else list(enumerate(detector.spec.streams))
     without = [
@@ -117,7 +117,7 @@ def _by_name(documents: Iterable[Document]) -> dict[str, EventRule]:
 
 def _rule_problems(
     document: Document,
-    detectors: Sequence[tuple[Document, Detector, Inlets]],
+    detectors: Sequence[tuple[Document, Detector, StreamReaders]],
     wrong: Mapping[str, Mapping[str, Sequence[RuleProblem]]],
     others: Mapping[str, EventRule],
     warnings: list[Problem],

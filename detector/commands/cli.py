@@ -19,11 +19,11 @@ from detector.commands.mine_command import mine
 from detector.results.kinds import ResultKind, chosen
 from wayside.inputerror import InputError
 from wayside.process import commandline
-from wayside.process.beginning import importing
 from wayside.process.commandline import leave, refuse
+from wayside.process.startup import importing
 
 if TYPE_CHECKING:
-    from detector.live.running import View
+    from detector.live.running import EvaluationView
 
 app = typer.Typer(
     help="Detects developer-defined events in the data of vehicles and roadside stations, and acts on them.",
@@ -109,22 +109,22 @@ def run(
     with importing():
         import asyncio
 
-        from detector.live.service import Files, Named, RunOptions
+        from detector.live.service import FromCluster, FromFiles, RunOptions
         from detector.live.service import run_detector as run_service
         from detector.status.server import PagesAddress
 
     pages = None if metrics_port is None else PagesAddress(metrics_port, metrics_certificates)
     if name is not None:
         holder = _holder_in_pod(name) if as_pod else name
-        source: Files | Named = Named(name, namespace, output, holder)
+        source: FromFiles | FromCluster = FromCluster(name, namespace, output, holder)
     else:
         assert detector is not None  # noqa: S101  one of the two is given
-        source = Files(detector, tuple(rules or ()), output or Path("out"))
+        source = FromFiles(detector, tuple(rules or ()), output or Path("out"))
     asyncio.run(run_service(RunOptions(source, record_intake, pages, _view(foxglove))))
     leave()
 
 
-def _view(address: str | None) -> View | None:
+def _view(address: str | None) -> EvaluationView | None:
     if address is None:
         return None
     host, _, port = address.rpartition(":")

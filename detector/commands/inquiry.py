@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from wayside.process.beginning import importing
 from wayside.process.commandline import refuse, table_console
+from wayside.process.startup import importing
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-    from detector.streams.answering import Reply
+    from detector.streams.query_handler import Reply
     from wayside.api.zenoh import Zenoh
 
 DetectorFile = Annotated[
@@ -124,7 +124,7 @@ def _inquire_all(
         return [answer.payload for answer in query_selected("status", {}, None, None, connect, timeout)], {}
     with importing():
         from detector.resources.files import load_detectors
-        from detector.streams.answering import NoAnswerError, query_detectors
+        from detector.streams.query_handler import NoAnswerError, query_detectors
         from detector.streams.session import NetworkError
         from wayside.api.pod import DetectorMode
 
@@ -207,7 +207,7 @@ def query_selected(
     """Query the detectors that the options name. Raises NoAnswerError, NetworkError, DocumentError."""
     with importing():
         from detector.resources.files import load_rules
-        from detector.streams.answering import query_detectors
+        from detector.streams.query_handler import query_detectors
         from wayside.api.pod import DetectorMode
         from wayside.api.zenoh import Zenoh, ZenohMode
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from wayside.process.beginning import importing
+from wayside.process.startup import importing
 
 
 def mine(

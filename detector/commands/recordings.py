@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from detector.commands.inquiry import Connect, DetectorFile, Name, Timeout, query_selected
-from wayside.process.beginning import importing
 from wayside.process.commandline import refuse, table_console
+from wayside.process.startup import importing
 
 if TYPE_CHECKING:
     from detector.actions.trigger.requests import RecordingRequest
@@ -84,7 +84,7 @@ def _request(**given: object) -> RecordingRequest:
         from pydantic import ValidationError
 
         from detector.actions.trigger.requests import RecordingRequest
-        from wayside.api.wording import messages
+        from wayside.api.validation_errors import messages
 
     try:
         return RecordingRequest.model_validate(given)

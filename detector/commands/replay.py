@@ -25,16 +25,16 @@ from detector.replay.clips import Clips
 from detector.replay.gathering import Recording, intake_file_of, recording_name, recordings_of
 from detector.replay.intake_file import read_intake, recorded_outages
 from detector.replay.message import RecordingError
-from detector.replay.playing import Played, play
+from detector.replay.playing import PlayResult, play
 from detector.replay.progress import ProgressLine
 from detector.replay.recordings import quick_span_of
-from detector.replay.replaying import Replayed, replay_intake
+from detector.replay.replaying import ReplayResult, replay_intake
 from detector.replay.variants import Variant, variants_of, with_variants
 from detector.resources.files import load_rules
 from detector.resources.selection import select
 from detector.results.kinds import ResultKind
 from detector.results.variants import comparisons, show_variants, write_variants
-from detector.results.writing import Look, Looking, check_installed, show_summary, write_results
+from detector.results.writing import RecordingTrace, ResultCollector, check_installed, show_summary, write_results
 from wayside.api import ApplicationTask, Detector, EventRule
 from wayside.api.documents import Document, Problem
 from wayside.findings import Finding, ignored_by
@@ -87,7 +87,7 @@ def replay_files(
         DocumentError, DetectorError, RecordingError, OSError: a file cannot be used; the text gives the reason.
     """
     check_installed(kinds)
-    looking = Looking() if kinds else None
+    looking = ResultCollector() if kinds else None
     with ProgressLine(Console(stderr=True)) as progress:
         clips = Clips(output / CLIPS) if record else None
         options = PlayOptions(as_one, clips, tuple(sets), tuple(sweeps))
@@ -126,7 +126,7 @@ def replay_files(
         raise typer.Exit(1)
 
 
-def _lines(outcome: Replayed, where: str) -> Iterator[str]:
+def _lines(outcome: ReplayResult, where: str) -> Iterator[str]:
     """Messages about a recording for the user."""
     yield from (f"warning: {cut}" for cut in outcome.cuts)  # these name their files
     yield from (f"warning: {where}{doubt}" for doubt in outcome.doubts)
@@ -137,7 +137,7 @@ def _lines(outcome: Replayed, where: str) -> Iterator[str]:
         yield f"{outcome.lost} samples are missing in the intake file, since the disk was too slow: events may differ"
 
 
-def _counted(outcomes: Sequence[Replayed], tried: Set[str]) -> str:
+def _counted(outcomes: Sequence[ReplayResult], tried: Set[str]) -> str:
     events = [event for outcome in outcomes for event in outcome.events if event.episode.rule not in tried]
     started = sum(event.started for event in events)
     several = f"{len(outcomes)} recordings, " if len(outcomes) > 1 else ""
@@ -210,8 +210,8 @@ def _replayed(
     rules: Sequence[Path],
     options: PlayOptions,
     progress: ProgressLine,
-    looking: Looking | None,
-) -> tuple[Played, Sequence[Variant]]:
+    looking: ResultCollector | None,
+) -> tuple[PlayResult, Sequence[Variant]]:
     """The outcome of the recordings, and the variants of rules."""
     intake = intake_file_of(recordings)
     if intake is not None:
@@ -221,7 +221,7 @@ def _replayed(
         outcome = _intake_replayed(
             intake, detector, rules, progress, None if looking is None else looking.watch(name), options.clips
         )
-        return Played({name: outcome}, []), variants_of([*outcome.rules.values()], options.sets, ())
+        return PlayResult({name: outcome}, []), variants_of([*outcome.rules.values()], options.sets, ())
     if detector is None:
         refuse("give --detector FILE and --rules FILE: only an intake file contains its own")
     loaded = load_rules(detector, rules, lasting_problems)
@@ -250,9 +250,9 @@ def _intake_replayed(
     detector: Path | None,
     rules: Sequence[Path],
     progress: ProgressLine,
-    look: Look | None,
+    look: RecordingTrace | None,
     clips: Clips | None,
-) -> Replayed:
+) -> ReplayResult:
     if detector is None and rules:
         refuse("give --detector as well: rules are compiled against their Detector")
     given = None if detector is None else load_rules(detector, rules, lasting_problems).rule_set
@@ -268,7 +268,7 @@ def _intake_replayed(
         )
 
 
-def _traced(outcome: Replayed) -> tuple[Iterable[Event], Iterable[ApplicationTask]]:
+def _traced(outcome: ReplayResult) -> tuple[Iterable[Event], Iterable[ApplicationTask]]:
     """The events and tasks, with their trace context if the environment requests traces."""
     with episode_traces(export=False) as traces:
         if traces is None:

@@ -10,7 +10,7 @@ import numpy as np
 import typer
 from pydantic import ValidationError
 
-from detector.assembly import inlets
+from detector.assembly import stream_readers
 from detector.commands.topics.doubts import fields_of
 from detector.commands.topics.proposal import Proposal, detector_document, proposals
 from detector.commands.topics.survey import survey
@@ -21,7 +21,7 @@ from detector.replay.recorded_types import with_recorded_types
 from detector.results.series import Series, SeriesKind, Trace
 from detector.results.tracing import Tracer
 from wayside.api import Detector, EventRule
-from wayside.api.wording import messages
+from wayside.api.validation_errors import messages
 from wayside.process.commandline import refuse
 from wayside.rules import RuleError, compile_rule
 
@@ -77,7 +77,7 @@ def _rule(expression: str, stream: str, every: str) -> EventRule:
 
 def _stream(expression: str, found: Sequence[Proposal], detector: Detector, wanted: str | None, every: str) -> str:
     """The stream that the expression fits. Raises an error if none or several fit."""
-    known = {**inlets(detector).fields, **fields_of(found)}
+    known = {**stream_readers(detector).fields, **fields_of(found)}
     names = [each.name for each in found]
     if wanted is not None and wanted not in names:
         refuse(f"--stream {wanted}: there is no such stream; the streams are {', '.join(names)}")

@@ -14,20 +14,20 @@ import msgspec
 from detector.engine.buffering.messages import KeyReader
 from detector.engine.consequences.consequences import Consequences
 from detector.engine.counters import Counters
-from detector.engine.episodes.current import Identity
+from detector.engine.episodes.current import DetectorIdentity
 from detector.engine.episodes.demands import Demand
-from detector.engine.episodes.episodes import Ending
+from detector.engine.episodes.episodes import EndReason
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.open_episodes import OpenEpisode
 from detector.engine.episodes.record import EpisodeRecord
 from detector.engine.evaluation.executor import Executor
-from detector.engine.evaluation.knowledge import Knowledge
-from detector.engine.evaluation.observing import Instruments
+from detector.engine.evaluation.inputs import RuleInputs
+from detector.engine.evaluation.observing import Observers
 from detector.engine.evaluation.rule import OnDemandResult, RuleRun, same_semantics
 from detector.engine.queries.queries import BufferQueries
 from detector.engine.samples.sample import Arrival, Decoder, Sample
 from detector.engine.scoping.plugins import NoPlugins, PluginHost, PluginSignals
-from detector.engine.signals.starts import Starts
+from detector.engine.signals.starts import EpisodeStarts
 from detector.engine.timing.data import DataTimeline
 from detector.engine.timing.schedule import Schedule
 from detector.engine.timing.ticks import Ticks
@@ -65,7 +65,7 @@ class Engine:
         Raises:
             RuleError: an expression of one of the Detector's streams does not compile.
         """
-        self.identity = Identity(detector.name, holder, detector.namespace)
+        self.identity = DetectorIdentity(detector.name, holder, detector.namespace)
         self.counters = Counters()
         self._runs: dict[str, RuleRun] = {}
         self._rules_version = 0
@@ -74,15 +74,15 @@ class Engine:
         self._exact = order >= ORDER
         self._ticks = Ticks()
         self.schedule = Schedule(self._ticks)
-        self._starts = Starts()
-        self._known = Knowledge(detector, decoders, read_key, start, self.counters, self._starts, exact=self._exact)
+        self._starts = EpisodeStarts()
+        self._known = RuleInputs(detector, decoders, read_key, start, self.counters, self._starts, exact=self._exact)
         self.buffer, self.clients = self._known.buffer, self._known.clients
         self._starts.is_known = self.clients.__contains__
         self._plugins = PluginSignals(plugins or NoPlugins(), self.queries)
         self.consequences = Consequences(self.buffer)
         """The messages for all actions except deploy."""
         self._timeline = self._make_timeline(start)
-        self.instruments = Instruments()
+        self.observers = Observers()
         """Observers; set them before the rules."""
         self._executor = Executor(
             self._known,
@@ -91,7 +91,7 @@ class Engine:
             self._starts,
             self._plugins,
             self.consequences,
-            self.instruments,
+            self.observers,
             lambda: self._timeline.now,
         )
 
@@ -153,7 +153,7 @@ class Engine:
         for name, run in sorted(self._runs.items()):
             rule = new.get(name)
             if rule is None or not same_semantics(run, rule):
-                events += self._executor.noted(run, run.end_all(now, Ending.RULE_CHANGED))
+                events += self._executor.noted(run, run.end_all(now, EndReason.RULE_CHANGED))
                 self._starts.forget(name)
                 self.schedule.forget(name)
             else:
@@ -217,7 +217,7 @@ class Engine:
 
     def _ended_while_away(self, record: EpisodeRecord, now: int) -> Event:
         """The end of an episode whose rule changed or was removed while the detector was not running."""
-        return Event(self.identity.holder, record, {}, now, Ending.RULE_CHANGED)
+        return Event(self.identity.holder, record, {}, now, EndReason.RULE_CHANGED)
 
     def open_episodes(self) -> list[OpenEpisode]:
         """All episodes that have not ended."""

@@ -23,7 +23,7 @@ from detector.findings.checks import (
     STREAM_WITHOUT_STAMPS,
     ZERO_STAMPS,
 )
-from detector.streams.tally import Tally
+from detector.streams.loss_counter import LossCounter
 from wayside.api.detector import DetectorSpec
 from wayside.findings import Finding
 from wayside.rules import PairSubject
@@ -63,13 +63,13 @@ class Losses:
         self._engine = engine
         self._intake = intake
         self._monotonic = monotonic
-        self._tallies: list[Tally] = []
+        self._counters: list[LossCounter] = []
         self._others: list[Callable[[], Iterable[Loss]]] = []
         self._logged: dict[str, tuple[int, float]] = {}
 
-    def watch(self, tally: Tally) -> None:
-        """Also report the counts of this tally."""
-        self._tallies.append(tally)
+    def watch(self, loss_counter: LossCounter) -> None:
+        """Also report the counts of this counter."""
+        self._counters.append(loss_counter)
 
     def watch_also(self, losses: Callable[[], Iterable[Loss]]) -> None:
         """Also report these losses."""
@@ -171,8 +171,8 @@ class Losses:
     def all(self) -> Iterator[Loss]:
         """Every kind of loss, including those with count 0."""
         counters, timeline = self._engine.counters, self._engine.timeline
-        for tally in self._tallies:
-            for entry in tally.entries():
+        for loss_counter in self._counters:
+            for entry in loss_counter.entries():
                 yield Loss(entry.text, entry.count, entry.last, cause=entry.cause.name.lower(), stream=entry.name)
         for losses in self._others:
             yield from losses()

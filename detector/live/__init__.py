@@ -1,1 +1,1 @@
-"""The running detector: its evaluator, its outlets, its responses to requests, and how it starts, resumes and stops."""
+"""The running detector: its evaluator, event sink and responses to requests, and how it starts, resumes and stops."""

@@ -17,8 +17,8 @@ import msgspec
 from detector.actions.trigger.requests import RECORDINGS
 from detector.engine.episodes.plain import plain
 from detector.live.evaluator import Evaluator
-from detector.live.outlet import LiveOutlet
-from detector.live.requested import Requested
+from detector.live.requested import RequestedRecordings
+from detector.live.sink import LiveSink
 from detector.sources.supervision import SourceThread
 from detector.status.model import ActionStatus, CertificateStatus, Drops, RuleExplanation, SourceStatus, Status, to_json
 from wayside.times import format_time
@@ -41,12 +41,12 @@ class Answers:
     def __init__(
         self,
         evaluator: Evaluator,
-        outlet: Callable[[], LiveOutlet],
+        sink: Callable[[], LiveSink],
         sources: Callable[[], list[SourceThread]],
-        requested: Requested,
+        requested: RequestedRecordings,
         pulse: Callable[[], float] = lambda: 0.0,
     ) -> None:
-        """`outlet` returns the outlet: its network changes with the Detector, and so do the `sources`.
+        """`sink` returns the event sink: its network changes with the Detector, and so do the `sources`.
 
         `pulse` returns the seconds for which the event loop has not run.
         """
@@ -54,7 +54,7 @@ class Answers:
         self._evaluator = evaluator
         self._sources = sources
         self._requested = requested
-        self._outlet = outlet
+        self._outlet = sink
         self._answers: Mapping[str, Callable[[Mapping[str, str]], bytes]] = {
             "status": self._status,
             "evaluate": self._evaluate,
@@ -74,10 +74,10 @@ class Answers:
 
     def status(self) -> Status:
         """The latest status, with the parts that the engine does not have."""
-        latest, outlet = self._evaluator.status.latest, self._outlet()
+        latest, sink = self._evaluator.status.latest, self._outlet()
         dropped = [
-            Drops("event_unpublished", "events not published", outlet.network.dropped_events),
-            Drops("event_unwritten", "events not written to events.jsonl", outlet.unwritten),
+            Drops("event_unpublished", "events not published", sink.network.dropped_events),
+            Drops("event_unwritten", "events not written to events.jsonl", sink.unwritten),
         ]
         sources = [
             SourceStatus(each.source.name, each.source.plugin, each.state.value, each.messages, each.last_error)
@@ -85,16 +85,16 @@ class Answers:
         ]
         actions = [
             ActionStatus(
-                which.rule, which.action, tally.kind, tally.running, tally.done, tally.failed, tally.samples,
-                tally.missing, tally.bytes, tally.files, tally.last_file, tally.last_failure,
-                dict(islice(tally.current.items(), _RUNS)),
+                which.rule, which.action, counts.kind, counts.running, counts.done, counts.failed, counts.samples,
+                counts.missing, counts.bytes, counts.files, counts.last_file, counts.last_failure,
+                dict(islice(counts.current.items(), _RUNS)),
             )
-            for which, tally in outlet.actions.outcomes.tallies().items()
+            for which, counts in sink.actions.outcomes.counts_by_action().items()
         ]  # fmt: skip
         return msgspec.structs.replace(
             latest,
-            connected=outlet.network.connected,
-            certificate=CertificateStatus(**asdict(outlet.network.certificate_state)),
+            connected=sink.network.connected,
+            certificate=CertificateStatus(**asdict(sink.network.certificate_state)),
             drops=[*latest.drops, *dropped],
             sources=sources,
             actions=actions,

@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
 from typing import Any, Protocol, TypeVar
 
-from detector.actions.base import Surroundings
-from detector.assembly import RuleIndex, inlets
+from detector.actions.base import DetectorConfiguration
+from detector.assembly import RuleIndex, stream_readers
 from detector.assembly.memory import Sweeper
 from detector.engine.consequences.consequences import Consequence
 from detector.engine.engine import Engine, NotEvaluableError
@@ -28,10 +28,10 @@ from detector.engine.samples.sample import Arrival
 from detector.engine.timing.timeline import ORDER
 from detector.findings.losses import Losses
 from detector.live.overload import LONG, Overload
-from detector.live.state import Restored
+from detector.live.state import RestoredState
 from detector.plugins.outages import Outages
 from detector.resources.selection import RuleSet
-from detector.status.keeping import StatusKeeper
+from detector.status.updating import StatusUpdater
 from detector.streams.codecs.ros import RosTypes
 from wayside.api import EventRule
 from wayside.api.stream import Stream
@@ -69,7 +69,7 @@ class IntakeRecorder(Protocol):
         """Another input of the engine, at a time in nanoseconds since the epoch."""
 
 
-class Outlet(Protocol):
+class EventSink(Protocol):
     """Receives events and demands. Never waits."""
 
     def events(self, events: Sequence[Event]) -> None:
@@ -78,7 +78,7 @@ class Outlet(Protocol):
     def open_episodes(self, episodes: Callable[[], Sequence[OpenEpisode]]) -> None:
         """Open episodes may have changed; `episodes` returns them, and must be called immediately or not at all."""
 
-    def follow(self, rules: Sequence[EventRule], surroundings: Surroundings) -> None:
+    def follow(self, rules: Sequence[EventRule], configuration: DetectorConfiguration) -> None:
         """These rules are evaluated from now on."""
 
     def consequences(self, consequences: Sequence[Consequence]) -> None:
@@ -105,7 +105,7 @@ class Evaluator:
         self,
         engine: Engine,
         intake: Intake,
-        outlet: Outlet,
+        sink: EventSink,
         *,
         now: Callable[[], int],
         recorder: IntakeRecorder | None = None,
@@ -119,12 +119,12 @@ class Evaluator:
         """
         self._engine = engine
         self._intake = intake
-        self._outlet = outlet
+        self._outlet = sink
         self._now = now
         self._recorder = recorder
         self._on_failure = on_failure
         self._outages = outages or Outages()
-        self._onlooker = engine.instruments.observer = onlooker
+        self._onlooker = engine.observers.observer = onlooker
         self._rule_index = RuleIndex()
         self._wake = threading.Condition()
         self._wanted: RuleSet | None = None
@@ -140,13 +140,13 @@ class Evaluator:
         self._version: tuple[int, int] | None = None
         self._demands: dict[str, Demand] = {}
         self.losses = Losses(engine, intake)
-        self.status = StatusKeeper(engine, self.losses, now)
-        engine.instruments.stopwatch = time.perf_counter_ns
+        self.status = StatusUpdater(engine, self.losses, now)
+        engine.observers.stopwatch = time.perf_counter_ns
         engine.consequences.wanted = True
         intake.on_urgent = self._hurry
         self._thread = threading.Thread(target=self._run, name="evaluator", daemon=True)
 
-    def start(self, rule_set: RuleSet, restored: Restored) -> None:
+    def start(self, rule_set: RuleSet, restored: RestoredState) -> None:
         """Begin with these rules and the restored episodes; returns at once."""
         start = self._engine.now
         self._record(
@@ -312,10 +312,10 @@ class Evaluator:
         if self._recorder is not None and arrivals:
             self._recorder.arrivals(arrivals)
         self.status.arrived(arrivals)
-        begin = self._engine.instruments.stopwatch()
+        begin = self._engine.observers.stopwatch()
         events = self._engine.advance(arrivals, now)
         self._record_outages()
-        self._adapt(self._engine.instruments.stopwatch() - begin)
+        self._adapt(self._engine.observers.stopwatch() - begin)
         return events
 
     def _record_outages(self) -> None:
@@ -332,7 +332,7 @@ class Evaluator:
         """Switch to a changed Detector or rules."""
         changed = wanted.detector.spec != self._engine.detector.spec
         if changed:
-            entries = inlets(wanted.detector)
+            entries = stream_readers(wanted.detector)
             self._engine.set_detector(wanted.detector, entries.decoders, entries.read_key)
             if self._recorder is not None:
                 self._recorder.follow(wanted.detector.spec.streams, entries.types)
@@ -347,12 +347,14 @@ class Evaluator:
         return self._apply_rules(wanted)
 
     def _apply_rules(self, rule_set: RuleSet) -> list[Event]:
-        entries = inlets(rule_set.detector)
+        entries = stream_readers(rule_set.detector)
         compiled, refused = self._rule_index.compile(rule_set.rules, rule_set.detector, entries.fields, entries.places)
         for refusal in refused:
             _log.error("%s", refusal)
         self.status.refused(refused)
-        self._outlet.follow(self._rule_index.good, Surroundings(rule_set.detector, entries.decoders, entries.types))
+        self._outlet.follow(
+            self._rule_index.good, DetectorConfiguration(rule_set.detector, entries.decoders, entries.types)
+        )
         events = self._engine.set_rules(compiled)
         if self._onlooker is not None:
             self._onlooker.attend(self._engine)

@@ -15,7 +15,7 @@ from detector.actions.deploy.lease import HolderLease
 from detector.actions.deploy.reconciler import DemandReconciler
 from detector.actions.deploy.stores import TaskStore
 from detector.actions.tracing import EpisodeTraces
-from detector.live.running import Running, View
+from detector.live.running import EvaluationView, Running
 from detector.live.state import state_file, what_was_open
 from detector.resources.kubernetes import PROGRAM, ClusterRules
 from detector.status.server import PagesAddress
@@ -34,7 +34,7 @@ async def run_in_cluster(
     stopping: asyncio.Event,
     pages: PagesAddress | None,
     traces: EpisodeTraces | None,
-    view: View | None = None,
+    view: EvaluationView | None = None,
 ) -> None:
     """Run the Detector of that name, and emit its tasks as the holder, until `stopping` is set.
 
@@ -67,7 +67,7 @@ async def _run_while_held(
     reconciler: DemandReconciler,
     pages: PagesAddress | None,
     traces: EpisodeTraces | None,
-    view: View | None = None,
+    view: EvaluationView | None = None,
 ) -> None:
     changes = rules.follow()
     first = await _unless(stopping, anext(changes))

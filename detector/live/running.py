@@ -16,22 +16,22 @@ from typing import TYPE_CHECKING, Protocol
 from detector.actions.deploy.reconciler import DemandReconciler
 from detector.actions.outcomes import Outcomes
 from detector.actions.tracing import EpisodeTraces
-from detector.assembly import DetectorError, Inlets, inlets, make_engine
+from detector.assembly import DetectorError, StreamReaders, make_engine, stream_readers
 from detector.engine.samples.intake import Intake
 from detector.engine.samples.liveliness import LIVELINESS
 from detector.findings.losses import Loss
 from detector.live.answers import Answers
 from detector.live.evaluator import Evaluator, LiveObserver
-from detector.live.outlet import EventLog, LiveOutlet
-from detector.live.requested import Requested
-from detector.live.state import Restored, StateFile
+from detector.live.requested import RequestedRecordings
+from detector.live.sink import EventLog, LiveSink
+from detector.live.state import RestoredState, StateFile
 from detector.plugins.processes import ProcessHost
 from detector.resources.selection import RuleSet
 from detector.sources.registry import source_plugin_problems
 from detector.sources.supervision import Sources
 from detector.status.server import PagesAddress, StatusServer
-from detector.streams.answering import Answering
-from detector.streams.tally import Tally
+from detector.streams.loss_counter import LossCounter
+from detector.streams.query_handler import QueryHandler
 from detector.streams.zenoh import Network
 from wayside.api import Detector
 from wayside.api.plugin import ZENOH
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 
-class View(LiveObserver, Protocol):
+class EvaluationView(LiveObserver, Protocol):
     """Displays the evaluation to users."""
 
     @property
@@ -67,11 +67,11 @@ class Running:
         reconciler: DemandReconciler,
         output: Path | None,
         record: Path | None,
-        restored: Restored,
+        restored: RestoredState,
         pages: PagesAddress | None = None,
         state: StateFile | None = None,
         traces: EpisodeTraces | None = None,
-        view: View | None = None,
+        view: EvaluationView | None = None,
     ) -> None:
         """Starts nothing yet.
 
@@ -86,13 +86,13 @@ class Running:
         self._restored = restored
         detector = rule_set.detector
         entries = _checked(detector)
-        self._tally = Tally()
+        self._loss_counter = LossCounter()
         self._intake = Intake(time.time_ns)
         self._plugins = ProcessHost()
         self._engine = make_engine(detector, entries, holder=holder, start=time.time_ns(), plugins=self._plugins)
         self._writer = None if record is None else _writer(record, detector, entries)
         self._log = None if output is None else EventLog(output / "events.jsonl")
-        self._outlet = LiveOutlet(self._network(detector), holder, self._log, reconciler, state, traces)
+        self._outlet = LiveSink(self._network(detector), holder, self._log, reconciler, state, traces)
         self._state = state
         self._reconciler = reconciler
         self._evaluator = Evaluator(
@@ -105,7 +105,7 @@ class Running:
             outages=self._plugins.outages,
             onlooker=view,
         )
-        requested = Requested(self._engine, self._evaluator.call)
+        requested = RequestedRecordings(self._engine, self._evaluator.call)
         self._outlet.actions.outcomes.on_outcome = requested.on_outcome
         pulse = LoopMonitor(self._loop)
         self.answers = Answers(
@@ -113,7 +113,7 @@ class Running:
         )
         self._server = None if pages is None else _server(pages, self.answers)
 
-        self._evaluator.losses.watch(self._tally)
+        self._evaluator.losses.watch(self._loss_counter)
         self._evaluator.losses.watch_also(lambda: _of_actions(self._outlet.actions.outcomes))
         if state is not None:
             self._evaluator.losses.watch_also(lambda: _of_state(state))
@@ -122,7 +122,7 @@ class Running:
             self._evaluator.losses.watch_also(view.losses)
         if traces is not None:
             self._evaluator.losses.watch_also(lambda: _of_traces(traces))
-        self._sources = Sources(self._intake.putter, self._tally)
+        self._sources = Sources(self._intake.putter, self._loss_counter)
 
     def __enter__(self) -> Running:
         self._evaluator.start(self._rule_set, self._restored)
@@ -190,8 +190,8 @@ class Running:
             streams,
             self._putter,
             on_failure=self._fail,
-            answering=lambda session: Answering(session, holder, self.answers.answer),
-            tally=self._tally,
+            answering=lambda session: QueryHandler(session, holder, self.answers.answer),
+            loss_counter=self._loss_counter,
         )
 
     def _putter(self, stream: str) -> Callable[[Sequence[tuple[str, bytes]]], None]:
@@ -220,7 +220,7 @@ class Running:
             _log.warning("in total, %d events were not published", self._outlet.network.dropped_events)
 
 
-def _writer(path: Path, detector: Detector, entries: Inlets) -> IntakeWriter:
+def _writer(path: Path, detector: Detector, entries: StreamReaders) -> IntakeWriter:
     # Not at the top: only a detector that records its intake needs the MCAP library.
     from detector.replay.intake_writer import IntakeWriter  # noqa: PLC0415
 
@@ -269,9 +269,9 @@ def _unused(path: Path) -> Path:
     return free
 
 
-def _checked(detector: Detector) -> Inlets:
+def _checked(detector: Detector) -> StreamReaders:
     """The inputs of its streams. Raises DetectorError, also if a plugin is missing or rejects its parameters."""
-    entries = inlets(detector)
+    entries = stream_readers(detector)
     problems = list(source_plugin_problems(detector))
     if problems:
         raise DetectorError(problems)

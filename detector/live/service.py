@@ -18,7 +18,7 @@ from detector.actions.deploy.reconciler import DemandReconciler
 from detector.actions.tracing import EpisodeTraces, episode_traces
 from detector.assembly import detector_problems
 from detector.assembly.memory import tune_garbage_collection
-from detector.live.running import Running, View
+from detector.live.running import EvaluationView, Running
 from detector.live.state import state_file, what_was_open
 from detector.resources.files import follow_files, hangups, load_rules
 from detector.status.server import PagesAddress
@@ -27,7 +27,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class Files:
+class FromFiles:
     """The Detector and its rules come from files; tasks go into files."""
 
     detector: Path
@@ -36,7 +36,7 @@ class Files:
 
 
 @dataclass(frozen=True, slots=True)
-class Named:
+class FromCluster:
     """The Detector of that name and its rules come from the API server; tasks go there."""
 
     name: str
@@ -50,11 +50,11 @@ class Named:
 class RunOptions:
     """The options of a run."""
 
-    source: Files | Named
+    source: FromFiles | FromCluster
     record_intake: Path | None = None
     pages: PagesAddress | None = None
     """The address of /metrics, /healthz and /readyz; None: not served."""
-    view: View | None = None
+    view: EvaluationView | None = None
 
 
 async def run_detector(options: RunOptions) -> None:
@@ -75,9 +75,9 @@ async def run_detector(options: RunOptions) -> None:
 
 async def _run(options: RunOptions, stopping: asyncio.Event, traces: EpisodeTraces | None) -> None:
     match options.source:
-        case Files() as files:
+        case FromFiles() as files:
             await _run_from_files(files, options, stopping, traces)
-        case Named() as named:
+        case FromCluster() as named:
             # Not at the top: the Kubernetes client takes half a second to import, and only a cluster needs it.
             from detector.live.in_cluster import run_in_cluster  # noqa: PLC0415
 
@@ -88,7 +88,7 @@ async def _run(options: RunOptions, stopping: asyncio.Event, traces: EpisodeTrac
 
 
 async def _run_from_files(
-    files: Files, options: RunOptions, stopping: asyncio.Event, traces: EpisodeTraces | None
+    files: FromFiles, options: RunOptions, stopping: asyncio.Event, traces: EpisodeTraces | None
 ) -> None:
     changed = hangups()
     loaded = load_rules(files.detector, files.rules, detector_problems)

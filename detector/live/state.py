@@ -179,7 +179,7 @@ class StateFile:
 
 
 @dataclass(frozen=True, slots=True)
-class Restored:
+class RestoredState:
     """The input of the engine's restore."""
 
     demands: Sequence[Demand] = ()
@@ -188,14 +188,14 @@ class Restored:
     """Of the state volume, except those whose task has ended: the detector ended it and was killed before it wrote."""
 
 
-async def what_was_open(store: TaskStore, state: StateFile | None) -> Restored:
+async def what_was_open(store: TaskStore, state: StateFile | None) -> RestoredState:
     """Read both. Waits while the store is unavailable; cancel it to give up."""
     async with aclosing(store.follow()) as changes:
         async for change in changes:
             if isinstance(change, Snapshot):
                 episodes = [] if state is None else state.load()
                 over = _ended(change)
-                return Restored(live_demands(change), [each for each in episodes if each.record.id not in over])
+                return RestoredState(live_demands(change), [each for each in episodes if each.record.id not in over])
     raise AssertionError("the stream of a store's changes ended")
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import msgspec
 
 from detector.mining.sources import InputRecording, RecordingPreview
-from detector.mining.work import Mined, decode_mined
+from detector.mining.work import RecordingResult, decode_mined
 from wayside.process.files import replace_file
 
 
@@ -93,7 +93,7 @@ def read_entry(path: Path) -> CacheEntry | None:
         return None
 
 
-def mined_in(entry: CacheEntry) -> Mined:
+def mined_in(entry: CacheEntry) -> RecordingResult:
     """The contents of the entry."""
     return decode_mined(entry.mined)
 

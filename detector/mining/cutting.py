@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
-from detector.assembly import RuleIndex, inlets, make_engine
+from detector.assembly import RuleIndex, make_engine, stream_readers
 from detector.engine.buffering.buffer import HOUSEKEEPING
 from detector.engine.columns.group import names_of, signals_of
 from detector.engine.engine import Engine
@@ -61,7 +61,7 @@ def cutting_of(recording: Recording, detector: Detector, rules: Sequence[EventRu
     if pieces < 2 or not chunks or any(each is None for each in chunks):
         return None
     completed = with_recorded_types(detector, recording)
-    entries = inlets(completed)
+    entries = stream_readers(completed)
     compiled, _ = RuleIndex().compile(rules, completed, entries.fields, entries.places)
     engine = make_engine(completed, entries, holder=detector.name, start=0)
     engine.set_rules(compiled)

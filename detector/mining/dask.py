@@ -8,7 +8,7 @@ from typing import Any
 from distributed import Client, as_completed
 from distributed.scheduler import KilledWorker
 
-from detector.mining.workers import ATTEMPTS, Lost, RemoteCall
+from detector.mining.workers import ATTEMPTS, LostWorker, RemoteCall
 from wayside.inputerror import InputError
 
 _PATIENCE = 60
@@ -48,7 +48,9 @@ class DaskWorkers:
             try:
                 result = future.result()
             except KilledWorker as error:
-                result = Lost(f"its worker was killed each time, e.g. for lack of memory: {error.last_worker.address}")
+                result = LostWorker(
+                    f"its worker was killed each time, e.g. for lack of memory: {error.last_worker.address}"
+                )
             yield call, result
             future.release()  # the cluster need not keep it
 

@@ -18,7 +18,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from detector.mining.work import Mined
+from detector.mining.work import RecordingResult
 from detector.results.episodes import EpisodeRow, merged_kind, table_of, value_kinds
 from detector.results.nearest import nearest_by_rule
 
@@ -34,7 +34,7 @@ class MinedRecording(NamedTuple):
     name: str
     content: str
     """Identifies the content; empty if it cannot be read."""
-    parts: Callable[[], Sequence[Mined]]
+    parts: Callable[[], Sequence[RecordingResult]]
     """Reads the cached parts, each about other rules; called more than once."""
 
 
@@ -155,7 +155,7 @@ def _tables(recordings: Iterable[MinedRecording]) -> dict[str, tuple[dict[str, A
     }  # fmt: skip
 
 
-def _recording_row(recording: MinedRecording, parts: Sequence[Mined]) -> tuple[object, ...]:
+def _recording_row(recording: MinedRecording, parts: Sequence[RecordingResult]) -> tuple[object, ...]:
     best = max(parts, key=lambda part: part.samples, default=None)
     if best is None or not best.samples:
         return recording.name, recording.content, 0, None, None, None
@@ -163,7 +163,7 @@ def _recording_row(recording: MinedRecording, parts: Sequence[Mined]) -> tuple[o
     return recording.name, recording.content, best.samples, best.begin, best.end, seconds
 
 
-def _stream_rows(parts: Sequence[Mined]) -> Iterator[tuple[object, ...]]:
+def _stream_rows(parts: Sequence[RecordingResult]) -> Iterator[tuple[object, ...]]:
     """The stream statistics of all parts agree, except for unreadable messages: only rules that read these find
     them."""
     by_stream = [[part.streams[at] for part in parts if part.streams] for at in range(_streams(parts))]
@@ -175,7 +175,7 @@ def _stream_rows(parts: Sequence[Mined]) -> Iterator[tuple[object, ...]]:
         )  # fmt: skip
 
 
-def _streams(parts: Sequence[Mined]) -> int:
+def _streams(parts: Sequence[RecordingResult]) -> int:
     return max((len(part.streams) for part in parts), default=0)
 
 

@@ -8,16 +8,16 @@ from itertools import pairwise
 
 import numpy as np
 
-from detector.assembly import RuleIndex, inlets
+from detector.assembly import RuleIndex, stream_readers
 from detector.engine.counters import Counters, RuleCounters
-from detector.engine.episodes.current import Identity
-from detector.engine.episodes.episodes import Ended, Ending, Started, SubjectState
+from detector.engine.episodes.current import DetectorIdentity
+from detector.engine.episodes.episodes import Ended, EndReason, Started, SubjectState
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.subjects import Subject
 from detector.engine.evaluation.rule import RuleRun
 from detector.engine.scoping.scopes import Candidate
-from detector.mining.pieces import LOST, Observed, Values
-from detector.mining.work import Mined, MiningJob, RuleCount, in_their_order, job_holder
+from detector.mining.pieces import LOST, PieceResult, SignalChanges
+from detector.mining.work import MiningJob, RecordingResult, RuleCount, in_their_order, job_holder
 from detector.replay.batches import PAUSE
 from detector.replay.gathering import Recording
 from detector.replay.recorded_types import with_recorded_types
@@ -30,7 +30,7 @@ from wayside.expressions.columns.values import Tag
 _KNOWN = (Tag.NUMBER, Tag.BOOLEAN, Tag.TEXT)
 
 
-def flaw_of(pieces: Sequence[Observed]) -> str | None:
+def flaw_of(pieces: Sequence[PieceResult]) -> str | None:
     """Why the recording cannot be cut after all."""
     flaws = [piece.flaw for piece in pieces if piece.flaw is not None]
     there = [piece for piece in pieces if piece.samples]
@@ -41,16 +41,16 @@ def flaw_of(pieces: Sequence[Observed]) -> str | None:
     return flaws[0] if flaws else None
 
 
-def joined(job: MiningJob, recording: Recording, pieces: Sequence[Observed]) -> Mined:
+def joined(job: MiningJob, recording: Recording, pieces: Sequence[PieceResult]) -> RecordingResult:
     """The result of a recording; the pieces, in order, have no flaw. The job's rules are those that they evaluated."""
     detector = with_recorded_types(job.detector, recording)
-    entries = inlets(detector)
+    entries = stream_readers(detector)
     compiled, _ = RuleIndex().compile(job.rules, detector, entries.fields, entries.places)
     there = [piece for piece in pieces if piece.samples]
     end = there[-1].last
     texts = _Texts()
     subjects = sorted({key for piece in pieces for key in piece.seen}, key=lambda key: (key[0], key[1] or "", key[2]))
-    identity = Identity(detector.name, job_holder(job), detector.namespace)
+    identity = DetectorIdentity(detector.name, job_holder(job), detector.namespace)
     runs = {rule.name: RuleRun(rule, identity, RuleCounters()) for rule in compiled}
     events: list[Event] = []
     traces = []
@@ -74,7 +74,7 @@ def joined(job: MiningJob, recording: Recording, pieces: Sequence[Observed]) -> 
         arrivals.follow(piece.arrivals)
         counters.unnamed.update(piece.unnamed)
     counts = {name: sum(piece.counts.get(name, 0) for piece in pieces) for name in sorted(runs)}
-    mined = Mined(
+    mined = RecordingResult(
         episodes=in_their_order(episodes_of("", events, Trace(traces, end=end))),
         counts=[RuleCount(name, *map(int, np.broadcast_to(each, 3))) for name, each in counts.items()],
         streams=arrivals.by_stream(detector, counters),
@@ -97,7 +97,7 @@ def _stepped(
         if code == LOST:
             if state.is_open:
                 state.end(time, run.timing)
-                yield from _event(run, time, Ended(Ending.CLIENT_LOST), Candidate(subject, {}, True, True))
+                yield from _event(run, time, Ended(EndReason.CLIENT_LOST), Candidate(subject, {}, True, True))
             else:
                 state.gap()
             continue
@@ -123,7 +123,7 @@ class _Texts:
         self._places: dict[str, int] = {}
         self.texts: list[str] = []
 
-    def common(self, values: Values, texts: Sequence[str]) -> Values:
+    def common(self, values: SignalChanges, texts: Sequence[str]) -> SignalChanges:
         """The values, with texts as their indices here."""
         found = values.tags == Tag.TEXT
         if not found.any():
@@ -139,7 +139,7 @@ class _Texts:
         return values._replace(values=numbers)
 
 
-def _whole(parts: Sequence[Values]) -> Values:
+def _whole(parts: Sequence[SignalChanges]) -> SignalChanges:
     """The parts as one; repeated values are no changes."""
     times = np.concatenate([part.times for part in parts])
     values = np.concatenate([part.values for part in parts])
@@ -148,10 +148,10 @@ def _whole(parts: Sequence[Values]) -> Values:
     kept = np.ones(len(times), bool)
     kept[1:] = (bits[1:] != bits[:-1]) | (tags[1:] != tags[:-1])
     kinds = frozenset[int]().union(*(part.kinds for part in parts))
-    return Values(times[kept], values[kept], tags[kept], kinds)
+    return SignalChanges(times[kept], values[kept], tags[kept], kinds)
 
 
-def _series(values: Values, texts: Sequence[str]) -> Series:
+def _series(values: SignalChanges, texts: Sequence[str]) -> Series:
     """As for the whole recording: a value that is ever a text has no statistics."""
     series = series_of(values.times, values.values, values.tags, texts)
     kinds = {Tag.BOOLEAN: SeriesKind.BOOLEAN, Tag.TEXT: SeriesKind.TEXT}
@@ -161,7 +161,7 @@ def _series(values: Values, texts: Sequence[str]) -> Series:
 class _At:
     """The values that a rule reads for a subject at a time."""
 
-    def __init__(self, values: Mapping[str, Values], texts: Sequence[str]) -> None:
+    def __init__(self, values: Mapping[str, SignalChanges], texts: Sequence[str]) -> None:
         self._values = values
         self._texts = texts
 

@@ -23,9 +23,9 @@ from detector.mining.cache import Cache, CacheEntry, job_digest, mined_in, read_
 from detector.mining.dataset import EPISODES, TABLES, MinedRecording, write_dataset
 from detector.mining.keys import mined_rule, records, rule_keys, with_dependencies
 from detector.mining.sources import InputRecording, RecordingPreview, look, stamp_of
-from detector.mining.tasks import CutRecording, Done, run_jobs
-from detector.mining.work import Flaw, Mined, MiningJob
-from detector.mining.workers import Lost, Workers
+from detector.mining.tasks import CutRecording, JobResult, run_jobs
+from detector.mining.work import MiningJob, MiningProblem, RecordingResult
+from detector.mining.workers import LostWorker, Workers
 from wayside.api import Detector, EventRule
 
 CLIPS = "clips"
@@ -143,11 +143,11 @@ class _Work(NamedTuple):
             clips = str((self.output / CLIPS / self._folder(content, wanted)).resolve())
         return MiningJob(source, content, self.detector, evaluated, wanted, clips)
 
-    def entry(self, done: Done) -> CacheEntry:
+    def entry(self, done: JobResult) -> CacheEntry:
         """The cache entry of a result."""
         result = done.result
-        if isinstance(result, Lost):
-            result = msgspec.msgpack.encode(Mined(flaws=[Flaw("failed", result.reason)]))
+        if isinstance(result, LostWorker):
+            result = msgspec.msgpack.encode(RecordingResult(flaws=[MiningProblem("failed", result.reason)]))
         keys = {name: self.keys[name] for name in sorted(done.rules)}
         clips = None if done.job.clips is None else Path(done.job.clips).name
         entry = CacheEntry(keys, result, clips)
@@ -195,18 +195,18 @@ class _Entries:
         return good | bad
 
 
-def _look_at(sources: Sequence[InputRecording], cache: Cache) -> dict[InputRecording, RecordingPreview | Flaw]:
+def _look_at(sources: Sequence[InputRecording], cache: Cache) -> dict[InputRecording, RecordingPreview | MiningProblem]:
     """The identity of each recording, or why it cannot be read."""
 
-    def seen(source: InputRecording) -> tuple[str | None, RecordingPreview | Flaw, bool]:
+    def seen(source: InputRecording) -> tuple[str | None, RecordingPreview | MiningProblem, bool]:
         try:
             stamp = stamp_of(source)
             known = cache.seen(source, stamp) if stamp is not None else None
             return stamp, known or look(source), known is None
         except FileNotFoundError:
-            return None, Flaw("unreadable", "there is no such file: correct the name"), False
+            return None, MiningProblem("unreadable", "there is no such file: correct the name"), False
         except OSError as error:
-            return None, Flaw("unreadable", f"cannot read it: {error.strerror or error}"), False
+            return None, MiningProblem("unreadable", f"cannot read it: {error.strerror or error}"), False
 
     with ThreadPoolExecutor(_READERS) as pool:
         looks = dict(zip(sources, pool.map(seen, sources), strict=True))
@@ -221,7 +221,7 @@ def _look_at(sources: Sequence[InputRecording], cache: Cache) -> dict[InputRecor
 def _write(
     output: Path,
     sources: Sequence[InputRecording],
-    seen: Mapping[InputRecording, RecordingPreview | Flaw],
+    seen: Mapping[InputRecording, RecordingPreview | MiningProblem],
     entries: _Entries,
     work: _Work,
 ) -> bool:
@@ -259,15 +259,15 @@ def _forget_clips(folder: Path, used: Iterable[Path]) -> None:
 
 
 def _recording(
-    source: InputRecording, seen: RecordingPreview | Flaw, used: Mapping[Path, frozenset[str]]
+    source: InputRecording, seen: RecordingPreview | MiningProblem, used: Mapping[Path, frozenset[str]]
 ) -> MinedRecording:
-    if isinstance(seen, Flaw):
-        return MinedRecording(source.name, "", lambda: [Mined(flaws=[seen])])
+    if isinstance(seen, MiningProblem):
+        return MinedRecording(source.name, "", lambda: [RecordingResult(flaws=[seen])])
     return MinedRecording(source.name, seen.content, _reader(used))
 
 
-def _reader(used: Mapping[Path, frozenset[str]]) -> Callable[[], Sequence[Mined]]:
-    def parts() -> list[Mined]:
+def _reader(used: Mapping[Path, frozenset[str]]) -> Callable[[], Sequence[RecordingResult]]:
+    def parts() -> list[RecordingResult]:
         found = []
         for path, names in used.items():
             entry = read_entry(path)

@@ -25,9 +25,9 @@ from detector.mining.cutting import END, PieceTimes
 from detector.mining.work import tuned
 from detector.replay.batches import PAUSE, merged_batches, parts_of
 from detector.replay.mcap_file import read_mcap
-from detector.replay.message import Cut
+from detector.replay.message import Truncation
 from detector.replay.recorded_types import with_recorded_types
-from detector.replay.replaying import Replay, Replayed
+from detector.replay.replaying import Replay, ReplayResult
 from detector.replay.routing import MessageRouter
 from detector.results.changes import Changes
 from detector.results.quality import Arrivals
@@ -49,7 +49,7 @@ class PieceJob(NamedTuple):
     rules: Sequence[EventRule]
 
 
-class Values(NamedTuple):
+class SignalChanges(NamedTuple):
     """The changes of one signal of one client; arrays of equal length."""
 
     times: Integers
@@ -66,12 +66,12 @@ class _Seen(NamedTuple):
     times: Integers
     codes: Bytes
     """Observations, or LOST, each valid from its time."""
-    signals: dict[str, Values]
+    signals: dict[str, SignalChanges]
     """Complete wherever an episode may be open; elsewhere with gaps."""
 
 
 @dataclass
-class Observed:
+class PieceResult:
     """The result of a piece."""
 
     flaw: str | None = None
@@ -89,33 +89,33 @@ class Observed:
     unnamed: dict[str, int] = field(default_factory=dict)
 
 
-def observe(job: PieceJob) -> Observed:
+def observe(job: PieceJob) -> PieceResult:
     """Process a piece. Everything for which cutting cannot be exact is a flaw."""
     tuned()
     try:
         return _observed(job)
     except (InputError, OSError) as error:
-        return Observed(flaw=str(error))
+        return PieceResult(flaw=str(error))
 
 
-def _observed(job: PieceJob) -> Observed:
+def _observed(job: PieceJob) -> PieceResult:
     recording = tuple(map(Path, job.files))
     detector = with_recorded_types(job.detector, recording)
     router = MessageRouter(detector.spec.streams, str(recording[0]))
-    cuts: list[Cut] = []
+    cuts: list[Truncation] = []
     between = (job.span.reads, job.span.until)
     batches = merged_batches([read_mcap(path, router.wanted, cuts.append, between=between) for path in recording])
-    found, recorder = Observed(), _Recorder(job.span.after)
+    found, recorder = PieceResult(), _Recorder(job.span.after)
     replay: Replay | None = None
     before = _Counted({}, {}, 0, 0)
     for part in _split(parts_of(router.arrivals(batches)), job.span.after):
         first = part[0].received
         if replay is None:
             replay = Replay(
-                detector, job.rules, holder=detector.name, start=first - 1, outcome=Replayed(), onlooker=recorder
+                detector, job.rules, holder=detector.name, start=first - 1, outcome=ReplayResult(), onlooker=recorder
             )
         elif first - replay.engine.now > PAUSE:
-            return Observed(flaw="it pauses for more than an hour")
+            return PieceResult(flaw="it pauses for more than an hour")
         if first > job.span.after:
             if not found.samples:
                 before = _begun(replay, job.span)
@@ -133,7 +133,9 @@ def _observed(job: PieceJob) -> Observed:
     recorder.close(replay.engine.now)
     now = _counted(replay.engine)
     if cuts or recorder.odd or now.lost or now.unreadable != before.unreadable:
-        return Observed(flaw="its end is missing, messages cannot be read, samples were dropped, or values are lists")
+        return PieceResult(
+            flaw="its end is missing, messages cannot be read, samples were dropped, or values are lists"
+        )
     found.counts = {name: counts - before.rules.get(name, np.zeros(3, np.int64)) for name, counts in now.rules.items()}
     found.unnamed = {name: count - before.unnamed.get(name, 0) for name, count in now.unnamed.items()}
     found.seen, found.texts = recorder.seen(), [*recorder.texts]
@@ -242,10 +244,10 @@ class _Recorder:
         found: dict[tuple[str, str | None, str], _Seen] = {}
         names = [*self._numbers]
         for group in self._groups.values():
-            signals: dict[int, dict[int, Values]] = {}
+            signals: dict[int, dict[int, SignalChanges]] = {}
             for at, (changes, _, _) in group.signals.items():
                 for client, times, values, tags in changes.by_client(None):
-                    signals.setdefault(client, {})[at] = Values(
+                    signals.setdefault(client, {})[at] = SignalChanges(
                         times, values, tags, frozenset(np.unique(tags).tolist())
                     )
             for track, changes in zip(group.tracks, group.codes, strict=True):
@@ -315,11 +317,11 @@ class _Relevant:
         opening = np.flatnonzero(self._behind & ~self._before)
         self._opens = np.concatenate((times[:1], times[opening]))
 
-    def of(self, values: Values) -> Values:
+    def of(self, values: SignalChanges) -> SignalChanges:
         """The relevant changes, and the values valid at their beginning."""
         at = np.searchsorted(self._times, values.times, "right") - 1
         known = np.maximum(at, 0)
         kept = (at < 0) | self._behind[known] | (self._before[known] & (self._times[known] == values.times))
         holding = np.searchsorted(values.times, self._opens, "right") - 1
         kept[holding[holding >= 0]] = True
-        return Values(values.times[kept], values.values[kept], values.tags[kept], values.kinds)
+        return SignalChanges(values.times[kept], values.values[kept], values.tags[kept], values.kinds)

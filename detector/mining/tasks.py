@@ -16,21 +16,21 @@ from detector.assembly import DetectorError
 from detector.mining.cutting import Cutting, cutting_of
 from detector.mining.joining import flaw_of, joined
 from detector.mining.keys import with_dependencies
-from detector.mining.pieces import Observed, PieceJob, observe
+from detector.mining.pieces import PieceJob, PieceResult, observe
 from detector.mining.work import MiningJob, mine_recording
-from detector.mining.workers import Lost, RemoteCall, Workers
+from detector.mining.workers import LostWorker, RemoteCall, Workers
 from detector.replay.message import RecordingError
 
 _PER_WORKER = 2
 """Minimum number of calls per worker when a recording is cut."""
 
 
-class Done(NamedTuple):
+class JobResult(NamedTuple):
     """The result of a job, or of some of its rules."""
 
     job: MiningJob
     rules: frozenset[str]
-    result: bytes | Lost
+    result: bytes | LostWorker
 
 
 class CutRecording(NamedTuple):
@@ -42,7 +42,7 @@ class CutRecording(NamedTuple):
     """The rules that ran over the whole recording, with the reasons."""
 
 
-def run_jobs(jobs: Iterable[tuple[MiningJob, int]], workers: Workers, cut: list[CutRecording]) -> Iterator[Done]:
+def run_jobs(jobs: Iterable[tuple[MiningJob, int]], workers: Workers, cut: list[CutRecording]) -> Iterator[JobResult]:
     """Run the jobs, each with the size of its recording in bytes; yields results when they are ready, by parts of the
     rules.
 
@@ -71,15 +71,15 @@ def run_jobs(jobs: Iterable[tuple[MiningJob, int]], workers: Workers, cut: list[
     for call, result in workers.run(calls):
         found = of_pieces.get(id(call))
         if found is None:
-            yield Done(call.argument, call.argument.wanted, result)
+            yield JobResult(call.argument, call.argument.wanted, result)
         elif found.take(call, result):
             done = found.result()
             if done is None:
                 again.append(RemoteCall(mine_recording, found.job))
             else:
-                yield Done(found.job, found.job.wanted, done)
+                yield JobResult(found.job, found.job.wanted, done)
     for call, result in workers.run(again):
-        yield Done(call.argument, call.argument.wanted, result)
+        yield JobResult(call.argument, call.argument.wanted, result)
 
 
 def _cutting(job: MiningJob, count: int) -> Cutting | None:
@@ -106,17 +106,17 @@ class _Pieces:
         self.job = job._replace(clips=None)
         given = job.source.files, job.detector, job.rules
         self.calls = [RemoteCall(observe, PieceJob(span, *given)) for span in cutting.spans]
-        self._observed: dict[int, Observed] = {}
+        self._observed: dict[int, PieceResult] = {}
 
-    def take(self, call: RemoteCall, result: Observed | Lost) -> bool:
+    def take(self, call: RemoteCall, result: PieceResult | LostWorker) -> bool:
         """Store the result of a piece; returns whether it was the last one."""
-        found = Observed(flaw=result.reason) if isinstance(result, Lost) else result
+        found = PieceResult(flaw=result.reason) if isinstance(result, LostWorker) else result
         self._observed[[id(each) for each in self.calls].index(id(call))] = found
         return len(self._observed) == len(self.calls)
 
     def result(self) -> bytes | None:
         """The joined result; None: the recording must be mined as a whole."""
-        pieces: Sequence[Observed] = [self._observed[at] for at in range(len(self.calls))]
+        pieces: Sequence[PieceResult] = [self._observed[at] for at in range(len(self.calls))]
         if flaw_of(pieces) is not None:
             return None
         return msgspec.msgpack.encode(joined(self.job, tuple(map(Path, self.job.source.files)), pieces))

@@ -21,7 +21,7 @@ from detector.plugins.processes import REPLAY_PATIENCE, ProcessHost
 from detector.replay.clips import Clips
 from detector.replay.gathering import Recording
 from detector.replay.playing import play
-from detector.replay.replaying import Replayed
+from detector.replay.replaying import ReplayResult
 from detector.results.episodes import EpisodeRow
 from detector.results.nearest import NearMoment
 from detector.results.quality import Arrivals, StreamQuality
@@ -35,7 +35,7 @@ _DIGITS = 12
 the same beginning."""
 
 
-class Flaw(msgspec.Struct, frozen=True, order=True):
+class MiningProblem(msgspec.Struct, frozen=True, order=True):
     """A problem of a recording, or of a rule over it."""
 
     kind: str
@@ -54,14 +54,14 @@ class RuleCount(msgspec.Struct, frozen=True):
     errors: int
 
 
-class Mined(msgspec.Struct):
+class RecordingResult(msgspec.Struct):
     """The result of a recording, for some rules."""
 
     episodes: list[EpisodeRow] = []
     """In order of the rules, then of their starts; without the recording's name."""
     counts: list[RuleCount] = []
     streams: list[StreamQuality] = []
-    flaws: list[Flaw] = []
+    flaws: list[MiningProblem] = []
     nearest: list[NearMoment] = []
     """The near misses of rules with a margin; they name no recording."""
     clips: dict[str, list[str]] = {}
@@ -92,7 +92,7 @@ class MiningJob(NamedTuple):
 
 
 def mine_recording(job: MiningJob) -> bytes:
-    """Mine one recording; returns a `Mined` as msgpack, including the recording's problems."""
+    """Mine one recording; returns a `RecordingResult` as msgpack, including the recording's problems."""
     tuned()
     return msgspec.msgpack.encode(_mined(job))
 
@@ -103,23 +103,27 @@ def tuned() -> None:
     tune_garbage_collection()
 
 
-def decode_mined(data: bytes) -> Mined:
+def decode_mined(data: bytes) -> RecordingResult:
     """The inverse of `mine`'s encoding. Raises msgspec.DecodeError if another version wrote it."""
-    return msgspec.msgpack.decode(data, type=Mined)
+    return msgspec.msgpack.decode(data, type=RecordingResult)
 
 
-def _mined(job: MiningJob) -> Mined:
+def _mined(job: MiningJob) -> RecordingResult:
     recording: Recording = ()
     try:
         with fetched(job.source) as recording:
             return _replayed(job, recording)
     except (InputError, ExceptionGroup) as error:
         causes = error.exceptions if isinstance(error, ExceptionGroup) else (error,)
-        return Mined(flaws=[Flaw("unreadable", "; ".join(_plain(str(each), recording) for each in causes))])
+        return RecordingResult(
+            flaws=[MiningProblem("unreadable", "; ".join(_plain(str(each), recording) for each in causes))]
+        )
     except OSError as error:
-        return Mined(flaws=[Flaw("failed", _plain(str(error), recording))])
+        return RecordingResult(flaws=[MiningProblem("failed", _plain(str(error), recording))])
     except Exception as error:  # noqa: BLE001  one recording of thousands must not stop the others
-        return Mined(flaws=[Flaw("failed", f"{type(error).__name__}: {error}: run `detector replay` to see where")])
+        return RecordingResult(
+            flaws=[MiningProblem("failed", f"{type(error).__name__}: {error}: run `detector replay` to see where")]
+        )
 
 
 def _plain(text: str, recording: Recording) -> str:
@@ -129,7 +133,7 @@ def _plain(text: str, recording: Recording) -> str:
     return text
 
 
-def _replayed(job: MiningJob, recording: Recording) -> Mined:
+def _replayed(job: MiningJob, recording: Recording) -> RecordingResult:
     tracer, arrivals = Tracer(dict.fromkeys(job.wanted), ways=False), Arrivals()
     clips = None if job.clips is None else _clips(Path(job.clips))
     played = play(
@@ -157,12 +161,12 @@ def job_holder(job: MiningJob) -> str:
     return f"{job.detector.name}.{job.content[:_DIGITS]}"
 
 
-def mined_of(result: Result, wanted: frozenset[str]) -> Mined:
+def mined_of(result: Result, wanted: frozenset[str]) -> RecordingResult:
     """The cached part of a replay's result; flaws and clips are added later."""
     episodes = [each for each in result.episodes if each.rule in wanted]
     for each in episodes:
         each.recording = ""
-    return Mined(
+    return RecordingResult(
         episodes=in_their_order(episodes),
         counts=[RuleCount(name, *counts) for name, counts in sorted(result.counts.items()) if name in wanted],
         streams=[*result.streams],
@@ -172,14 +176,14 @@ def mined_of(result: Result, wanted: frozenset[str]) -> Mined:
 
 
 def in_their_order(episodes: Iterable[EpisodeRow]) -> list[EpisodeRow]:
-    """In the order of a `Mined`."""
+    """In the order of a `RecordingResult`."""
     return sorted(episodes, key=lambda each: (each.rule, each.start_time, each.subject))
 
 
-def _flaws(outcome: Replayed, job: MiningJob, recording: Recording) -> list[Flaw]:
-    cuts = [Flaw("cut", _plain(str(cut), recording)) for cut in outcome.cuts]
+def _flaws(outcome: ReplayResult, job: MiningJob, recording: Recording) -> list[MiningProblem]:
+    cuts = [MiningProblem("cut", _plain(str(cut), recording)) for cut in outcome.cuts]
     refusals = [
-        Flaw("refused", str(refusal), refusal.rule.name)
+        MiningProblem("refused", str(refusal), refusal.rule.name)
         for refusal in outcome.refusals
         if refusal.rule.name in job.wanted
     ]

@@ -22,7 +22,7 @@ class RemoteCall(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Lost:
+class LostWorker:
     """Stands in for a result: the process died each time."""
 
     reason: str
@@ -36,7 +36,7 @@ class Workers(Protocol):
         """How many calls run in parallel."""
 
     def run(self, calls: Iterable[RemoteCall]) -> Iterator[tuple[RemoteCall, Any]]:
-        """Each call with its result, or `Lost`, as they become ready.
+        """Each call with its result, or `LostWorker`, as they become ready.
 
         An exception of a call is raised here.
         """
@@ -72,7 +72,7 @@ class LocalWorkers:
                 try:
                     result = executor.submit(call.function, call.argument).result()
                 except BrokenProcessPool:
-                    result = Lost("its process was killed, e.g. for lack of memory: mine with fewer processes")
+                    result = LostWorker("its process was killed, e.g. for lack of memory: mine with fewer processes")
                 yield call, result
 
     def close(self) -> None:

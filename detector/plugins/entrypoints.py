@@ -15,7 +15,7 @@ from typing import Any, Generic, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from wayside.api.wording import FieldPath, messages
+from wayside.api.validation_errors import FieldPath, messages
 from wayside.names import did_you_mean
 
 T = TypeVar("T")
@@ -37,7 +37,7 @@ class PluginError(ValueError):
 
 
 @dataclass(frozen=True)
-class Offers(Generic[T]):
+class PluginClasses(Generic[T]):
     """The classes of one kind that packages provide. Loading runs their code: only named ones are loaded, once."""
 
     group: str
@@ -84,7 +84,7 @@ def _foreign(entry: EntryPoint) -> bool:
 
 
 @cache
-def _load(offers: Offers[T], name: str) -> type[T]:
+def _load(offers: PluginClasses[T], name: str) -> type[T]:
     """Raises LookupError, with a text for the user."""
     entries = offers.installed()
     entry = entries.get(name)

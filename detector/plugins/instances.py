@@ -10,14 +10,14 @@ from typing import Any
 from detector.engine.queries.queries import Queries
 from detector.engine.scoping.plugins import PluginCall, PluginFailedError
 from detector.plugins.base import Plugin, PluginParameters, PluginSubject
-from detector.plugins.entrypoints import Offers, PluginError
+from detector.plugins.entrypoints import PluginClasses, PluginError
 from wayside.api import Detector, EventRule
 from wayside.expressions import Reason, Value
 from wayside.rules import CompiledRule, RuleProblem
 
 _GROUP = "wayside.signals"
 
-OFFERS = Offers[Plugin[Any]](
+OFFERS = PluginClasses[Plugin[Any]](
     group=_GROUP,
     noun="plugin",
     base=Plugin,

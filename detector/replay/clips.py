@@ -9,7 +9,7 @@ import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from detector.actions.base import ActionError, Surroundings
+from detector.actions.base import ActionError, DetectorConfiguration
 from detector.actions.host import ActionHost
 from detector.actions.record.destination import finished_recordings
 from detector.engine.consequences.consequences import Consequence
@@ -53,9 +53,9 @@ class Recorders:
     def __init__(self, holder: str) -> None:
         self._host = ActionHost(holder, _Nobody(), patient=True)
 
-    def follow(self, rules: Sequence[EventRule], surroundings: Surroundings) -> None:
+    def follow(self, rules: Sequence[EventRule], configuration: DetectorConfiguration) -> None:
         """Use these rules from now on."""
-        self._host.follow([_recording(rule) for rule in rules], surroundings)
+        self._host.follow([_recording(rule) for rule in rules], configuration)
 
     def dispatch(self, consequences: Sequence[Consequence]) -> None:
         """Pass on what happened, in order."""
@@ -64,10 +64,10 @@ class Recorders:
     def close(self) -> Iterator[str]:
         """Complete all clips. Returns a line for each action that failed or lost something."""
         self._host.close(_GRACE)
-        for which, tally in self._host.outcomes.tallies().items():
-            if tally.failed:
-                of = f"{tally.failed} of {tally.done + tally.failed} clips"
-                yield f"{of} of action {which.action}, EventRule {which.rule}, are not whole: {tally.last_failure}"
+        for which, counts in self._host.outcomes.counts_by_action().items():
+            if counts.failed:
+                of = f"{counts.failed} of {counts.done + counts.failed} clips"
+                yield f"{of} of action {which.action}, EventRule {which.rule}, are not whole: {counts.last_failure}"
         for lost in self._host.outcomes.lost():
             where = f"action {lost.which.action}, EventRule {lost.which.rule}"
             yield f"{lost.count} {lost.what} ({where}): {lost.last}"

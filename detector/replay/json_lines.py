@@ -9,7 +9,7 @@ from typing import NamedTuple
 import msgspec
 
 from detector.replay.batches import Batch, Channel
-from detector.replay.message import Cut, OnCut, RecordingError, Wanted, topic_key
+from detector.replay.message import OnCut, RecordingError, Truncation, Wanted, topic_key
 
 EXAMPLE = '{"t": 1700000000000000000, "key": "vehicles/car7/pose", "value": {"x": 1.5}}'
 
@@ -65,7 +65,7 @@ def read_json_lines(path: Path, wanted: Wanted, on_cut: OnCut) -> Iterator[Batch
             if block.unreadable is not None:
                 where, text, error = block.unreadable
                 if not text.endswith(b"\n"):
-                    on_cut(Cut(path, messages, f"line {where} has no end"))
+                    on_cut(Truncation(path, messages, f"line {where} has no end"))
                     return
                 raise RecordingError(f"{path}:{where}: {error}: write each line as {EXAMPLE}") from error
 

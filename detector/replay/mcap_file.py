@@ -20,12 +20,12 @@ from detector.replay.mcap_chunks import Chunks, Left
 from detector.replay.mcap_cut import MAGIC, ChunkLocation, UnindexedMcap, messages_at, scan_mcap
 from detector.replay.message import (
     DAMAGE,
-    Cut,
     Message,
     OnCut,
     Piece,
     RecordedType,
     RecordingError,
+    Truncation,
     Wanted,
     messages_in_order,
     topic_key,
@@ -143,7 +143,7 @@ def _without_index(
         count += 1
         yield message
     if contents.cut is not None:
-        on_cut(Cut(path, count, contents.cut))
+        on_cut(Truncation(path, count, contents.cut))
 
 
 def mcap_types(path: Path) -> list[RecordedType]:

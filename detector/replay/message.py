@@ -61,7 +61,7 @@ class RecordedType(NamedTuple):
     """Whether the text is IDL; otherwise it is in the form of a .msg file."""
 
 
-class Cut(NamedTuple):
+class Truncation(NamedTuple):
     """A truncated recording: its recorder was killed, or the file was not copied completely."""
 
     path: Path
@@ -73,11 +73,11 @@ class Cut(NamedTuple):
         return f"{self.path}: the recording is cut ({self.reason}): it contains {self.messages} messages up to there"
 
 
-OnCut = Callable[[Cut], None]
+OnCut = Callable[[Truncation], None]
 """Called when the reading of a recording ends at a cut."""
 
 
-def ignore(cut: Cut) -> None:
+def ignore(cut: Truncation) -> None:
     """For a second pass over a recording."""
 
 

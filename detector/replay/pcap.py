@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from detector.engine.samples.sample import DecodeError
 from detector.replay.batches import Batch, batched
-from detector.replay.message import Cut, Message, OnCut, RecordingError, Wanted
+from detector.replay.message import Message, OnCut, RecordingError, Truncation, Wanted
 from detector.streams.codecs.etsi.messages import BY_NUMBER, PREFIX
 from detector.streams.codecs.etsi.packets import ETHERTYPE, message_in
 
@@ -57,7 +57,7 @@ def read_pcap(path: Path, wanted: Wanted, on_cut: OnCut) -> Iterator[Batch]:
                 if wanted(key):
                     messages.append(Message(time, key, packet, "uper", None))
     except _CutError as error:
-        on_cut(Cut(path, len(messages), str(error)))
+        on_cut(Truncation(path, len(messages), str(error)))
     # Captures of several interfaces go back in time by a little; they are small enough to be sorted as a whole.
     yield from batched(sorted(messages, key=attrgetter("time")))
 

@@ -15,17 +15,17 @@ from typing import NamedTuple, Protocol
 import msgspec
 from msgspec.structs import replace
 
-from detector.assembly import inlets
+from detector.assembly import stream_readers
 from detector.engine.buffering.lanes import latched_topics
 from detector.engine.buffering.latched import Topic
 from detector.engine.samples.sample import Arrival
 from detector.engine.scoping.plugins import PluginHost
 from detector.replay.clips import Clips
 from detector.replay.gathering import Recording, recording_name
-from detector.replay.message import Cut, OnCut, RecordingError, ignore
+from detector.replay.message import OnCut, RecordingError, Truncation, ignore
 from detector.replay.recorded_types import with_recorded_types
 from detector.replay.recordings import open_recordings
-from detector.replay.replaying import Replayed, ReplayObserver, replay_arrivals
+from detector.replay.replaying import ReplayObserver, ReplayResult, replay_arrivals
 from detector.replay.routing import MessageRouter
 from wayside.api import Detector, EventRule
 
@@ -40,10 +40,10 @@ class ReplayWatch(Protocol):
         """The same arrivals."""
 
 
-class Played(NamedTuple):
+class PlayResult(NamedTuple):
     """The result of playing several recordings."""
 
-    outcomes: dict[str, Replayed]
+    outcomes: dict[str, ReplayResult]
     """By the recording's name, in the order given; at least one."""
     errors: list[RecordingError]
     """Why the other recordings could not be replayed."""
@@ -58,7 +58,7 @@ def play(
     onlooker: Callable[[str], ReplayObserver | None] = lambda _: None,
     clips: Clips | None = None,
     holder: str | None = None,
-) -> Played:
+) -> PlayResult:
     """The outcome of each recording. Without `plugins` they run in this process. `holder` is by default the Detector.
 
     For several recordings, the events of each name it, and from the second on its number is part of the holder: ids and
@@ -70,7 +70,7 @@ def play(
         RecordingError: the one recording is damaged or does not fit the streams, or no message of any belongs to a
             stream; an ExceptionGroup of these where several recordings have several errors.
     """
-    outcomes: dict[str, Replayed] = {}
+    outcomes: dict[str, ReplayResult] = {}
     errors: list[RecordingError] = []
     unrouted: dict[str, list[str]] = {}
     for number, recording in enumerate(recordings, start=1):
@@ -87,7 +87,7 @@ def play(
     if not any(outcome.samples for outcome in outcomes.values()):
         errors += _without_samples(outcomes, unrouted, detector)
         raise errors[0] if len(errors) == 1 else ExceptionGroup("no recording can be replayed", errors)
-    return Played(outcomes, errors)
+    return PlayResult(outcomes, errors)
 
 
 def _played(
@@ -99,9 +99,9 @@ def _played(
     holder: str,
     onlooker: ReplayObserver | None,
     clips: Clips | None,
-) -> tuple[Replayed, list[str]]:
+) -> tuple[ReplayResult, list[str]]:
     """The outcome of a recording, and its keys that belong to no stream."""
-    cuts: list[Cut] = []
+    cuts: list[Truncation] = []
     completed = with_recorded_types(detector, recording)
     router = MessageRouter(completed.spec.streams, recording_name(recording))
     arrivals = recorded_arrivals(recording, router, completed, cuts.append)
@@ -116,7 +116,7 @@ def _played(
 
 
 def _without_samples(
-    outcomes: dict[str, Replayed], unrouted: dict[str, list[str]], detector: Detector
+    outcomes: dict[str, ReplayResult], unrouted: dict[str, list[str]], detector: Detector
 ) -> Iterator[RecordingError]:
     """Why none of the recordings has anything to evaluate."""
     for name, outcome in outcomes.items():
@@ -146,7 +146,7 @@ def recorded_arrivals(
         RecordingError: a recording is missing or damaged, or does not fit the streams.
     """
     arrivals = router.arrivals(open_recordings(recordings, router.wanted, on_cut))
-    topics = latched_topics(detector, inlets(detector).decoders)
+    topics = latched_topics(detector, stream_readers(detector).decoders)
     if not topics:
         return arrivals
     # Read once for these only (a recording with an index skips the rest): it need not fit into memory as a whole.

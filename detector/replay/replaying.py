@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Protocol
 
-from detector.actions.base import Surroundings
-from detector.assembly import Inlets, RefusedRule, RuleIndex, inlets, make_engine
+from detector.actions.base import DetectorConfiguration
+from detector.assembly import RefusedRule, RuleIndex, StreamReaders, make_engine, stream_readers
 from detector.engine.engine import Engine, NotEvaluableError
 from detector.engine.episodes.demands import Demand, from_task, to_task
 from detector.engine.episodes.events import Event
@@ -26,7 +26,7 @@ from detector.findings.losses import Losses
 from detector.replay.batches import PAUSE, parts_of
 from detector.replay.clips import Clips, Recorders
 from detector.replay.intake_file import Control, detector_as_of, rule_as_of
-from detector.replay.message import Cut, RecordingError
+from detector.replay.message import RecordingError, Truncation
 from wayside.api import ApplicationTask, Detector, EventRule
 from wayside.findings import Finding
 from wayside.times import format_time
@@ -42,7 +42,7 @@ class ReplayObserver(Observer, Protocol):
 
 
 @dataclass(slots=True)
-class Replayed:
+class ReplayResult:
     """The outcome of a replay."""
 
     events: list[Event] = field(default_factory=list)
@@ -51,7 +51,7 @@ class Replayed:
     samples: int = 0
     notes: list[str] = field(default_factory=list)
     """Notes for the user: pauses, losses, unknown values and failures."""
-    cuts: list[Cut] = field(default_factory=list)
+    cuts: list[Truncation] = field(default_factory=list)
     """Truncated files of the recording."""
     doubts: list[Finding] = field(default_factory=list)
     """Stamps that do not fit the clock, many old samples, streams that become stale between their samples."""
@@ -75,7 +75,7 @@ class Replay:
         *,
         holder: str,
         start: int,
-        outcome: Replayed,
+        outcome: ReplayResult,
         plugins: PluginHost | None = None,
         version: int = ORDER,
         order: int = ORDER,
@@ -95,15 +95,15 @@ class Replay:
         self._clips = clips
         self._recorders: Recorders | None = None if clips is None else clips.recorders(holder)
         self._detector = detector = detector if clips is None else clips.placed(detector)
-        self._entries: Inlets = inlets(detector)
+        self._entries: StreamReaders = stream_readers(detector)
         self._rule_index = RuleIndex()
         self._engine: Engine = make_engine(
             detector, self._entries, holder=holder, start=start, plugins=plugins, order=order
         )
         self._engine.counters.watch_ages = True
-        self._engine.instruments.journal = []
+        self._engine.observers.journal = []
         self._engine.consequences.wanted = clips is not None
-        self._engine.instruments.observer = self._onlooker = onlooker
+        self._engine.observers.observer = self._onlooker = onlooker
         self._demands: dict[str, Demand] = {}
         self._demands_version: tuple[int, int] | None = None
         self.set_rules(rules)
@@ -146,7 +146,7 @@ class Replay:
     def set_detector(self, detector: Detector) -> None:
         """Switch to a changed Detector; `set_rules` follows."""
         self._detector = detector = detector if self._clips is None else self._clips.placed(detector)
-        self._entries = inlets(detector)
+        self._entries = stream_readers(detector)
         self._engine.set_detector(detector, self._entries.decoders, self._entries.read_key)
 
     def set_rules(self, rules: Sequence[EventRule]) -> None:
@@ -155,8 +155,8 @@ class Replay:
         self.outcome.refusals += refused
         self.outcome.rules |= {rule.name: rule for rule in rules}
         if self._recorders is not None:
-            surroundings = Surroundings(self._detector, self._entries.decoders, self._entries.types)
-            self._recorders.follow(self._rule_index.good, surroundings)
+            configuration = DetectorConfiguration(self._detector, self._entries.decoders, self._entries.types)
+            self._recorders.follow(self._rule_index.good, configuration)
         self._note(self._engine.set_rules([rule_as_of(rule, self._version) for rule in compiled]))
         if self._onlooker is not None:
             self._onlooker.attend(self._engine)
@@ -195,7 +195,7 @@ class Replay:
 
     def _note_changes(self) -> None:
         """Note changes of demands since the last call: one that began and ended in between is a task as well."""
-        journal = self._engine.instruments.journal or []
+        journal = self._engine.observers.journal or []
         changed = {change.demand.name: change for change in journal}
         for name, (_, demand, end) in changed.items():
             self.outcome.tasks[name] = to_task(demand, end)
@@ -213,7 +213,7 @@ def replay_intake(
     plugins: PluginHost | None = None,
     onlooker: ReplayObserver | None = None,
     clips: Clips | None = None,
-) -> Replayed:
+) -> ReplayResult:
     """Replay an intake file with its own Detector and rules, or with others if given.
 
     `plugins` runs them; without it they run in this process. With `clips`, record actions run.
@@ -222,7 +222,7 @@ def replay_intake(
         RecordingError: it does not begin with a start.
         DetectorError: the Detector cannot run.
     """
-    outcome = Replayed()
+    outcome = ReplayResult()
     replay: Replay | None = None
     batch: list[Arrival] = []
     for record in records:
@@ -257,7 +257,7 @@ def _begin(
     record: Control,
     detector: Detector | None,
     rules: Sequence[EventRule] | None,
-    outcome: Replayed,
+    outcome: ReplayResult,
     plugins: PluginHost | None,
     onlooker: ReplayObserver | None,
     clips: Clips | None,
@@ -281,7 +281,7 @@ def _begin(
 
 
 def _control(
-    replay: Replay, record: Control, detector: Detector | None, rules: Sequence[EventRule] | None, outcome: Replayed
+    replay: Replay, record: Control, detector: Detector | None, rules: Sequence[EventRule] | None, outcome: ReplayResult
 ) -> None:
     document = record.document
     match record.kind:
@@ -325,7 +325,7 @@ def replay_arrivals(
     holder: str | None = None,
     onlooker: ReplayObserver | None = None,
     clips: Clips | None = None,
-) -> Replayed:
+) -> ReplayResult:
     """Replay any other recording in the way the live intake would have queued it; `plugins` as for an intake file.
 
     Args:
@@ -336,7 +336,7 @@ def replay_arrivals(
     Raises:
         DetectorError: the Detector cannot run.
     """
-    outcome = Replayed()
+    outcome = ReplayResult()
     replay: Replay | None = None
     last = 0
     begin = partial(

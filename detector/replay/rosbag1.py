@@ -20,12 +20,12 @@ from rosbags.typesys.store import Typestore
 from detector.replay.batches import Batch, batched
 from detector.replay.message import (
     DAMAGE,
-    Cut,
     Message,
     OnCut,
     Piece,
     RecordedType,
     RecordingError,
+    Truncation,
     Wanted,
     messages_in_order,
     topic_key,
@@ -81,7 +81,7 @@ def _read_cut(path: Path, contents: UnindexedBag, wanted: Wanted, on_cut: OnCut)
     for message in messages_in_order(Piece(chunk.start, partial(messages, chunk)) for chunk in contents.chunks):
         count += 1
         yield message
-    on_cut(Cut(path, count, contents.cut or "it has no index"))
+    on_cut(Truncation(path, count, contents.cut or "it has no index"))
 
 
 def _contents(path: Path) -> UnindexedBag | None:

@@ -30,7 +30,7 @@ _UNPACK: dict[str, Callable[[bytes], bytes]] = {
 """Decompresses as much as possible of data that may be truncated."""
 
 
-class Recorded(NamedTuple):
+class BagMessage(NamedTuple):
     """One message."""
 
     time: int
@@ -87,14 +87,14 @@ def scan_bag(path: Path, magic: bytes) -> UnindexedBag:
     return found
 
 
-def chunk_messages(path: Path, chunk: Chunk, contents: UnindexedBag) -> Iterator[Recorded]:
+def chunk_messages(path: Path, chunk: Chunk, contents: UnindexedBag) -> Iterator[BagMessage]:
     """The messages of a chunk, in the order of the file."""
     with path.open("rb") as file:
         file.seek(chunk.offset)
         return _messages(file.read(chunk.length), chunk.compression, contents)
 
 
-def _messages(data: bytes, compression: str, contents: UnindexedBag) -> Iterator[Recorded]:
+def _messages(data: bytes, compression: str, contents: UnindexedBag) -> Iterator[BagMessage]:
     if compression not in _UNPACK:
         raise ValueError(f"unknown bag compression {compression!r}")
     inside = _UNPACK[compression](data)
@@ -108,7 +108,7 @@ def _messages(data: bytes, compression: str, contents: UnindexedBag) -> Iterator
             case op if op == _MESSAGE:
                 seconds, nanoseconds = _TIME.unpack(header["time"])
                 number = _LENGTH.unpack(header["conn"])[0]
-                yield Recorded(seconds * 10**9 + nanoseconds, number, body)
+                yield BagMessage(seconds * 10**9 + nanoseconds, number, body)
 
 
 def _connection(header: dict[str, bytes], body: bytes) -> Connection:

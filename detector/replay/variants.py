@@ -12,7 +12,7 @@ import yaml
 from pydantic import ValidationError
 
 from wayside.api import Detector, EventRule
-from wayside.api.wording import messages
+from wayside.api.validation_errors import messages
 from wayside.inputerror import InputError
 from wayside.names import did_you_mean
 

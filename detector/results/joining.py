@@ -15,7 +15,7 @@ from detector.results.series import Integers
 from wayside.expressions.columns.values import Bools, Column, Tag
 
 
-class Waiting(NamedTuple):
+class EvaluatedBlock(NamedTuple):
     """An evaluated block, and the numbers of its clients."""
 
     block: Block
@@ -23,7 +23,7 @@ class Waiting(NamedTuple):
     numbers: Integers
 
 
-class Seen:
+class JoinedBlock:
     """Consecutive blocks of the same clients as one block."""
 
     def __init__(self, blocks: Sequence[Block]) -> None:
@@ -85,14 +85,14 @@ class Seen:
 class Joined(NamedTuple):
     """Blocks as one."""
 
-    block: Seen
+    block: JoinedBlock
     codes: Codes
     numbers: Integers
 
 
-def joined_blocks(waiting: Sequence[Waiting]) -> Iterator[Joined]:
+def joined_blocks(waiting: Sequence[EvaluatedBlock]) -> Iterator[Joined]:
     """The blocks, with those of the same clients joined."""
     for _, group in itertools.groupby(waiting, key=lambda each: each.numbers.tobytes()):
         parts = [*group]
         codes = parts[0].codes if len(parts) == 1 else np.concatenate([part.codes for part in parts], axis=2)
-        yield Joined(Seen([part.block for part in parts]), codes, parts[0].numbers)
+        yield Joined(JoinedBlock([part.block for part in parts]), codes, parts[0].numbers)

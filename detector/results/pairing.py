@@ -17,13 +17,13 @@ from detector.results.series import (
     AWAY,
     UNKNOWN,
     Bytes,
+    ClientPath,
     Doubles,
     Integers,
     Series,
     SeriesKind,
     SubjectTrace,
     Wanted,
-    Way,
     codes_of,
     steps_of,
 )
@@ -149,7 +149,7 @@ class PairLog:
         return "a value that it reads does not exist"
 
 
-class WayLog:
+class PathLog:
     """The places of clients, as seen by one of the rules about pairs: the first one."""
 
     def __init__(self) -> None:
@@ -170,7 +170,7 @@ class WayLog:
         self._clients.append(numbers[known])
         self._axes.append(these.places.axes[:2, known])
 
-    def ways(self, names: Sequence[str]) -> dict[str, Way]:
+    def ways(self, names: Sequence[str]) -> dict[str, ClientPath]:
         """By client, its places; without repeated ones."""
         if not self._times:
             return {}
@@ -184,7 +184,7 @@ class WayLog:
         clients, times, axes = clients[moved], times[moved], axes[:, moved]
         bounds = [0, *(np.flatnonzero(np.diff(clients)) + 1).tolist(), len(clients)] if len(clients) else [0]
         return {
-            names[int(clients[begin])]: Way(times[begin:end], axes[:, begin:end])
+            names[int(clients[begin])]: ClientPath(times[begin:end], axes[:, begin:end])
             for begin, end in itertools.pairwise(bounds)
         }
 

@@ -27,7 +27,7 @@ from wayside.manifests import to_yaml
 from wayside.times import format_time, parse_time
 
 
-class Deed(NamedTuple):
+class ActionRow(NamedTuple):
     """One action for one episode. Times are nanoseconds since the epoch."""
 
     rule: str
@@ -42,13 +42,13 @@ class Deed(NamedTuple):
     """None: still running at the end of the recording."""
 
 
-def deeds_of(result: Result) -> list[Deed]:
+def deeds_of(result: Result) -> list[ActionRow]:
     """The actions that would have run, in time order."""
     found = [*_tasks(result), *_windows(result)]
     return sorted(found, key=lambda deed: (deed.begin, deed.rule, deed.subject, deed.action))
 
 
-def _tasks(result: Result) -> Iterator[Deed]:
+def _tasks(result: Result) -> Iterator[ActionRow]:
     for task in result.tasks:
         event, spec = task.spec.event, task.spec
         if event is None:
@@ -57,10 +57,10 @@ def _tasks(result: Result) -> Iterator[Deed]:
         about = f"{spec.template_name}: {parameters}" if parameters else spec.template_name
         end = None if spec.end_time is None else parse_time(spec.end_time)
         begin = parse_time(event.start_time)
-        yield Deed(event.rule, event.action, event.subject, str(spec.operation).lower(), about, begin, end)
+        yield ActionRow(event.rule, event.action, event.subject, str(spec.operation).lower(), about, begin, end)
 
 
-def _windows(result: Result) -> Iterator[Deed]:
+def _windows(result: Result) -> Iterator[ActionRow]:
     for episode in result.episodes:
         rule = result.rules.get(episode.rule)
         if rule is None or rule.dry_run:
@@ -68,13 +68,13 @@ def _windows(result: Result) -> Iterator[Deed]:
         for action in rule.actions:
             kind = next((key for key in json.loads(action.source) if key != "name"), "action")
             if action.window is None:
-                yield Deed(rule.name, action.name, episode.subject, kind, "", episode.start_time, episode.end_time)
+                yield ActionRow(rule.name, action.name, episode.subject, kind, "", episode.start_time, episode.end_time)
                 continue
             window = action.window
             begin = episode.onset_time - window.before_ns
             end = None if episode.end_time is None else episode.end_time + window.after_ns
             about = ", ".join(sorted(window.streams))
-            yield Deed(rule.name, action.name, episode.subject, kind, about, begin, end)
+            yield ActionRow(rule.name, action.name, episode.subject, kind, about, begin, end)
 
 
 MOST = 140_000
@@ -345,7 +345,7 @@ def _ways(result: Result, table: _Table) -> list[dict[str, Any]]:
     return found
 
 
-def _demands(deeds: Sequence[Deed], table: _Table) -> list[dict[str, Any]]:
+def _demands(deeds: Sequence[ActionRow], table: _Table) -> list[dict[str, Any]]:
     """By template, the number of tasks that demand it over time."""
     edges: dict[str, list[tuple[float, int]]] = {}
     for deed in deeds:

@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 from detector.engine.episodes.events import Event
-from detector.replay.replaying import Replayed
+from detector.replay.replaying import ReplayResult
 from detector.results.episodes import EpisodeRow, episodes_of
 from detector.results.nearest import NearMoment, nearest_moments
 from detector.results.quality import Arrivals, StreamQuality
@@ -52,7 +52,7 @@ class Result:
         return nearest_moments(self.recording, self.rules, self.trace.subjects, self.episodes)
 
 
-def result_of(name: str, outcome: Replayed, tracer: Tracer, arrivals: Arrivals) -> Result:
+def result_of(name: str, outcome: ReplayResult, tracer: Tracer, arrivals: Arrivals) -> Result:
     """The result of a replay; `tracer` and `arrivals` observed it.
 
     Raises:

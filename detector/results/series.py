@@ -117,7 +117,7 @@ class SubjectTrace:
 
 
 @dataclass(frozen=True, slots=True)
-class Way:
+class ClientPath:
     """The path of a client."""
 
     times: Integers
@@ -129,7 +129,7 @@ _AXES = {("x", "y"): False, ("latitude", "longitude"): True}
 """Signals that form a position, and whether it is in degrees."""
 
 
-def ways_of(subjects: Sequence[SubjectTrace]) -> tuple[dict[str, Way], bool]:
+def ways_of(subjects: Sequence[SubjectTrace]) -> tuple[dict[str, ClientPath], bool]:
     """By client, its path, from the signals `x` and `y`, or `latitude` and `longitude`, of the first rule that has
     them.
 
@@ -138,7 +138,7 @@ def ways_of(subjects: Sequence[SubjectTrace]) -> tuple[dict[str, Way], bool]:
     for axes, geographic in _AXES.items():
         having = [each for each in subjects if len(each.clients) == 1 and _have(each, axes)]
         if having:
-            ways: dict[str, Way] = {}
+            ways: dict[str, ClientPath] = {}
             for subject in having:
                 if subject.rule == having[0].rule and subject.clients[0] not in ways:
                     series = [subject.signals[axis] for axis in axes]
@@ -146,7 +146,7 @@ def ways_of(subjects: Sequence[SubjectTrace]) -> tuple[dict[str, Way], bool]:
                     places = np.stack([each.at(times) for each in series])
                     known = ~np.isnan(places).any(axis=0)
                     if known.any():
-                        ways[subject.clients[0]] = Way(times[known], places[:, known])
+                        ways[subject.clients[0]] = ClientPath(times[known], places[:, known])
             return ways, geographic
     return {}, False
 
@@ -161,7 +161,7 @@ class Trace:
 
     subjects: list[SubjectTrace] = field(default_factory=list)
     """In order of the rules' names, then of the subjects."""
-    ways: dict[str, Way] = field(default_factory=dict)
+    ways: dict[str, ClientPath] = field(default_factory=dict)
     """By client, if known."""
     geographic: bool = False
     """Whether paths are in degrees."""

@@ -17,9 +17,10 @@ from detector.engine.engine import Engine
 from detector.engine.episodes.episodes import OUTSIDE
 from detector.engine.episodes.subjects import FLEET, Subject
 from detector.results.changes import Changes
-from detector.results.joining import Seen, Waiting, joined_blocks
-from detector.results.pairing import PairLog, WayLog
+from detector.results.joining import EvaluatedBlock, JoinedBlock, joined_blocks
+from detector.results.pairing import PairLog, PathLog
 from detector.results.reasons import of_variables, why_unknown
+from detector.results.recorded_values import RecordedValues
 from detector.results.series import (
     AWAY,
     UNKNOWN,
@@ -36,7 +37,6 @@ from detector.results.series import (
     steps_of,
     ways_of,
 )
-from detector.results.witnessing import Witnessed
 from wayside.expressions.columns.values import Tag
 from wayside.names import parse_subject
 from wayside.rules import CompiledRule, PairSubject
@@ -55,7 +55,7 @@ class _Plan(NamedTuple):
     """The row of a track, the track, the field and its changes."""
     seen: set[int]
     """The clients of the previous block."""
-    waiting: list[Waiting]
+    waiting: list[EvaluatedBlock]
     """Small blocks, which are recorded together: live and beside rules about pairs, blocks have few ticks."""
 
 
@@ -87,8 +87,8 @@ class Tracer:
         self._clients: tuple[Sequence[str], Integers] = ((), np.zeros(0, np.int64))
         self._pairs: dict[tuple[str, str], PairLog] = {}
         """By rule and its digest."""
-        self._ways = WayLog()
-        self._witnessed: dict[str, Witnessed] = {}
+        self._ways = PathLog()
+        self._witnessed: dict[str, RecordedValues] = {}
         self._begin: int | None = None
         self._end = 0
 
@@ -101,9 +101,9 @@ class Tracer:
             if name not in engine.in_columns:
                 run.witness = self.witnessed(run.rule).saw
 
-    def witnessed(self, rule: CompiledRule) -> Witnessed:
+    def witnessed(self, rule: CompiledRule) -> RecordedValues:
         """The record of a rule that is not in columns."""
-        return self._witnessed.setdefault(rule.name, Witnessed(rule))
+        return self._witnessed.setdefault(rule.name, RecordedValues(rule))
 
     def clients(self, tracks: Sequence[Track], block: Block, codes: Codes, looked: Truths | None) -> None:
         """Record the changes in a block of rules about clients."""
@@ -116,12 +116,12 @@ class Tracer:
             return
         numbers = self._numbers_of(block.clients)
         if looked is None and not _has_texts(plan, block):  # codes of texts may not last
-            plan.waiting.append(Waiting(block, codes, numbers))
+            plan.waiting.append(EvaluatedBlock(block, codes, numbers))
             if sum(len(each.block.ticks) for each in plan.waiting) * len(numbers) >= _POINTS:
                 self._flush(plan)
             return
         self._flush(plan)
-        self._note(plan, Seen([block]), codes, numbers, looked)
+        self._note(plan, JoinedBlock([block]), codes, numbers, looked)
 
     def settle(self) -> None:
         """Record what is queued. After this call, the trace no longer needs the engine."""
@@ -134,7 +134,7 @@ class Tracer:
             self._note(plan, joined.block, joined.codes, joined.numbers, None)
         plan.waiting.clear()
 
-    def _note(self, plan: _Plan, block: Seen, codes: Codes, numbers: Integers, looked: Truths | None) -> None:
+    def _note(self, plan: _Plan, block: JoinedBlock, codes: Codes, numbers: Integers, looked: Truths | None) -> None:
         everybody = looked is None
         at_all = self._rows(numbers, None if looked is None else np.asarray(looked.any(axis=0)))
         for at, track, name, changes in plan.signals:
@@ -271,7 +271,7 @@ class Tracer:
 
     def _signal(
         self,
-        block: Seen,
+        block: JoinedBlock,
         track: Track,
         name: str,
         numbers: Integers,
@@ -299,7 +299,7 @@ class Tracer:
 
     def _condition(
         self,
-        block: Seen,
+        block: JoinedBlock,
         codes: Codes,
         row: int,
         track: Track,

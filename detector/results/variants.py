@@ -19,7 +19,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from detector.engine.episodes.events import Event
-from detector.replay.replaying import Replayed
+from detector.replay.replaying import ReplayResult
 from detector.replay.variants import Variant
 from wayside.times import format_time
 
@@ -151,7 +151,7 @@ def _matched(first: str, second: str, spans: Sequence[EpisodeTimes], others: Seq
     return Comparison(first, second, tuple(both), tuple(only), tuple(rest))
 
 
-def comparisons(outcomes: Sequence[Replayed], variants: Sequence[Variant]) -> list[Comparison]:
+def comparisons(outcomes: Sequence[ReplayResult], variants: Sequence[Variant]) -> list[Comparison]:
     """Each variant with its rule as written, over all recordings."""
     return [
         combined([compare(outcome.events, each.of, each.rule.name, outcome.end) for outcome in outcomes])

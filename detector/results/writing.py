@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from detector.engine.samples.sample import Arrival
-from detector.replay.replaying import Replayed
+from detector.replay.replaying import ReplayResult
 from detector.results.episodes import write_csv, write_parquet
 from detector.results.kinds import ResultKind, check_package
 from detector.results.nearest import NearMoment, nearest_by_rule, show_moments
@@ -28,29 +28,29 @@ def check_installed(kinds: Iterable[ResultKind]) -> None:
         check_package(_NEEDED[kind], f"--results {kind}")
 
 
-class Look(NamedTuple):
+class RecordingTrace(NamedTuple):
     """The observers of the replay of one recording."""
 
     tracer: Tracer
     arrivals: Arrivals
 
 
-class Looking:
+class ResultCollector:
     """Observes the replay of several recordings, one after another."""
 
     def __init__(self) -> None:
-        self._looks: dict[str, Look] = {}
+        self._looks: dict[str, RecordingTrace] = {}
 
-    def watch(self, name: str) -> Look:
+    def watch(self, name: str) -> RecordingTrace:
         """The observers of the recording of that name, which comes next."""
-        look = self._looks[name] = Look(Tracer(), Arrivals())
+        look = self._looks[name] = RecordingTrace(Tracer(), Arrivals())
         return look
 
     def batches(self, batches: Iterable[Sequence[Arrival]]) -> Iterator[Sequence[Arrival]]:
         """The batches of the current recording, unchanged."""
         return [*self._looks.values()][-1].arrivals.watch_batches(batches)
 
-    def results(self, outcomes: Mapping[str, Replayed]) -> list[Result]:
+    def results(self, outcomes: Mapping[str, ReplayResult]) -> list[Result]:
         """The result of each recording."""
         return [result_of(name, outcome, *self._looks[name]) for name, outcome in outcomes.items()]
 

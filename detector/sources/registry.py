@@ -7,13 +7,13 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from detector.plugins.entrypoints import Offers, PluginError
+from detector.plugins.entrypoints import PluginClasses, PluginError
 from detector.sources.base import Source
 from wayside.api import Detector
 from wayside.api.plugin import DataSource
 from wayside.rules import RuleProblem
 
-OFFERS = Offers[Source[Any]](
+OFFERS = PluginClasses[Source[Any]](
     group="wayside.sources", noun="plugin", base=Source, model=BaseModel, guide="docs/sources.md"
 )
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from detector.sources.base import Feed, Putter
 from detector.sources.registry import Make, prepare_source
-from detector.streams.tally import Cause, Tally
+from detector.streams.loss_counter import Cause, LossCounter
 from wayside.api import Detector
 from wayside.api.plugin import DataSource
 from wayside.api.stream import Stream
@@ -46,7 +46,7 @@ class SourceThread:
         source: DataSource,
         streams: tuple[Stream, ...],
         putter: Putter,
-        tally: Tally,
+        loss_counter: LossCounter,
         *,
         first_pause: float = _FIRST_PAUSE,
         longest_pause: float = _LONGEST_PAUSE,
@@ -57,9 +57,9 @@ class SourceThread:
         self.state = SourceState.RUNNING
         self.last_error = ""
         self._make: Make = prepare_source(source)
-        self._tally = tally
+        self._loss_counter = loss_counter
         self._backoff = Backoff(first_pause, longest_pause)
-        self._feed = Feed(streams, putter, lambda key: tally.add(Cause.UNROUTED, source.name, last=key))
+        self._feed = Feed(streams, putter, lambda key: loss_counter.add(Cause.UNROUTED, source.name, last=key))
         self._thread = threading.Thread(target=self._run, name=f"source {source.name}", daemon=True)
 
     @property
@@ -79,7 +79,7 @@ class SourceThread:
         """Wait for its end, for at most `timeout` seconds; then it is abandoned, logged and counted."""
         self._thread.join(timeout)
         if self._thread.is_alive():
-            self._tally.add(Cause.LEFT_BEHIND, self.source.name)
+            self._loss_counter.add(Cause.LEFT_BEHIND, self.source.name)
             log.error(
                 "source %s (%s) does not stop; abandoning its thread: its run() must check feed.stopping",
                 self.source.name,
@@ -112,7 +112,7 @@ class SourceThread:
         pause = self._backoff.fail()
         self.state = SourceState.PAUSING
         self.last_error = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
-        self._tally.add(Cause.FAILED, self.source.name, last=self.last_error)
+        self._loss_counter.add(Cause.FAILED, self.source.name, last=self.last_error)
         log.warning("source %s failed; restarting it in %.1f s: %s", self.source.name, pause, self.last_error)
         log.debug("source %s", self.source.name, exc_info=error)
         return pause
@@ -121,10 +121,10 @@ class SourceThread:
 class Sources:
     """The sources of a Detector, which may change."""
 
-    def __init__(self, putter: Putter, tally: Tally, *, timeout: float = 2.0) -> None:
+    def __init__(self, putter: Putter, loss_counter: LossCounter, *, timeout: float = 2.0) -> None:
         """`putter` returns the function that receives messages of streams; sources have `timeout` seconds to stop."""
         self._putter = putter
-        self._tally = tally
+        self._loss_counter = loss_counter
         self._timeout = timeout
         self._threads: dict[str, SourceThread] = {}
 
@@ -139,7 +139,7 @@ class Sources:
             for source in detector.spec.sources
         }
         new = {
-            name: SourceThread(source, streams, self._putter, self._tally)
+            name: SourceThread(source, streams, self._putter, self._loss_counter)
             for name, (source, streams) in wanted.items()
             if (running := self._threads.get(name)) is None
             or running.source != source

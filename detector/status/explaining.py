@@ -26,7 +26,7 @@ MAXIMUM_SUBJECTS = 20
 _MAXIMUM_NOTES = 20
 
 
-class Watching:
+class RuleWatch:
     """Watches one rule until it has been evaluated. Only for the evaluation thread."""
 
     def __init__(self, engine: Engine, rule: str, subject: str | None) -> None:

@@ -1,10 +1,10 @@
 """Renews certificates and passwords when their files change: a second session replaces the first.
 
 The credentials of a running session cannot be changed, and a router closes the connection when the certificate expires.
-So the new material is tested with a separate session, beside the first; `inlets` describes how no sample is lost
-between them. If the new session cannot be opened, or receives nothing, the first one is kept, and that is logged. A
-listening detector cannot listen twice: its session is closed and reopened, with the old material if the new one fails,
-and samples sent in between are lost.
+So the new credentials are tested with a separate session, beside the first; `stream_input` describes how no sample is
+lost between them. If the new session cannot be opened, or receives nothing, the first one is kept, and that is logged.
+A listening detector cannot listen twice: its session is closed and reopened, with the old credentials if the new ones
+fail, and samples sent in between are lost.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from dataclasses import dataclass
 
 import zenoh
 
-from detector.access.mounted import Material
-from detector.streams.answering import Answering
-from detector.streams.inlets import Inlet
+from detector.access.mounted import LoadedCredentials
 from detector.streams.liveliness import TokenWatch, subscribe_tokens
-from detector.streams.session import Connections, NetworkError, material_of, open_session
+from detector.streams.loss_counter import LossCounter
+from detector.streams.query_handler import QueryHandler
+from detector.streams.session import Connections, NetworkError, credentials_of, open_session
+from detector.streams.stream_input import StreamInput
 from detector.streams.subscribing import Subscription, subscribe
-from detector.streams.tally import Tally
 from wayside.api.stream import Stream
 from wayside.api.zenoh import Zenoh, ZenohMode
 from wayside.process.backoff import retry
@@ -37,23 +37,30 @@ _PATIENCE = 10.0
 """Seconds for which a session is kept that is no longer needed, but on which a response is awaited."""
 
 
-class Membership:
+class SessionSubscriptions:
     """Subscribed to all streams and to the clients' tokens. `subscriptions` queue samples, in the streams' order."""
 
     def __init__(
-        self, session: zenoh.Session, material: Material, streams: Sequence[Stream], tokens: str | None, tally: Tally
+        self,
+        session: zenoh.Session,
+        credentials: LoadedCredentials,
+        streams: Sequence[Stream],
+        tokens: str | None,
+        loss_counter: LossCounter,
     ) -> None:
         """`tokens`: their key. Raises KeyPatternError, zenoh.ZError."""
         self.session = session
-        self.material = material
+        self.credentials = credentials
         self.connections = Connections(session)
-        self.subscriptions: list[Subscription] = [subscribe(session, stream, _CHANNEL, tally) for stream in streams]
+        self.subscriptions: list[Subscription] = [
+            subscribe(session, stream, _CHANNEL, loss_counter) for stream in streams
+        ]
         self.tokens = None if tokens is None else subscribe_tokens(session, tokens)
-        self._answering: Answering | None = None
+        self._answering: QueryHandler | None = None
         self._users = 0
         self._unused = threading.Condition()
 
-    def answer(self, answering: Callable[[zenoh.Session], Answering]) -> None:
+    def answer(self, answering: Callable[[zenoh.Session], QueryHandler]) -> None:
         """Handle queries on this session from now on."""
         self._answering = answering(self.session)
 
@@ -104,12 +111,12 @@ _REOPEN_EVERY = 0.2
 """Seconds between two attempts to open a closed session again, since samples are lost meanwhile."""
 
 _AGAIN = 60.0
-"""Seconds after which material that failed is tried again: the other side may have been the cause."""
+"""Seconds after which credentials that failed are tried again: the other side may have been the cause."""
 
 
 @dataclass(frozen=True, slots=True)
 class CertificateState:
-    """The state of the material in use."""
+    """The state of the credentials in use."""
 
     expires: float | None = None
     """When the first certificate of the own chain expires, seconds since the epoch; None: it has none."""
@@ -124,11 +131,11 @@ class Renewal:
     def __init__(
         self,
         config: Zenoh,
-        first: Membership,
-        inlets: Sequence[Inlet],
+        first: SessionSubscriptions,
+        inputs: Sequence[StreamInput],
         tokens: TokenWatch | None,
-        join: Callable[[zenoh.Session, Material], Membership],
-        use: Callable[[Membership], None],
+        join: Callable[[zenoh.Session, LoadedCredentials], SessionSubscriptions],
+        use: Callable[[SessionSubscriptions], None],
         *,
         look_every: float = LOOK_EVERY,
         on_failure: Callable[[BaseException], None],
@@ -136,7 +143,7 @@ class Renewal:
         """`join` subscribes a session; `use` switches all outgoing data to a membership."""
         self._config = config
         self._member = first
-        self._inlets = inlets
+        self._inputs = inputs
         self._tokens = tokens
         self._join = join
         self._use = use
@@ -145,9 +152,9 @@ class Renewal:
         self._stop = threading.Event()
         self.reopening = threading.Event()
         """Set while there is no session because another one is being opened."""
-        self._failed: Material | None = None
+        self._failed: LoadedCredentials | None = None
         self._again = 0.0
-        self.certificate_state = CertificateState(first.material.expires)
+        self.certificate_state = CertificateState(first.credentials.expires)
         self._thread = threading.Thread(target=self._run, name="certificates", daemon=True)
 
     def start(self) -> None:
@@ -176,52 +183,56 @@ class Renewal:
 
     def _look(self) -> None:
         try:
-            material = material_of(self._config)
+            credentials = credentials_of(self._config)
         except NetworkError as error:
             self._set_problem(str(error))
             return
-        if material == self._member.material:
+        if credentials == self._member.credentials:
             self._failed = None
             self._set_problem("")
-        elif material != self._failed or time.monotonic() >= self._again:
+        elif credentials != self._failed or time.monotonic() >= self._again:
             try:
-                self._exchange(material)
+                self._exchange(credentials)
             except NetworkError as error:
-                self._failed, self._again = material, time.monotonic() + _AGAIN
+                self._failed, self._again = credentials, time.monotonic() + _AGAIN
                 self._set_problem(str(error))
 
     def _set_problem(self, problem: str) -> None:
         if problem and problem != self.certificate_state.problem and not self._stop.is_set():
             log.warning("cannot use the new certificates or password; keeping the current session: %s", problem)
         self.certificate_state = CertificateState(
-            self._member.material.expires, self.certificate_state.renewals, problem
+            self._member.credentials.expires, self.certificate_state.renewals, problem
         )
 
-    def _exchange(self, material: Material) -> None:
-        """Raises NetworkError if the new material fails; then nothing has changed."""
+    def _exchange(self, credentials: LoadedCredentials) -> None:
+        """Raises NetworkError if the new credentials fail; then nothing has changed."""
         listens = bool(self._config.listen) or self._config.mode is ZenohMode.ROUTER
         before = self._member
         if listens:
-            self._reopen(material)
+            self._reopen(credentials)
         else:
-            self._take_over(material)
+            self._take_over(credentials)
         if self._member is before or self._stop.is_set():
             return
-        self.certificate_state = CertificateState(material.expires, self.certificate_state.renewals + 1)
-        until = "" if material.expires is None else f", until {time.strftime('%FT%TZ', time.gmtime(material.expires))}"
+        self.certificate_state = CertificateState(credentials.expires, self.certificate_state.renewals + 1)
+        until = (
+            ""
+            if credentials.expires is None
+            else f", until {time.strftime('%FT%TZ', time.gmtime(credentials.expires))}"
+        )
         log.info("zenoh: using the new certificates or password%s", until)
 
-    def _take_over(self, material: Material) -> None:
+    def _take_over(self, credentials: LoadedCredentials) -> None:
         first = self._member
-        session = open_session(self._config, material)
-        for inlet in self._inlets:  # before the second subscription: every sample that comes twice is noted
-            inlet.note()
-        second = self._join(session, material)
+        session = open_session(self._config, credentials)
+        for stream_input in self._inputs:  # before the second subscription: every sample that comes twice is noted
+            stream_input.note()
+        second = self._join(session, credentials)
         try:
             self._run_both(first, second)
         except NetworkError:
-            for inlet in self._inlets:
-                inlet.forget()
+            for stream_input in self._inputs:
+                stream_input.forget()
             second.close()
             raise
         if self._stop.is_set():
@@ -229,62 +240,62 @@ class Renewal:
             return
         self._member = second
         self._use(second)
-        for inlet in self._inlets:
-            inlet.expect()
-            inlet.withdraw()
-        for inlet, subscription in zip(self._inlets, second.subscriptions, strict=True):
-            inlet.follow(subscription)
+        for stream_input in self._inputs:
+            stream_input.expect()
+            stream_input.withdraw()
+        for stream_input, subscription in zip(self._inputs, second.subscriptions, strict=True):
+            stream_input.follow(subscription)
         if self._tokens is not None and first.tokens is not None and second.tokens is not None:
             self._tokens.follow(second.tokens, second.connections)
             first.tokens.undeclare()  # type: ignore[no-untyped-call]
         first.retire()
 
-    def _run_both(self, first: Membership, second: Membership) -> None:
+    def _run_both(self, first: SessionSubscriptions, second: SessionSubscriptions) -> None:
         """Run both until they have delivered the same samples. Raises NetworkError if the second receives nothing."""
         if first.connections.any and not second.await_connection(self._stop, _AT_MOST):
             raise NetworkError(
                 f"zenoh: cannot connect to {[*self._config.connect]} with the new certificates or password"
             )
         begin = time.monotonic()
-        pairs = [*zip(self._inlets, second.subscriptions, strict=True)]
+        pairs = [*zip(self._inputs, second.subscriptions, strict=True)]
         while not self._stop.wait(_LOOK_AT_BOTH):
-            for inlet, subscription in pairs:
-                inlet.try_second(subscription)
+            for stream_input, subscription in pairs:
+                stream_input.try_second(subscription)
             elapsed = time.monotonic() - begin
-            if elapsed >= _AT_MOST or any(inlet.full for inlet in self._inlets):
+            if elapsed >= _AT_MOST or any(stream_input.full for stream_input in self._inputs):
                 break
-            if elapsed >= _AT_LEAST and not any(inlet.waits for inlet in self._inlets):
+            if elapsed >= _AT_LEAST and not any(stream_input.waits for stream_input in self._inputs):
                 break
-        if not self._stop.is_set() and any(inlet.only_first for inlet in self._inlets):
+        if not self._stop.is_set() and any(stream_input.only_first for stream_input in self._inputs):
             raise NetworkError(
                 "zenoh: received nothing with the new certificates or password: the router must permit the new name "
                 "to subscribe"
             )
 
-    def _reopen(self, material: Material) -> None:
+    def _reopen(self, credentials: LoadedCredentials) -> None:
         try:
-            self._close_and_open(material)
+            self._close_and_open(credentials)
         finally:
             self.reopening.clear()
 
-    def _close_and_open(self, material: Material) -> None:
+    def _close_and_open(self, credentials: LoadedCredentials) -> None:
         first, refused = self._member, None
-        for inlet in self._inlets:
-            inlet.expect()
+        for stream_input in self._inputs:
+            stream_input.expect()
         if self._tokens is not None:
             self._tokens.expect()
         began = time.monotonic()
         self.reopening.set()
         first.close()
-        tried = material
+        tried = credentials
 
-        def attempt() -> Membership | None:
+        def attempt() -> SessionSubscriptions | None:
             return None if self._stop.is_set() else self._join(open_session(self._config, tried), tried)
 
         def failed(error: NetworkError) -> float:
             nonlocal refused, tried
             refused = refused or error
-            tried = first.material
+            tried = first.credentials
             return _REOPEN_EVERY
 
         second = retry(attempt, NetworkError, failed, self._stop.wait)
@@ -295,11 +306,11 @@ class Renewal:
             return
         self._member = second
         self._use(second)
-        for inlet, subscription in zip(self._inlets, second.subscriptions, strict=True):
-            inlet.follow(subscription)
+        for stream_input, subscription in zip(self._inputs, second.subscriptions, strict=True):
+            stream_input.follow(subscription)
         if self._tokens is not None and second.tokens is not None:
             self._tokens.follow(second.tokens, second.connections)
         lost = "zenoh: reopened the session within %.1f s: samples sent in the meantime are lost"
         log.warning(lost, time.monotonic() - began)
-        if tried is not material and refused is not None:
+        if tried is not credentials and refused is not None:
             raise refused

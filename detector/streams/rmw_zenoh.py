@@ -20,7 +20,7 @@ from collections.abc import Iterable, Sequence
 import zenoh
 
 from detector.streams.bursts import Put
-from detector.streams.tally import Cause, Tally
+from detector.streams.loss_counter import Cause, LossCounter
 
 MAXIMUM_PUBLISHERS = 10_000
 """Maximum number of tracked publishers of a stream; beyond it, the oldest one is forgotten."""
@@ -35,11 +35,11 @@ _BACK = 1000
 class Sequences:
     """Tracks the sequence numbers of a stream's publishers; only for the thread that receives the stream."""
 
-    __slots__ = ("_last", "_stream", "_tally")
+    __slots__ = ("_last", "_loss_counter", "_stream")
 
-    def __init__(self, stream: str, tally: Tally) -> None:
+    def __init__(self, stream: str, loss_counter: LossCounter) -> None:
         self._stream = stream
-        self._tally = tally
+        self._loss_counter = loss_counter
         self._last: dict[bytes, int] = {}
 
     def follow(self, publisher: bytes, number: int, topic: str) -> None:
@@ -56,10 +56,10 @@ class Sequences:
             self._last[publisher] = number
             which = str(last + 1) if number == last + 2 else f"{last + 1} to {number - 1}"
             missed = f"{topic}: {which} of publisher {publisher.hex()}"
-            self._tally.add(Cause.MISSED, self._stream, number - last - 1, missed)
+            self._loss_counter.add(Cause.MISSED, self._stream, number - last - 1, missed)
         elif last - _BACK < number <= last:
             if number < last:
-                self._tally.add(Cause.OVERTAKEN, self._stream, last=topic)
+                self._loss_counter.add(Cause.OVERTAKEN, self._stream, last=topic)
         else:
             self._last[publisher] = number
 
@@ -72,7 +72,7 @@ _NAMED = b"\x0fsequence_number"
 _NAMED_GID = b"\x0asource_gid\x10"
 
 
-class MisfitError(ValueError):
+class KeyMismatchError(ValueError):
     """A key does not belong to the stream; the message gives the reason."""
 
 
@@ -82,17 +82,17 @@ def topics_expression(topics: str, domain: int | None) -> str:
 
 
 def split(key: str) -> tuple[str, str]:
-    """Topic and type, e.g. car1/odom and nav_msgs/msg/Odometry. Raises MisfitError."""
+    """Topic and type, e.g. car1/odom and nav_msgs/msg/Odometry. Raises KeyMismatchError."""
     domain, _, rest = key.partition("/")
     parts = rest.rsplit("/", 2)
     if len(parts) < 3 or not domain.isdecimal():
-        raise MisfitError(f"{key} is not of the form <domain>/<topic>/<type>/<type hash>")
+        raise KeyMismatchError(f"{key} is not of the form <domain>/<topic>/<type>/<type hash>")
     topic, mangled, _ = parts
     names = mangled.replace("%", "/").replace("::", "/").split("/")
     if len(names) == 4 and names[2] == "dds_" and names[3].endswith("_"):
         names = [*names[:2], names[3][:-1]]
     if len(names) != 3 or not all(names):
-        raise MisfitError(f"{key} contains no type: {mangled} is not of the form <package>::msg::dds_::<Type>_")
+        raise KeyMismatchError(f"{key} contains no type: {mangled} is not of the form <package>::msg::dds_::<Type>_")
     return topic, "/".join(names)
 
 
@@ -109,12 +109,12 @@ def numbered(attachment: bytes) -> tuple[bytes, int] | None:
 class RmwReader:
     """Reads keys and attachments of one stream; only for the thread that receives it."""
 
-    def __init__(self, stream: str, type_name: str | None, tally: Tally) -> None:
+    def __init__(self, stream: str, type_name: str | None, loss_counter: LossCounter) -> None:
         """`type_name`: the type that the keys must have, None for any."""
         self._stream = stream
         self._type = type_name
-        self._tally = tally
-        self._sequences = Sequences(stream, tally)
+        self._loss_counter = loss_counter
+        self._sequences = Sequences(stream, loss_counter)
         self._topics: dict[str, str] = {}
 
     def topic(self, key: str) -> str | None:
@@ -123,12 +123,12 @@ class RmwReader:
         if topic is None:
             try:
                 topic, given = split(key)
-            except MisfitError as error:
-                self._tally.add(Cause.MISFIT, self._stream, last=str(error))
+            except KeyMismatchError as error:
+                self._loss_counter.add(Cause.MISFIT, self._stream, last=str(error))
                 return None
             if self._type not in (None, given):
                 misfit = f"{topic} is of type {given}, but the type of the stream is {self._type}"
-                self._tally.add(Cause.MISFIT, self._stream, last=misfit)
+                self._loss_counter.add(Cause.MISFIT, self._stream, last=misfit)
                 return None
             if len(self._topics) >= _TOPICS:
                 self._topics.clear()
@@ -139,7 +139,7 @@ class RmwReader:
         """Track the attachment of a sample on the topic."""
         given = None if attachment is None else numbered(attachment)
         if given is None:
-            self._tally.add(Cause.UNNUMBERED, self._stream, last=topic)
+            self._loss_counter.add(Cause.UNNUMBERED, self._stream, last=topic)
         else:
             self._sequences.follow(*given, topic)
 

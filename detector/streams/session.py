@@ -10,7 +10,7 @@ import time
 
 import zenoh
 
-from detector.access.mounted import AccessError, Material, read_material
+from detector.access.mounted import AccessError, LoadedCredentials, read_material
 from wayside.api.zenoh import Zenoh, ZenohMode
 from wayside.inputerror import InputError
 from wayside.process.backoff import Backoff, retry
@@ -27,7 +27,7 @@ class NetworkError(InputError, ValueError):
     """The Zenoh session cannot be opened with this configuration; the message names the field and the reason."""
 
 
-def material_of(config: Zenoh) -> Material:
+def credentials_of(config: Zenoh) -> LoadedCredentials:
     """The current certificates and credentials. Raises NetworkError."""
     try:
         return read_material(config, _FIELD)
@@ -35,13 +35,13 @@ def material_of(config: Zenoh) -> Material:
         raise NetworkError(str(error)) from error
 
 
-def open_session(config: Zenoh, material: Material | None = None) -> zenoh.Session:
+def open_session(config: Zenoh, credentials: LoadedCredentials | None = None) -> zenoh.Session:
     """Opens a session. A peer or router connects in the background; a client must reach a router now.
 
-    `material`: default: that of the configuration. Raises NetworkError.
+    `credentials`: default: that of the configuration. Raises NetworkError.
     """
     try:
-        return zenoh.open(_settings(config, material_of(config) if material is None else material))
+        return zenoh.open(_settings(config, credentials_of(config) if credentials is None else credentials))
     except zenoh.ZError as error:
         raise NetworkError(
             f"zenoh: cannot open a session as {config.mode} with connect {[*config.connect]}, listen "
@@ -49,15 +49,15 @@ def open_session(config: Zenoh, material: Material | None = None) -> zenoh.Sessi
         ) from error
 
 
-def await_session(config: Zenoh, stop: threading.Event) -> tuple[zenoh.Session, Material] | None:
+def await_session(config: Zenoh, stop: threading.Event) -> tuple[zenoh.Session, LoadedCredentials] | None:
     """Tries to open a session until it succeeds; None once `stop` is set. Once open, it reconnects by itself."""
     backoff, logged = Backoff(_FIRST, _LONGEST), ""
 
-    def attempt() -> tuple[zenoh.Session, Material] | None:
+    def attempt() -> tuple[zenoh.Session, LoadedCredentials] | None:
         if stop.is_set():
             return None
-        material = material_of(config)
-        return open_session(config, material), material
+        credentials = credentials_of(config)
+        return open_session(config, credentials), credentials
 
     def failed(error: NetworkError) -> float:
         nonlocal logged
@@ -116,7 +116,7 @@ class Connections:
                 log.warning("zenoh: lost the last connection, to %s %s; reconnecting", role, other)
 
 
-def _settings(config: Zenoh, material: Material) -> zenoh.Config:
+def _settings(config: Zenoh, credentials: LoadedCredentials) -> zenoh.Config:
     waits = config.mode is ZenohMode.CLIENT
     values: dict[str, object] = {
         "mode": config.mode.value,
@@ -127,36 +127,36 @@ def _settings(config: Zenoh, material: Material) -> zenoh.Config:
         "connect/retry": {"period_init_ms": 200, "period_max_ms": 2000, "period_increase_factor": 2},
         "scouting/multicast/enabled": config.scouting,
         "transport/shared_memory/enabled": config.shared_memory,
-        **_tls(material),
+        **_tls(credentials),
     }
     if config.listen:
         values["listen/endpoints"] = [*config.listen]
         values["listen/exit_on_failure"] = True
-    if (credentials := material.login) is not None:
-        values["transport/auth/usrpwd/user"] = credentials.username
-        values["transport/auth/usrpwd/password"] = credentials.password
+    if (login := credentials.login) is not None:
+        values["transport/auth/usrpwd/user"] = login.username
+        values["transport/auth/usrpwd/password"] = login.password
     settings = zenoh.Config()
     for path, value in values.items():
         settings.insert_json5(path, json.dumps(value))
     return settings
 
 
-def _tls(material: Material) -> dict[str, object]:
+def _tls(credentials: LoadedCredentials) -> dict[str, object]:
     """Contents instead of files: the files may change one after the other while Zenoh reads them."""
-    if not material.tls:
+    if not credentials.tls:
         return {}
     at = "transport/link/tls/"
-    values: dict[str, object] = {f"{at}verify_name_on_connect": material.verify_name}
-    if material.ca is not None:
-        values[f"{at}root_ca_certificate_base64"] = _base64(material.ca)
-    if material.certificate is not None and material.key is not None:
-        certificate, key = _base64(material.certificate), _base64(material.key)
+    values: dict[str, object] = {f"{at}verify_name_on_connect": credentials.verify_name}
+    if credentials.ca is not None:
+        values[f"{at}root_ca_certificate_base64"] = _base64(credentials.ca)
+    if credentials.certificate is not None and credentials.key is not None:
+        certificate, key = _base64(credentials.certificate), _base64(credentials.key)
         values |= {
             f"{at}connect_certificate_base64": certificate,
             f"{at}connect_private_key_base64": key,
             f"{at}listen_certificate_base64": certificate,
             f"{at}listen_private_key_base64": key,
-            f"{at}enable_mtls": material.ca is not None,
+            f"{at}enable_mtls": credentials.ca is not None,
         }
     return values
 

@@ -18,7 +18,7 @@ from zenoh import ext
 
 from detector.streams import rmw_zenoh
 from detector.streams.bursts import Put
-from detector.streams.tally import Cause, Tally
+from detector.streams.loss_counter import Cause, LossCounter
 from wayside.api.stream import Layout, Stream
 from wayside.keys import KeyPattern
 
@@ -49,14 +49,14 @@ def expression(stream: Stream) -> zenoh.KeyExpr:
             return zenoh.KeyExpr.autocanonize(rmw_zenoh.topics_expression(topics, stream.domain))
 
 
-def pump_for(stream: Stream, put: Put, tally: Tally) -> Pump:
-    """The function that delivers the stream's samples; problems on the way are counted in the tally."""
+def pump_for(stream: Stream, put: Put, loss_counter: LossCounter) -> Pump:
+    """The function that delivers the stream's samples; problems on the way are counted in `loss_counter`."""
     match stream.layout:
         case Layout.PLAIN:
             return partial(pump_by_key, put=put)
         case Layout.RMW_ZENOH:
             return partial(
-                rmw_zenoh.pump_by_topic, put=put, reader=rmw_zenoh.RmwReader(stream.name, stream.type, tally)
+                rmw_zenoh.pump_by_topic, put=put, reader=rmw_zenoh.RmwReader(stream.name, stream.type, loss_counter)
             )
 
 
@@ -88,7 +88,7 @@ class _Watched:
         self._subscriber.undeclare()  # type: ignore[no-untyped-call]
 
 
-def subscribe(session: zenoh.Session, stream: Stream, capacity: int, tally: Tally) -> Subscription:
+def subscribe(session: zenoh.Session, stream: Stream, capacity: int, loss_counter: LossCounter) -> Subscription:
     """Subscribes to the stream's key; at most `capacity` samples are queued. Raises KeyPatternError, zenoh.ZError."""
     channel: zenoh.handlers.FifoChannel[zenoh.Sample] = zenoh.handlers.FifoChannel(capacity)
     if stream.history is None and not stream.recover:
@@ -110,6 +110,6 @@ def subscribe(session: zenoh.Session, stream: Stream, capacity: int, tally: Tall
 
     def missed(count: int) -> None:
         if stream.layout is Layout.PLAIN:  # rmw_zenoh numbers its samples itself: losses are counted once
-            tally.add(Cause.MISSED, stream.name, count)
+            loss_counter.add(Cause.MISSED, stream.name, count)
 
     return _Watched(subscriber, missed)

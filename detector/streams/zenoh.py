@@ -15,16 +15,16 @@ from collections.abc import Callable, Iterable
 
 import zenoh
 
-from detector.access.mounted import Material
+from detector.access.mounted import LoadedCredentials
 from detector.engine.samples.liveliness import LIVELINESS
-from detector.streams.answering import Answering
 from detector.streams.bursts import Put
-from detector.streams.inlets import Inlet
 from detector.streams.liveliness import TokenWatch
-from detector.streams.renewal import LOOK_EVERY, CertificateState, Membership, Renewal
-from detector.streams.session import NetworkError, await_session, material_of, open_session
+from detector.streams.loss_counter import LossCounter
+from detector.streams.query_handler import QueryHandler
+from detector.streams.renewal import LOOK_EVERY, CertificateState, Renewal, SessionSubscriptions
+from detector.streams.session import NetworkError, await_session, credentials_of, open_session
+from detector.streams.stream_input import StreamInput
 from detector.streams.subscribing import Pump, pump_for
-from detector.streams.tally import Tally
 from wayside.api.stream import Stream
 from wayside.api.zenoh import Zenoh, ZenohMode
 
@@ -46,20 +46,20 @@ class Network:
         *,
         capacity: int = 4096,
         on_failure: Callable[[BaseException], None] = lambda error: None,
-        answering: Callable[[zenoh.Session], Answering] | None = None,
-        tally: Tally | None = None,
+        answering: Callable[[zenoh.Session], QueryHandler] | None = None,
+        loss_counter: LossCounter | None = None,
         look_every: float = LOOK_EVERY,
     ) -> None:
         """`putter` returns the function that receives a stream's messages; at most `capacity` events are queued.
 
-        `answering` handles queries once there is a session. Losses before the detector are counted in the `tally`.
+        `answering` handles queries once there is a session. `loss_counter` counts losses before the detector.
         `on_failure` is called if a thread dies of an error. Certificates are checked every `look_every` seconds.
         """
         self._on_failure = on_failure
         self._config = config
-        self._tally = Tally() if tally is None else tally
+        self._loss_counter = LossCounter() if loss_counter is None else loss_counter
         self._streams = [*streams]
-        self._pumps = [pump_for(stream, putter(stream.name), self._tally) for stream in self._streams]
+        self._pumps = [pump_for(stream, putter(stream.name), self._loss_counter) for stream in self._streams]
         self._put_token = putter(LIVELINESS)
         self._tokens: TokenWatch | None = None
         self._look_every = look_every
@@ -68,8 +68,8 @@ class Network:
         self._events: deque[tuple[str, bytes, str]] = deque()
         self._changed = threading.Condition()
         self._stop = threading.Event()
-        self._member: Membership | None = None
-        self._inlets: list[Inlet] = []
+        self._member: SessionSubscriptions | None = None
+        self._inlets: list[StreamInput] = []
         self._receivers: list[threading.Thread] = []
         self._make_answering = answering
         self._thread = threading.Thread(target=self._run, name="network", daemon=True)
@@ -79,8 +79,8 @@ class Network:
     def start(self) -> None:
         """Opens the session: a client's in the background until it succeeds, else at once (raises NetworkError)."""
         if self._config.mode is not ZenohMode.CLIENT:
-            material = material_of(self._config)
-            self._begin(open_session(self._config, material), material)
+            credentials = credentials_of(self._config)
+            self._begin(open_session(self._config, credentials), credentials)
         self._thread.start()
 
     def publish(self, key: str, payload: bytes, encoding: str = EVENT_ENCODING) -> None:
@@ -167,8 +167,8 @@ class Network:
             self._thread.join(timeout)
         if self._renewal is not None:
             self._renewal.join(timeout)
-        for inlet in self._inlets:
-            inlet.close()
+        for stream_input in self._inlets:
+            stream_input.close()
         if (member := self._member) is not None:
             self._member = None
             member.close(timeout)  # unblocks the threads that wait to put or to receive
@@ -180,17 +180,17 @@ class Network:
             self.dropped_events += left
             log.warning("%d events were not published: the network did not accept them within %g s", left, timeout)
 
-    def _join(self, session: zenoh.Session, material: Material) -> Membership:
-        return Membership(session, material, self._streams, self._config.liveliness, self._tally)
+    def _join(self, session: zenoh.Session, credentials: LoadedCredentials) -> SessionSubscriptions:
+        return SessionSubscriptions(session, credentials, self._streams, self._config.liveliness, self._loss_counter)
 
-    def _begin(self, session: zenoh.Session, material: Material) -> None:
-        member = self._join(session, material)
+    def _begin(self, session: zenoh.Session, credentials: LoadedCredentials) -> None:
+        member = self._join(session, credentials)
         for stream, pump, subscription in zip(self._streams, self._pumps, member.subscriptions, strict=True):
-            inlet = Inlet(subscription, history=stream.history is not None)
+            stream_input = StreamInput(subscription, history=stream.history is not None)
             name = f"stream {stream.name}"
-            thread = threading.Thread(target=self._receive, args=(inlet, pump), name=name, daemon=True)
+            thread = threading.Thread(target=self._receive, args=(stream_input, pump), name=name, daemon=True)
             thread.start()
-            self._inlets.append(inlet)
+            self._inlets.append(stream_input)
             self._receivers.append(thread)
         if member.tokens is not None:
             self._tokens = TokenWatch(member.tokens, member.connections, self._put_token)
@@ -207,16 +207,16 @@ class Network:
         )
         self._renewal.start()
 
-    def _use(self, member: Membership) -> None:
+    def _use(self, member: SessionSubscriptions) -> None:
         """Publish events and handle queries here from now on."""
         self._member = member
         if self._make_answering is not None:
             member.answer(self._make_answering)
 
-    def _receive(self, inlet: Inlet, pump: Pump) -> None:
+    def _receive(self, stream_input: StreamInput, pump: Pump) -> None:
         """Delivers the samples of a stream, until the session is closed."""
         try:
-            pump(inlet.bursts())
+            pump(stream_input.bursts())
         except Exception as error:  # noqa: BLE001  otherwise the stream would stay silent
             if not self._stop.is_set():
                 log.critical("the thread of a stream ended; receiving from it has stopped: %s", error)
@@ -265,7 +265,7 @@ class Network:
                     break
         self.dropped_events += 1
 
-    def _successor(self, member: Membership) -> Membership | None:
+    def _successor(self, member: SessionSubscriptions) -> SessionSubscriptions | None:
         """The membership that replaces it, now or in a moment; itself if there is none, None once all is closed."""
         renewal = self._renewal
         while renewal is not None and renewal.reopening.is_set() and self._member is member:

@@ -27,7 +27,7 @@ HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
 sys.path[:0] = [str(ROOT), str(HERE)]
 
-from cooperative_recording.standing import Standing  # noqa: E402
+from cooperative_recording.parked import ParkedVehicles  # noqa: E402
 from cooperative_recording.transcript import Uniform  # noqa: E402
 
 from tests.cluster.api import Api, Object, Objects  # noqa: E402  the tests' client is made for looking
@@ -53,7 +53,7 @@ class Stage:
     """Where it plays."""
 
     api: Api
-    vehicles: Standing
+    vehicles: ParkedVehicles
     kubectl: Path
     kubeconfig: Path
     uniform: Uniform
@@ -317,7 +317,7 @@ def staged(api: Api, kubectl: Path, folder: Path) -> Iterator[Stage]:
         processes.start("application-manager", "run", "--namespace", api.namespace).wait_for_output("watching")
         detector = processes.start("detector", "run", "--name", "town", "--namespace", api.namespace)
         detector.wait_for_output("Detector town runs with 1 rules")
-        with Standing([endpoint], PATIENCE) as vehicles:
+        with ParkedVehicles([endpoint], PATIENCE) as vehicles:
             yield Stage(api, vehicles, kubectl, kubeconfig, Uniform(api.namespace))
     finally:
         processes.kill_all()

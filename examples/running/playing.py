@@ -16,18 +16,18 @@ from pathlib import Path
 from threading import Lock
 from typing import Any
 
-from detector.actions.base import ActionError, Surroundings
+from detector.actions.base import ActionError, DetectorConfiguration
 from detector.actions.episode import Outcome as ActionOutcome
 from detector.actions.episode import OutcomeState
 from detector.actions.host import ActionHost
-from detector.actions.outcomes import Which
-from detector.assembly import inlets
+from detector.actions.outcomes import ActionKey
+from detector.assembly import stream_readers
 from detector.engine.engine import Engine
 from detector.engine.episodes.events import Event
 from detector.engine.samples.sample import Arrival
 from detector.replay.playing import recorded_arrivals
 from detector.replay.recorded_types import with_recorded_types
-from detector.replay.replaying import Replay, Replayed
+from detector.replay.replaying import Replay, ReplayResult
 from detector.replay.routing import MessageRouter
 from detector.resources.files import load_rules
 from detector.testing import RefusedError
@@ -61,7 +61,7 @@ class Played:
     """As they were last, in the order of their names."""
     history: list[tuple[float, ApplicationTask]] = field(default_factory=list)
     """Each version of each task, with the second at which it was there; parameters may follow what happens."""
-    outcomes: list[tuple[Which, ActionOutcome]] = field(default_factory=list)
+    outcomes: list[tuple[ActionKey, ActionOutcome]] = field(default_factory=list)
     """What became of each episode at each action that is no deploy."""
     notices: list[Notice] = field(default_factory=list)
     samples: int = 0
@@ -102,7 +102,7 @@ def play(folder: Path, recording: Path, output: Path) -> Played:
         raise RefusedError("; ".join(loaded.warnings))
     detector = _at(with_recorded_types(loaded.rule_set.detector, [recording]), output)
     arrivals = chain.from_iterable(recorded_arrivals([recording], MessageRouter(detector.spec.streams), detector))
-    wire, outcome = _Wire(), Replayed()
+    wire, outcome = _Wire(), ReplayResult()
     host = ActionHost(detector.name, wire)
     played = Played(output)
     versions: dict[str, ApplicationTask] = {}
@@ -116,13 +116,13 @@ def play(folder: Path, recording: Path, output: Path) -> Played:
                 versions[name] = task
                 played.history.append((seconds(engine.now), task))
 
-    def heard(which: Which, episode: str, logged: ActionOutcome) -> None:
+    def heard(which: ActionKey, episode: str, logged: ActionOutcome) -> None:
         if logged.state is not OutcomeState.RUNNING:
             with lock:
                 played.outcomes.append((which, logged))
 
     host.outcomes.on_outcome = heard
-    entries = inlets(detector)
+    entries = stream_readers(detector)
     replay: Replay | None = None
     try:
         for batch in _batches(arrivals):
@@ -133,7 +133,7 @@ def play(folder: Path, recording: Path, output: Path) -> Played:
                 replay.set_rules(loaded.rule_set.rules)
                 if outcome.refusals:
                     raise RefusedError("; ".join(map(str, outcome.refusals)))
-                host.follow(loaded.rule_set.rules, Surroundings(detector, entries.decoders, entries.types))
+                host.follow(loaded.rule_set.rules, DetectorConfiguration(detector, entries.decoders, entries.types))
             # A tick at the very time of the last sample must wait for what else was received before its end.
             replay.take(batch, batch[-1].received - 1)
             note(replay.engine)
@@ -173,7 +173,7 @@ def _batches(arrivals: Iterable[Arrival]) -> Iterator[list[Arrival]]:
 def _wait(host: ActionHost) -> None:
     """Until all actions have ended their work."""
     deadline = time.monotonic() + _PATIENCE
-    while any(tally.running for tally in host.outcomes.tallies().values()) and time.monotonic() < deadline:
+    while any(counts.running for counts in host.outcomes.counts_by_action().values()) and time.monotonic() < deadline:
         time.sleep(0.005)
 
 

@@ -16,7 +16,7 @@ from typing import Any
 
 from detector.streams.zenoh import open_session
 from tests.cluster.api import Api, Object
-from tests.cluster.managed_world import condition, start_manager, wait_settled
+from tests.cluster.expected_objects import condition, start_manager, wait_settled
 from tests.cluster.processes import Process, Processes
 from tests.cluster.waiting import PATIENCE, wait_until
 from tests.ports import free_endpoint

@@ -16,7 +16,7 @@ from tests.cluster.api import Api
 from tests.cluster.chain import Chain, Vehicles, detector, rule, template
 from tests.cluster.controlplane import ControlPlane
 from tests.cluster.crds import CRDS
-from tests.cluster.managed_world import start_manager
+from tests.cluster.expected_objects import start_manager
 from tests.cluster.namespaces import new_namespace
 from tests.cluster.pods import kubelet as playing_kubelet
 from tests.cluster.processes import Process, Processes

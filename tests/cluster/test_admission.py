@@ -22,7 +22,7 @@ from application_manager.core.findings.webhooks import TIMEOUT
 from tests.certificates import Authority
 from tests.cluster.api import Api, ApiError, Object
 from tests.cluster.controlplane import ControlPlane
-from tests.cluster.managed_world import condition, config, deployment, end, start_manager, task, template
+from tests.cluster.expected_objects import condition, config, deployment, end, start_manager, task, template
 from tests.cluster.manifests import DETECTOR, EVENT_RULE
 from tests.cluster.processes import Processes
 from tests.cluster.waiting import wait_until

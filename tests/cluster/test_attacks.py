@@ -14,7 +14,7 @@ import yaml
 from application_manager.core.claims.claims import instance_name
 from tests.cluster.api import Api, ApiError, Object
 from tests.cluster.controlplane import ControlPlane
-from tests.cluster.managed_world import condition, config, deployment, start_manager, task, template, wait_settled
+from tests.cluster.expected_objects import condition, config, deployment, start_manager, task, template, wait_settled
 from tests.cluster.manifests import DETECTOR
 from tests.cluster.namespaces import new_namespace
 from tests.cluster.processes import Process, Processes

@@ -39,7 +39,7 @@ from tests.cluster.chain import (
     template,
     untouched,
 )
-from tests.cluster.managed_world import condition
+from tests.cluster.expected_objects import condition
 from tests.cluster.processes import Process, Processes
 from tests.ros_messages import cdr, pose_stamped
 

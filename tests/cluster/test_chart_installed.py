@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 import yaml
 
-from application_manager.admission.issuing import issued, make_certificates
+from application_manager.admission.issuer import issued, make_certificates
 from tests.cluster.api import Api, ApiError, Object
 from tests.cluster.binaries import ensure_binaries
 from tests.cluster.controlplane import ControlPlane

@@ -13,7 +13,7 @@ import pytest
 from application_manager.core.objects.detectors import detector_roles, object_name, sidecar_roles
 from tests.cluster.api import Api, ApiError, Object
 from tests.cluster.controlplane import ControlPlane
-from tests.cluster.managed_world import task
+from tests.cluster.expected_objects import task
 from tests.cluster.test_manager_memory import event, with_spec
 from tests.cluster.waiting import wait_until
 from tests.helm import ensure_tools

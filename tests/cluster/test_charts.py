@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from tests.cluster.api import Api, Object
-from tests.cluster.managed_world import condition, end, start_manager, task
+from tests.cluster.expected_objects import condition, end, start_manager, task
 from tests.cluster.processes import Process, Processes
 from tests.helm import Tools, ensure_tools
 from tests.helm.charts import APPLICATION, CRD, HOOK, RANDOM, registry, repository, silence, write_chart

@@ -9,7 +9,7 @@ import pytest
 
 from tests.cluster.api import Api
 from tests.cluster.binaries import VERSION
-from tests.cluster.managed_world import deployment
+from tests.cluster.expected_objects import deployment
 from tests.cluster.pods import mark_pods_ready
 
 

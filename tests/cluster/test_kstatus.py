@@ -11,7 +11,7 @@ import yaml
 
 from application_manager.core.claims.claims import instance_name
 from tests.cluster.api import Api, Object
-from tests.cluster.managed_world import condition, start_manager, task, template
+from tests.cluster.expected_objects import condition, start_manager, task, template
 from tests.cluster.pods import kubelet as playing_kubelet
 from tests.cluster.processes import Process, Processes
 from tests.kstatus import judged

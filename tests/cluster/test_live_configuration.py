@@ -16,7 +16,7 @@ import zenoh
 
 from application_manager.core.objects.configuration import ANNOTATION, fingerprint
 from tests.cluster.api import Api, Object
-from tests.cluster.managed_world import end, start_manager, task, wait_settled
+from tests.cluster.expected_objects import end, start_manager, task, wait_settled
 from tests.cluster.processes import Process, Processes
 from tests.cluster.repeating import repeated
 from tests.cluster.waiting import wait_until

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from application_manager.core.claims.claims import instance_name
 from tests.cluster.api import Api
-from tests.cluster.managed_world import condition, deployment, start_manager, task, template
+from tests.cluster.expected_objects import condition, deployment, start_manager, task, template
 from tests.cluster.processes import Processes
 
 

@@ -10,7 +10,7 @@ from application_manager.core.claims.claims import instance_name
 from tests import programs
 from tests.cluster.api import Api, Object
 from tests.cluster.controlplane import ControlPlane
-from tests.cluster.managed_world import start_manager, task, template, wait_settled
+from tests.cluster.expected_objects import start_manager, task, template, wait_settled
 from tests.cluster.pods import mark_pods_ready
 from tests.cluster.processes import Process, Processes
 from tests.cluster.waiting import wait_until

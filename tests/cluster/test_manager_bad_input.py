@@ -10,7 +10,7 @@ import pytest
 from application_manager.core.claims.claims import instance_name
 from tests.cluster.api import Api, ApiError, Object
 from tests.cluster.controlplane import ControlPlane
-from tests.cluster.managed_world import condition, config, deployment, start_manager, task, template, wait_settled
+from tests.cluster.expected_objects import condition, config, deployment, start_manager, task, template, wait_settled
 from tests.cluster.processes import Process, Processes
 
 pytestmark = pytest.mark.own_control_plane  # the manager here serves all namespaces

@@ -14,8 +14,8 @@ from application_manager.core.objects.rights import detector_rights
 from tests.cluster.api import Api, Object
 from tests.cluster.chain import CARS, FAR, HOLDER, NEAR, Vehicles
 from tests.cluster.controlplane import ControlPlane
+from tests.cluster.expected_objects import condition, start_manager
 from tests.cluster.faulty_proxy import faulty_proxy
-from tests.cluster.managed_world import condition, start_manager
 from tests.cluster.processes import Process, Processes
 from tests.cluster.test_manager_rbac import (
     ALLOWED,

@@ -11,7 +11,7 @@ import pytest
 from application_manager.core.claims.claims import instance_name
 from application_manager.core.holders.leases import LeaseView
 from tests.cluster.api import Api, Object
-from tests.cluster.managed_world import condition, task, template, wait_settled
+from tests.cluster.expected_objects import condition, task, template, wait_settled
 from tests.cluster.processes import Process
 from tests.cluster.repeating import repeated
 from tests.cluster.waiting import wait_until

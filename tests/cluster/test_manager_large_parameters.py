@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from application_manager.core.claims.claims import instance_name
 from tests.cluster.api import Api, Object
-from tests.cluster.managed_world import condition, config, deployment, end, task, template
+from tests.cluster.expected_objects import condition, config, deployment, end, task, template
 from tests.cluster.processes import Process
 
 NORTH, SOUTH = instance_name("app", "north"), instance_name("app", "south")

@@ -10,7 +10,7 @@ import pytest
 
 from application_manager.core.claims.claims import instance_name
 from tests.cluster.api import Api, Object
-from tests.cluster.managed_world import condition, end, start_manager, task, template, wait_settled
+from tests.cluster.expected_objects import condition, end, start_manager, task, template, wait_settled
 from tests.cluster.processes import Processes
 from tests.cluster.repeating import repeated
 

@@ -19,9 +19,9 @@ from application_manager.watching.router import Router
 from application_manager.work.applying import Applier
 from application_manager.work.instances import InstanceWork
 from application_manager.work.recorder import Recorder
-from application_manager.work.suspending import Suspending
+from application_manager.work.scaling import WorkloadScaler
 from tests.cluster.api import Api
-from tests.cluster.managed_world import deployment, task, template
+from tests.cluster.expected_objects import deployment, task, template
 from tests.inprocess import objects
 from wayside.api import API_VERSION
 from wayside.kubernetes.client import Client
@@ -46,7 +46,7 @@ def work_on(cache: ClusterCache, client: Client) -> tuple[Router, InstanceWork]:
         client=client,
         applier=applier,
         recorder=Recorder(client),
-        suspending=Suspending(client, applier, router.observe),
+        suspending=WorkloadScaler(client, applier, router.observe),
         again=ignore,
         enqueue=ignore,
         done=ignore,

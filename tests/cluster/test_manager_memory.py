@@ -8,7 +8,7 @@ import pytest
 
 from application_manager.core.claims.claims import instance_name
 from tests.cluster.api import Api, ApiError, Object
-from tests.cluster.managed_world import condition, start_manager, task, template, wait_settled
+from tests.cluster.expected_objects import condition, start_manager, task, template, wait_settled
 from tests.cluster.processes import Process, Processes
 
 MIB = 1024 * 1024

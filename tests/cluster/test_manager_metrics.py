@@ -12,7 +12,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from application_manager.measures import PREFIX
 from tests.cluster.api import Api
 from tests.cluster.controlplane import ControlPlane
-from tests.cluster.managed_world import start_manager, task, template
+from tests.cluster.expected_objects import start_manager, task, template
 from tests.cluster.pods import mark_pods_ready
 from tests.cluster.processes import Processes
 from tests.cluster.waiting import wait_until

@@ -8,7 +8,7 @@ import pytest
 
 from application_manager.core.claims.claims import instance_name
 from tests.cluster.api import Api, Object
-from tests.cluster.managed_world import (
+from tests.cluster.expected_objects import (
     condition,
     config,
     deployment,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from application_manager.core.claims.claims import instance_name
 from tests.cluster.api import Api
-from tests.cluster.managed_world import (
+from tests.cluster.expected_objects import (
     condition,
     config,
     deployment,

@@ -10,7 +10,7 @@ from application_manager.core.claims.claims import instance_name
 from tests.cluster.api import Api, Object
 from tests.cluster.binaries import ensure_binaries
 from tests.cluster.controlplane import ControlPlane
-from tests.cluster.managed_world import condition, deployment, start_manager, task, template, wait_settled
+from tests.cluster.expected_objects import condition, deployment, start_manager, task, template, wait_settled
 from tests.cluster.processes import Processes
 
 SCHEDULER = "wayside-test"  # that of these tests only: no other pod is bound to their nodes

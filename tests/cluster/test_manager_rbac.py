@@ -15,7 +15,7 @@ import pytest
 import yaml
 
 from application_manager.cluster.client import manager_client
-from application_manager.cluster.entitlement import missing_rights
+from application_manager.cluster.permissions import missing_rights
 from application_manager.core.claims.claims import instance_name
 from application_manager.core.objects.policy import PLURALS as ALL_PLURALS
 from application_manager.core.objects.policy import Policy
@@ -23,8 +23,17 @@ from application_manager.core.objects.rights import lease_rights, rights, roles
 from tests import programs
 from tests.cluster.api import Api, ApiError, Object
 from tests.cluster.controlplane import ControlPlane
+from tests.cluster.expected_objects import (
+    condition,
+    config,
+    deployment,
+    end,
+    start_manager,
+    task,
+    template,
+    wait_settled,
+)
 from tests.cluster.faulty_proxy import Seen, faulty_proxy
-from tests.cluster.managed_world import condition, config, deployment, end, start_manager, task, template, wait_settled
 from tests.cluster.manifests import DETECTOR, EVENT_RULE
 from tests.cluster.namespaces import new_namespace
 from tests.cluster.processes import Processes

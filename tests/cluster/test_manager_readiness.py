@@ -9,7 +9,7 @@ from typing import Any
 
 from application_manager.core.claims.claims import instance_name
 from tests.cluster.api import Api, Object
-from tests.cluster.managed_world import condition, deployment, task, template, wait_settled
+from tests.cluster.expected_objects import condition, deployment, task, template, wait_settled
 from tests.cluster.pods import running
 from tests.cluster.processes import Process
 from tests.cluster.waiting import wait_until

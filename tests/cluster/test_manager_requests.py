@@ -7,8 +7,8 @@ import time
 from application_manager.core.claims.claims import instance_name
 from tests.cluster.api import Api
 from tests.cluster.controlplane import ControlPlane
+from tests.cluster.expected_objects import condition, start_manager, task, template, wait_settled
 from tests.cluster.faulty_proxy import Proxy, Seen, faulty_proxy
-from tests.cluster.managed_world import condition, start_manager, task, template, wait_settled
 from tests.cluster.processes import Processes
 from tests.cluster.waiting import wait_until
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 
 from tests.cluster.api import Api, Object
-from tests.cluster.managed_world import condition, config, start_manager, template
+from tests.cluster.expected_objects import condition, config, start_manager, template
 from tests.cluster.manifests import DETECTOR, EVENT_RULE
 from tests.cluster.processes import Processes
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from application_manager.core.claims.claims import instance_name
 from tests.cluster.api import Api
 from tests.cluster.controlplane import ControlPlane
-from tests.cluster.managed_world import condition, config, end, start_manager, task, template
+from tests.cluster.expected_objects import condition, config, end, start_manager, task, template
 from tests.cluster.namespaces import new_namespace
 from tests.cluster.processes import Processes
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from application_manager.running.watchdog import STALLED
 from tests import programs
 from tests.cluster.api import Api
-from tests.cluster.managed_world import start_manager, task, template, wait_settled
+from tests.cluster.expected_objects import start_manager, task, template, wait_settled
 from tests.cluster.processes import Processes
 from tests.ports import free_port
 

@@ -16,8 +16,8 @@ from application_manager.cluster.leadership import DURATION
 from application_manager.core.claims.claims import instance_name
 from tests.cluster.api import Api
 from tests.cluster.controlplane import ControlPlane
+from tests.cluster.expected_objects import end, start_manager, task, template, wait_settled
 from tests.cluster.faulty_proxy import Proxy, faulty_proxy
-from tests.cluster.managed_world import end, start_manager, task, template, wait_settled
 from tests.cluster.processes import Process, Processes
 from tests.cluster.test_manager_metrics import get, scraped
 from tests.cluster.waiting import wait_until

@@ -8,8 +8,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 from tests.cluster.api import Api
 from tests.cluster.controlplane import ControlPlane
+from tests.cluster.expected_objects import start_manager, task, template, wait_settled
 from tests.cluster.faulty_proxy import Seen, faulty_proxy
-from tests.cluster.managed_world import start_manager, task, template, wait_settled
 from tests.cluster.processes import Processes
 from tests.cluster.waiting import wait_until
 from wayside.kubernetes.pacing import AT_ONCE, MOST_WRITES

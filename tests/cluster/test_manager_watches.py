@@ -12,8 +12,8 @@ from application_manager.running.watchdog import STALLED
 from tests import programs
 from tests.cluster.api import Api
 from tests.cluster.controlplane import ControlPlane
+from tests.cluster.expected_objects import start_manager, task, template, wait_settled
 from tests.cluster.faulty_proxy import faulty_proxy
-from tests.cluster.managed_world import start_manager, task, template, wait_settled
 from tests.cluster.processes import Processes
 from tests.cluster.test_manager_metrics import scraped
 from tests.ports import free_port

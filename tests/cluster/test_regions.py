@@ -14,7 +14,7 @@ from detector.status.total import Total
 from examples.regions.drive import area, message
 from tests import programs
 from tests.cluster.api import Api, Object
-from tests.cluster.managed_world import start_manager, wait_settled
+from tests.cluster.expected_objects import start_manager, wait_settled
 from tests.cluster.processes import Processes
 from tests.cluster.waiting import PATIENCE, wait_until
 from tests.guides import guide, yaml_blocks

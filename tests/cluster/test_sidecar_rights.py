@@ -14,8 +14,8 @@ from tests import programs
 from tests.cluster.api import Api
 from tests.cluster.chain import CARS, FAR, HOLDER, NEAR, Vehicles
 from tests.cluster.controlplane import ControlPlane
+from tests.cluster.expected_objects import condition, start_manager
 from tests.cluster.faulty_proxy import faulty_proxy
-from tests.cluster.managed_world import condition, start_manager
 from tests.cluster.processes import Processes
 from tests.cluster.sidecars import RUNS, create_accounts, event_of, pod, sidecar_detector, wait_injecting
 from tests.cluster.test_manager_detectors import close_vehicles, detector, live

@@ -17,7 +17,7 @@ import yaml
 from tests.cluster.api import Api, Object
 from tests.cluster.chain import HOLDER
 from tests.cluster.controlplane import ControlPlane
-from tests.cluster.managed_world import condition, start_manager
+from tests.cluster.expected_objects import condition, start_manager
 from tests.cluster.processes import BIN, Processes
 from tests.cluster.sidecars import (
     IMAGE,

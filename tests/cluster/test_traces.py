@@ -12,7 +12,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from tests import programs
 from tests.cluster.api import Api
 from tests.cluster.chain import BUSES, CARS, FAR, HOLDER, NEAR, Chain, Vehicles, rule, template
-from tests.cluster.managed_world import end, start_manager
+from tests.cluster.expected_objects import end, start_manager
 from tests.cluster.processes import Processes
 from tests.cluster.waiting import wait_until
 from tests.otlp import Received, Receiver

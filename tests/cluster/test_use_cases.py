@@ -21,7 +21,7 @@ from examples.running.cases import folder_of, scenario_of, use_cases
 from examples.running.demanding import Running, consists_of, unlike
 from examples.running.scenario import SECOND, Message, Moment
 from tests.cluster.api import Api
-from tests.cluster.managed_world import condition, start_manager, wait_settled
+from tests.cluster.expected_objects import condition, start_manager, wait_settled
 from tests.cluster.processes import Processes
 from tests.cluster.repeating import repeated
 from tests.cluster.waiting import INTERVAL, PATIENCE, wait_until

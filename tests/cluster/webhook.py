@@ -13,7 +13,7 @@ from typing import Any
 
 import yaml
 
-from application_manager.admission.issuing import make_certificates
+from application_manager.admission.issuer import make_certificates
 from application_manager.core.findings.webhooks import (
     WebhookClientConfig,
     injection_configuration,
@@ -22,7 +22,7 @@ from application_manager.core.findings.webhooks import (
 from tests import programs
 from tests.cluster.api import Api, ApiError, Object
 from tests.cluster.controlplane import ControlPlane
-from tests.cluster.managed_world import config, start_manager, template
+from tests.cluster.expected_objects import config, start_manager, template
 from tests.cluster.processes import Process, Processes
 from tests.cluster.waiting import PATIENCE, wait_until
 from tests.ports import free_port

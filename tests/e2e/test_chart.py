@@ -35,7 +35,7 @@ from tests.helm.wayside_chart import CHART, Helm
 
 sys.path.insert(0, str(EXAMPLE))
 
-from cooperative_recording.standing import Standing
+from cooperative_recording.parked import ParkedVehicles
 from cooperative_recording.vehicles import LIDAR_VEHICLES
 
 DETECTOR_SPEC = yaml.safe_load((EXAMPLE / "detector.yaml").read_text(encoding="utf-8"))["spec"]
@@ -98,7 +98,9 @@ def test_the_example_from_nothing_by_mutual_tls_through_an_upgrade_until_nothing
     example = [each for each in example_documents(image, ["python3", "-c", REPORT]) if each["kind"] != "Detector"]
     for document in example:
         api.apply(document)
-    one, other = (Standing(vehicle(outside(node, api), authority.ca, authority.sign(name))) for name in (first, second))
+    one, other = (
+        ParkedVehicles(vehicle(outside(node, api), authority.ca, authority.sign(name))) for name in (first, second)
+    )
     with one, other:  # each may send its own data only
         one.put(first, 0)
         other.put(second, 100)

@@ -14,7 +14,7 @@ from tests.e2e.wayside_in_cluster import EXAMPLE, apply_example, run_town
 
 sys.path.insert(0, str(EXAMPLE))
 
-from cooperative_recording.standing import Standing
+from cooperative_recording.parked import ParkedVehicles
 from cooperative_recording.vehicles import LIDAR_VEHICLES
 
 PATIENCE = 300.0
@@ -52,7 +52,7 @@ def test_applications_really_run_while_vehicles_are_close_follow_who_joins_and_a
     first, second, third = (vehicle.name for vehicle in LIDAR_VEHICLES[:3])
     apply_example(api, image, ["python3", "-c", REPORT])
     port = run_town(api, image)
-    with Standing([f"tcp/{node.address}:{port}"], wait_s=PATIENCE) as vehicles:
+    with ParkedVehicles([f"tcp/{node.address}:{port}"], wait_s=PATIENCE) as vehicles:
         vehicles.put(first, 0)
         vehicles.put(second, 100)
 

@@ -8,13 +8,13 @@ import pytest
 
 from application_manager.core.objects.sidecars import CONTAINER
 from tests.cluster.api import Api, Object
-from tests.cluster.managed_world import condition
+from tests.cluster.expected_objects import condition
 from tests.cluster.waiting import wait_until
 from tests.e2e.released import MANAGER, PATIENCE, RELEASE, available, image_values
 from tests.e2e.wayside_in_cluster import RESTRICTED, ZENOH_PORT
 from tests.e2e.workloads import deployment, wait_available
 from tests.helm.wayside_chart import CHART, Helm
-from wayside.process.beginning import ENDED
+from wayside.process.startup import ENDED
 
 DETECTOR = "on-board"
 RETRIES = {"wayside.dev/detector": DETECTOR}

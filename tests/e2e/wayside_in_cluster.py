@@ -11,7 +11,7 @@ from typing import Any
 import yaml
 
 from tests.cluster.api import Api, Object
-from tests.cluster.managed_world import condition
+from tests.cluster.expected_objects import condition
 from tests.e2e.workloads import deployment, service, wait_available
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "cooperative-recording"

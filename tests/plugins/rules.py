@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from detector.assembly import inlets, make_engine
+from detector.assembly import make_engine, stream_readers
 from detector.engine.scoping.plugins import PluginHost
 from tests.driving import Drive, a_rule, at, compiled
 from wayside.api import Detector, EventRule
@@ -33,5 +33,5 @@ class PluginDrive(Drive):
     def __init__(self, detector: Detector, *rules: EventRule, host: PluginHost) -> None:
         super().__init__(detector)
         self.host = host
-        self.engine = make_engine(detector, inlets(detector), holder="h", start=at(0), plugins=host)
+        self.engine = make_engine(detector, stream_readers(detector), holder="h", start=at(0), plugins=host)
         self.engine.set_rules(compiled(detector, *rules))

@@ -17,7 +17,7 @@ from tests.mongodb import MongoServer, running
 from tests.mongodb.way import Way
 from tests.networks import Arrivals
 from tests.ports import free_endpoint
-from tests.process.database_desk import Desk, MakeDesk
+from tests.process.database_harness import Harness, MakeHarness
 from tests.sharing import run_folder, shared
 
 
@@ -48,9 +48,9 @@ def way(mongodb: MongoServer) -> Iterator[Way]:
 
 
 @pytest.fixture
-def desk(way: Way, name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[MakeDesk]:
+def harness(way: Way, name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[MakeHarness]:
     monkeypatch.setenv("TEST_MONGODB_URI", way.uri)
-    made: list[Desk] = []
+    made: list[Harness] = []
 
     def make(
         spool: int | None = None,
@@ -59,14 +59,14 @@ def desk(way: Way, name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -
         above: str = "64Ki",
         concern: str = "Majority",
         **parameters: Any,
-    ) -> Desk:
+    ) -> Harness:
         place: dict[str, Any] = {"uriVariable": "TEST_MONGODB_URI", "writeConcern": concern}
         if spool is not None:
             place["spool"] = {"path": str(tmp_path / "spool"), "bytes": str(spool)}
         if files:
             place["files"] = {"path": str(tmp_path / "files")}
             parameters["files"] = {"above": above}
-        made.append(Desk(place, name, streams, **parameters))
+        made.append(Harness(place, name, streams, **parameters))
         return made[-1]
 
     yield make

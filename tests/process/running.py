@@ -14,7 +14,7 @@ import zenoh
 from prometheus_client.parser import text_string_to_metric_families
 
 from detector.status.model import Status, read_status
-from detector.streams.answering import NoAnswerError, query_detectors
+from detector.streams.query_handler import NoAnswerError, query_detectors
 from tests import programs
 from tests.driving import a_detector
 from tests.networks import session

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from wayside.process.beginning import ENDED
+from wayside.process.startup import ENDED
 
 WHILE_IT_IMPORTS = """
 import os, signal, sys, threading

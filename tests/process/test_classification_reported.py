@@ -12,7 +12,7 @@ import yaml
 
 from tests.driving import a_deploy, a_rule, a_stream
 from tests.mongodb.way import Way
-from tests.process.database_desk import wait_until
+from tests.process.database_harness import wait_until
 from tests.process.running import PATIENCE, Process
 from tests.recording_bench import mcap_files, metadata_of
 

@@ -12,10 +12,10 @@ import pytest
 from detector.actions import ActionError, EpisodeSample, OutcomeState
 from detector.actions.database.server import Redactor
 from tests.driving import START, a_stream
-from tests.process.database_desk import (
+from tests.process.database_harness import (
     SPEEDS,
-    Desk,
-    MakeDesk,
+    Harness,
+    MakeHarness,
     numbers,
     scenario,
     scenario_or_none,
@@ -24,8 +24,8 @@ from tests.process.database_desk import (
 )
 
 
-def test_an_episode_becomes_a_scenario_with_each_sample_once(desk: MakeDesk, database: Any) -> None:
-    keep = desk()
+def test_an_episode_becomes_a_scenario_with_each_sample_once(harness: MakeHarness, database: Any) -> None:
+    keep = harness()
     episode = keep.begin(rendered={"metadata": {"driver": "Ada"}})
     keep.take(episode, speeds(2500))
     keep.finish(episode)
@@ -50,8 +50,8 @@ def test_an_episode_becomes_a_scenario_with_each_sample_once(desk: MakeDesk, dat
     assert client["streams"] == ["speed"]
 
 
-def test_with_renew_after_an_episode_becomes_one_scenario_after_the_other(desk: MakeDesk, database: Any) -> None:
-    keep = desk(streams=[a_stream("speed"), a_stream("map", latched=True)], renew_after="3s")
+def test_with_renew_after_an_episode_becomes_one_scenario_after_the_other(harness: MakeHarness, database: Any) -> None:
+    keep = harness(streams=[a_stream("speed"), a_stream("map", latched=True)], renew_after="3s")
     episode = keep.begin()
     logged = EpisodeSample("car1", "map", "vehicles/car1/map", START - 10**12, START - 10**12, b'{"v": -1}')
     later = logged._replace(time=START + 7 * 10**9, received=START + 7 * 10**9, payload=b'{"v": -2}')
@@ -75,8 +75,8 @@ def test_with_renew_after_an_episode_becomes_one_scenario_after_the_other(desk: 
     assert sorted(numbers(database, part, "json/map") for part in parts) == [[-2], [-1], [-1], [-1, -2]]
 
 
-def test_after_a_restart_a_renewed_episode_leaves_alone_what_was_complete(desk: MakeDesk, database: Any) -> None:
-    keep = desk(renew_after="3s")
+def test_after_a_restart_a_renewed_episode_leaves_alone_what_was_complete(harness: MakeHarness, database: Any) -> None:
+    keep = harness(renew_after="3s")
     episode = keep.begin()
     keep.take(episode, speeds(500))
     wait_until(lambda: scenario_or_none(database, "e1.keep").get("complete") is True)
@@ -89,8 +89,8 @@ def test_after_a_restart_a_renewed_episode_leaves_alone_what_was_complete(desk: 
     assert states == ["Complete", "Complete", "Interrupted", "Open"]
 
 
-def test_overlapping_episodes_have_their_samples_each(desk: MakeDesk, database: Any) -> None:
-    keep = desk()
+def test_overlapping_episodes_have_their_samples_each(harness: MakeHarness, database: Any) -> None:
+    keep = harness()
     one, two = keep.begin("e1"), keep.begin("e2")
     samples = speeds(30)
     keep.take(one, samples[:20])
@@ -103,9 +103,9 @@ def test_overlapping_episodes_have_their_samples_each(desk: MakeDesk, database: 
 
 
 def test_a_scenario_is_not_complete_while_it_lasts_nor_where_something_is_missing(
-    desk: MakeDesk, database: Any
+    harness: MakeHarness, database: Any
 ) -> None:
-    keep = desk()
+    keep = harness()
     lasting, cut = keep.begin("e1"), keep.begin("e2")
     keep.take(lasting, speeds(5))
     keep.finish(cut, cut="the detector ends", missing=3)
@@ -123,8 +123,8 @@ def test_a_scenario_is_not_complete_while_it_lasts_nor_where_something_is_missin
     )
 
 
-def test_an_episode_whose_beginning_another_run_saw_is_never_complete(desk: MakeDesk, database: Any) -> None:
-    keep = desk()
+def test_an_episode_whose_beginning_another_run_saw_is_never_complete(harness: MakeHarness, database: Any) -> None:
+    keep = harness()
     episode = keep.begin(resumed=True)
     keep.take(episode, speeds(5))
     keep.finish(episode)
@@ -133,9 +133,9 @@ def test_an_episode_whose_beginning_another_run_saw_is_never_complete(desk: Make
 
 
 def test_with_dry_run_everything_is_counted_and_nothing_is_written(
-    desk: MakeDesk, database: Any, tmp_path: Path
+    harness: MakeHarness, database: Any, tmp_path: Path
 ) -> None:
-    keep = desk(streams=[a_stream("blob", encoding="raw")], files=True, dry_run=True)
+    keep = harness(streams=[a_stream("blob", encoding="raw")], files=True, dry_run=True)
     episode = keep.begin()
     keep.take(episode, [EpisodeSample("car1", "blob", "vehicles/car1/blob", START, START, bytes(100_000))])
     keep.finish(episode)
@@ -146,8 +146,10 @@ def test_with_dry_run_everything_is_counted_and_nothing_is_written(
     assert not (tmp_path / "files").exists()
 
 
-def test_large_binary_data_goes_to_files_that_the_documents_name(desk: MakeDesk, database: Any, tmp_path: Path) -> None:
-    keep = desk(streams=[a_stream("blob", encoding="raw")], files=True, above="1k")
+def test_large_binary_data_goes_to_files_that_the_documents_name(
+    harness: MakeHarness, database: Any, tmp_path: Path
+) -> None:
+    keep = harness(streams=[a_stream("blob", encoding="raw")], files=True, above="1k")
     episode = keep.begin()
     blobs = [bytes([number]) * size for number, size in ((1, 999), (2, 5000), (3, 20_000_000))]
     keep.take(
@@ -164,8 +166,10 @@ def test_large_binary_data_goes_to_files_that_the_documents_name(desk: MakeDesk,
     assert scenario(database)["files"] == 2
 
 
-def test_without_files_what_mongodb_does_not_take_is_cut_counted_and_reported(desk: MakeDesk, database: Any) -> None:
-    keep = desk(streams=[a_stream("blob", encoding="raw")])
+def test_without_files_what_mongodb_does_not_take_is_cut_counted_and_reported(
+    harness: MakeHarness, database: Any
+) -> None:
+    keep = harness(streams=[a_stream("blob", encoding="raw")])
     episode = keep.begin()
     keep.take(episode, [EpisodeSample("car1", "blob", "vehicles/car1/blob", START, START, bytes(17 * 2**20))])
     keep.finish(episode)
@@ -178,10 +182,10 @@ def test_without_files_what_mongodb_does_not_take_is_cut_counted_and_reported(de
 
 
 def test_a_file_that_cannot_be_written_costs_the_scenarios_completeness(
-    desk: MakeDesk, database: Any, tmp_path: Path
+    harness: MakeHarness, database: Any, tmp_path: Path
 ) -> None:
     (tmp_path / "files").write_text("no folder")
-    keep = desk(streams=[a_stream("blob", encoding="raw")], files=True)
+    keep = harness(streams=[a_stream("blob", encoding="raw")], files=True)
     episode = keep.begin()
     keep.take(episode, [EpisodeSample("car1", "blob", "vehicles/car1/blob", START, START, bytes(100_000))])
     keep.finish(episode)
@@ -210,7 +214,7 @@ def test_credentials_are_in_no_error_log_or_outcome(
 ) -> None:
     caplog.set_level(logging.DEBUG)
     monkeypatch.setenv("TEST_MONGODB_URI", uri)
-    keep = Desk({"uriVariable": "TEST_MONGODB_URI"}, name)
+    keep = Harness({"uriVariable": "TEST_MONGODB_URI"}, name)
     logged = ""
     try:
         episode = keep.begin()
@@ -234,10 +238,12 @@ def test_the_redactor_takes_out_every_form_of_the_password() -> None:
     )
 
 
-def test_two_detectors_cannot_share_a_spool(desk: MakeDesk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    desk(spool=2**20)
+def test_two_detectors_cannot_share_a_spool(
+    harness: MakeHarness, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    harness(spool=2**20)
     monkeypatch.setenv("OTHER_URI", "mongodb://127.0.0.1:1/")
     place = {"uriVariable": "OTHER_URI", "spool": {"path": str(tmp_path / "spool"), "bytes": "1Mi"}}
-    other = Desk(place, "other")
+    other = Harness(place, "other")
     with pytest.raises(ActionError, match=r"spec.database.spool.path: another process uses"):
         other.begin()

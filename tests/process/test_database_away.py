@@ -14,7 +14,7 @@ import pytest
 from tests.driving import a_rule, a_stream
 from tests.mongodb import MongoServer
 from tests.mongodb.way import Way
-from tests.process.database_desk import wait_until
+from tests.process.database_harness import wait_until
 from tests.process.running import PATIENCE, Process
 from tests.recording_bench import mcap_files, read_with_mcap
 

@@ -9,9 +9,9 @@ import pytest
 
 from detector.actions import OutcomeState
 from tests.mongodb.way import Way
-from tests.process.database_desk import (
+from tests.process.database_harness import (
     SPEEDS,
-    MakeDesk,
+    MakeHarness,
     numbers,
     scenario,
     scenario_or_none,
@@ -22,9 +22,9 @@ from tests.process.database_desk import (
 
 
 def test_while_the_server_is_away_documents_wait_on_disk_and_follow_in_order_each_once(
-    desk: MakeDesk, database: Any, way: Way, tmp_path: Path
+    harness: MakeHarness, database: Any, way: Way, tmp_path: Path
 ) -> None:
-    keep = desk(spool=2**26)
+    keep = harness(spool=2**26)
     first, second = keep.begin("e1"), keep.begin("e2")
     keep.take(first, speeds(1500))
     wait_until(lambda: len(numbers(database)) >= 1000)
@@ -45,10 +45,10 @@ def test_while_the_server_is_away_documents_wait_on_disk_and_follow_in_order_eac
 
 
 def test_a_full_spool_drops_what_is_new_counts_it_and_keeps_earlier_scenarios_whole(
-    desk: MakeDesk, database: Any, way: Way, monkeypatch: pytest.MonkeyPatch
+    harness: MakeHarness, database: Any, way: Way, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("detector.actions.database.queue.MEMORY", 100_000)
-    keep = desk(spool=400_000)
+    keep = harness(spool=400_000)
     way.cut()
     early, late = keep.begin("e1"), keep.begin("e2")
     keep.take(early, speeds(500))
@@ -71,10 +71,10 @@ def test_a_full_spool_drops_what_is_new_counts_it_and_keeps_earlier_scenarios_wh
 
 
 def test_what_waited_when_the_detector_ended_is_written_by_the_next_run(
-    desk: MakeDesk, database: Any, way: Way
+    harness: MakeHarness, database: Any, way: Way
 ) -> None:
     way.cut()
-    before = desk(spool=2**26)
+    before = harness(spool=2**26)
     episode, open_one = before.begin("e1"), before.begin("e2")
     before.take(episode, speeds(1200))
     before.take(open_one, speeds(10))
@@ -82,7 +82,7 @@ def test_what_waited_when_the_detector_ended_is_written_by_the_next_run(
     before.close()
     assert "stay in the spool" in before.outcome("e1").message
     way.restore()
-    after = desk(spool=2**26)
+    after = harness(spool=2**26)
     wait_until(lambda: scenario_or_none(database, "e2.keep").get("state") == "Interrupted")
     assert numbers(database) == list(range(1200))
     assert scenario(database)["complete"] is True
@@ -91,9 +91,9 @@ def test_what_waited_when_the_detector_ended_is_written_by_the_next_run(
 
 
 def test_a_document_that_the_server_refuses_costs_its_scenarios_completeness_and_no_other(
-    desk: MakeDesk, database: Any, way: Way
+    harness: MakeHarness, database: Any, way: Way
 ) -> None:
-    keep = desk()
+    keep = harness()
     good, bad = keep.begin("e1"), keep.begin("e2")
     samples = speeds(40)
     way.poison = b"a poisoned text"
@@ -113,10 +113,10 @@ def test_a_document_that_the_server_refuses_costs_its_scenarios_completeness_and
 
 
 def test_a_server_that_hangs_holds_up_nothing_but_the_queue(
-    desk: MakeDesk, database: Any, way: Way, monkeypatch: pytest.MonkeyPatch
+    harness: MakeHarness, database: Any, way: Way, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("detector.actions.database.server._SECONDS", 4.0)
-    keep = desk(spool=2**26)
+    keep = harness(spool=2**26)
     episode = keep.begin()
     way.hang()
     keep.take(episode, speeds(2000))
@@ -128,9 +128,9 @@ def test_a_server_that_hangs_holds_up_nothing_but_the_queue(
 
 
 def test_with_write_concern_one_a_scenario_that_lost_documents_afterwards_is_not_called_complete(
-    desk: MakeDesk, database: Any
+    harness: MakeHarness, database: Any
 ) -> None:
-    keep = desk(concern="One")
+    keep = harness(concern="One")
     episode = keep.begin()
     keep.take(episode, speeds(1000))
     wait_until(lambda: len(numbers(database)) == 1000)
@@ -143,9 +143,9 @@ def test_with_write_concern_one_a_scenario_that_lost_documents_afterwards_is_not
 
 
 def test_a_damaged_request_in_the_spool_costs_its_scenario_and_no_other(
-    desk: MakeDesk, database: Any, way: Way
+    harness: MakeHarness, database: Any, way: Way
 ) -> None:
-    keep = desk(spool=2**26)
+    keep = harness(spool=2**26)
     way.cut()
     first, second = keep.begin("e1"), keep.begin("e2")
     keep.take(first, speeds(2000))
@@ -174,9 +174,9 @@ def test_a_damaged_request_in_the_spool_costs_its_scenario_and_no_other(
 
 
 def test_a_spool_whose_disk_fails_holds_up_nothing_and_continues_at_the_next_start(
-    desk: MakeDesk, database: Any, way: Way, tmp_path: Path
+    harness: MakeHarness, database: Any, way: Way, tmp_path: Path
 ) -> None:
-    keep = desk(spool=2**26)
+    keep = harness(spool=2**26)
     way.cut()
     first = keep.begin("e1")
     keep.take(first, speeds(2000))
@@ -195,14 +195,14 @@ def test_a_spool_whose_disk_fails_holds_up_nothing_and_continues_at_the_next_sta
     assert keep.outcome("e1").state is OutcomeState.FAILED
     assert keep.losses.total() > 0
     keep.close()
-    after = desk(spool=2**26)
+    after = harness(spool=2**26)
     wait_until(lambda: len(numbers(database)) == 2000)
     assert not scenario(database).get("complete")
     assert not after.losses
 
 
-def test_open_episodes_report_that_the_database_is_away(desk: MakeDesk, way: Way) -> None:
-    keep = desk(spool=2**26)
+def test_open_episodes_report_that_the_database_is_away(harness: MakeHarness, way: Way) -> None:
+    keep = harness(spool=2**26)
     episode = keep.begin()
     way.cut()
 

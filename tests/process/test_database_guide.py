@@ -10,13 +10,13 @@ from typing import Any
 import pytest
 import yaml
 
-from detector.actions import Surroundings
+from detector.actions import DetectorConfiguration
 from detector.actions.host import ActionHost
-from detector.assembly import inlets
+from detector.assembly import stream_readers
 from detector.assembly.checking import findings
 from tests.driving import a_detector, a_rule, a_stream, an_engine, arrival, at, compiled
 from tests.mongodb.way import Way
-from tests.process.database_desk import wait_until
+from tests.process.database_harness import wait_until
 from wayside.api import Detector, EventRule
 from wayside.api.documents import DocumentError, load_documents
 
@@ -113,8 +113,8 @@ class Drive:
         self.engine.consequences.wanted = True
         self.published: list[dict[str, Any]] = []
         self.host = ActionHost("h", self, now=lambda: 0)
-        entries = inlets(self.detector)
-        self.host.follow([rule], Surroundings(self.detector, entries.decoders, entries.types))
+        entries = stream_readers(self.detector)
+        self.host.follow([rule], DetectorConfiguration(self.detector, entries.decoders, entries.types))
         self.engine.set_rules(compiled(self.detector, rule))
 
     def publish(self, key: str, payload: bytes, encoding: str) -> None:

@@ -7,8 +7,8 @@ import pytest
 import zenoh
 from zenoh import ext
 
-from detector.assembly import DetectorError, inlets
-from detector.streams.tally import Cause, Tally
+from detector.assembly import DetectorError, stream_readers
+from detector.streams.loss_counter import Cause, LossCounter
 from detector.streams.zenoh import Network
 from tests.driving import a_detector, a_stream
 from tests.networks import PATIENCE, Arrivals, router, session, stream, wait_for
@@ -22,8 +22,10 @@ LOSSY = [{"messages": ["put"], "flows": ["egress"], "rules": [{"key_expr": "vehi
 """The router forwards only this number of samples a second."""
 
 
-def network(endpoint: str, arrivals: Arrivals, tally: Tally, streams: list[Stream]) -> Network:
-    running = Network(Zenoh(mode=ZenohMode.CLIENT, connect=[endpoint]), streams, arrivals.putter, tally=tally)
+def network(endpoint: str, arrivals: Arrivals, loss_counter: LossCounter, streams: list[Stream]) -> Network:
+    running = Network(
+        Zenoh(mode=ZenohMode.CLIENT, connect=[endpoint]), streams, arrivals.putter, loss_counter=loss_counter
+    )
     running.start()
     wait_for(lambda: running.connected)
     return running
@@ -50,7 +52,7 @@ def test_a_late_joiner_gets_the_history_that_it_requests(endpoint: str, arrivals
         publisher = remembering(there)
         for number in range(10):
             publisher.put(str(number))
-        running = network(endpoint, arrivals, Tally(), streams)
+        running = network(endpoint, arrivals, LossCounter(), streams)
         arrivals.wait_for(lambda seen: len(seen) >= 23)
         publisher.put("10")
         arrivals.wait_for(lambda seen: sum(payload == b"10" for _, _, payload in seen) == 4)
@@ -62,14 +64,14 @@ def test_a_late_joiner_gets_the_history_that_it_requests(endpoint: str, arrivals
 
 
 def test_samples_lost_on_the_way_are_counted_or_requested_again(endpoint: str, arrivals: Arrivals) -> None:
-    tally = Tally()
+    loss_counter = LossCounter()
     streams = [stream("counted", history=History(samples=1)), stream("recovered", recover=True)]
     with router(listen__endpoints=[endpoint], downsampling=LOSSY):
-        running = network(endpoint, arrivals, tally, streams)
+        running = network(endpoint, arrivals, loss_counter, streams)
         with session(connect__endpoints=[endpoint]) as vehicle:
             publisher = remembering(vehicle)
             deadline, number = time.monotonic() + PATIENCE, 0
-            while not tally.entries():
+            while not loss_counter.entries():
                 assert time.monotonic() < deadline
                 publisher.put(str(number))
                 number += 1
@@ -79,7 +81,7 @@ def test_samples_lost_on_the_way_are_counted_or_requested_again(endpoint: str, a
     recovered = [int(payload) for name, _, payload in arrivals.seen if name == "recovered"]
     counted = [int(payload) for name, _, payload in arrivals.seen if name == "counted"]
     assert recovered == [*range(number)]
-    (entry,) = tally.entries()
+    (entry,) = loss_counter.entries()
     assert (entry.cause, entry.name) == (Cause.MISSED, "counted")
     assert entry.count == counted[-1] - counted[0] + 1 - len(counted)
 
@@ -93,5 +95,5 @@ def test_history_is_for_streams_over_zenoh() -> None:
     with pytest.raises(
         DetectorError, match=re.escape("spec.streams[0].history: is valid only for streams over Zenoh")
     ) as caught:
-        inlets(detector)
+        stream_readers(detector)
     assert "spec.streams[1].recover: is valid only for streams over Zenoh" in str(caught.value)

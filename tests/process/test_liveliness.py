@@ -9,12 +9,12 @@ import zenoh
 
 from detector.actions.deploy.file_store import FileTaskStore
 from detector.actions.deploy.reconciler import DemandReconciler
-from detector.assembly import DetectorError, inlets
+from detector.assembly import DetectorError, stream_readers
 from detector.engine.samples import liveliness
 from detector.engine.samples.liveliness import LIVELINESS, TokenState
 from detector.engine.samples.sample import Arrival
 from detector.live.running import Running
-from detector.live.state import Restored
+from detector.live.state import RestoredState
 from detector.replay.intake_file import read_intake
 from detector.replay.replaying import replay_intake
 from detector.resources.selection import RuleSet
@@ -96,7 +96,7 @@ def test_when_the_detector_requests_other_tokens_the_timeout_decides_about_the_o
     drive = Drive(detector(), HERE)
     drive.take(alive(0.1, "car1", TokenState.DECLARED), until=10)
     changed = a_detector(a_stream("speed"), clientTimeout="3s")
-    entries = inlets(changed)
+    entries = stream_readers(changed)
     drive.engine.set_detector(changed, entries.decoders, entries.read_key)
     assert drive.take(until=20) == ["here car1 ClientLost 14"]
 
@@ -123,7 +123,7 @@ def _reported(drive: Drive) -> list[str]:
 
 def test_a_pattern_that_is_none_is_reported_with_its_field() -> None:
     with pytest.raises(DetectorError, match=r"spec\.zenoh\.liveliness: key 'a/x\$\{client:\*\}', column 3"):
-        inlets(a_detector(zenoh={"liveliness": "a/x${client:*}"}))
+        stream_readers(a_detector(zenoh={"liveliness": "a/x${client:*}"}))
     with pytest.raises(ValueError, match="liveliness does not capture the client"):
         Zenoh(liveliness="alive/*")
 
@@ -187,7 +187,7 @@ def test_live_and_replay_agree_on_tokens(endpoint: str, tmp_path: Path) -> None:
 
     async def live() -> None:
         reconciler = DemandReconciler(FileTaskStore(tmp_path / "tasks", "h"))
-        with Running(RuleSet(watched, (rule,)), "h", reconciler, tmp_path, tmp_path / "intake.mcap", Restored()):
+        with Running(RuleSet(watched, (rule,)), "h", reconciler, tmp_path, tmp_path / "intake.mcap", RestoredState()):
             for times, reason in ((1, "ended"), (2, None)):  # the second time, the detector ends first
                 car1 = await asyncio.to_thread(vehicle, endpoint)
                 token = car1.liveliness().declare_token("alive/car1")

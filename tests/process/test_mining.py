@@ -25,7 +25,7 @@ from distributed import LocalCluster
 from detector.commands.cli import app
 from detector.commands.replay import replay_files
 from detector.mining.dask import DaskWorkers
-from detector.mining.workers import LocalWorkers, Lost, RemoteCall
+from detector.mining.workers import LocalWorkers, LostWorker, RemoteCall
 from detector.results.kinds import ResultKind
 from tests import s3
 from tests.cluster.waiting import wait_until
@@ -230,7 +230,7 @@ def test_a_dask_cluster_of_which_a_worker_is_killed_gives_the_same(fleet: Path) 
         workers = DaskWorkers(cluster.scheduler_address)
         assert sorted(result for _, result in workers.run(calls)) == [-1, 0, 1, 2]
         ((_, lost),) = workers.run([RemoteCall(end, 3)])
-        assert isinstance(lost, Lost)
+        assert isinstance(lost, LostWorker)
         workers.close()
         assert f"{RECORDINGS + BROKEN} mined now" in mine(fleet, "dask", "--dask", cluster.scheduler_address)
     assert files(fleet / "dask") == files(fleet / "out")
@@ -302,5 +302,5 @@ def test_a_call_that_kills_its_process_takes_no_other_with_it() -> None:
         found = {call.argument: result for call, result in pool.run(RemoteCall(end, number) for number in range(8))}
     finally:
         pool.close()
-    assert isinstance(found.pop(3), Lost)
+    assert isinstance(found.pop(3), LostWorker)
     assert found == {number: number for number in range(8) if number != 3}

@@ -12,7 +12,7 @@ from paho.mqtt.client import Client
 
 from detector.sources.mqtt import topic_filter
 from detector.sources.supervision import SourceState, SourceThread
-from detector.streams.tally import Cause, Tally
+from detector.streams.loss_counter import Cause, LossCounter
 from tests.certificates import Authority
 from tests.networks import PATIENCE, Arrivals, stream, wait_for
 from tests.ports import free_port
@@ -27,11 +27,11 @@ def port() -> int:
 
 @contextmanager
 def mqtt(
-    arrivals: Arrivals, tally: Tally, *, key: str = "vehicles/${client:*}/pose", **parameters: Any
+    arrivals: Arrivals, loss_counter: LossCounter, *, key: str = "vehicles/${client:*}/pose", **parameters: Any
 ) -> Iterator[SourceThread]:
     source = DataSource(name="broker", plugin="mqtt", parameters={"host": "localhost", **parameters})
     thread = SourceThread(
-        source, (stream(key=key, source="broker"),), arrivals.putter, tally, first_pause=0.1, longest_pause=0.5
+        source, (stream(key=key, source="broker"),), arrivals.putter, loss_counter, first_pause=0.1, longest_pause=0.5
     )
     thread.start()
     try:
@@ -52,29 +52,29 @@ def publish_until(client: Client, topic: str, done: Callable[[], object]) -> Non
 
 
 def test_messages_arrive_on_their_keys_also_after_the_broker_was_killed(port: int, arrivals: Arrivals) -> None:
-    tally = Tally()
-    with mqtt(arrivals, tally, port=port) as thread:
+    loss_counter = LossCounter()
+    with mqtt(arrivals, loss_counter, port=port) as thread:
         for client in ("car1", "car2"):  # at first there is no broker yet
             wait_for(lambda: thread.state is SourceState.PAUSING)
             with broker(port), publisher(port) as sender:
                 publish_until(sender, f"vehicles/{client}/pose", lambda: client in str(arrivals.seen))  # noqa: B023
     assert set(arrivals.seen) == {("pose", "vehicles/car1/pose", b"{}"), ("pose", "vehicles/car2/pose", b"{}")}
-    failures = [entry for entry in tally.entries() if entry.cause is Cause.FAILED]
+    failures = [entry for entry in loss_counter.entries() if entry.cause is Cause.FAILED]
     assert [entry.name for entry in failures] == ["broker"]
     assert failures[0].count >= 2
 
 
 def test_what_stands_before_the_key_is_taken_off_and_other_topics_are_dropped(port: int, arrivals: Arrivals) -> None:
-    tally = Tally()
+    loss_counter = LossCounter()
     with (
         broker(port),
         publisher(port) as client,
-        mqtt(arrivals, tally, port=port, prefix="/site/", key="v/${client:car$*}/pose"),
+        mqtt(arrivals, loss_counter, port=port, prefix="/site/", key="v/${client:car$*}/pose"),
     ):
-        publish_until(client, "/site/v/bike1/pose", tally.entries)
+        publish_until(client, "/site/v/bike1/pose", loss_counter.entries)
         publish_until(client, "/site/v/car1/pose", lambda: arrivals.seen)
     assert {key for _, key, _ in arrivals.seen} == {"v/car1/pose"}
-    assert [(entry.cause, entry.last) for entry in tally.entries()] == [(Cause.UNROUTED, "v/bike1/pose")]
+    assert [(entry.cause, entry.last) for entry in loss_counter.entries()] == [(Cause.UNROUTED, "v/bike1/pose")]
 
 
 def test_over_tls_with_a_password(
@@ -88,7 +88,7 @@ def test_over_tls_with_a_password(
         "credentials": {"username": "detector", "passwordVariable": "MQTT_PASSWORD"},
     }
     with broker(port, guarded=True, ssl=True, certfile=str(certificate), keyfile=str(key)):
-        with mqtt(arrivals, Tally(), **given) as thread:
+        with mqtt(arrivals, LossCounter(), **given) as thread:
             wait_for(lambda: "MQTT_PASSWORD is not set" in thread.last_error)
             monkeypatch.setenv("MQTT_PASSWORD", "close sesame")
             wait_for(lambda: "refused the connection" in thread.last_error)
@@ -96,7 +96,7 @@ def test_over_tls_with_a_password(
             with publisher(port, str(authority.ca)) as client:
                 publish_until(client, "vehicles/car1/pose", lambda: arrivals.seen)
         stranger = Authority(tmp_path, "stranger")
-        with mqtt(arrivals, Tally(), **{**given, "tls": {"ca": str(stranger.ca)}}) as thread:
+        with mqtt(arrivals, LossCounter(), **{**given, "tls": {"ca": str(stranger.ca)}}) as thread:
             wait_for(lambda: "certificate verify failed" in thread.last_error)
     assert "sesame" not in caplog.text
 
@@ -108,12 +108,12 @@ def test_with_a_client_id_the_broker_keeps_messages_while_the_detector_is_away(
     credentials = {"username": "detector", "passwordFile": str(tmp_path / "password")}
     given = {"port": port, "clientId": "detector", "qos": 1, "credentials": credentials}
     with broker(port, guarded=True), publisher(port) as client:  # this broker keeps nothing for who has no name
-        with mqtt(arrivals, Tally(), **given):
+        with mqtt(arrivals, LossCounter(), **given):
             publish_until(client, "vehicles/car1/pose", lambda: arrivals.seen)
         # What comes before this broker has noticed that the detector is away goes to the old connection, and is lost.
         for number in itertools.count():
             client.publish("vehicles/car1/pose", b"meanwhile", qos=1).wait_for_publish(PATIENCE)
-            with mqtt(arrivals, Tally(), **given):
+            with mqtt(arrivals, LossCounter(), **given):
                 came = arrivals.comes(lambda seen: any(payload == b"meanwhile" for _, _, payload in seen), 5.0)
             if came or number == 9:
                 break

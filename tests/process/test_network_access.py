@@ -17,7 +17,7 @@ from detector.actions.deploy.file_store import FileTaskStore
 from detector.actions.deploy.reconciler import DemandReconciler
 from detector.engine.samples.liveliness import LIVELINESS, TokenState
 from detector.live.running import Running
-from detector.live.state import Restored
+from detector.live.state import RestoredState
 from detector.resources.selection import RuleSet
 from detector.streams.session import NetworkError, open_session
 from detector.streams.zenoh import Network
@@ -240,7 +240,7 @@ def test_a_running_detector_moves_to_another_network_with_its_buffer(endpoint: s
 
     async def live() -> None:
         reconciler = DemandReconciler(FileTaskStore(tmp_path, "h"))
-        with Running(at(endpoint), "h", reconciler, None, None, Restored()) as running:
+        with Running(at(endpoint), "h", reconciler, None, None, RestoredState()) as running:
 
             def buffered(client: str) -> bool:
                 with open_session(

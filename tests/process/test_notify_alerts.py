@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from detector.actions import Completion, OutcomeState
 from detector.actions.notify import alerts
 from tests.http_servers import Endpoint, answers, hangs, holds
-from tests.notifying import a_desk, an_episode
+from tests.notifying import a_harness, an_episode
 from wayside.times import parse_time
 
 NOBODY = "alerts that were accepted too late to notify"
@@ -39,9 +39,9 @@ def open_of(episode: Any) -> Any:
 
 
 def test_an_alert_fires_at_the_start_and_is_resolved_at_the_end(there: Endpoint) -> None:
-    desk = a_desk(notify(there, title="t", text="x", labels={"severity": "page"}))
+    harness = a_harness(notify(there, title="t", text="x", labels={"severity": "page"}))
     episode = an_episode(rendered={"title": "braking", "text": "car1 brakes", "labels": {"severity": "page", "n": ""}})
-    desk.action.started(open_of(episode))
+    harness.action.started(open_of(episode))
     (first,) = posted(there)
     assert (there.requests[0].method, there.requests[0].path) == ("POST", "/am/api/v2/alerts")
     assert there.requests[0].headers["content-type"] == "application/json"
@@ -53,121 +53,121 @@ def test_an_alert_fires_at_the_start_and_is_resolved_at_the_end(there: Endpoint)
         "severity": "page",
     }
     assert first["annotations"] == {"summary": "braking", "description": "car1 brakes"}
-    assert desk.outcome("e1", OutcomeState.RUNNING).message == "fires"
-    desk.action.ended(episode)
+    assert harness.outcome("e1", OutcomeState.RUNNING).message == "fires"
+    harness.action.ended(episode)
     second = posted(there, 2)[1]
     assert second["labels"] == first["labels"]
     assert second["startsAt"] == first["startsAt"] == "2026-01-01T00:00:00.000000000Z"
     assert second["endsAt"] == "2026-01-01T00:00:05.000000000Z"
     assert parse_time(first["endsAt"]) - 4 * 3600 * 10**9 > parse_time(first["startsAt"])
-    desk.outcome("e1")
-    desk.action.completed(episode, Completion())
-    desk.end()
+    harness.outcome("e1")
+    harness.action.completed(episode, Completion())
+    harness.end()
     assert len(there.requests) == 2
 
 
 def test_an_alert_is_repeated_with_a_later_end_while_its_episode_lasts(there: Endpoint) -> None:
-    desk = a_desk(notify(there, repeat="50ms"))
-    desk.action.started(open_of(an_episode()))
+    harness = a_harness(notify(there, repeat="50ms"))
+    harness.action.started(open_of(an_episode()))
     ends = [parse_time(alert["endsAt"]) for alert in posted(there, 4)[:4]]
     assert ends == sorted(set(ends))
-    desk.action.ended(an_episode())
-    desk.outcome("e1")
+    harness.action.ended(an_episode())
+    harness.outcome("e1")
     count = len(there.requests)
-    desk.end()
+    harness.end()
     assert len(there.requests) == count
 
 
 def test_many_alerts_share_a_request(there: Endpoint) -> None:
     reported = threading.Event()
     there.behaviour = holds(reported, answers(200))
-    desk = a_desk(notify(there))
-    desk.action.started(open_of(an_episode("e0")))
+    harness = a_harness(notify(there))
+    harness.action.started(open_of(an_episode("e0")))
     there.received(1)
     for number in range(1, 50):
-        desk.action.started(open_of(an_episode(f"e{number}", f"car{number}")))
+        harness.action.started(open_of(an_episode(f"e{number}", f"car{number}")))
     reported.set()
-    desk.outcome("e49", OutcomeState.RUNNING)
+    harness.outcome("e49", OutcomeState.RUNNING)
     assert len(posted(there, 2)) == 1 + 49
-    desk.end()
+    harness.end()
 
 
 def test_an_alert_whose_end_comes_while_it_is_sent_as_firing_is_resolved_next(there: Endpoint) -> None:
     ended = threading.Event()
     there.behaviour = holds(ended, answers(503))
-    desk = a_desk(notify(there))
-    desk.action.started(open_of(an_episode()))
+    harness = a_harness(notify(there))
+    harness.action.started(open_of(an_episode()))
     there.received(1)
-    desk.action.ended(an_episode())
+    harness.action.ended(an_episode())
     there.behaviour = answers(200)
     ended.set()
     first, second = posted(there, 2)
     assert parse_time(first["endsAt"]) > parse_time(second["endsAt"])
-    failed = desk.outcome("e1", OutcomeState.FAILED)
+    failed = harness.outcome("e1", OutcomeState.FAILED)
     assert "accepted only after the end of the episode" in failed.message
-    assert desk.lost[NOBODY] == 1
-    desk.end()
+    assert harness.lost[NOBODY] == 1
+    harness.end()
 
 
 def test_an_alertmanager_that_is_away_for_a_while_hears_of_it_when_it_is_back(there: Endpoint) -> None:
     there.behaviour = answers(503)
-    desk = a_desk(notify(there))
-    desk.action.started(open_of(an_episode()))
+    harness = a_harness(notify(there))
+    harness.action.started(open_of(an_episode()))
     there.received(3)
-    assert desk.outcome("e1", OutcomeState.RUNNING).message == "not delivered yet: answered 503"
+    assert harness.outcome("e1", OutcomeState.RUNNING).message == "not delivered yet: answered 503"
     there.behaviour = answers(200)
-    desk.until(lambda: desk.outcomes[-1][1].message == "fires")
-    desk.action.ended(an_episode())
-    desk.outcome("e1")
-    desk.end()
-    assert not desk.lost
+    harness.until(lambda: harness.outcomes[-1][1].message == "fires")
+    harness.action.ended(an_episode())
+    harness.outcome("e1")
+    harness.end()
+    assert not harness.lost
 
 
 def test_what_is_over_and_refused_is_a_dead_letter(there: Endpoint, tmp_path: Path) -> None:
     there.behaviour = answers(400, b"bad label")
-    desk = a_desk(notify(there), state=tmp_path)
-    desk.action.started(open_of(an_episode()))
-    desk.until(lambda: desk.lost["alerts rejected by the Alertmanager"])
-    desk.action.ended(an_episode())
-    assert desk.outcome("e1", OutcomeState.FAILED).message == "not delivered: answered 400: bad label"
+    harness = a_harness(notify(there), state=tmp_path)
+    harness.action.started(open_of(an_episode()))
+    harness.until(lambda: harness.lost["alerts rejected by the Alertmanager"])
+    harness.action.ended(an_episode())
+    assert harness.outcome("e1", OutcomeState.FAILED).message == "not delivered: answered 400: bad label"
     (file,) = (tmp_path / "notify").glob("*.dead.jsonl")
     assert json.loads(file.read_text())["event"]["id"] == "e1.ended"
-    desk.end()
+    harness.end()
 
 
 def test_more_alerts_than_may_be_are_dead_letters(there: Endpoint) -> None:
     there.behaviour = hangs()
-    desk = a_desk(notify(there) | {"waiting": 2})
+    harness = a_harness(notify(there) | {"waiting": 2})
     for number in range(3):
-        desk.action.started(open_of(an_episode(f"e{number}")))
-    assert "the queue is full" in desk.outcome("e2", OutcomeState.FAILED).message
-    desk.end()
+        harness.action.started(open_of(an_episode(f"e{number}")))
+    assert "the queue is full" in harness.outcome("e2", OutcomeState.FAILED).message
+    harness.end()
 
 
 def test_at_the_end_what_is_over_is_reported_and_what_fires_is_left_to_the_next_start(there: Endpoint) -> None:
     there.behaviour = answers(503, Retry_After="60")
-    desk = a_desk(notify(there))
-    desk.action.started(open_of(an_episode("over")))
+    harness = a_harness(notify(there))
+    harness.action.started(open_of(an_episode("over")))
     there.received(1)
-    desk.outcome("over", OutcomeState.RUNNING)
-    desk.action.started(open_of(an_episode("open")))
-    desk.action.ended(an_episode("over"))
+    harness.outcome("over", OutcomeState.RUNNING)
+    harness.action.started(open_of(an_episode("open")))
+    harness.action.ended(an_episode("over"))
     there.behaviour = answers(200)
-    desk.end()
+    harness.end()
     reported = {alert["labels"]["episode"]: alert for alert in json.loads(there.requests[-1].body)}
     assert reported["over"]["endsAt"] == "2026-01-01T00:00:05.000000000Z"
     assert parse_time(reported["open"]["endsAt"]) > parse_time(reported["over"]["endsAt"])
-    assert "had not ended" in desk.outcome("open").message
+    assert "had not ended" in harness.outcome("open").message
     assert len(there.requests) == 2
 
 
 def test_a_resumed_episode_has_the_labels_that_it_had(there: Endpoint, tmp_path: Path) -> None:
     rule = notify(there, labels={"road": "${road}"})
-    first = a_desk(rule, state=tmp_path)
+    first = a_harness(rule, state=tmp_path)
     first.action.started(open_of(an_episode(rendered={"labels": {"road": "A1"}})))
     there.received(1)
     first.end()
-    second = a_desk(rule, state=tmp_path)
+    second = a_harness(rule, state=tmp_path)
     second.action.started(open_of(an_episode(resumed=True, unrendered={"labels": "it is of before the restart"})))
     before, after = posted(there, 2)
     assert before["labels"] == after["labels"]

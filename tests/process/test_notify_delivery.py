@@ -25,7 +25,7 @@ from tests.http_servers import (
     nobody,
 )
 from tests.networks import session
-from tests.notifying import a_desk, an_episode
+from tests.notifying import a_harness, an_episode
 
 LOST = "events not delivered to any target"
 
@@ -58,8 +58,8 @@ def letters(state: Path) -> list[dict[str, Any]]:
 @pytest.mark.parametrize("mode", ["Structured", "Binary"])
 def test_the_cloudevents_sdk_reads_what_arrives(there: Endpoint, mode: str) -> None:
     texts = {"title": "car1 brakes", "text": "at 12.5 m/s", "labels": {"severity": "warning", "speed": 12.0}}
-    desk = a_desk({"http": http(there, mode=mode)})
-    desk.run(an_episode(client="Käfer 1%", rendered=texts))
+    harness = a_harness({"http": http(there, mode=mode)})
+    harness.run(an_episode(client="Käfer 1%", rendered=texts))
     start, end = there.received(2)
     for request, what in ((start, "started"), (end, "ended")):
         event = from_http_event(HTTPMessage(request.headers, request.body))
@@ -72,61 +72,61 @@ def test_the_cloudevents_sdk_reads_what_arrives(there: Endpoint, mode: str) -> N
         assert data["values"] == {"speed": 12.5}
         assert data["notification"] == {**texts, "labels": {"severity": "warning", "speed": "12"}}
     assert (start.method, start.path) == ("POST", "/hook")
-    done = desk.outcome("e1")
+    done = harness.outcome("e1")
     assert done.details == {"messages": 2, "attempts": 2}
     assert done.bytes > 0
-    desk.end()
+    harness.end()
 
 
 @pytest.mark.parametrize(("wanted", "reported"), [(["Started"], ["e1.started"]), (["Ended"], ["e1.ended"])])
 def test_only_the_wanted_events_are_reported(there: Endpoint, wanted: list[str], reported: list[str]) -> None:
-    desk = a_desk({"http": http(there), "events": wanted})
-    desk.run(an_episode())
-    desk.outcome("e1")
+    harness = a_harness({"http": http(there), "events": wanted})
+    harness.run(an_episode())
+    harness.outcome("e1")
     assert ids(there.requests) == reported
-    desk.end()
+    harness.end()
 
 
 @pytest.mark.parametrize("fault", [answers(500, b"out of memory"), hangs()], ids=["500", "hangs"])
 def test_what_fails_is_tried_again_until_it_arrives(there: Endpoint, fault: Behaviour) -> None:
     there.behaviour = fault
-    desk = a_desk({"http": http(there, "200ms"), "events": ["Started"]})
-    desk.run(an_episode())
+    harness = a_harness({"http": http(there, "200ms"), "events": ["Started"]})
+    harness.run(an_episode())
     there.received(2)
-    running = desk.outcome("e1", OutcomeState.RUNNING)
+    running = harness.outcome("e1", OutcomeState.RUNNING)
     assert running.message.startswith("not delivered yet: ")
     there.behaviour = answers(204)
-    assert desk.outcome("e1").details["attempts"] >= 3
+    assert harness.outcome("e1").details["attempts"] >= 3
     assert set(ids(there.requests)) == {"e1.started"}
-    assert not desk.lost
-    desk.end()
+    assert not harness.lost
+    harness.end()
 
 
 def test_what_is_refused_is_a_dead_letter_at_once(there: Endpoint, tmp_path: Path) -> None:
     there.behaviour = answers(400, b"no such field: x")
-    desk = a_desk({"http": http(there), "text": "${a}"}, state=tmp_path)
-    desk.run(an_episode(rendered={"text": "car1 brakes"}))
-    failed = desk.outcome("e1", OutcomeState.FAILED)
+    harness = a_harness({"http": http(there), "text": "${a}"}, state=tmp_path)
+    harness.run(an_episode(rendered={"text": "car1 brakes"}))
+    failed = harness.outcome("e1", OutcomeState.FAILED)
     assert failed.message.startswith("not delivered: answered 400: no such field: x")
     assert failed.missing == 2
-    assert desk.lost[LOST] == 2
+    assert harness.lost[LOST] == 2
     assert len(there.requests) == 2
     first, second = letters(tmp_path)
     assert (first["event"]["id"], second["event"]["id"]) == ("e1.started", "e1.ended")
     assert first["texts"] == {"text": "car1 brakes"}
     assert (first["rule"], first["action"], first["attempts"]) == ("braking", "notify", 1)
-    desk.end()
+    harness.end()
 
 
 def test_what_does_not_arrive_in_time_is_given_up(tmp_path: Path) -> None:
     with nobody() as gone:
-        desk = a_desk({"http": http(gone), "giveUpAfter": "100ms", "events": ["Ended"]}, state=tmp_path)
-        desk.run(an_episode())
-        failed = desk.outcome("e1", OutcomeState.FAILED)
+        harness = a_harness({"http": http(gone), "giveUpAfter": "100ms", "events": ["Ended"]}, state=tmp_path)
+        harness.run(an_episode())
+        failed = harness.outcome("e1", OutcomeState.FAILED)
         assert "attempts, http://localhost" in failed.message
         assert "/hook" not in failed.message
         assert [letter["event"]["id"] for letter in letters(tmp_path)] == ["e1.ended"]
-        desk.end()
+        harness.end()
 
 
 def test_a_message_that_the_endpoint_cannot_take_holds_up_no_other_episode(there: Endpoint) -> None:
@@ -134,56 +134,56 @@ def test_a_message_that_the_endpoint_cannot_take_holds_up_no_other_episode(there
         answers(500 if b'"e1.' in request.body else 200)(here, connection, request)
 
     there.behaviour = poisoned
-    desk = a_desk({"http": http(there)})
-    desk.run(an_episode("e1"), an_episode("e2"))
-    desk.outcome("e2")
+    harness = a_harness({"http": http(there)})
+    harness.run(an_episode("e1"), an_episode("e2"))
+    harness.outcome("e2")
     assert "e1.ended" not in ids(there.requests), "the end is not sent before the start"
-    desk.end()
+    harness.end()
 
 
 def test_the_end_is_reported_after_the_start(there: Endpoint) -> None:
     there.behaviour = answers(500)
-    desk = a_desk({"http": http(there)})
-    desk.run(an_episode())
+    harness = a_harness({"http": http(there)})
+    harness.run(an_episode())
     there.received(3)
     there.behaviour = answers(200)
-    desk.outcome("e1")
+    harness.outcome("e1")
     reported = ids(there.requests)
     assert reported[-1] == "e1.ended"
     assert set(reported[:-1]) == {"e1.started"}
-    desk.end()
+    harness.end()
 
 
 def test_an_endpoint_that_gives_a_time_is_left_alone_until_then(
     there: Endpoint, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     there.behaviour = first_then(answers(429, Retry_After="1"), answers(200))
-    desk = a_desk({"http": http(there), "events": ["Started"]})
-    desk.run(an_episode("e1"), an_episode("e2"))
-    desk.outcome("e1")
+    harness = a_harness({"http": http(there), "events": ["Started"]})
+    harness.run(an_episode("e1"), an_episode("e2"))
+    harness.outcome("e1")
     assert there.requests[1].at - there.requests[0].at > 0.9
-    desk.outcome("e2")
+    harness.outcome("e2")
     assert len(there.requests) == 3
-    desk.end()
+    harness.end()
 
 
 def test_the_publisher_does_not_wait_for_an_endpoint_that_hangs(there: Endpoint) -> None:
     there.behaviour = hangs()
-    desk = a_desk({"http": http(there, "30s"), "waiting": 3, "events": ["Started"]})
-    desk.run(an_episode("e0"))
+    harness = a_harness({"http": http(there, "30s"), "waiting": 3, "events": ["Started"]})
+    harness.run(an_episode("e0"))
     there.received(1)
     begun = time.monotonic()
-    desk.run(*(an_episode(f"e{number}") for number in range(1, 200)))
+    harness.run(*(an_episode(f"e{number}") for number in range(1, 200)))
     assert time.monotonic() - begun < 20
-    assert desk.lost[LOST] == 197  # three wait, one of them being sent
-    assert "the queue is full" in desk.outcome("e199", OutcomeState.FAILED).message
+    assert harness.lost[LOST] == 197  # three wait, one of them being sent
+    assert "the queue is full" in harness.outcome("e199", OutcomeState.FAILED).message
     begun = time.monotonic()
-    desk.end()
+    harness.end()
     assert time.monotonic() - begun < 20, "the end does not wait for the endpoint either"
 
 
 def test_a_hundred_vehicles_are_one_message(there: Endpoint) -> None:
-    desk = a_desk(
+    harness = a_harness(
         {
             "http": http(there),
             "events": ["Started"],
@@ -193,8 +193,8 @@ def test_a_hundred_vehicles_are_one_message(there: Endpoint) -> None:
         }
     )
     for number in range(100):
-        desk.run(an_episode(f"e{number}", f"car{number}", {"text": f"car{number} stands", "labels": {"road": "A1"}}))
-    desk.run(an_episode("other", "bus", {"text": "bus stands", "labels": {"road": "B7"}}))
+        harness.run(an_episode(f"e{number}", f"car{number}", {"text": f"car{number} stands", "labels": {"road": "A1"}}))
+    harness.run(an_episode("other", "bus", {"text": "bus stands", "labels": {"road": "B7"}}))
     first, second = events(there.received(2))
     assert first["type"] == "dev.wayside.event.group"
     assert first["data"]["count"] == first["data"]["started"] == 100
@@ -203,56 +203,56 @@ def test_a_hundred_vehicles_are_one_message(there: Endpoint) -> None:
     assert first["data"]["notification"] == {"text": "car0 stands (and 99 more)", "labels": {"road": "A1"}}
     assert (second["data"]["count"], second["data"]["notification"]["text"]) == (1, "bus stands")
     for number in range(100):
-        desk.outcome(f"e{number}")
+        harness.outcome(f"e{number}")
     assert len(there.requests) == 2
-    desk.end()
+    harness.end()
 
 
 def test_no_more_messages_go_out_than_the_rate_allows(there: Endpoint) -> None:
-    desk = a_desk({"http": http(there), "events": ["Started"], "rate": {"messages": 3, "per": "1h"}})
-    desk.run(*(an_episode(f"e{number}") for number in range(10)))
+    harness = a_harness({"http": http(there), "events": ["Started"], "rate": {"messages": 3, "per": "1h"}})
+    harness.run(*(an_episode(f"e{number}") for number in range(10)))
     there.received(3)
-    desk.outcome("e2")
-    desk.end()  # also then
+    harness.outcome("e2")
+    harness.end()  # also then
     assert len(there.requests) == 3
-    assert desk.lost[LOST] == 7
+    assert harness.lost[LOST] == 7
 
 
 def test_at_the_end_what_waits_is_tried_once_more(there: Endpoint, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(outbox, "FIRST", 60.0)
     monkeypatch.setattr(outbox, "LONGEST", 60.0)
     there.behaviour = answers(500)
-    desk = a_desk({"http": http(there), "events": ["Started"]})
-    desk.run(an_episode("e1"), an_episode("e2"))
-    desk.outcome("e2", OutcomeState.RUNNING)
+    harness = a_harness({"http": http(there), "events": ["Started"]})
+    harness.run(an_episode("e1"), an_episode("e2"))
+    harness.outcome("e2", OutcomeState.RUNNING)
     there.behaviour = answers(200)
-    desk.end()
-    desk.outcome("e1")
-    desk.outcome("e2")
-    assert not desk.lost
+    harness.end()
+    harness.outcome("e1")
+    harness.outcome("e2")
+    assert not harness.lost
     assert len(there.requests) == 4
 
 
 def test_at_the_end_a_group_does_not_wait(there: Endpoint) -> None:
-    desk = a_desk({"http": http(there), "grouping": {"wait": "1h"}})
-    desk.run(an_episode("e1"), an_episode("e2"))
-    desk.end()
+    harness = a_harness({"http": http(there), "grouping": {"wait": "1h"}})
+    harness.run(an_episode("e1"), an_episode("e2"))
+    harness.end()
     assert [event["data"]["count"] for event in events(there.requests)] == [4]
 
 
 def test_what_cannot_be_delivered_by_the_end_is_a_dead_letter_where_nothing_keeps_it() -> None:
     with nobody() as gone:
-        desk = a_desk({"http": http(gone), "events": ["Started"]})
-        desk.run(an_episode("e1"), an_episode("e2"))
-        desk.end()
-    assert desk.lost[LOST] == 2
-    assert "before it was delivered" in desk.outcome("e1", OutcomeState.FAILED).message
+        harness = a_harness({"http": http(gone), "events": ["Started"]})
+        harness.run(an_episode("e1"), an_episode("e2"))
+        harness.end()
+    assert harness.lost[LOST] == 2
+    assert "before it was delivered" in harness.outcome("e1", OutcomeState.FAILED).message
 
 
 def test_what_cannot_be_delivered_by_the_end_is_delivered_after_the_next_start(there: Endpoint, tmp_path: Path) -> None:
     there.behaviour = answers(503)
     notify = {"http": http(there), "text": "x"}
-    first = a_desk(notify, state=tmp_path)
+    first = a_harness(notify, state=tmp_path)
     first.run(an_episode("e1", rendered={"text": "car1 brakes"}))
     there.received(1)
     first.end()
@@ -260,13 +260,13 @@ def test_what_cannot_be_delivered_by_the_end_is_delivered_after_the_next_start(t
     assert "after its next start" in first.outcomes[-1][1].message
     there.requests.clear()
     there.behaviour = answers(200)
-    second = a_desk(notify, state=tmp_path)
+    second = a_harness(notify, state=tmp_path)
     start, end = events(there.received(2))
     assert (start["id"], end["id"]) == ("e1.started", "e1.ended")
     assert start["data"]["notification"] == {"text": "car1 brakes"}
     second.end()
     assert not second.lost
-    third = a_desk(notify, state=tmp_path)
+    third = a_harness(notify, state=tmp_path)
     third.end()
     assert len(there.requests) == 2
     assert not list((tmp_path / "notify").iterdir())
@@ -274,10 +274,10 @@ def test_what_cannot_be_delivered_by_the_end_is_delivered_after_the_next_start(t
 
 def test_an_action_that_the_rule_no_longer_has_leaves_dead_letters(tmp_path: Path) -> None:
     with nobody() as gone:
-        desk = a_desk({"http": http(gone), "events": ["Started"]}, state=tmp_path)
-        desk.run(an_episode("e1"))
-        desk.action.close()
-    assert desk.lost[LOST] == 1
+        harness = a_harness({"http": http(gone), "events": ["Started"]}, state=tmp_path)
+        harness.run(an_episode("e1"))
+        harness.action.close()
+    assert harness.lost[LOST] == 1
     assert [letter["event"]["id"] for letter in letters(tmp_path)] == ["e1.started"]
     assert len(list((tmp_path / "notify").iterdir())) == 1
 
@@ -286,7 +286,7 @@ def test_of_a_resumed_episode_only_the_end_is_reported_with_the_texts_of_its_sta
     there: Endpoint, tmp_path: Path
 ) -> None:
     notify = {"http": http(there), "text": "x"}
-    first = a_desk(notify, state=tmp_path)
+    first = a_harness(notify, state=tmp_path)
     first.action.started(
         an_episode(
             rendered={"text": "car1 brakes"},
@@ -294,7 +294,7 @@ def test_of_a_resumed_episode_only_the_end_is_reported_with_the_texts_of_its_sta
     )
     there.received(1)
     first.end()
-    second = a_desk(notify, state=tmp_path)
+    second = a_harness(notify, state=tmp_path)
     second.run(an_episode(resumed=True, unrendered={"text": "it is of before the restart"}))
     end = events(there.received(2))[1]
     assert (end["id"], end["data"]["notification"]) == ("e1.ended", {"text": "car1 brakes"})
@@ -303,37 +303,37 @@ def test_of_a_resumed_episode_only_the_end_is_reported_with_the_texts_of_its_sta
 
 
 def test_a_text_that_could_not_be_rendered_is_missing_and_reported(there: Endpoint) -> None:
-    desk = a_desk({"http": http(there), "title": "t", "text": "x"})
-    desk.run(an_episode(rendered={"title": "braking"}, unrendered={"text": "speed is unknown"}))
+    harness = a_harness({"http": http(there), "title": "t", "text": "x"})
+    harness.run(an_episode(rendered={"title": "braking"}, unrendered={"text": "speed is unknown"}))
     assert events(there.received(1))[0]["data"]["notification"] == {"title": "braking"}
-    assert desk.outcome("e1").message == "text: speed is unknown"
-    desk.end()
+    assert harness.outcome("e1").message == "text: speed is unknown"
+    harness.end()
 
 
 def test_an_episode_that_does_not_end_is_done_when_its_start_is_reported(there: Endpoint) -> None:
-    desk = a_desk({"http": http(there)})
+    harness = a_harness({"http": http(there)})
     open_ = replace(an_episode(), ended=None, end_time=None, reason=None)
-    desk.action.started(open_)
+    harness.action.started(open_)
     there.received(1)
-    desk.action.completed(open_, Completion(cut="the detector stops"))
-    desk.outcome("e1")
-    desk.end()
+    harness.action.completed(open_, Completion(cut="the detector stops"))
+    harness.outcome("e1")
+    harness.end()
 
 
 def test_a_secret_that_is_mounted_late_is_waited_for(
     there: Endpoint, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("WAYSIDE_SECRETS", str(tmp_path))
-    desk = a_desk({"http": {"urlSecretKeyRef": {"name": "hook", "key": "url"}}, "events": ["Started"]})
-    desk.run(an_episode())
-    assert "urlSecretKeyRef: the Secret hook is not mounted" in desk.outcome("e1", OutcomeState.RUNNING).message
+    harness = a_harness({"http": {"urlSecretKeyRef": {"name": "hook", "key": "url"}}, "events": ["Started"]})
+    harness.run(an_episode())
+    assert "urlSecretKeyRef: the Secret hook is not mounted" in harness.outcome("e1", OutcomeState.RUNNING).message
     (tmp_path / "hook.new").mkdir()
     (tmp_path / "hook.new" / "url").write_text(f"{there.url}/T0K3N\n")
     (tmp_path / "hook.new").rename(tmp_path / "hook")
-    desk.outcome("e1")
+    harness.outcome("e1")
     assert there.requests[0].path == "/T0K3N"
-    assert all("T0K3N" not in outcome.message for _, outcome in desk.outcomes)
-    desk.end()
+    assert all("T0K3N" not in outcome.message for _, outcome in harness.outcomes)
+    harness.end()
 
 
 class Session:
@@ -357,11 +357,11 @@ def test_a_zenoh_key_gets_the_event() -> None:
 
     with session("peer") as alone:
         subscriber = alone.declare_subscriber("city/alerts", take)
-        desk = a_desk({"zenoh": {"key": "city/alerts"}, "title": "t"}, messenger=Session(alone))
-        desk.run(an_episode(rendered={"title": "braking"}))
+        harness = a_harness({"zenoh": {"key": "city/alerts"}, "title": "t"}, messenger=Session(alone))
+        harness.run(an_episode(rendered={"title": "braking"}))
         assert changed.wait(60), arrived
-        desk.outcome("e1")
-        desk.end()
+        harness.outcome("e1")
+        harness.end()
         subscriber.undeclare()
     assert [key for key, _, _ in arrived] == ["city/alerts"] * 2
     assert {encoding for _, encoding, _ in arrived} == {"application/cloudevents+json"}

@@ -11,18 +11,18 @@ from pathlib import Path
 
 import pytest
 
-from detector.actions.notify.keeping import DeadLetters
+from detector.actions.notify.storage import DeadLetters
 from detector.actions.store import action_store
 from tests.http_servers import answers, endpoint, hangs
-from tests.notifying import a_desk, an_episode
+from tests.notifying import a_harness, an_episode
 
 _KILLED = """
 import sys
 from pathlib import Path
-from tests.notifying import a_desk, an_episode
-desk = a_desk({"http": {"url": sys.argv[1], "timeout": "2m"}, "text": "x"}, state=Path(sys.argv[2]))
+from tests.notifying import a_harness, an_episode
+harness = a_harness({"http": {"url": sys.argv[1], "timeout": "2m"}, "text": "x"}, state=Path(sys.argv[2]))
 for number in range(20):
-    desk.run(an_episode(f"e{number}", rendered={"text": f"number {number}"}))
+    harness.run(an_episode(f"e{number}", rendered={"text": f"number {number}"}))
 print("accepted", flush=True)
 sys.stdin.read()
 """
@@ -40,10 +40,10 @@ def test_what_was_reported_before_a_kill_is_delivered_after_it_each_event_once(t
         process.communicate()
         there.requests.clear()
         there.behaviour = answers(200)
-        desk = a_desk({"http": {"url": there.url}, "text": "x"}, state=tmp_path)
+        harness = a_harness({"http": {"url": there.url}, "text": "x"}, state=tmp_path)
         events = [json.loads(request.body) for request in there.received(40)]
-        desk.end()
-    assert not desk.lost
+        harness.end()
+    assert not harness.lost
     assert [event["id"] for event in events] == [
         f"e{number}.{what}" for number in range(20) for what in ("started", "ended")
     ]
@@ -57,22 +57,22 @@ def test_entries_that_are_no_events_are_counted_and_removed(tmp_path: Path) -> N
     store.put("notice/e2.started", b"{}")
     store.close()
     with endpoint() as there:
-        desk = a_desk({"http": {"url": there.url}}, state=tmp_path)
-        assert desk.lost == {"journal entries that could not be read": 2}
-        desk.end()
+        harness = a_harness({"http": {"url": there.url}}, state=tmp_path)
+        assert harness.lost == {"journal entries that could not be read": 2}
+        harness.end()
     assert not list((tmp_path / "notify").iterdir())
 
 
 def test_a_folder_that_cannot_be_written_is_reported_and_costs_only_the_keeping(tmp_path: Path) -> None:
     (tmp_path / "notify").write_text("a file where a folder should be")
     with endpoint() as there:
-        desk = a_desk({"http": {"url": there.url}}, state=tmp_path)
-        assert desk.lost["events that would not survive a restart"] == 1
-        desk.run(an_episode())
+        harness = a_harness({"http": {"url": there.url}}, state=tmp_path)
+        assert harness.lost["events that would not survive a restart"] == 1
+        harness.run(an_episode())
         there.received(2)
-        desk.end()
-    assert desk.lost.total() == 1
-    (why,) = desk.reasons
+        harness.end()
+    assert harness.lost.total() == 1
+    (why,) = harness.reasons
     assert f"cannot use {tmp_path / 'notify'}" in why
 
 

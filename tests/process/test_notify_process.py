@@ -8,7 +8,7 @@ from typing import Any
 
 from tests.driving import a_rule
 from tests.http_servers import Endpoint, Received, answers, endpoint, hangs
-from tests.process.database_desk import wait_until
+from tests.process.database_harness import wait_until
 from tests.process.running import Process
 
 SPEED = {"name": "v", "stream": "speed", "value": "msg.v"}

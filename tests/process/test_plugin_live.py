@@ -11,15 +11,15 @@ from pathlib import Path
 
 import pytest
 
-from detector.actions.base import Surroundings
-from detector.assembly import inlets, make_engine
+from detector.actions.base import DetectorConfiguration
+from detector.assembly import make_engine, stream_readers
 from detector.engine.consequences.consequences import Consequence
 from detector.engine.episodes.demands import Demand
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.open_episodes import OpenEpisode
 from detector.engine.samples.intake import Intake
 from detector.live.evaluator import Evaluator
-from detector.live.state import Restored
+from detector.live.state import RestoredState
 from detector.plugins.outages import Outages
 from detector.plugins.processes import ProcessHost
 from detector.replay.intake_file import read_intake, recorded_outages
@@ -46,7 +46,7 @@ class Kept:
     def events(self, events: Sequence[Event]) -> None:
         self.all += events
 
-    def follow(self, rules: Sequence[EventRule], surroundings: Surroundings) -> None:
+    def follow(self, rules: Sequence[EventRule], configuration: DetectorConfiguration) -> None:
         pass
 
     def consequences(self, consequences: Sequence[Consequence]) -> None:
@@ -74,7 +74,7 @@ def test_killed_and_started_again_the_replay_gives_the_same_events(tmp_path: Pat
     kept, intake = Kept(), Intake(time.time_ns)
     writer = IntakeWriter(tmp_path / "intake.mcap", detector.spec.streams)
     with closing(ProcessHost(patience=60)) as host:
-        engine = make_engine(detector, inlets(detector), holder="h", start=time.time_ns(), plugins=host)
+        engine = make_engine(detector, stream_readers(detector), holder="h", start=time.time_ns(), plugins=host)
         evaluator = Evaluator(
             engine,
             intake,
@@ -84,7 +84,7 @@ def test_killed_and_started_again_the_replay_gives_the_same_events(tmp_path: Pat
             on_failure=failures.append,
             outages=host.outages,
         )
-        evaluator.start(RuleSet(detector, (RULE, OTHER)), Restored())
+        evaluator.start(RuleSet(detector, (RULE, OTHER)), RestoredState())
         put = intake.putter("speed")
 
         def feed() -> None:

@@ -23,11 +23,11 @@ from hypothesis import strategies as st
 
 from detector.actions.base import ActionError
 from detector.actions.episode import Completion, OutcomeState
-from detector.actions.outcomes import Outcomes, Which
+from detector.actions.outcomes import ActionKey, Outcomes
 from detector.actions.record.destination import Destination
 from detector.actions.record.recovery import contents_of, recover, salvage
 from detector.actions.worker import Worker
-from detector.engine.consequences.consequences import Begun, Completed, Run, Sampled
+from detector.engine.consequences.consequences import ActionRun, RunCompleted, RunSamples, RunStarted
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.record import EpisodeRecord
 from detector.engine.episodes.rendering import Rendered
@@ -281,24 +281,24 @@ def test_a_slow_disk_costs_samples_that_are_counted_and_nobody_waits(
     bench = Bench(tmp_path)
     published: list[dict[str, Any]] = []
     outcomes = Outcomes("h", lambda key, payload, encoding: published.append(json.loads(payload)), lambda: at(0))
-    which = Which("r", "bag")
+    which = ActionKey("r", "bag")
     outcomes.know(which, "record")
-    bench.action.setting = replace(bench.action.setting, report=partial(outcomes.report, which))
+    bench.action.context = replace(bench.action.context, report=partial(outcomes.report, which))
     worker = Worker(which, lambda: bench.action, outcomes, maximum_bytes=5_500_000)
-    run = Run("r", "bag", "episode1")
+    run = ActionRun("r", "bag", "episode1")
     begun = Event("h", EpisodeRecord("episode1", "r", "car1", ("car1",), None, at(1), at(1), {}, None), {})
     points = [a_sample(1 + k / 10, "points", MEGABYTE) for k in range(8)]
     begin = time.monotonic()
-    worker.enqueue(Begun(run, begun, Rendered(), resumed=False))
+    worker.enqueue(RunStarted(run, begun, Rendered(), resumed=False))
     for sample in points:
-        worker.enqueue(Sampled(run, [sample]))
-    worker.enqueue(Completed(run))
+        worker.enqueue(RunSamples(run, [sample]))
+    worker.enqueue(RunCompleted(run))
     assert time.monotonic() - begin < 30  # the disk stands still for twice as long
     go_on.set()
     worker.request_close()
     assert worker.join(60)
-    tally = outcomes.tallies()[which]
-    assert (tally.failed, tally.samples, tally.missing) == (1, 5, 3)
+    loss_counter = outcomes.counts_by_action()[which]
+    assert (loss_counter.failed, loss_counter.samples, loss_counter.missing) == (1, 5, 3)
     (folder,) = (tmp_path / "r").iterdir()
     assert folder.name.endswith("_cut")
     assert read_with_mcap(mcap_files(folder)[0]) == list(map(as_recorded, points[:5]))

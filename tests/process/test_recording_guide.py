@@ -14,7 +14,7 @@ import yaml
 
 from detector.assembly.checking import findings
 from detector.status.model import read_status
-from detector.streams.answering import query_detectors
+from detector.streams.query_handler import query_detectors
 from tests.process.running import PATIENCE, Process
 from tests.recording_bench import mcap_files, metadata_of, read_with_mcap
 from wayside.api import EventRule

@@ -20,7 +20,7 @@ from detector.streams.codecs.cdr import CdrDecoder
 from tests import programs
 from tests.driving import a_rule, a_stream
 from tests.mongodb.way import Way
-from tests.process.database_desk import wait_until
+from tests.process.database_harness import wait_until
 from tests.process.running import PATIENCE, Process
 from tests.recording_bench import Recorded, mcap_files, read_with_mcap, read_with_rosbags, seconds
 from tests.ros_messages import cdr, point_cloud

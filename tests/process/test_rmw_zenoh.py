@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 from rosbags.rosbag2 import Writer as BagWriter
 
-from detector.assembly import inlets, make_engine
+from detector.assembly import make_engine, stream_readers
 from detector.assembly.checking import findings
 from detector.engine.samples.intake import Intake
 from detector.findings.losses import Losses
@@ -22,8 +22,8 @@ from detector.replay.recordings import open_recordings
 from detector.replay.replaying import replay_arrivals
 from detector.replay.routing import MessageRouter
 from detector.streams.codecs.ros import standard
-from detector.streams.rmw_zenoh import MAXIMUM_PUBLISHERS, MisfitError, Sequences, numbered, split
-from detector.streams.tally import Cause, Tally
+from detector.streams.loss_counter import Cause, LossCounter
+from detector.streams.rmw_zenoh import MAXIMUM_PUBLISHERS, KeyMismatchError, Sequences, numbered, split
 from detector.streams.zenoh import Network
 from tests.driving import Drive, a_detector, a_rule, at, compiled, lines
 from tests.networks import session, wait_for
@@ -84,27 +84,27 @@ class Receiver:
 
     def __init__(self, **fields: Any) -> None:
         self.intake = Intake(lambda: at(0))
-        self.tally = Tally()
+        self.loss_counter = LossCounter()
         self.detector = a_detector({**POSE, **fields})
         self.endpoint = free_endpoint()
         self.network = Network(
             Zenoh(listen=[self.endpoint]),
             self.detector.spec.streams,
             self.intake.putter,
-            tally=self.tally,
+            loss_counter=self.loss_counter,
         )
 
     def counted(self, cause: Cause) -> int:
-        return counted(self.tally, cause)
+        return counted(self.loss_counter, cause)
 
     def losses(self) -> list[str]:
         losses = Losses(Drive(self.detector, MOVED).engine, self.intake)
-        losses.watch(self.tally)
+        losses.watch(self.loss_counter)
         return [*losses.report()]
 
 
-def counted(tally: Tally, cause: Cause) -> int:
-    return sum(entry.count for entry in tally.entries() if entry.cause is cause)
+def counted(loss_counter: LossCounter, cause: Cause) -> int:
+    return sum(entry.count for entry in loss_counter.entries() if entry.cause is cause)
 
 
 @pytest.fixture
@@ -195,7 +195,7 @@ def test_the_same_detector_gives_the_same_events_live_and_from_a_bag_of_topics(
             node.publish(cdr(pose_stamped((step + 3 * index) % 20)))
     arrivals = [replace(arrival, received=at(1 + number / 10)) for number, arrival in enumerate(drained(receiver, 60))]
     detector, name = receiver.detector, receiver.detector.name
-    live = make_engine(detector, inlets(detector), holder=name, start=arrivals[0].received - 1)
+    live = make_engine(detector, stream_readers(detector), holder=name, start=arrivals[0].received - 1)
     events = live.set_rules(compiled(detector, MOVED)) + live.advance(arrivals, arrivals[-1].received)
     with BagWriter(tmp_path / "bag", version=9) as bag:
         connections = {
@@ -225,7 +225,7 @@ def test_a_key_contains_topic_and_type(key: str, reported: tuple[str, str]) -> N
 
 @pytest.mark.parametrize("key", ["", "0", "0/a/b", "x/chatter/std_msgs::msg::dds_::String_/h", "0/chatter/String/h"])
 def test_what_is_no_such_key_is_reported(key: str) -> None:
-    with pytest.raises(MisfitError):
+    with pytest.raises(KeyMismatchError):
         split(key)
 
 
@@ -243,24 +243,26 @@ def test_other_attachments_have_no_number_or_some_number(noise: bytes) -> None:
 
 @given(st.lists(st.integers(1, 40), min_size=1))
 def test_losses_less_late_ones_are_what_is_missing_in_any_order(numbers: list[int]) -> None:
-    tally = Tally()
-    sequences = Sequences("s", tally)
+    loss_counter = LossCounter()
+    sequences = Sequences("s", loss_counter)
     first, *rest = [0, *dict.fromkeys(numbers)]
     for number in (first, *rest):
         sequences.follow(b"publisher", number, "t")
-    assert counted(tally, Cause.MISSED) - counted(tally, Cause.OVERTAKEN) == max(rest) + 1 - (len(rest) + 1)
+    assert counted(loss_counter, Cause.MISSED) - counted(loss_counter, Cause.OVERTAKEN) == max(rest) + 1 - (
+        len(rest) + 1
+    )
 
 
 def test_a_publisher_that_restarts_has_lost_nothing_and_one_sent_twice_neither() -> None:
-    tally = Tally()
-    sequences = Sequences("s", tally)
+    loss_counter = LossCounter()
+    sequences = Sequences("s", loss_counter)
     for number in (5_000, 5_001, 5_001, 1, 2, 2**62, 3):
         sequences.follow(b"publisher", number, "t")
-    assert tally.entries() == []
+    assert loss_counter.entries() == []
 
 
 def test_made_up_publishers_cost_no_more_than_the_bound() -> None:
-    sequences = Sequences("s", Tally())
+    sequences = Sequences("s", LossCounter())
     for number in range(MAXIMUM_PUBLISHERS + 10):
         sequences.follow(number.to_bytes(16, "little"), 1, "t")
     assert len(sequences._last) == MAXIMUM_PUBLISHERS

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from detector.status.model import RuleState, Status, read_status
-from detector.streams.answering import NoAnswerError, query_detectors
+from detector.streams.query_handler import NoAnswerError, query_detectors
 from tests import programs
 from tests.certificates import Authority
 from tests.driving import a_rule, a_stream

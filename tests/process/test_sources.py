@@ -13,16 +13,16 @@ from pydantic import BaseModel, ConfigDict
 
 from detector.actions.deploy.file_store import FileTaskStore
 from detector.actions.deploy.reconciler import DemandReconciler
-from detector.assembly import DetectorError, inlets
+from detector.assembly import DetectorError, stream_readers
 from detector.engine.samples.intake import Intake
 from detector.live.running import Running
-from detector.live.state import Restored
+from detector.live.state import RestoredState
 from detector.plugins import entrypoints
 from detector.resources.selection import RuleSet
 from detector.sources import Feed, Source
 from detector.sources.registry import OFFERS, source_plugin_problems
 from detector.sources.supervision import Sources, SourceState, SourceThread
-from detector.streams.tally import Cause, Tally
+from detector.streams.loss_counter import Cause, LossCounter
 from tests.driving import a_detector, a_stream
 from tests.networks import PATIENCE, Arrivals, stream, wait_for
 from wayside.api import Detector
@@ -97,9 +97,9 @@ def plugins(monkeypatch: pytest.MonkeyPatch) -> None:
     entrypoints._load.cache_clear()
 
 
-def a_thread(plugin: str, arrivals: Arrivals, tally: Tally) -> SourceThread:
+def a_thread(plugin: str, arrivals: Arrivals, loss_counter: LossCounter) -> SourceThread:
     source = DataSource(name="s", plugin=plugin)
-    thread = SourceThread(source, (stream(source="s"),), arrivals.putter, tally, first_pause=0.01)
+    thread = SourceThread(source, (stream(source="s"),), arrivals.putter, loss_counter, first_pause=0.01)
     thread.start()
     return thread
 
@@ -133,12 +133,12 @@ def test_a_message_that_belongs_to_several_streams_reaches_them_at_one_time() ->
 
 
 def test_messages_reach_their_streams_and_others_are_counted(arrivals: Arrivals) -> None:
-    tally = Tally()
-    thread = a_thread("once", arrivals, tally)
+    loss_counter = LossCounter()
+    thread = a_thread("once", arrivals, loss_counter)
     wait_for(lambda: thread.state is SourceState.FINISHED)
     assert arrivals.seen == [("pose", "vehicles/car1/pose", b"once")]
     assert thread.messages == 1
-    assert [(e.cause, e.name, e.count, e.last) for e in tally.entries()] == [
+    assert [(e.cause, e.name, e.count, e.last) for e in loss_counter.entries()] == [
         (Cause.UNROUTED, "s", 1, "vehicles/car1/other")
     ]
 
@@ -147,11 +147,11 @@ def test_messages_reach_their_streams_and_others_are_counted(arrivals: Arrivals)
     ("plugin", "error"), [("failing", "RuntimeError: the cable is out"), ("leaving", "SystemExit: 3")]
 )
 def test_a_source_that_fails_is_run_again_and_counted(plugin: str, error: str, arrivals: Arrivals) -> None:
-    tally = Tally()
-    thread = a_thread(plugin, arrivals, tally)
+    loss_counter = LossCounter()
+    thread = a_thread(plugin, arrivals, loss_counter)
 
     def failures() -> int:
-        return sum(entry.count for entry in tally.entries() if entry.cause is Cause.FAILED)
+        return sum(entry.count for entry in loss_counter.entries() if entry.cause is Cause.FAILED)
 
     wait_for(lambda: failures() >= 3)
     thread.request_stop()
@@ -162,21 +162,21 @@ def test_a_source_that_fails_is_run_again_and_counted(plugin: str, error: str, a
 
 
 def test_a_source_that_hangs_is_left_behind_and_what_it_brings_later_is_not_taken(arrivals: Arrivals) -> None:
-    tally = Tally()
+    loss_counter = LossCounter()
     Hanging.began.clear()
     Hanging.ended.clear()
-    thread = a_thread("hanging", arrivals, tally)
+    thread = a_thread("hanging", arrivals, loss_counter)
     assert Hanging.began.wait(PATIENCE)  # a source that is stopped before it runs ends
     thread.request_stop()
     thread.join(0.05)
-    assert [(entry.cause, entry.count) for entry in tally.entries()] == [(Cause.LEFT_BEHIND, 1)]
+    assert [(entry.cause, entry.count) for entry in loss_counter.entries()] == [(Cause.LEFT_BEHIND, 1)]
     Hanging.ended.set()
     wait_for(lambda: thread.state is SourceState.STOPPED)
     assert arrivals.seen == []
 
 
 def test_sources_that_stay_the_same_go_on_while_others_change(arrivals: Arrivals) -> None:
-    sources = Sources(arrivals.putter, Tally())
+    sources = Sources(arrivals.putter, LossCounter())
     first = {"name": "first", "plugin": "lasting"}
     second = {"name": "second", "plugin": "lasting"}
     sources.follow(a_detector_of(first, second))
@@ -208,7 +208,7 @@ def test_a_running_detector_follows_changes_of_its_sources_and_reports_their_sta
 
     async def live() -> None:
         reconciler = DemandReconciler(FileTaskStore(tmp_path, "h"))
-        with Running(RuleSet(a_detector_of(first), ()), "h", reconciler, None, None, Restored()) as running:
+        with Running(RuleSet(a_detector_of(first), ()), "h", reconciler, None, None, RestoredState()) as running:
             await asyncio.to_thread(wait_for, lambda: states(running) == [("first", "Running", 1)])
             await running.follow(changes())
             await asyncio.to_thread(
@@ -252,7 +252,7 @@ def test_streams_and_sources_must_fit_together() -> None:
         sources=[{"name": "broker", "plugin": "once"}, {"name": "zenoh", "plugin": "once"}],
     )
     with pytest.raises(DetectorError) as caught:
-        inlets(detector)
+        stream_readers(detector)
     assert [str(problem) for problem in caught.value.problems] == [
         "spec.sources[0].name: no stream uses broker: set source: broker in a stream, or remove it",
         "spec.sources[1].name: zenoh is the session of spec.zenoh, which always exists: choose another name",

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from detector.actions.tracing import episode_traces
-from detector.engine.consequences.consequences import Begun, Completed, Run
+from detector.engine.consequences.consequences import ActionRun, RunCompleted, RunStarted
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.record import EpisodeRecord
 from detector.engine.episodes.rendering import Rendered
@@ -156,14 +156,14 @@ def test_an_endpoint_that_is_away_costs_its_spans_and_they_are_counted(monkeypat
 def test_events_and_the_input_of_actions_have_the_trace_of_their_episode(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OTEL_EXPORTER_OTLP_ENDPOINT", "http://127.0.0.1:1")
     event = Event("town", EpisodeRecord("e", "close", "a+b", ("a", "b"), None, 1, 2, {}, None), {})
-    run = Run("close", "notify", "e")
+    run = ActionRun("close", "notify", "e")
     with episode_traces(export=False) as traces:
         assert traces is not None
         marked = traces.event(event)
-        begun, completed = traces.consequences([Begun(run, event, Rendered(), False), Completed(run)])
+        begun, completed = traces.consequences([RunStarted(run, event, Rendered(), False), RunCompleted(run)])
     assert marked.cloud_event()["traceparent"] == str(episode_context("e"))
-    assert begun == Begun(run, marked, Rendered(), False)
-    assert completed == Completed(run)
+    assert begun == RunStarted(run, marked, Rendered(), False)
+    assert completed == RunCompleted(run)
     assert "traceparent" not in event.cloud_event()
 
 

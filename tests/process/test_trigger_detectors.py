@@ -23,7 +23,7 @@ from detector.actions.trigger.requests import (
     write_request,
 )
 from detector.commands.cli import app
-from detector.streams.answering import status_key
+from detector.streams.query_handler import status_key
 from detector.streams.session import open_session
 from tests.driving import a_rule
 from tests.networks import router_process, wait_for

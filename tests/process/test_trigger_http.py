@@ -11,9 +11,17 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from detector.actions import ActionError, Completion, Episode, Outcome, OutcomeState, Setting, Surroundings
+from detector.actions import (
+    ActionContext,
+    ActionError,
+    Completion,
+    DetectorConfiguration,
+    Episode,
+    Outcome,
+    OutcomeState,
+)
 from detector.actions.trigger.action import Trigger
-from detector.assembly import inlets
+from detector.assembly import stream_readers
 from tests.driving import a_detector, a_rule
 from tests.http_servers import answers, endpoint, hangs
 from wayside.api.actions import trigger as api
@@ -39,23 +47,25 @@ class Driven:
     def __init__(self, trigger: dict[str, Any], state: Path | None = None) -> None:
         spec = {} if state is None else {"state": {"path": str(state)}}
         detector = a_detector(**spec)
-        surroundings = Surroundings(detector, inlets(detector).decoders, inlets(detector).types)
+        configuration = DetectorConfiguration(
+            detector, stream_readers(detector).decoders, stream_readers(detector).types
+        )
         self.outcomes: list[Outcome] = []
         self.lost: list[str] = []
         self.closing = threading.Event()
         self.parameters = api.TriggerAction.model_validate(trigger)
         rule = a_rule("r", when="true", actions=[{"name": "other", "trigger": trigger}])
-        self.setting = Setting(
+        self.context = ActionContext(
             rule=rule,
             action="other",
             holder="h",
-            surroundings=lambda: surroundings,
+            configuration=lambda: configuration,
             messenger=NoNetwork(),
             report=lambda _, outcome: self.outcomes.append(outcome),
             lose=lambda what, count, why: self.lost.append(f"{count} {what}: {why}"),
             closing=self.closing,
         )
-        self.action = Trigger(self.parameters, self.setting)
+        self.action = Trigger(self.parameters, self.context)
 
     def until(self, done: Any) -> None:
         deadline = time.monotonic() + PATIENCE

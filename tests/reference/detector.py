@@ -8,9 +8,9 @@ from typing import Any
 from tests.reference.aggregates import NOTHING
 from tests.reference.derived import Evaluations
 from tests.reference.episodes import Break, Episode, Seen, Truth, episodes, in_progress, wakes
+from tests.reference.samples import SECOND, Received, Sample
 from tests.reference.scopes import Look, Subject, both, looks, text
 from tests.reference.signals import Sources, Start, nanoseconds, of_rule, truth
-from tests.reference.world import SECOND, Sample, World
 
 
 @dataclass(frozen=True)
@@ -93,10 +93,16 @@ class Reference:
     """A detector of which only the meaning counts."""
 
     def __init__(
-        self, rules: dict[str, dict[str, Any]], world: World, *, lateness: int | None, start: int, keep_starts: int
+        self,
+        rules: dict[str, dict[str, Any]],
+        received: Received,
+        *,
+        lateness: int | None,
+        start: int,
+        keep_starts: int,
     ) -> None:
         """`rules` are specs by name; `lateness` (ns) with clock Data, None with clock Wall; `keep_starts` in ns."""
-        self.world = world
+        self.received = received
         self.rules = [Rule(name, rules[name]) for name in _in_order(rules)]
         self.lateness = lateness
         self.now = start
@@ -121,7 +127,7 @@ class Reference:
         if self.lateness is None:
             self.advance(sample.time - 1)
         elif self._begins(sample.time):
-            self.now = self.world.floor = sample.time - 1
+            self.now = self.received.floor = sample.time - 1
         self.waiting.append(sample)
         self._enter(self.now)
         self._heard(sample.time)
@@ -131,7 +137,7 @@ class Reference:
         if self.lateness is None:
             self.advance(time - 1)
         elif self._begins(time):
-            self.now = self.world.floor = time - 1
+            self.now = self.received.floor = time - 1
         self._heard(time)
 
     def _heard(self, time: int) -> None:
@@ -156,7 +162,7 @@ class Reference:
         for each in sorted(self.waiting, key=lambda each: (each.time, each.number)):
             if each.time <= until:
                 self.waiting.remove(each)
-                self.world.take(each)
+                self.received.take(each)
 
     def advance(self, until: int) -> None:
         """Run the ticks up to here."""
@@ -173,14 +179,14 @@ class Reference:
         """When it may be the turn of a rule."""
         regular = {self.now - self.now % period + period for period in self._periods()}
         samples = {each.time for each in self.waiting if each.stream in self._triggers()}
-        wakes = {time for rule in self.rules if rule.on_sample for time in rule.wakes(self.world.timeout)}
+        wakes = {time for rule in self.rules if rule.on_sample for time in rule.wakes(self.received.timeout)}
         return {time for time in regular | samples | wakes if time > self.now}
 
     def gap(self, time: int) -> None:
         """Time continues here without the ticks between."""
         self._enter(time)
         self.now = time
-        self.world.gap(time)
+        self.received.gap(time)
         for rule in self.rules:
             for evaluations in rule.evaluations.values():
                 evaluations.before.clear()
@@ -195,9 +201,9 @@ class Reference:
         """`sampled` has the streams and clients of the samples of this very time."""
         regular = any(self.now % period == 0 for period in self._periods())
         if self.now % SECOND == 0:
-            self.world.sweep(self.now)
+            self.received.sweep(self.now)
         if regular:
-            lost = self.world.lose(self.now)
+            lost = self.received.lose(self.now)
             self.starts = [_without(each, lost) for each in self.starts]
             for rule in self.rules:
                 for client in lost:
@@ -210,21 +216,21 @@ class Reference:
                 continue
             if rule.on_sample is not None:
                 clients = {client for stream, client in sampled if stream == rule.on_sample}
-                self._evaluate(rule, Selection(clients, rule.waking(self.now, self.world.timeout)), lose=regular)
+                self._evaluate(rule, Selection(clients, rule.waking(self.now, self.received.timeout)), lose=regular)
             elif self.now % rule.every == 0:
                 self._evaluate(rule, None, lose=True)
 
     def _evaluate(self, rule: Rule, selection: Selection | None, *, lose: bool) -> None:
-        timeout = self.world.timeout
+        timeout = self.received.timeout
         found: dict[Subject, tuple[Seen | Break, dict[str, Any]]] = {}
         if lose:
             for subject in rule.history:
-                if any(client not in self.world.known for client in subject[0]):
+                if any(client not in self.received.known for client in subject[0]):
                     found[subject] = (Break(self.now, lost=True), {})
         if selection is None or selection.clients or selection.subjects:
-            for client in self.world.known:
+            for client in self.received.known:
                 rule.looked.setdefault(client, []).append(self.now)
-            for look in looks(rule.spec, self.world, self.now, lambda client: self._view(rule, client)):
+            for look in looks(rule.spec, self.received, self.now, lambda client: self._view(rule, client)):
                 if (
                     selection is None
                     or look.subject in selection.subjects
@@ -257,13 +263,13 @@ class Reference:
                 message = {"subject": event.subject, "subjects": list(clients), "values": event.values}
                 self.starts.append(Start(rule.name, self.now, clients or None, message))
             else:
-                left = tuple(client for client in clients if client in self.world.known)
+                left = tuple(client for client in clients if client in self.received.known)
                 message = {"subject": event.subject, "reason": event.reason, "values": event.values}
                 self.starts.append(Start(rule.name, self.now, left if clients else None, message, ends=True))
 
     def _view(self, rule: Rule, client: str) -> dict[str, Any]:
-        sources = Sources(self.world, self.starts, self._open(), self._keep)
-        streams = [stream for stream in self.world.stale_after if self.world.fresh(client, stream, self.now)]
+        sources = Sources(self.received, self.starts, self._open(), self._keep)
+        streams = [stream for stream in self.received.stale_after if self.received.fresh(client, stream, self.now)]
         view: dict[str, Any] = {"client": client, "labels": {}, "streams": streams}
         for signal in rule.spec.get("signals", []):
             if signal in rule.derived:
@@ -278,7 +284,7 @@ class Reference:
             rule.name: [
                 subject[0] or None
                 for subject in rule.history
-                if any(each.end is None for each in rule.episodes(subject, self.world.timeout))
+                if any(each.end is None for each in rule.episodes(subject, self.received.timeout))
             ]
             for rule in self.rules
             if rule.spec.get("enabled", True)

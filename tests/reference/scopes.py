@@ -9,8 +9,8 @@ from itertools import permutations
 from typing import Any
 
 from tests.reference.episodes import Truth
+from tests.reference.samples import SECOND, Received
 from tests.reference.signals import nanoseconds, truth
-from tests.reference.world import SECOND, World
 
 MEMBER = ("client", "labels", "streams")
 
@@ -41,9 +41,9 @@ def _uses(spec: dict[str, Any], word: str) -> bool:
     return any(word in str(spec.get(field, "")) for field in ("when", "until", "scope", "signals"))
 
 
-def looks(spec: dict[str, Any], world: World, now: int, view: Callable[[str], dict[str, Any]]) -> Iterator[Look]:
+def looks(spec: dict[str, Any], received: Received, now: int, view: Callable[[str], dict[str, Any]]) -> Iterator[Look]:
     """All subjects that a rule can be about now."""
-    views = {client: view(client) for client in sorted(world.known)}
+    views = {client: view(client) for client in sorted(received.known)}
     signals = [signal["name"] for signal in spec.get("signals", []) if "stream" in signal or "ruleName" in signal]
     each = spec.get("each")
     for element in [None] if each is None else each["of"]:
@@ -54,7 +54,7 @@ def looks(spec: dict[str, Any], world: World, now: int, view: Callable[[str], di
             yield from _clients(scope["client"], views, signals, extra, name)
         elif "pairs" in scope:
             pairs = {**scope["pairs"], "closing": _uses(spec, "closingSpeed")}
-            yield from _pairs(pairs, views, signals, extra, name, world, now)
+            yield from _pairs(pairs, views, signals, extra, name, received, now)
         else:
             yield _fleet(scope["fleet"], views, signals, extra, name)
 
@@ -94,11 +94,11 @@ def _pairs(
     signals: list[str],
     extra: dict[str, Any],
     element: str | None,
-    world: World,
+    received: Received,
     now: int,
 ) -> Iterator[Look]:
     ordered = "a" in scope or "b" in scope
-    places = {client: _place(scope["position"], client, world, now, now) for client in views}
+    places = {client: _place(scope["position"], client, received, now, now) for client in views}
     placed = {
         client: view if places[client] is None else {**view, "position": dict(zip("xyz", places[client], strict=True))}
         for client, view in views.items()
@@ -113,7 +113,7 @@ def _pairs(
         if distance is not None:
             variables["distance"] = distance
             near = distance <= scope["within"]
-            closing = _closing_speed(scope["position"], a, b, world, now) if scope["closing"] else None
+            closing = _closing_speed(scope["position"], a, b, received, now) if scope["closing"] else None
             if closing is not None:
                 variables["closingSpeed"] = closing
         roles = [
@@ -134,30 +134,30 @@ def _distance(one: tuple[float, ...] | None, other: tuple[float, ...] | None) ->
     return math.sqrt(dx * dx + dy * dy + dz * dz)
 
 
-def _closing_speed(position: dict[str, str], a: str, b: str, world: World, now: int) -> float | None:
+def _closing_speed(position: dict[str, str], a: str, b: str, received: Received, now: int) -> float | None:
     """By how much the distance shrank in the last second for which both have sent their places."""
     end = now
-    if _limits(position, world) != []:
-        end = min(world.kept(client, position["stream"], now)[-1].time for client in (a, b))
+    if _limits(position, received) != []:
+        end = min(received.kept(client, position["stream"], now)[-1].time for client in (a, b))
     before, after = (
-        _distance(*(_place(position, client, world, time, now) for client in (a, b))) for time in (end - SECOND, end)
+        _distance(*(_place(position, client, received, time, now) for client in (a, b))) for time in (end - SECOND, end)
     )
     return None if before is None or after is None else before - after
 
 
-def _limits(position: dict[str, str], world: World) -> list[int]:
+def _limits(position: dict[str, str], received: Received) -> list[int]:
     """How old a place may be; none of these where it has no age."""
-    stale = world.stale_after[position["stream"]]
+    stale = received.stale_after[position["stream"]]
     oldest = nanoseconds(position["maxAge"]) if "maxAge" in position else None if stale is None else SECOND
     return [limit for limit in (stale, oldest) if limit is not None]
 
 
-def _place(position: dict[str, str], client: str, world: World, then: int, now: int) -> tuple[float, ...] | None:
+def _place(position: dict[str, str], client: str, received: Received, then: int, now: int) -> tuple[float, ...] | None:
     """Where the client was; of the past, no more than the buffer has and not from before a gap."""
-    mine = [each for each in world.kept(client, position["stream"], now) if each.time <= then]
+    mine = [each for each in received.kept(client, position["stream"], now) if each.time <= then]
     if then < now:
-        mine = [each for each in mine if world.floor is None or each.time > world.floor]
-    if not mine or any(then - mine[-1].time > limit for limit in _limits(position, world)):
+        mine = [each for each in mine if received.floor is None or each.time > received.floor]
+    if not mine or any(then - mine[-1].time > limit for limit in _limits(position, received)):
         return None
     if mine[-1].message is None:
         return None

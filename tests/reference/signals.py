@@ -9,7 +9,7 @@ from typing import Any
 
 from tests.reference.aggregates import NOTHING, aggregated
 from tests.reference.places import Where, with_fields
-from tests.reference.world import SECOND, World
+from tests.reference.samples import SECOND, Received
 from wayside.expressions import UNKNOWN, CelType, Environment, Expression
 
 VARIABLES = ("msg", "item", "before", "key", "sample")
@@ -78,7 +78,7 @@ def of_rule(signal: dict[str, Any]) -> tuple[str, bool]:
 class Sources:
     """All that signals are computed from."""
 
-    world: World
+    received: Received
     starts: list[Start]
     """In order; those of a client that was lost since are not its own any more."""
     open_of: dict[str, list[tuple[str, ...] | None]]
@@ -90,7 +90,7 @@ class Sources:
         aggregate = signal.get("aggregate", "Last")
         if "client" in signal:
             client = signal["client"]
-            if client not in self.world.known:
+            if client not in self.received.known:
                 return NOTHING
         if "ruleName" in signal:
             if signal["ruleName"] not in self.open_of:
@@ -100,23 +100,23 @@ class Sources:
         if aggregate == "Age":
             return self._age(signal, client, now, ticks)
         always_known = "ruleName" in signal or aggregate in ("Count", "Any")
-        if not always_known and not self.world.fresh(client, signal["stream"], now):
+        if not always_known and not self.received.fresh(client, signal["stream"], now):
             return NOTHING
         window = list(self._picked(signal, self._items(signal, client, now)))
         if "over" in signal:
             after = now - nanoseconds(signal["over"])
-            if self.world.floor is not None:
-                after = max(after, self.world.floor)
+            if self.received.floor is not None:
+                after = max(after, self.received.floor)
             window = [item for item in window if item.time > after]
         return aggregated(aggregate, [(item.time, _value(signal, item)) for item in window], signal.get("quantile"))
 
     def _age(self, signal: dict[str, Any], client: str, now: int, ticks: list[int]) -> float:
         if "where" not in signal and "stream" in signal:
-            times = [each.time for each in self.world.of(client, signal["stream"], now)]
+            times = [each.time for each in self.received.of(client, signal["stream"], now)]
         else:
             seen = [item for tick in ticks for item in self._items(signal, client, tick)]
             times = [item.time for item in self._picked(signal, seen)]
-        return (now - max(times, default=self.world.known[client].since)) / SECOND
+        return (now - max(times, default=self.received.known[client].since)) / SECOND
 
     def _items(self, signal: dict[str, Any], client: str, now: int) -> list[Item]:
         if "stream" in signal:
@@ -128,7 +128,7 @@ class Sources:
                     each.item,
                     each.before,
                 )
-                for each in self.world.kept(client, signal["stream"], now)
+                for each in self.received.kept(client, signal["stream"], now)
             ]
         mine = [
             each

@@ -15,7 +15,7 @@ from pydantic import ValidationError
 from wayside.api import API_VERSION, KINDS
 from wayside.api.base import Kind
 from wayside.api.schema import field_names_at
-from wayside.api.wording import FieldPath, field_text, messages
+from wayside.api.validation_errors import FieldPath, field_text, messages
 from wayside.findings import ignored_by
 from wayside.inputerror import InputError
 

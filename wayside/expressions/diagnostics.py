@@ -12,7 +12,7 @@ from typing import Final
 from wayside.expressions.errors import ExpressionError
 from wayside.expressions.functions import FUNCTIONS
 from wayside.expressions.lexer import TokenKind, tokens
-from wayside.expressions.numbers import DIGITS, Doubled
+from wayside.expressions.numbers import DIGITS, Rewritten
 from wayside.names import did_you_mean
 
 _ENTRY = re.compile(r"^(?:[A-Z_]+: )?ERROR: <input>:(-?\d+):(-?\d+): (.*)$", re.MULTILINE)
@@ -46,7 +46,7 @@ _DEPTH = "the maximum is 32 levels; each operator of a chain such as `a + b + c`
 EMPTY = "YAML interprets a leading `!`, `#` or quote itself: put the whole expression in quotes, as in '!braking'"
 
 
-def diagnose(report: str, source: str, compiled: Doubled, names: Collection[str]) -> ExpressionError:
+def diagnose(report: str, source: str, compiled: Rewritten, names: Collection[str]) -> ExpressionError:
     """The first error of CEL's report, the further ones in its `others`."""
     errors: list[ExpressionError] = []
     lines = [0, *(match.end() for match in re.finditer("\n", compiled.text))]

@@ -38,14 +38,14 @@ _PAIRS = {")": "(", "]": "[", "}": "{"}
 
 
 @dataclass(frozen=True, slots=True)
-class Doubled:
+class Rewritten:
     """An expression after the pass; `origin[i]` is the offset in the author's text that character i stems from."""
 
     text: str
     origin: tuple[int, ...]
 
 
-def doubled(source: str, stems: Sequence[int] | None = None) -> Doubled:
+def doubled(source: str, stems: Sequence[int] | None = None) -> Rewritten:
     """Rewrites `source` as described in the module. Never fails: CEL reports syntax errors.
 
     `stems` are the offsets in the author's text of its characters; None: it is that text.
@@ -61,7 +61,7 @@ def doubled(source: str, stems: Sequence[int] | None = None) -> Doubled:
         origin += [token.start] * len(text[-3])
         origin += range(token.start, token.end) if own == token.text else [token.start] * len(own)
         origin += [token.end - 1] * len(text[-1])
-    return Doubled("".join(text), tuple(origin) if stems is None else tuple(stems[at] for at in origin))
+    return Rewritten("".join(text), tuple(origin) if stems is None else tuple(stems[at] for at in origin))
 
 
 def _edits(line: list[Token]) -> tuple[dict[int, str], dict[int, str], dict[int, str]]:

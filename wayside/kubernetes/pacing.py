@@ -32,7 +32,7 @@ _SPARSE, _DENSE = 0.3, 1.0  # of a namespace's writes, those that wait at the AP
 _MEMORY = 300.0  # s; the quickest time is that of this period and the one before
 
 
-class Turns(Generic[Item]):
+class FairQueue(Generic[Item]):
     """A queue that is fair by namespace: namespaces take turns, so a flood of items in one delays no other."""
 
     def __init__(self) -> None:
@@ -70,7 +70,7 @@ class Turns(Generic[Item]):
         return None
 
 
-class Share:
+class CongestionWindow:
     """The maximum number of writes of one namespace that are under way: the congestion control of TCP Vegas.
 
     The quickest mean time of writes is the API server's own time for them. The rest of their time now, they wait there,
@@ -108,13 +108,13 @@ class Share:
 class Pacing:
     """Lets requests begin."""
 
-    def __init__(self, at_once: int = AT_ONCE, share: Share | None = None) -> None:
+    def __init__(self, at_once: int = AT_ONCE, share: CongestionWindow | None = None) -> None:
         """`share`: of writes in one namespace; None: any number."""
         self._at_once = at_once
         self._share = share
         self._under_way = 0
         self._writing: Counter[str] = Counter()  # writes by namespace
-        self._waiting: Turns[asyncio.Future[None]] = Turns()
+        self._waiting: FairQueue[asyncio.Future[None]] = FairQueue()
         self._held_until = 0.0  # on the monotonic clock
 
     @property

@@ -19,7 +19,7 @@ from contextlib import suppress
 from typing import Any, Generic, Protocol, TypeVar
 
 from wayside.kubernetes.errors import NotGranted, RequestError
-from wayside.kubernetes.pacing import Turns
+from wayside.kubernetes.pacing import FairQueue
 from wayside.process.backoff import pause_after
 
 Key = TypeVar("Key", bound=Hashable)
@@ -72,7 +72,7 @@ class WorkQueue(Generic[Key]):
         self._work = work
         self._concurrency = concurrency
         self._share = share
-        self._waiting: Turns[Key] = Turns()
+        self._waiting: FairQueue[Key] = FairQueue()
         self._at_work: Counter[str] = Counter()  # keys by namespace
         self._queued: set[Key] = set()
         self._running: dict[Key, float] = {}  # and since when, on the monotonic clock

@@ -11,7 +11,7 @@ from wayside.api.actions.deploy import Deploy
 from wayside.api.actions.window import Window, WindowClients
 from wayside.api.detector import DetectorSpec
 from wayside.api.stream import Stream
-from wayside.api.wording import FieldPath
+from wayside.api.validation_errors import FieldPath
 from wayside.expressions import Environment, compile_template
 from wayside.rules.compiled import CompiledAction, CompiledDeploy, CompiledWindow
 from wayside.rules.compiler import Compiler

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 from wayside.api import Detector
 from wayside.api.plugin import ZENOH
 from wayside.api.stream import Stream
-from wayside.api.wording import FieldPath
+from wayside.api.validation_errors import FieldPath
 from wayside.expressions import CelType, ExpressionError, InterpolationError, compile_template
 from wayside.keys import KeyPattern, KeyPatternError
 from wayside.names import did_you_mean

@@ -21,7 +21,7 @@ from wayside.expressions import CelType, CompiledTemplate, Embedded, Environment
 MAXIMUM_KEY_LENGTH = 1024  # characters, as ApplicationInstance's spec.key allows
 
 
-class Refused(StrEnum):
+class RefusalReason(StrEnum):
     """Why a task does not count: reasons of its condition Accepted=False."""
 
     TEMPLATE_NOT_FOUND = "TemplateNotFound"
@@ -40,7 +40,7 @@ class Refused(StrEnum):
 class Refusal:
     """A task that cannot be served, with the reason for programs and for people."""
 
-    reason: Refused
+    reason: RefusalReason
     message: str
 
 
@@ -89,10 +89,10 @@ def claim(template: TemplateState, task: ApplicationTask) -> Claim | Refusal:
     """What the task requests of its template, None where there is no such template."""
     if isinstance(template, InvalidTemplate):
         message = f"spec.templateName: ApplicationTemplate {template.name} is not valid: {template.problem}"
-        return Refusal(Refused.TEMPLATE_INVALID, f"{message}; correct the template")
+        return Refusal(RefusalReason.TEMPLATE_INVALID, f"{message}; correct the template")
     if template is None:
         return Refusal(
-            Refused.TEMPLATE_NOT_FOUND,
+            RefusalReason.TEMPLATE_NOT_FOUND,
             f"spec.templateName: there is no ApplicationTemplate {task.spec.template_name!r} in namespace "
             f"{task.namespace}: create it, or correct the rule that emitted this task",
         )
@@ -100,7 +100,7 @@ def claim(template: TemplateState, task: ApplicationTask) -> Claim | Refusal:
     deploys = task.spec.operation is Operation.DEPLOY
     problems = parameters.problems(declared, task.spec.parameters, template.name, "spec.parameters", whole=deploys)
     if problems:
-        return Refusal(Refused.INVALID_PARAMETERS, "; ".join(problems))
+        return Refusal(RefusalReason.INVALID_PARAMETERS, "; ".join(problems))
     given = parameters.given(task.spec.parameters)
     if not deploys:
         return _on_what_runs(template, task, given)
@@ -116,18 +116,18 @@ def _on_what_runs(template: ApplicationTemplate, task: ApplicationTask, given: M
     try:
         of_key = key_parameters(template)
     except InterpolationError as error:
-        return Refusal(Refused.INVALID_KEY, f"the key of template {template.name}, {error}")
+        return Refusal(RefusalReason.INVALID_KEY, f"the key of template {template.name}, {error}")
     rest = {name: value for name, value in given.items() if name not in of_key}
     if operation is Operation.SUSPEND and rest:
         name, value = next(iter(rest.items()))
         return Refusal(
-            Refused.INVALID_PARAMETERS,
+            RefusalReason.INVALID_PARAMETERS,
             f"spec.parameters.{name}: {values.shown(value)} is given, but a Suspend task cannot change parameters: "
             f"remove it{_which(of_key)}",
         )
     if operation is Operation.RECONFIGURE and not rest:
         return Refusal(
-            Refused.INVALID_PARAMETERS,
+            RefusalReason.INVALID_PARAMETERS,
             f"spec.parameters: {values.shown(dict(given))} changes nothing: give at least one parameter of "
             f"template {template.name}{_which(of_key)}",
         )
@@ -138,7 +138,7 @@ def _on_what_runs(template: ApplicationTemplate, task: ApplicationTask, given: M
     missing = sorted(name for name in of_key - given.keys() if declared[name].default is None)
     if missing:
         return Refusal(
-            Refused.INVALID_KEY,
+            RefusalReason.INVALID_KEY,
             f"spec.parameters.{missing[0]}: is missing, but the key of template {template.name} ({template.spec.key}) "
             "needs it to identify the instance: give it, or omit all parameters of the key to select all instances",
         )
@@ -154,10 +154,10 @@ def _key_or_refusal(template: ApplicationTemplate, given: Mapping[str, Any]) -> 
     try:
         key = instance_key(template, parameters.with_defaults(template.spec.parameters, given))
     except InterpolationError as error:
-        return Refusal(Refused.INVALID_KEY, f"the key of template {template.name}, {error}")
+        return Refusal(RefusalReason.INVALID_KEY, f"the key of template {template.name}, {error}")
     if len(key) > MAXIMUM_KEY_LENGTH:
         return Refusal(
-            Refused.INVALID_KEY,
+            RefusalReason.INVALID_KEY,
             f"the key of template {template.name} ({template.spec.key}) has {len(key)} characters for this task; at "
             f"most {MAXIMUM_KEY_LENGTH} are allowed: use shorter parameters",
         )

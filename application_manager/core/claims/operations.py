@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-from application_manager.core.claims.claims import Claim, Refused, template_of_all
+from application_manager.core.claims.claims import Claim, RefusalReason, template_of_all
 from application_manager.core.claims.merging import Contribution, Merged, merge, too_large
 from application_manager.core.claims.parameters import baseline, with_defaults
 from wayside.api import ApplicationTemplate
@@ -26,7 +26,7 @@ NOTHING_RUNS = "NothingRuns"
 _SHOWN = 5  # names of instances in a message
 
 
-class Standing(StrEnum):
+class VerdictKind(StrEnum):
     """What a task is to the demand."""
 
     COUNTS = "Counts"
@@ -43,7 +43,7 @@ class Verdict:
     `instance`: the one that serves it; `acts`: whether it acts on what runs, and does not deploy it.
     """
 
-    standing: Standing
+    kind: VerdictKind
     reason: str
     message: str
     instance: str | None = None
@@ -127,18 +127,18 @@ def _outbids(served: Sequence[Claim], suspend: Claim) -> Claim | None:
 def _deploy_verdict(name: str, each: Claim, base: Merged, suspender: str | None) -> Verdict:
     conflict = base.conflicts.get(each.task.name)
     if conflict is not None:
-        return Verdict(Standing.REFUSED, Refused.CONFLICT, conflict.message())
+        return Verdict(VerdictKind.REFUSED, RefusalReason.CONFLICT, conflict.message())
     stopped = f", which task {suspender} suspends" if suspender else ""
-    return Verdict(Standing.COUNTS, ACCEPTED, f"counts for instance {name}{stopped}", name)
+    return Verdict(VerdictKind.COUNTS, ACCEPTED, f"counts for instance {name}{stopped}", name)
 
 
 def _change_verdict(name: str, each: Claim, layer: Merged, demanded: bool) -> Verdict:
     conflict = layer.conflicts.get(each.task.name)
     if conflict is not None:
-        return Verdict(Standing.REFUSED, Refused.CONFLICT, conflict.message())
+        return Verdict(VerdictKind.REFUSED, RefusalReason.CONFLICT, conflict.message())
     if not demanded:
         return _waiting(name, each)
-    return Verdict(Standing.COUNTS, ACCEPTED, f"reconfigures instance {name}", name, acts=True)
+    return Verdict(VerdictKind.COUNTS, ACCEPTED, f"reconfigures instance {name}", name, acts=True)
 
 
 def _stop_verdict(name: str, each: Claim, served: Sequence[Claim], runs: bool) -> Verdict:
@@ -151,13 +151,13 @@ def _stop_verdict(name: str, each: Claim, served: Sequence[Claim], runs: bool) -
             f"{higher.task.name}, which deploys instance {name}: set at least that priority, or wait until that "
             "task ends"
         )
-        return Verdict(Standing.REFUSED, Refused.OUTBID, message)
-    return Verdict(Standing.COUNTS, ACCEPTED, f"suspends instance {name}", name, acts=True)
+        return Verdict(VerdictKind.REFUSED, RefusalReason.OUTBID, message)
+    return Verdict(VerdictKind.COUNTS, ACCEPTED, f"suspends instance {name}", name, acts=True)
 
 
 def _waiting(name: str, each: Claim) -> Verdict:
     message = f"no task deploys instance {name}: this {each.operation} task waits until a Deploy task does"
-    return Verdict(Standing.WAITING, NOTHING_RUNS, message)
+    return Verdict(VerdictKind.WAITING, NOTHING_RUNS, message)
 
 
 def waiting_for_any(claim: Claim) -> Verdict:
@@ -166,7 +166,7 @@ def waiting_for_any(claim: Claim) -> Verdict:
         f"no task deploys an instance of template {template_of_all(claim.instance)}: this {claim.operation} task "
         "waits until a Deploy task does"
     )
-    return Verdict(Standing.WAITING, NOTHING_RUNS, message)
+    return Verdict(VerdictKind.WAITING, NOTHING_RUNS, message)
 
 
 def gathered(claim: Claim, parts: Mapping[str, Verdict], otherwise: Verdict) -> Verdict:
@@ -174,10 +174,10 @@ def gathered(claim: Claim, parts: Mapping[str, Verdict], otherwise: Verdict) -> 
 
     `otherwise`: what holds where there is no instance that it could be about.
     """
-    if otherwise.standing is not Standing.WAITING:  # its holder is lost: that is so for all of them
+    if otherwise.kind is not VerdictKind.WAITING:  # its holder is lost: that is so for all of them
         return otherwise
-    counting = sorted(name for name, each in parts.items() if each.standing is Standing.COUNTS)
-    others = [each for _, each in sorted(parts.items()) if each.standing not in (Standing.COUNTS, Standing.WAITING)]
+    counting = sorted(name for name, each in parts.items() if each.kind is VerdictKind.COUNTS)
+    others = [each for _, each in sorted(parts.items()) if each.kind not in (VerdictKind.COUNTS, VerdictKind.WAITING)]
     if not counting:
         return others[0] if others else otherwise
     verb = "reconfigures" if claim.operation is Operation.RECONFIGURE else "suspends"
@@ -185,4 +185,4 @@ def gathered(claim: Claim, parts: Mapping[str, Verdict], otherwise: Verdict) -> 
     message = f"{verb} instance{'s' if len(counting) > 1 else ''} {names}"
     if others:
         message += f"; except {len(others)} (the first: {others[0].message})"
-    return Verdict(Standing.COUNTS, ACCEPTED, message, counting[0] if len(counting) == 1 else None)
+    return Verdict(VerdictKind.COUNTS, ACCEPTED, message, counting[0] if len(counting) == 1 else None)

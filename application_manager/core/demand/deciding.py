@@ -12,8 +12,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Protocol
 
-from application_manager.core.claims.claims import Claim, InvalidTemplate, Refused, TemplateState, template_of_all
-from application_manager.core.claims.operations import Standing, Verdict, settle, waiting_for_any
+from application_manager.core.claims.claims import Claim, InvalidTemplate, RefusalReason, TemplateState, template_of_all
+from application_manager.core.claims.operations import Verdict, VerdictKind, settle, waiting_for_any
 from application_manager.core.claims.parameters import baseline
 from application_manager.core.conditions import find, holds
 from application_manager.core.demand.decisions import Decision, is_managed
@@ -228,7 +228,7 @@ def _left_alone(instance: ApplicationInstance, claims: list[Claim]) -> Decision:
         f"ApplicationInstance {instance.name} was created by a person and is not changed: delete it, or give it "
         "another name, so that tasks can be served"
     )
-    refused = Verdict(Standing.REFUSED, Refused.INSTANCE_NOT_MANAGED, message)
+    refused = Verdict(VerdictKind.REFUSED, RefusalReason.INSTANCE_NOT_MANAGED, message)
     verdicts = {each.task.name: refused for each in claims}
     spec = instance.spec
     return Decision(instance.name, spec.template_name, spec.key, verdicts=verdicts, paused=is_paused(instance))

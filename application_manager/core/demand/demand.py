@@ -20,7 +20,7 @@ from application_manager.core.claims.claims import (
     claim,
     template_of_all,
 )
-from application_manager.core.claims.operations import Standing, Verdict, gathered
+from application_manager.core.claims.operations import Verdict, VerdictKind, gathered
 from application_manager.core.demand.deciding import (
     decide,
     decide_without_limits,
@@ -179,7 +179,7 @@ def verdict_of(claimed: Claim, decided: Mapping[str, Decision], meant: Iterable[
     if template_of_all(claimed.instance) is not None:
         found = {name: decided[name].verdicts for name in meant if name in decided and name != claimed.instance}
         parts = {name: verdicts[task] for name, verdicts in found.items() if task in verdicts}
-        serving = tuple(name for name, each in parts.items() if each.standing is Standing.COUNTS)
+        serving = tuple(name for name, each in parts.items() if each.kind is VerdictKind.COUNTS)
         return TaskVerdict(gathered(claimed, parts, own.verdicts[task]), serving)
     instead = own.fallback.instance_of(task) if own.fallback is not None else None
     other = decided.get(instead) if instead is not None else None
@@ -200,12 +200,12 @@ def claim_or_verdict(template: TemplateState, task: ApplicationTask) -> Claim | 
 def finished(task: ApplicationTask) -> Verdict | None:
     """The verdict of a task that has ended; None where it has not."""
     if task.spec.end_time is not None:
-        return Verdict(Standing.FINISHED, "Ended", f"the demand ended at {task.spec.end_time}")
+        return Verdict(VerdictKind.FINISHED, "Ended", f"the demand ended at {task.spec.end_time}")
     if task.metadata.deletion_timestamp is not None:
-        return Verdict(Standing.FINISHED, "Deleted", "the task is being deleted")
+        return Verdict(VerdictKind.FINISHED, "Deleted", "the task is being deleted")
     return None
 
 
 def refused(refusal: Refusal) -> Verdict:
     """The verdict of a task that is refused."""
-    return Verdict(Standing.REFUSED, refusal.reason, refusal.message)
+    return Verdict(VerdictKind.REFUSED, refusal.reason, refusal.message)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from application_manager.core.claims.claims import InvalidTemplate, TemplateState
-from application_manager.core.conditions import Aspect
+from application_manager.core.conditions import ConditionState
 from application_manager.core.demand.decisions import Decision, is_managed
 from application_manager.core.demand.lingering import LINGER_ANNOTATION, linger_of
 from application_manager.core.objects.charts import ChartRequest
@@ -72,7 +72,7 @@ EXPRESSION_LIMIT = "ExpressionLimit"
 """The reason of the condition Applied where the expressions of the template take more than they may."""
 
 
-def without_template(wanted: ApplicationInstance, template: TemplateState) -> Aspect | None:
+def without_template(wanted: ApplicationInstance, template: TemplateState) -> ConditionState | None:
     """Why the instance has no objects, where that is for want of a template, as the condition Applied has it."""
     of = wanted.spec.template_name
     if template is None:
@@ -80,17 +80,17 @@ def without_template(wanted: ApplicationInstance, template: TemplateState) -> As
             f"spec.templateName: there is no ApplicationTemplate {of!r} in namespace {wanted.namespace}: create "
             "it; until then, the running objects are not changed"
         )
-        return Aspect("Applied", False, "TemplateNotFound", message)
+        return ConditionState("Applied", False, "TemplateNotFound", message)
     if isinstance(template, InvalidTemplate):
-        return Aspect("Applied", False, "TemplateInvalid", f"ApplicationTemplate {of}: {template.problem}")
+        return ConditionState("Applied", False, "TemplateInvalid", f"ApplicationTemplate {of}: {template.problem}")
     return None
 
 
-def problem(template: ApplicationTemplate, reason: str, message: str) -> Aspect:
+def problem(template: ApplicationTemplate, reason: str, message: str) -> ConditionState:
     """Why the instance cannot be rendered, as the condition Applied gives it."""
-    return Aspect("Applied", False, reason, f"ApplicationTemplate {template.name}: {message}")
+    return ConditionState("Applied", False, reason, f"ApplicationTemplate {template.name}: {message}")
 
 
-def chart_pending(template: ApplicationTemplate, request: ChartRequest) -> Aspect:
+def chart_pending(template: ApplicationTemplate, request: ChartRequest) -> ConditionState:
     """That the instance's chart is being rendered, as the condition Applied gives it."""
     return problem(template, CHART_PENDING, f"chart {request.source} is being rendered")

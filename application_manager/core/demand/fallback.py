@@ -13,8 +13,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 from application_manager.core.claims.claims import Claim, InvalidTemplate, Refusal, TemplateState, claim
-from application_manager.core.claims.operations import Standing, Verdict
-from application_manager.core.conditions import Aspect, find, from_first, holds
+from application_manager.core.claims.operations import Verdict, VerdictKind
+from application_manager.core.conditions import ConditionState, find, from_first, holds
 from wayside.api import ApplicationInstance, ApplicationTemplate
 from wayside.api.base import Condition
 from wayside.api.operation import Operation
@@ -123,11 +123,11 @@ def turned(verdict: Verdict, task: str, to: Fallback | None, others: Mapping[str
     `verdict`: that of its own instance; `others`: the verdicts of the fallback's, empty where that was not looked at
     yet.
     """
-    if to is None or verdict.standing is not Standing.COUNTS or verdict.acts:
+    if to is None or verdict.kind is not VerdictKind.COUNTS or verdict.acts:
         return verdict
     refusal = to.refused.get(task)
     found = others.get(task)
-    if refusal is None and found is not None and found.standing is Standing.COUNTS:
+    if refusal is None and found is not None and found.kind is VerdictKind.COUNTS:
         message = (
             f"instance {verdict.instance} is not ready; until it is, instance {found.instance} of template "
             f"{to.template} serves the task"
@@ -140,9 +140,9 @@ def turned(verdict: Verdict, task: str, to: Fallback | None, others: Mapping[str
     return replace(verdict, reason=FALLBACK_FAILED, message=message)
 
 
-def aspects(
+def fallback_conditions(
     known: Iterable[Condition], late: str, turns: Fallback | None, stands_in_for: Iterable[str]
-) -> Iterator[Aspect]:
+) -> Iterator[ConditionState]:
     """The conditions TimedOut and StandsIn of an instance, each from when it was True for the first time.
 
     `late`: the readyTimeout that it is beyond, empty where it is not; `turns`: what its tasks turn to meanwhile;

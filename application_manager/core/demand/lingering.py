@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from application_manager.core.claims.claims import TemplateState
-from application_manager.core.conditions import Aspect, from_first
+from application_manager.core.conditions import ConditionState, from_first
 from wayside.api import ApplicationInstance, ApplicationTemplate
 from wayside.api.applicationtemplate import Lifecycle
 from wayside.api.base import Duration
@@ -67,7 +67,7 @@ def is_held(instance: ApplicationInstance) -> bool:
     return _reason(instance, HOLD_ANNOTATION) is not None
 
 
-def manual_aspects(instance: ApplicationInstance) -> Iterator[Aspect]:
+def manual_conditions(instance: ApplicationInstance) -> Iterator[ConditionState]:
     """The conditions Paused and Held: True while the annotation is there, False once it is gone, absent before."""
     known = instance.status.conditions if instance.status else ()
     for type_, annotation, meaning in _CONDITIONS:

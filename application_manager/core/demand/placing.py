@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 from application_manager.core.claims.claims import InvalidTemplate, TemplateState
-from application_manager.core.claims.operations import NOTHING_RUNS, Standing, Verdict
+from application_manager.core.claims.operations import NOTHING_RUNS, Verdict, VerdictKind
 from application_manager.core.demand.decisions import Decision, is_managed
 from application_manager.core.demand.lingering import is_held, protected_until
 from application_manager.core.demand.places import GrantedPlace, Limits, PlaceCandidate
@@ -68,7 +68,7 @@ def placed(decision: Decision, place: GrantedPlace | None, *, exists: bool, now:
         return decision
     reason, message = _why(decision, place)
     verdicts = {
-        name: _waiting(decision, each, reason, message) if each.standing is Standing.COUNTS else each
+        name: _waiting(decision, each, reason, message) if each.kind is VerdictKind.COUNTS else each
         for name, each in decision.verdicts.items()
     }
     changes = [each for each in (decision.next_change, place.next_change) if each is not None and each > now]
@@ -111,15 +111,13 @@ def _why(decision: Decision, place: GrantedPlace) -> tuple[str, str]:
 def _waiting(decision: Decision, each: Verdict, reason: str, message: str) -> Verdict:
     if each.acts:
         what = f"instance {decision.name} does not run ({reason}): the task takes effect once it runs"
-        return Verdict(Standing.WAITING, NOTHING_RUNS, what)
-    return Verdict(Standing.WAITING, reason, message)
+        return Verdict(VerdictKind.WAITING, NOTHING_RUNS, what)
+    return Verdict(VerdictKind.WAITING, reason, message)
 
 
 def _marked(decision: Decision, words: str) -> Decision:
     verdicts = {
-        name: replace(each, message=each.message + words)
-        if each.standing is Standing.COUNTS and not each.acts
-        else each
+        name: replace(each, message=each.message + words) if each.kind is VerdictKind.COUNTS and not each.acts else each
         for name, each in decision.verdicts.items()
     }
     return replace(decision, verdicts=verdicts)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from application_manager.core.claims.claims import Claim
-from application_manager.core.claims.operations import Standing, Verdict
+from application_manager.core.claims.operations import Verdict, VerdictKind
 from wayside.api import ApplicationTask, ApplicationTemplate
 from wayside.api.applicationtemplate import Lifecycle, LossPolicy
 from wayside.kubernetes.leases import DEFAULT_DURATION, lease_name
@@ -190,12 +190,12 @@ def _lapse(
     since = now if lost_since is None else lost_since
     if now - since >= FINISH_LOST_AFTER:
         message = f"holder {holder} has been lost for over an hour"
-        return Verdict(Standing.FINISHED, "DetectorLost", message), None
+        return Verdict(VerdictKind.FINISHED, "DetectorLost", message), None
     message = (
         f"holder {holder} is lost: its Lease {lease_name(holder)} was not renewed for {limit:g} s; the demand "
         "counts again once the Lease is renewed"
     )
-    return Verdict(Standing.LAPSED, HOLDER_LOST, message), since + FINISH_LOST_AFTER
+    return Verdict(VerdictKind.LAPSED, HOLDER_LOST, message), since + FINISH_LOST_AFTER
 
 
 def _lost_since(task: ApplicationTask) -> float | None:

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from typing import Self
 
-from application_manager.core.claims.claims import Refused
-from application_manager.core.claims.operations import Standing, Verdict
+from application_manager.core.claims.claims import RefusalReason
+from application_manager.core.claims.operations import Verdict, VerdictKind
 from wayside.api import ApplicationTask
 from wayside.api.operation import Operation
 
@@ -89,7 +89,7 @@ class TaskPolicy:
         else:
             return None
         message = f"{why}: change the rule, or have the administrator change --holder-policy"
-        return Verdict(Standing.REFUSED, Refused.NOT_ALLOWED, message)
+        return Verdict(VerdictKind.REFUSED, RefusalReason.NOT_ALLOWED, message)
 
 
 def _operation(text: str, whole: str) -> Operation:

@@ -14,7 +14,7 @@ from typing import Any
 
 import yaml
 
-from application_manager.core.objects.ownership import Obstacle
+from application_manager.core.objects.ownership import ApplyProblem
 from wayside.api.applicationtemplate import Helm
 
 UNAVAILABLE = "ChartUnavailable"
@@ -73,7 +73,7 @@ class ChartObjects:
     objects: tuple[ChartObject, ...]
 
 
-ChartOutcome = ChartObjects | Obstacle
+ChartOutcome = ChartObjects | ApplyProblem
 
 Charts = Callable[[ChartRequest], ChartOutcome | None]
 """What came of a request; None where it is still to come."""
@@ -81,7 +81,7 @@ Charts = Callable[[ChartRequest], ChartOutcome | None]
 
 def no_charts(request: ChartRequest) -> ChartOutcome:
     """For where there is no Helm."""
-    return Obstacle(UNAVAILABLE, f"spec.helm: cannot render chart {request.source} here: helm is not available")
+    return ApplyProblem(UNAVAILABLE, f"spec.helm: cannot render chart {request.source} here: helm is not available")
 
 
 def parse_chart(source: ChartSource, text: str) -> ChartOutcome:
@@ -107,7 +107,7 @@ def parse_chart(source: ChartSource, text: str) -> ChartOutcome:
     if not objects and not problems:
         problems.append("it renders no objects with these values: correct the values")
     if problems:
-        return Obstacle(FAILED, f"spec.helm: chart {source}: {'; '.join(problems)}")
+        return ApplyProblem(FAILED, f"spec.helm: chart {source}: {'; '.join(problems)}")
     return ChartObjects(tuple(objects))
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-from application_manager.core.conditions import Aspect
+from application_manager.core.conditions import ConditionState
 from application_manager.core.objects.podspecs import with_pod_template
 from wayside.api import API_VERSION, ApplicationInstance, Kind
 from wayside.api.applicationinstance import ObjectReference, SuspendedReplicas
@@ -31,7 +31,7 @@ Manifest = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
-class Known:
+class LastApplied:
     """What was applied before: the digest of the rendering that was last applied in full, and the uids of the objects.
 
     A uid is None where the object may not have been applied.
@@ -41,27 +41,27 @@ class Known:
     objects: Mapping[ObjectKey, str | None] = field(default_factory=dict)
 
     @classmethod
-    def read(cls, digest: str | None, references: Iterable[ObjectReference]) -> Known:
+    def read(cls, digest: str | None, references: Iterable[ObjectReference]) -> LastApplied:
         """The content of references, as `references` makes them."""
         return cls(digest, {reference_key(each): each.uid for each in references})
 
 
 @dataclass(frozen=True, slots=True)
-class Applied:
+class ApplyResult:
     """What came of it: the condition Applied, and what belongs to the instance now.
 
     `complete`: whether everything is as rendered; `took`: when applying began and ended, in nanoseconds since the
     epoch, None where nothing was applied.
     """
 
-    aspect: Aspect
+    state: ConditionState
     objects: tuple[ObjectReference, ...]
     complete: bool
     took: tuple[int, int] | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class Obstacle:
+class ApplyProblem:
     """What keeps objects from being applied: the reason of the condition Applied, and the problem with its remedy."""
 
     reason: str
@@ -86,13 +86,13 @@ def instance_of(live: Mapping[str, Any]) -> tuple[str, str] | None:
     return (metadata["namespace"], name) if name else None
 
 
-def foreign(live: Mapping[str, Any], owner: Kind, what: str, recorded: str | None = None) -> Obstacle | None:
+def foreign(live: Mapping[str, Any], owner: Kind, what: str, recorded: str | None = None) -> ApplyProblem | None:
     """Why the object may not be applied over, or None if it is the owner's, an instance's or Detector's.
 
     `what`: the object's kind and name; `recorded`: its uid, if the owner's status lists it.
     """
     if live["metadata"].get("deletionTimestamp"):
-        return Obstacle("Waiting", f"{what} is being deleted; the manager applies it again afterwards")
+        return ApplyProblem("Waiting", f"{what} is being deleted; the manager applies it again afterwards")
     controller = controller_of(live)
     if not controller:
         if live["metadata"]["uid"] == recorded:
@@ -100,10 +100,10 @@ def foreign(live: Mapping[str, Any], owner: Kind, what: str, recorded: str | Non
     elif controller["uid"] == owner.metadata.uid:
         return None
     elif (controller["apiVersion"], controller["kind"], controller["name"]) == (API_VERSION, owner.kind, owner.name):
-        return Obstacle("Waiting", f"{what} of the previous {owner.kind} {owner.name} is still being deleted")
+        return ApplyProblem("Waiting", f"{what} of the previous {owner.kind} {owner.name} is still being deleted")
     whose = f"is controlled by {controller['kind']} {controller['name']}" if controller else "has no controller"
     remedy = f"delete or rename it, or choose another name in {owner.kind} {owner.name}"
-    return Obstacle("ObjectExists", f"{what} already exists, {whose} and is not changed: {remedy}")
+    return ApplyProblem("ObjectExists", f"{what} already exists, {whose} and is not changed: {remedy}")
 
 
 def reference_key(of: ObjectReference | SuspendedReplicas) -> ObjectKey:

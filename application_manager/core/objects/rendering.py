@@ -19,7 +19,7 @@ from application_manager.core.claims import parameters, values
 from application_manager.core.claims.claims import unknown_members
 from application_manager.core.objects.charts import ChartRequest, Charts, ChartSource, no_charts
 from application_manager.core.objects.configuration import CONFIG_MAP, Configuration, config_map, config_map_name
-from application_manager.core.objects.ownership import Manifest, ObjectKey, Obstacle, labelled, object_key
+from application_manager.core.objects.ownership import ApplyProblem, Manifest, ObjectKey, labelled, object_key
 from application_manager.core.objects.policy import Policy
 from application_manager.core.objects.suspension import stated_replicas, stopped, yielded
 from wayside.api import ApplicationInstance, ApplicationTemplate
@@ -193,7 +193,7 @@ class Renderer:
         outcome = charts(request)
         if outcome is None:
             raise ChartPending(request)
-        if isinstance(outcome, Obstacle):
+        if isinstance(outcome, ApplyProblem):
             raise RenderError([outcome.message], outcome.reason)
         for each in outcome.objects:
             # Copied and in one form, since what comes from the chart is kept for the next time.

@@ -25,7 +25,7 @@ _REPORTED_BY_EVENTS = frozenset({("apps/v1", "StatefulSet"), ("apps/v1", "Daemon
 
 
 @dataclass(frozen=True, slots=True)
-class Right:
+class PolicyRule:
     """Verbs on a resource.
 
     Attributes:
@@ -57,41 +57,41 @@ class Right:
 REMEDY = "apply the output of `application-manager rbac`"
 
 
-def rights(plurals: Mapping[KindKey, str], *, detectors: bool = False) -> list[Right]:
+def rights(plurals: Mapping[KindKey, str], *, detectors: bool = False) -> list[PolicyRule]:
     """The rights that are needed in each managed namespace; `detectors`: whether the manager runs detectors too."""
     return [*_own(), *_children(plurals), *(_running_detectors() if detectors else ())]
 
 
-def read_only(needed: Iterable[Right]) -> list[Right]:
+def read_only(needed: Iterable[PolicyRule]) -> list[PolicyRule]:
     """What of the rights changes nothing: all that a manager of all namespaces has in each of them."""
     return _narrowed(needed, lambda verb: verb in _READING)
 
 
-def writing(needed: Iterable[Right]) -> list[Right]:
+def writing(needed: Iterable[PolicyRule]) -> list[PolicyRule]:
     """What of the rights changes something, or may be handed on to detectors: it is granted by namespace."""
     return _narrowed(needed, lambda verb: verb not in _READING)
 
 
-def granting() -> Right:
+def granting() -> PolicyRule:
     """The right that a manager of all namespaces queries to learn whether it may write in one."""
-    return Right(_GROUP, "applicationtasks/status", ("patch",), "their statuses are not written")
+    return PolicyRule(_GROUP, "applicationtasks/status", ("patch",), "their statuses are not written")
 
 
-def _narrowed(needed: Iterable[Right], wanted: Callable[[str], bool]) -> list[Right]:
+def _narrowed(needed: Iterable[PolicyRule], wanted: Callable[[str], bool]) -> list[PolicyRule]:
     narrowed = [replace(each, verbs=tuple(filter(wanted, each.verbs))) for each in needed]
     return [each for each in narrowed if each.verbs]
 
 
-def detector_rights(name: str) -> list[Right]:
+def detector_rights(name: str) -> list[PolicyRule]:
     """What the Detector of that name must be allowed to do in its namespace, where it runs by itself."""
     return [
         *_detecting(name, "hold"),
-        Right(_LEASES, "leases", ("get", "update"), "it counts as lost", vital=True, name=lease_name(name)),
-        Right(_LEASES, "leases", ("create",), "it counts as lost", vital=True),
+        PolicyRule(_LEASES, "leases", ("get", "update"), "it counts as lost", vital=True, name=lease_name(name)),
+        PolicyRule(_LEASES, "leases", ("create",), "it counts as lost", vital=True),
     ]
 
 
-def sidecar_rights(name: str) -> list[Right]:
+def sidecar_rights(name: str) -> list[PolicyRule]:
     """What the Detector of that name must be allowed to do in its namespace, where it runs in others' pods.
 
     Each pod has a Lease of its own, whose name no role knows: that the others' are left alone, the chart's policy sees
@@ -99,58 +99,62 @@ def sidecar_rights(name: str) -> list[Right]:
     """
     return [
         *_detecting(name, "hold-as-pod"),
-        Right(_LEASES, "leases", ("get", "update", "create"), "it counts as lost", vital=True),
+        PolicyRule(_LEASES, "leases", ("get", "update", "create"), "it counts as lost", vital=True),
     ]
 
 
-def _detecting(name: str, hold: str) -> Iterator[Right]:
+def _detecting(name: str, hold: str) -> Iterator[PolicyRule]:
     tasks = ("get", "list", "watch", "create", "patch", "delete")
-    yield Right(_GROUP, "detectors", _LOOKING, "it does not know its configuration", vital=True, name=name)
-    yield Right(_GROUP, "detectors", (hold,), "the chart's policy refuses its tasks and its Lease", name=name)
-    yield Right(_GROUP, "eventrules", _LOOKING, "it does not know its rules", vital=True)
-    yield Right(_GROUP, "applicationtasks", tasks, "it creates no tasks", vital=True)
+    yield PolicyRule(_GROUP, "detectors", _LOOKING, "it does not know its configuration", vital=True, name=name)
+    yield PolicyRule(_GROUP, "detectors", (hold,), "the chart's policy refuses its tasks and its Lease", name=name)
+    yield PolicyRule(_GROUP, "eventrules", _LOOKING, "it does not know its rules", vital=True)
+    yield PolicyRule(_GROUP, "applicationtasks", tasks, "it creates no tasks", vital=True)
 
 
-def lease_rights(name: str) -> list[Right]:
+def lease_rights(name: str) -> list[PolicyRule]:
     """What is needed in the namespace of the managers' own Lease."""
     purpose = "no manager becomes active"
     return [
-        Right(_LEASES, "leases", ("get", "update"), purpose, vital=True, name=name),
-        Right(_LEASES, "leases", ("create",), purpose, vital=True),  # of what is not there yet, no role knows the name
+        PolicyRule(_LEASES, "leases", ("get", "update"), purpose, vital=True, name=name),
+        PolicyRule(
+            _LEASES, "leases", ("create",), purpose, vital=True
+        ),  # of what is not there yet, no role knows the name
     ]
 
 
-def certificate_rights(secret: str, webhooks: str) -> tuple[list[Right], list[Right]]:
+def certificate_rights(secret: str, webhooks: str) -> tuple[list[PolicyRule], list[PolicyRule]]:
     """What a manager needs that makes its webhook's certificate: in the Secret's namespace, and in the cluster."""
     purpose = "the webhook has no certificate that the API server trusts"
     group = "admissionregistration.k8s.io"
     plurals = ("validatingwebhookconfigurations", "mutatingwebhookconfigurations")
     return (
-        [Right("", "secrets", ("get", "update"), purpose, vital=True, name=secret)],
-        [Right(group, each, ("get", "patch"), purpose, vital=True, name=webhooks) for each in plurals],
+        [PolicyRule("", "secrets", ("get", "update"), purpose, vital=True, name=secret)],
+        [PolicyRule(group, each, ("get", "patch"), purpose, vital=True, name=webhooks) for each in plurals],
     )
 
 
-def node_rights() -> list[Right]:
+def node_rights() -> list[PolicyRule]:
     """What is of use for the whole cluster, and can be done without: nodes belong to no namespace."""
-    return [Right("", "nodes", ("list",), "only the scheduler reports that no node fits a template")]
+    return [PolicyRule("", "nodes", ("list",), "only the scheduler reports that no node fits a template")]
 
 
-def _own() -> Iterator[Right]:
-    yield Right(_GROUP, "applicationtemplates", ("get", *_LOOKING), "nothing can be decided", vital=True)
+def _own() -> Iterator[PolicyRule]:
+    yield PolicyRule(_GROUP, "applicationtemplates", ("get", *_LOOKING), "nothing can be decided", vital=True)
     instances = ("get", *_LOOKING, "create", "patch", "delete")
-    yield Right(_GROUP, "applicationinstances", instances, "no instance is created, changed or released", vital=True)
-    yield Right(_GROUP, "applicationtasks", _LOOKING, "nothing can be decided", vital=True)
-    yield Right(_GROUP, "applicationtasks", ("delete",), "finished tasks are never deleted")
-    yield Right(_GROUP, "detectors", _LOOKING, "rules and detectors have no status", vital=True)
-    yield Right(_GROUP, "eventrules", _LOOKING, "rules and detectors have no status", vital=True)
+    yield PolicyRule(
+        _GROUP, "applicationinstances", instances, "no instance is created, changed or released", vital=True
+    )
+    yield PolicyRule(_GROUP, "applicationtasks", _LOOKING, "nothing can be decided", vital=True)
+    yield PolicyRule(_GROUP, "applicationtasks", ("delete",), "finished tasks are never deleted")
+    yield PolicyRule(_GROUP, "detectors", _LOOKING, "rules and detectors have no status", vital=True)
+    yield PolicyRule(_GROUP, "eventrules", _LOOKING, "rules and detectors have no status", vital=True)
     for plural in ("applicationinstances", "applicationtasks", "applicationtemplates", "detectors", "eventrules"):
-        yield Right(_GROUP, f"{plural}/status", ("patch",), "their statuses are not written")
-    yield Right(_LEASES, "leases", ("get", *_LOOKING), "lost holders are not detected", vital=True)
-    yield Right("events.k8s.io", "events", ("create", "patch"), "no Kubernetes Events are posted")
+        yield PolicyRule(_GROUP, f"{plural}/status", ("patch",), "their statuses are not written")
+    yield PolicyRule(_LEASES, "leases", ("get", *_LOOKING), "lost holders are not detected", vital=True)
+    yield PolicyRule("events.k8s.io", "events", ("create", "patch"), "no Kubernetes Events are posted")
 
 
-def _running_detectors() -> Iterator[Right]:
+def _running_detectors() -> Iterator[PolicyRule]:
     """To make a detector's objects; what it hands on by their Roles, the manager must have itself (no `escalate`)."""
     no_detector = "no detector runs"
     for group, resource in (
@@ -159,31 +163,31 @@ def _running_detectors() -> Iterator[Right]:
         (_RBAC, "rolebindings"),
         ("apps", "deployments"),
     ):
-        yield Right(group, resource, ("get", "list", "create", "patch", "delete"), no_detector)
-    yield Right("", "pods", ("list",), "statuses do not report why a detector does not run")
+        yield PolicyRule(group, resource, ("get", "list", "create", "patch", "delete"), no_detector)
+    yield PolicyRule("", "pods", ("list",), "statuses do not report why a detector does not run")
     for each in (*detector_rights(""), *sidecar_rights("")):
-        yield Right(each.group, each.resource, each.verbs, no_detector)
+        yield PolicyRule(each.group, each.resource, each.verbs, no_detector)
 
 
-def _children(plurals: Mapping[KindKey, str]) -> Iterator[Right]:
+def _children(plurals: Mapping[KindKey, str]) -> Iterator[PolicyRule]:
     all_verbs = ("get", *_LOOKING, "create", "patch", "delete")
     for (api_version, kind), plural in sorted(plurals.items()):
         group = api_version.rpartition("/")[0]
-        yield Right(group, plural, _LOOKING, f"the status of each {kind} is unknown", vital=True)
+        yield PolicyRule(group, plural, _LOOKING, f"the status of each {kind} is unknown", vital=True)
         others = tuple(verb for verb in all_verbs if verb not in _LOOKING)
-        yield Right(group, plural, others, f"no {kind} of a template is created, changed or deleted")
+        yield PolicyRule(group, plural, others, f"no {kind} of a template is created, changed or deleted")
         if (api_version, kind) in SCALED:
-            yield Right(group, f"{plural}/scale", ("patch",), f"no {kind} is suspended or resumed")
+            yield PolicyRule(group, f"{plural}/scale", ("patch",), f"no {kind} is suspended or resumed")
     if _REPORTED_BY_EVENTS & plurals.keys():
-        yield Right(
+        yield PolicyRule(
             "events.k8s.io",
             "events",
             ("list",),
             "statuses do not report why pods of workloads other than Deployments are refused",
         )
     if ("v1", "Pod") not in plurals:
-        yield Right("", "pods", _LOOKING, "statuses do not report why workloads do not run", vital=True)
-        yield Right("", "pods", ("patch",), "running applications get a changed configuration late")
+        yield PolicyRule("", "pods", _LOOKING, "statuses do not report why workloads do not run", vital=True)
+        yield PolicyRule("", "pods", ("patch",), "running applications get a changed configuration late")
 
 
 def roles(
@@ -229,16 +233,16 @@ def roles(
     return [*found, *bound(f"{name}-lease", lease[0], merged_rules(lease_rights(lease[1])), account)]
 
 
-def merged_rules(needed: Iterable[Right]) -> list[dict[str, Any]]:
+def merged_rules(needed: Iterable[PolicyRule]) -> list[dict[str, Any]]:
     """As few rules as possible: resources of a group with the same verbs are one."""
     verbs: dict[tuple[str, str, str], dict[str, None]] = {}
     for each in needed:
         verbs.setdefault((each.group, each.name, each.resource), {}).update(dict.fromkeys(each.verbs))
-    alike: dict[tuple[str, str, frozenset[str]], Right] = {}
+    alike: dict[tuple[str, str, frozenset[str]], PolicyRule] = {}
     resources: dict[tuple[str, str, frozenset[str]], list[str]] = {}
     for (group, only, resource), its in verbs.items():
         key = (group, only, frozenset(its))
-        alike.setdefault(key, Right(group, resource, tuple(its), "", name=only))
+        alike.setdefault(key, PolicyRule(group, resource, tuple(its), "", name=only))
         resources.setdefault(key, []).append(resource)
     return [each.rule() | {"resources": resources[key]} for key, each in alike.items()]
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from application_manager.core.claims import values
 from application_manager.core.claims.claims import InvalidTemplate, TemplateState, claim, template_of_all
-from application_manager.core.claims.operations import Standing, Verdict
+from application_manager.core.claims.operations import Verdict, VerdictKind
 from application_manager.core.conditions import find
 from application_manager.core.demand.deciding import precedence
 from application_manager.core.demand.decisions import Decision, is_managed
@@ -51,7 +51,7 @@ _BELOW = "a Reconfigure task overrides it"
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class NamespaceSnapshot:
     """What is live in one namespace: who has a place depends on all of it.
 
     `objects`: those that the instance's status lists, None where one is gone; `pods`: those that have its label;
@@ -66,7 +66,7 @@ class Found:
     leases: Mapping[str, Object] = field(default_factory=dict)
 
 
-def serving(found: Found, task: ApplicationTask, now: float) -> str | None:
+def serving(found: NamespaceSnapshot, task: ApplicationTask, now: float) -> str | None:
     """The name of the instance that serves the task, or that it claims; None where there is none, or all are meant.
 
     `now` is in seconds since 1970.
@@ -76,17 +76,17 @@ def serving(found: Found, task: ApplicationTask, now: float) -> str | None:
     if claimed is not None and template_of_all(claimed) is not None:
         return None
     verdict, written = _outcome(found, now).verdicts[task.name], task.status.instance_name if task.status else None
-    if verdict.standing is Standing.FINISHED:
+    if verdict.kind is VerdictKind.FINISHED:
         return written or claimed
     return verdict.instance or claimed or written
 
 
-def _outcome(found: Found, now: float) -> NamespaceOutcome:
+def _outcome(found: NamespaceSnapshot, now: float) -> NamespaceOutcome:
     """What is demanded; where the manager has written that a limit holds which is its own alone, that."""
     outcome = demand(found.templates, found.tasks, found.instances, _written_leases(found.tasks), now)
     limited = {each.name: verdict for each in found.tasks if (verdict := _written_limit(each)) is not None}
     verdicts = {
-        name: limited.get(name, verdict) if verdict.standing is Standing.COUNTS else verdict
+        name: limited.get(name, verdict) if verdict.kind is VerdictKind.COUNTS else verdict
         for name, verdict in outcome.verdicts.items()
     }
     return replace(outcome, verdicts=verdicts)
@@ -99,10 +99,10 @@ def _written_limit(task: ApplicationTask) -> Verdict | None:
         return None
     if task.status is None or task.status.observed_generation < task.metadata.generation:
         return None
-    return Verdict(Standing.WAITING, accepted.reason, accepted.message)
+    return Verdict(VerdictKind.WAITING, accepted.reason, accepted.message)
 
 
-def explanation_of(found: Found, *, task: str | None, instance: str | None, now: float) -> Explanation:
+def explanation_of(found: NamespaceSnapshot, *, task: str | None, instance: str | None, now: float) -> Explanation:
     """The chain of a task, or of an instance where `task` is None; these are names, of what is in `found`.
 
     `instance`: the one that serves the task, None where none does; `now` in seconds since 1970.
@@ -158,7 +158,7 @@ def _task(task: ApplicationTask, verdict: Verdict, leases: Mapping[str, Object],
     return ExplainedTask(
         name=task.name,
         phase=str(status.phase.value) if status and status.phase else None,
-        standing=str(verdict.standing.value),
+        verdict=str(verdict.kind.value),
         reason=verdict.reason,
         message=verdict.message,
         operation=str(task.spec.operation.value),
@@ -229,7 +229,7 @@ def _parameters(
         for each in tasks
         if each.spec.operation is Operation.RECONFIGURE
         and each.name in decision.verdicts
-        and decision.verdicts[each.name].standing is Standing.COUNTS
+        and decision.verdicts[each.name].kind is VerdictKind.COUNTS
     }
     # One that suspends gives parameters only to identify its instance.
     speaking = [each for each in tasks if each.spec.operation is not Operation.SUSPEND and each.spec.end_time is None]

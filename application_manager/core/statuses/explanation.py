@@ -43,13 +43,13 @@ class ExplainedParameter(Model):
 class ExplainedTask(Model):
     """One task, and why it counts or does not.
 
-    `phase` and `conditions` are as written; `standing`, `reason` and `message` are computed now. `not_looked_at`: the
+    `phase` and `conditions` are as written; `verdict`, `reason` and `message` are computed now. `not_looked_at`: the
     manager has not written of its present version.
     """
 
     name: str
     phase: str | None = None
-    standing: str
+    verdict: str
     reason: str
     message: str
     operation: str = "Deploy"

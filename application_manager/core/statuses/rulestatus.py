@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from application_manager.core.conditions import Aspect, concluded
+from application_manager.core.conditions import ConditionState, concluded
 from application_manager.core.findings.findings import Findings
 from application_manager.core.findings.rulefindings import detector_findings, rule_findings, selecting, selects
 from application_manager.core.health.pods import Trouble, summary, trouble
@@ -31,7 +31,7 @@ DETECTOR_INVALID = "DetectorInvalid"
 RUNNING = "Running"
 """The condition's type."""
 
-NOT_RUN = Aspect(
+NOT_RUN = ConditionState(
     RUNNING,
     False,
     "NotRun",
@@ -40,7 +40,9 @@ NOT_RUN = Aspect(
 )
 """The condition where the manager has no image."""
 
-NOT_ACCEPTED = Aspect(RUNNING, False, "NotAccepted", "no objects are created for a Detector that is not accepted")
+NOT_ACCEPTED = ConditionState(
+    RUNNING, False, "NotAccepted", "no objects are created for a Detector that is not accepted"
+)
 """The condition of a Detector that cannot run and was never made."""
 
 _NAMES_LISTED = 5  # in a column of a table
@@ -66,7 +68,7 @@ def rule_status(
         detectors=names,
         selected_by=_listed(names),
         conditions=concluded(
-            old.conditions, [_rule_aspect(findings, bool(names))], generation, now, stalled=(RULE_INVALID,)
+            old.conditions, [_rule_condition(findings, bool(names))], generation, now, stalled=(RULE_INVALID,)
         ),
     )
 
@@ -78,47 +80,50 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def detector_status(
-    detector: Detector, rules: Sequence[EventRule], now: float, running: Aspect | None = None
+    detector: Detector, rules: Sequence[EventRule], now: float, running: ConditionState | None = None
 ) -> DetectorStatus:
     """The detector's status, given the rules of its namespace; `now` in seconds since 1970.
 
     `running`: whether it runs, where the manager runs it and knows.
     """
     old = detector.status or DetectorStatus()
-    aspects = [_aspect(detector_findings(detector), DETECTOR_INVALID), *([] if running is None else [running])]
+    states = [
+        _accepted(detector_findings(detector), DETECTOR_INVALID),
+        *([] if running is None else [running]),
+    ]
     kept = [each for each in old.conditions if detector.spec.mode is not None or each.type != RUNNING]
     generation = detector.metadata.generation
     return DetectorStatus(
         observed_generation=generation,
         rules=sum(1 for each in rules if selects(detector, each)),
-        conditions=concluded(kept, aspects, generation, now, stalled=(DETECTOR_INVALID,)),
+        conditions=concluded(kept, states, generation, now, stalled=(DETECTOR_INVALID,)),
     )
 
 
 def unreadable_status(status: Status, reason: str, problem: str, generation: int, now: float) -> Status:
     """The status of a rule or detector that the API server took and that is none; `now` in seconds since 1970."""
-    aspect = Aspect("Accepted", False, reason, problem)
-    conditions = concluded(status.conditions, [aspect], generation, now, stalled=(reason,))
+    state = ConditionState("Accepted", False, reason, problem)
+    conditions = concluded(status.conditions, [state], generation, now, stalled=(reason,))
     return status.model_copy(update={"observed_generation": generation, "conditions": conditions})
 
 
-def _rule_aspect(findings: Findings, selected: bool) -> Aspect:
+def _rule_condition(findings: Findings, selected: bool) -> ConditionState:
     if selected or findings.problems:
-        return _aspect(findings, RULE_INVALID)
-    return Aspect("Accepted", False, "NotSelected", "; ".join(map(str, findings.doubts)))
+        return _accepted(findings, RULE_INVALID)
+    return ConditionState("Accepted", False, "NotSelected", "; ".join(map(str, findings.doubts)))
 
 
-def _aspect(findings: Findings, reason: str) -> Aspect:
+def _accepted(findings: Findings, reason: str) -> ConditionState:
     if findings.faults:
-        return Aspect("Accepted", False, reason, "; ".join(findings.faults))
+        return ConditionState("Accepted", False, reason, "; ".join(findings.faults))
     but = f"; but {'; '.join(map(str, findings.remarks))}" if findings.remarks else ""
-    return Aspect("Accepted", True, "Accepted", f"no errors found; {_AS_FAR_AS}{but}")
+    return ConditionState("Accepted", True, "Accepted", f"no errors found; {_AS_FAR_AS}{but}")
 
 
-def carried(detector: Detector, pods: Sequence[Mapping[str, Any]]) -> Aspect:
+def carried(detector: Detector, pods: Sequence[Mapping[str, Any]]) -> ConditionState:
     """The condition Running of a sidecar, by the pods that request it; pods that have ended do not count."""
     if not detector.spec.service_account_names:
-        return Aspect(
+        return ConditionState(
             RUNNING, False, "NoAccounts", "spec.serviceAccountNames: is empty: list the service accounts of its pods"
         )
     pods = [each for each in pods if not _is_over(each)]
@@ -127,10 +132,12 @@ def carried(detector: Detector, pods: Sequence[Mapping[str, Any]]) -> Aspect:
     of = f"of {len(pods)} pods with its label"
     running = sum(1 for each in sidecars if _runs(each))
     if troubles:
-        return Aspect(RUNNING, False, troubles[0].reason.value, f"it runs in {running} {of}: {troubles[0].text}")
+        return ConditionState(
+            RUNNING, False, troubles[0].reason.value, f"it runs in {running} {of}: {troubles[0].text}"
+        )
     missing = len(pods) - len(sidecars)
     but = f"; {missing} were created without it: their Events report why" if missing else ""
-    return Aspect(RUNNING, True, "InPods", f"it runs in {running} {of}{but}")
+    return ConditionState(RUNNING, True, "InPods", f"it runs in {running} {of}{but}")
 
 
 def _is_over(pod: Mapping[str, Any]) -> bool:
@@ -146,14 +153,14 @@ def _runs(pod: Mapping[str, Any]) -> bool:
     return any("running" in (each.get("state") or {}) for each in pod["status"]["initContainerStatuses"])
 
 
-def running(deployment: Mapping[str, Any] | None, troubles: Sequence[Trouble]) -> Aspect:
+def running(deployment: Mapping[str, Any] | None, troubles: Sequence[Trouble]) -> ConditionState:
     """The condition Running, by the Deployment as it is and what keeps its pods from running."""
     if deployment is None:
-        return Aspect(RUNNING, False, "NotReady", "its Deployment does not exist yet")
+        return ConditionState(RUNNING, False, "NotReady", "its Deployment does not exist yet")
     what = f"Deployment {deployment['metadata']['name']}"
     problem = not_ready(deployment)
     if problem is None:
-        return Aspect(RUNNING, True, "Running", f"{what} runs it")
+        return ConditionState(RUNNING, True, "Running", f"{what} runs it")
     if troubles:
-        return Aspect(RUNNING, False, troubles[0].reason.value, f"{what} {problem}: {troubles[0].text}")
-    return Aspect(RUNNING, False, "NotReady", f"{what} {problem}")
+        return ConditionState(RUNNING, False, troubles[0].reason.value, f"{what} {problem}: {troubles[0].text}")
+    return ConditionState(RUNNING, False, "NotReady", f"{what} {problem}")

@@ -10,11 +10,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from application_manager.core.claims.operations import ACCEPTED, Standing, Verdict
-from application_manager.core.conditions import STALLED, Aspect, concluded, cut, find, from_first, updated
+from application_manager.core.claims.operations import ACCEPTED, Verdict, VerdictKind
+from application_manager.core.conditions import STALLED, ConditionState, concluded, cut, find, from_first, updated
 from application_manager.core.demand import fallback
 from application_manager.core.demand.decisions import Decision
-from application_manager.core.demand.lingering import is_held, manual_aspects
+from application_manager.core.demand.lingering import is_held, manual_conditions
 from application_manager.core.findings.findings import Findings
 from application_manager.core.objects.suspension import autoscalers, pods_left
 from wayside.api import ApplicationInstance, ApplicationTask
@@ -35,7 +35,7 @@ TEMPLATE_INVALID = "TemplateInvalid"
 
 
 @dataclass(frozen=True, slots=True)
-class Service:
+class InstanceProgress:
     """What an instance has given to its tasks until now.
 
     Attributes:
@@ -56,9 +56,9 @@ class Service:
     stopped: bool = False
 
 
-def together(services: Sequence[Service]) -> Service:
+def together(services: Sequence[InstanceProgress]) -> InstanceProgress:
     """What several instances, at least one, have given to a task that means them all."""
-    return Service(
+    return InstanceProgress(
         instance=", ".join(sorted(each.instance for each in services)),
         applied=all(each.applied for each in services),
         ready=all(each.ready for each in services),
@@ -69,43 +69,45 @@ def together(services: Sequence[Service]) -> Service:
     )
 
 
-def task_status(task: ApplicationTask, verdict: Verdict, service: Service | None, now: float) -> ApplicationTaskStatus:
+def task_status(
+    task: ApplicationTask, verdict: Verdict, service: InstanceProgress | None, now: float
+) -> ApplicationTaskStatus:
     """The task's status as it is now; `service` is that of the verdict's instance.
 
     A finished task has no condition Applied or Ready: nothing is done for it any more.
     """
     old = task.status or ApplicationTaskStatus()
     since = format_seconds(now)
-    finished = verdict.standing is Standing.FINISHED
-    aspects: list[Aspect] = []
+    finished = verdict.kind is VerdictKind.FINISHED
+    states: list[ConditionState] = []
     if not finished:
-        accepted = verdict.standing in (Standing.COUNTS, Standing.WAITING)
-        aspects.append(Aspect("Accepted", accepted, verdict.reason, verdict.message))
+        accepted = verdict.kind in (VerdictKind.COUNTS, VerdictKind.WAITING)
+        states.append(ConditionState("Accepted", accepted, verdict.reason, verdict.message))
         if find(old.conditions, "Finished") is not None:
-            aspects.append(Aspect("Finished", False, "HolderReturned", "the holder is back"))
+            states.append(ConditionState("Finished", False, "HolderReturned", "the holder is back"))
     else:
-        aspects.append(Aspect("Finished", True, verdict.reason, verdict.message))
+        states.append(ConditionState("Finished", True, verdict.reason, verdict.message))
     suspends = task.spec.operation is Operation.SUSPEND
     applied_time, ready_time = old.applied_time, old.ready_time
-    if verdict.standing is Standing.COUNTS:
+    if verdict.kind is VerdictKind.COUNTS:
         if service is not None:
             done = service.stopped if suspends else service.ready
             word = "suspended" if suspends else "ready"
-            aspects += [
+            states += [
                 _served("Applied", service.applied, "Applied", "NotApplied", service),
                 _served("Ready", done, "Ready", "NotReady", service, word),
             ]
             applied_time = applied_time or (since if service.applied else None)
             ready_time = ready_time or (since if done else None)
         elif find(old.conditions, "Applied") is None:
-            aspects.append(Aspect("Ready", False, "NotReady", f"instance {verdict.instance} does not exist yet"))
+            states.append(ConditionState("Ready", False, "NotReady", f"instance {verdict.instance} does not exist yet"))
     elif not finished:
-        aspects.append(Aspect("Ready", False, verdict.reason, verdict.message))
-        if verdict.standing is Standing.REFUSED:
-            aspects.append(Aspect(STALLED, True, verdict.reason, verdict.message))
+        states.append(ConditionState("Ready", False, verdict.reason, verdict.message))
+        if verdict.kind is VerdictKind.REFUSED:
+            states.append(ConditionState(STALLED, True, verdict.reason, verdict.message))
     # A task that counts keeps what is known of its service while nothing newer is.
-    only_while = (STALLED,) if verdict.standing is Standing.COUNTS else ("Applied", "Ready", STALLED)
-    conditions = updated(old.conditions, aspects, task.metadata.generation, now, only_while=only_while)
+    only_while = (STALLED,) if verdict.kind is VerdictKind.COUNTS else ("Applied", "Ready", STALLED)
+    conditions = updated(old.conditions, states, task.metadata.generation, now, only_while=only_while)
     instance = old.instance_name or verdict.instance if finished else verdict.instance
     return ApplicationTaskStatus(
         phase=_task_phase(verdict, service, suspends),
@@ -125,24 +127,24 @@ def finished_since(task: ApplicationTask) -> float | None:
 
 
 def _served(
-    type_: str, now_holds: bool, reason: str, otherwise: str, service: Service, word: str = "applied"
-) -> Aspect:
+    type_: str, now_holds: bool, reason: str, otherwise: str, service: InstanceProgress, word: str = "applied"
+) -> ConditionState:
     if now_holds:
-        return Aspect(type_, True, reason, f"instance {service.instance} is {word}")
+        return ConditionState(type_, True, reason, f"instance {service.instance} is {word}")
     if service.applied and service.reason and word != "suspended":
         otherwise = service.reason
-    return Aspect(type_, False, otherwise, service.problem or f"instance {service.instance} is not {word} yet")
+    return ConditionState(type_, False, otherwise, service.problem or f"instance {service.instance} is not {word} yet")
 
 
-def _task_phase(verdict: Verdict, service: Service | None, suspends: bool) -> TaskPhase:
-    match verdict.standing:
-        case Standing.WAITING:
+def _task_phase(verdict: Verdict, service: InstanceProgress | None, suspends: bool) -> TaskPhase:
+    match verdict.kind:
+        case VerdictKind.WAITING:
             return TaskPhase.WAITING
-        case Standing.FINISHED:
+        case VerdictKind.FINISHED:
             return TaskPhase.FINISHED
-        case Standing.REFUSED:
+        case VerdictKind.REFUSED:
             return TaskPhase.REFUSED
-        case Standing.LAPSED:
+        case VerdictKind.LAPSED:
             return TaskPhase.LAPSED
     if service is None or not service.applied:
         return TaskPhase.PENDING
@@ -153,8 +155,8 @@ def _task_phase(verdict: Verdict, service: Service | None, suspends: bool) -> Ta
     return TaskPhase.READY if service.ready else TaskPhase.ACTIVE
 
 
-def _task_message(verdict: Verdict, service: Service | None, suspends: bool) -> str | None:
-    if verdict.standing is not Standing.COUNTS:
+def _task_message(verdict: Verdict, service: InstanceProgress | None, suspends: bool) -> str | None:
+    if verdict.kind is not VerdictKind.COUNTS:
         return _short(verdict.message)
     notes = [] if verdict.reason == ACCEPTED else [verdict.message]
     if service is None:
@@ -169,12 +171,12 @@ def _task_message(verdict: Verdict, service: Service | None, suspends: bool) -> 
 def instance_status(
     instance: ApplicationInstance,
     decision: Decision,
-    applied: Aspect,
-    ready: Aspect,
+    applied: ConditionState,
+    ready: ConditionState,
     objects: Iterable[ObjectReference],
     spec_hash: str | None,
     now: float,
-    suspended: Aspect | None = None,
+    suspended: ConditionState | None = None,
 ) -> ApplicationInstanceStatus:
     """The instance's status.
 
@@ -193,14 +195,14 @@ def instance_status(
         phase = InstancePhase.READY if ready.holds else InstancePhase.APPLIED
     generation = instance.metadata.generation
     capped = ("SumBeyondBounds", "; ".join(decision.capped)) if decision.capped else None
-    aspects = (
+    states = (
         applied,
         ready,
         *_stalled(phase, applied, ready, decision),
         *([suspended] if suspended else []),
         *from_first(old.conditions, "Capped", capped, ("WithinBounds", "no merged value is capped")),
-        *fallback.aspects(old.conditions, decision.overdue, decision.fallback, decision.stands_in_for),
-        *manual_aspects(instance),
+        *fallback.fallback_conditions(old.conditions, decision.overdue, decision.fallback, decision.stands_in_for),
+        *manual_conditions(instance),
     )
     return ApplicationInstanceStatus(
         phase=phase,
@@ -211,38 +213,42 @@ def instance_status(
         objects=list(objects),
         suspended_replicas=old.suspended_replicas,
         demands=demands(decision),
-        conditions=updated(old.conditions, aspects, generation, now, only_while=(STALLED,)),
+        conditions=updated(old.conditions, states, generation, now, only_while=(STALLED,)),
     )
 
 
-def suspension_aspect(
+def suspended_condition(
     instance: ApplicationInstance, decision: Decision, objects: Iterable[Mapping[str, Any] | None]
-) -> Aspect | None:
+) -> ConditionState | None:
     """The condition Suspended of an instance with these live objects; None before it ever was suspended."""
     known = instance.status.conditions if instance.status else ()
     if not instance.spec.suspended:
         if find(known, "Suspended") is None:
             return None
-        return Aspect("Suspended", False, "NotSuspended", "no task suspends it")
+        return ConditionState("Suspended", False, "NotSuspended", "no task suspends it")
     there = [each for each in objects if each is not None]
     left = [f"{each['kind']} {each['metadata']['name']} has {n} pods" for each in there if (n := pods_left(each))]
     whose = f"task {decision.suspender} suspends it" if decision.suspender else "spec.suspended is true"
     if left:
-        return Aspect("Suspended", False, "Stopping", f"{whose}: {', '.join(left)} left")
+        return ConditionState("Suspended", False, "Stopping", f"{whose}: {', '.join(left)} left")
     resting = "".join(f"; HorizontalPodAutoscaler {each} is inactive until it resumes" for each in autoscalers(there))
-    return Aspect("Suspended", True, "Suspended", f"{whose}; its workloads are scaled to zero{resting}")
+    return ConditionState("Suspended", True, "Suspended", f"{whose}; its workloads are scaled to zero{resting}")
 
 
-def _stalled(phase: InstancePhase, applied: Aspect, ready: Aspect, decision: Decision) -> list[Aspect]:
+def _stalled(
+    phase: InstancePhase, applied: ConditionState, ready: ConditionState, decision: Decision
+) -> list[ConditionState]:
     """The condition Stalled, where more than time is needed: the objects are refused, or were not ready in time."""
     if not applied.holds and phase is InstancePhase.FAILED and applied.reason not in _PASSING:
-        return [Aspect(STALLED, True, applied.reason, applied.message)]
+        return [ConditionState(STALLED, True, applied.reason, applied.message)]
     if decision.overdue and not ready.holds and phase is not InstancePhase.SUSPENDED:
-        return [Aspect(STALLED, True, fallback.READY_TIMEOUT, ready.message)]
+        return [ConditionState(STALLED, True, fallback.READY_TIMEOUT, ready.message)]
     return []
 
 
-def _instance_message(instance: ApplicationInstance, decision: Decision, applied: Aspect, ready: Aspect) -> str | None:
+def _instance_message(
+    instance: ApplicationInstance, decision: Decision, applied: ConditionState, ready: ConditionState
+) -> str | None:
     parts = ["paused"] if decision.paused else []
     if not applied.holds:
         parts.append(applied.message)
@@ -277,10 +283,10 @@ def template_status(
 ) -> ApplicationTemplateStatus:
     """The template's status, with why it cannot be rendered, if it cannot."""
     if findings.problems:
-        accepted = Aspect("Accepted", False, TEMPLATE_INVALID, "; ".join(findings.problems))
+        accepted = ConditionState("Accepted", False, TEMPLATE_INVALID, "; ".join(findings.problems))
     else:
         but = f", but {'; '.join(map(str, findings.remarks))}" if findings.remarks else ""
-        accepted = Aspect("Accepted", True, "Accepted", f"the template can be rendered{but}")
+        accepted = ConditionState("Accepted", True, "Accepted", f"the template can be rendered{but}")
     return ApplicationTemplateStatus(
         observed_generation=generation,
         instances=instances,

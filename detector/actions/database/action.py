@@ -11,10 +11,10 @@ from pathlib import Path
 
 import bson
 
-from detector.actions.base import Action, ActionError, Setting
+from detector.actions.base import Action, ActionContext, ActionError
 from detector.actions.database import scenario as scenarios
 from detector.actions.database.attachments import AttachmentFolder, FolderError
-from detector.actions.database.documents import Documents, Made, bson_bytes
+from detector.actions.database.documents import ConvertedDocument, Documents, bson_bytes
 from detector.actions.database.queue import BATCH_BYTES, BATCH_DOCUMENTS, Write
 from detector.actions.database.scenario import Scenario
 from detector.actions.database.writer import DatabaseWriter, acquire, release
@@ -39,7 +39,7 @@ class _Batch:
 
 
 @dataclass(slots=True)
-class Writing:
+class ScenarioProgress:
     """An episode's current scenario, and the totals of the previous ones."""
 
     episode: Episode
@@ -93,12 +93,12 @@ class Database(Action[DatabaseAction]):
 
     Parameters = DatabaseAction
 
-    def __init__(self, parameters: DatabaseAction, setting: Setting) -> None:
-        super().__init__(parameters, setting)
+    def __init__(self, parameters: DatabaseAction, context: ActionContext) -> None:
+        super().__init__(parameters, context)
         self._place: Place | None = None
         self._writer: DatabaseWriter | None = None
         self._folder: AttachmentFolder | None = None
-        self._writings: dict[str, Writing] = {}
+        self._writings: dict[str, ScenarioProgress] = {}
         self._batches: dict[str, _Batch] = {}
         self._due = 0.0
         self._awake = False
@@ -113,16 +113,18 @@ class Database(Action[DatabaseAction]):
         scenario, documents = self._open(episode, part, resumed=episode.resumed)
         if why := episode.unrendered.get("metadata"):
             scenario.lost[f"metadata: {why}"] += 1
-        streams = self.setting.surroundings().detector.spec.streams
+        streams = self.context.configuration().detector.spec.streams
         latched = frozenset(stream.name for stream in streams if stream.latched)
-        self._writings[episode.id] = Writing(episode, scenario, documents, latched, renew.ns if renew else None)
+        self._writings[episode.id] = ScenarioProgress(
+            episode, scenario, documents, latched, renew.ns if renew else None
+        )
         self._report(episode, OutcomeState.RUNNING)
 
     def _open(self, episode: Episode, part: str, *, resumed: bool) -> tuple[Scenario, Documents]:
-        rule, database = self.setting.rule, self.parameters.database
-        name = scenarios.scenario_id(episode, self.setting.action, part)
-        scenario = Scenario(name, self.setting.holder, self.setting.action, database, rule, resumed)
-        around = self.setting.surroundings()
+        rule, database = self.context.rule, self.parameters.database
+        name = scenarios.scenario_id(episode, self.context.action, part)
+        scenario = Scenario(name, self.context.holder, self.context.action, database, rule, resumed)
+        around = self.context.configuration()
         above = None
         if around.detector.spec.database is not None and around.detector.spec.database.files is not None:
             above = (self.parameters.files or Attachments()).above.bytes
@@ -142,7 +144,7 @@ class Database(Action[DatabaseAction]):
             if samples:
                 self._renew(writing, min(sample.time for sample in samples))
 
-    def _take(self, writing: Writing, samples: Iterable[EpisodeSample]) -> None:
+    def _take(self, writing: ScenarioProgress, samples: Iterable[EpisodeSample]) -> None:
         for sample in samples:
             made = writing.documents.make(sample)
             writing.scenario.saw(sample.client, sample.stream, sample.time)
@@ -151,13 +153,13 @@ class Database(Action[DatabaseAction]):
                 self._lose(writing.scenario, 1, f"too large: {made.cut}")
             self._add(writing.scenario, made)
 
-    def _renew(self, writing: Writing, begin: int) -> None:
+    def _renew(self, writing: ScenarioProgress, begin: int) -> None:
         """Complete the scenario; the episode continues in the next one."""
         self._finish(writing, Completion(), continues=True)
         writing.go_on(*self._open(writing.episode, str(begin), resumed=False))
         self._take(writing, list(writing.latest.values()))
 
-    def _add(self, scenario: Scenario, made: Made) -> None:
+    def _add(self, scenario: Scenario, made: ConvertedDocument) -> None:
         document = made.document if not made.files else self._with_files(scenario, made)
         scenario.messages[made.collection] += 1
         scenario.bytes += len(document)
@@ -175,7 +177,7 @@ class Database(Action[DatabaseAction]):
         if len(batch.documents) >= BATCH_DOCUMENTS:
             self._flush(made.collection)
 
-    def _with_files(self, scenario: Scenario, made: Made) -> bytes:
+    def _with_files(self, scenario: Scenario, made: ConvertedDocument) -> bytes:
         """The document, after writing the files that it refers to; it names those that could not be written."""
         if self.parameters.dry_run or self._folder is None:
             scenario.files += len(made.files)
@@ -201,10 +203,10 @@ class Database(Action[DatabaseAction]):
             return
 
         def losing(count: int, why: str) -> None:
-            self.setting.lose("database documents", count, why)
+            self.context.lose("database documents", count, why)
 
         write = Write(self.parameters.database, collection, batch.documents, losing=losing)
-        if self._writer.put(write, self.setting.closing):
+        if self._writer.put(write, self.context.closing):
             return
         open_ones = {each.scenario.id: each.scenario for each in self._writings.values()}
         why = "the queue is full" if not self._writer.away else "the queue is full while the database is unavailable"
@@ -221,7 +223,7 @@ class Database(Action[DatabaseAction]):
         self._finish(writing, completion, continues=False)
         del self._writings[episode.id]
 
-    def _finish(self, writing: Writing, completion: Completion, *, continues: bool) -> None:
+    def _finish(self, writing: ScenarioProgress, completion: Completion, *, continues: bool) -> None:
         for collection in list(self._batches):
             self._flush(collection)
         scenario, episode = writing.scenario, writing.episode
@@ -237,7 +239,7 @@ class Database(Action[DatabaseAction]):
         if self._writer is None:
             confirm(not incomplete, incomplete)
             return
-        detector = self.setting.surroundings().detector
+        detector = self.context.configuration().detector
         for write in scenarios.finish(scenario, episode, completion, detector, incomplete):
             self._writer.put_change(write, confirm if write.completes else None)
 
@@ -248,7 +250,7 @@ class Database(Action[DatabaseAction]):
             try:
                 self._connect()
             except ActionError as error:
-                _log.error("action %s of EventRule %s: %s", self.setting.action, self.setting.rule.name, error)
+                _log.error("action %s of EventRule %s: %s", self.context.action, self.context.rule.name, error)
         self._report_availability()
         if not self._batches:
             return None
@@ -277,10 +279,10 @@ class Database(Action[DatabaseAction]):
 
     def _connect(self) -> None:
         """Connect to the Detector's current database. Raises ActionError."""
-        place = self.setting.surroundings().detector.spec.database
+        place = self.context.configuration().detector.spec.database
         if self.parameters.dry_run or place is None or place == self._place:
             return
-        writer = acquire(place, self.setting.lose)
+        writer = acquire(place, self.context.lose)
         if self._place is not None:
             release(self._place)
         self._place, self._writer = place, writer
@@ -289,21 +291,21 @@ class Database(Action[DatabaseAction]):
             self._folder = AttachmentFolder(
                 Path(place.files.path), place.files.bytes.bytes if place.files.bytes else None
             )
-        rule = self.setting.rule.name
-        behind = (self.parameters.database, self.setting.holder, rule, self.setting.action)
+        rule = self.context.rule.name
+        behind = (self.parameters.database, self.context.holder, rule, self.context.action)
         if writer.first_time(behind):
             writer.put_change(scenarios.leave_behind(*behind))
 
     def _lose(self, scenario: Scenario, count: int, why: str) -> None:
         scenario.lost[why] += count
-        self.setting.lose("database documents", count, why)
+        self.context.lose("database documents", count, why)
 
     def _report(
         self,
         episode: Episode,
         state: OutcomeState,
         message: str = "",
-        writing: Writing | None = None,
+        writing: ScenarioProgress | None = None,
         completion: Completion | None = None,
     ) -> None:
         writing = writing or self._writings[episode.id]
@@ -325,4 +327,4 @@ class Database(Action[DatabaseAction]):
         lost = writing.lost + sum(scenario.lost.values()) + (0 if completion is None else completion.missing)
         where = (str(self._folder.path / scenario.database / episode.rule),) if files and self._folder else ()
         size = writing.bytes + scenario.bytes
-        self.setting.report(episode, Outcome(state, message, sum(messages.values()), size, lost, where, details))
+        self.context.report(episode, Outcome(state, message, sum(messages.values()), size, lost, where, details))

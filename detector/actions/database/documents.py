@@ -94,7 +94,7 @@ _RECENT = 256
 
 
 @dataclass(frozen=True, slots=True)
-class Made:
+class ConvertedDocument:
     """The result of converting a sample."""
 
     collection: str
@@ -127,7 +127,7 @@ class Documents:
     _recent: dict[tuple[str, str], dict[int, Counter[bytes]]] = field(default_factory=dict)
     """By client and stream, the number of equal samples at recent times."""
 
-    def make(self, sample: EpisodeSample) -> Made:
+    def make(self, sample: EpisodeSample) -> ConvertedDocument:
         """The sample's document."""
         stream = self.streams[sample.stream]
         decoder = self.decoders[sample.stream]
@@ -173,13 +173,13 @@ class Documents:
         files: tuple[Attachment, ...],
         *,
         undecoded: bool,
-    ) -> Made:
+    ) -> ConvertedDocument:
         """The document; if it is too large, one that refers to the payload or lists the omitted fields."""
         collection = collection_of(stream)
         try:
             made = bson_bytes(document)
             if len(made) <= LARGEST:
-                return Made(collection, made, files, undecoded=undecoded)
+                return ConvertedDocument(collection, made, files, undecoded=undecoded)
             reason = f"the document would have {len(made)} bytes; MongoDB accepts at most {LARGEST}"
         except UnfitError as error:
             reason = str(error)
@@ -188,9 +188,9 @@ class Documents:
         if self.above is not None:
             whole = Attachment(f"{self._path(sample, identity)}.{stream.encoding}", sample.payload)
             document |= {"payload": whole.reference(), "note": f"the message is in a file: {reason}"}
-            return Made(collection, bson_bytes(document), (whole,), undecoded=undecoded)
+            return ConvertedDocument(collection, bson_bytes(document), (whole,), undecoded=undecoded)
         document["cut"] = reason
-        return Made(collection, bson_bytes(document), cut=reason, undecoded=undecoded)
+        return ConvertedDocument(collection, bson_bytes(document), cut=reason, undecoded=undecoded)
 
     def _path(self, sample: EpisodeSample, identity: bytes) -> str:
         return f"{self.place}/{sample.stream}/{sample.client}/{sample.time}-{identity[8:14].hex()}"

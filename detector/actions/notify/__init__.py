@@ -13,14 +13,14 @@ from typing import ClassVar
 
 from pydantic import BaseModel
 
-from detector.actions.base import Action, Setting
+from detector.actions.base import Action, ActionContext
 from detector.actions.episode import Completion, Episode
 from detector.actions.notify.alerts import AlertBatch, AlertQueue, AlertTarget
 from detector.actions.notify.events import EventQueue
-from detector.actions.notify.keeping import Keeping
 from detector.actions.notify.notice import texts
 from detector.actions.notify.outbox import OutboxMessage
 from detector.actions.notify.sender import Sender
+from detector.actions.notify.storage import NotifyStore
 from detector.actions.notify.targets import HttpTarget, Target, ZenohTarget
 from wayside.api.actions import notify as api
 
@@ -32,19 +32,19 @@ class Notify(Action[api.NotifyAction]):
 
     Parameters: ClassVar[type[BaseModel]] = api.NotifyAction
 
-    def __init__(self, parameters: api.NotifyAction, setting: Setting) -> None:
-        super().__init__(parameters, setting)
-        self._keeping = Keeping(setting)
-        name = f"notify {setting.rule.name} {setting.action}"
-        field = f"EventRule {setting.rule.name}, action {setting.action}: notify"
+    def __init__(self, parameters: api.NotifyAction, context: ActionContext) -> None:
+        super().__init__(parameters, context)
+        self._keeping = NotifyStore(context)
+        name = f"notify {context.rule.name} {context.action}"
+        field = f"EventRule {context.rule.name}, action {context.action}: notify"
         self._queue: EventQueue | AlertQueue
         self._sender: Sender[OutboxMessage] | Sender[AlertBatch]
         if parameters.alertmanager is None:
-            target = _target(parameters, setting, field)
-            self._queue = events = EventQueue(parameters, setting, self._keeping)
+            target = _target(parameters, context, field)
+            self._queue = events = EventQueue(parameters, context, self._keeping)
             self._sender = Sender(name, events, lambda message, give_up: target.send(message.event, give_up))
         else:
-            self._queue = alerts = AlertQueue(parameters, parameters.alertmanager, setting, self._keeping)
+            self._queue = alerts = AlertQueue(parameters, parameters.alertmanager, context, self._keeping)
             self._sender = Sender(name, alerts, AlertTarget(parameters.alertmanager, field).send)
 
     def started(self, episode: Episode) -> None:
@@ -70,15 +70,15 @@ class Notify(Action[api.NotifyAction]):
 
     def close(self) -> None:
         """Make a last attempt for the queued notifications, for a few seconds."""
-        keep = self.setting.closing.is_set()  # otherwise the rule no longer has this action
+        keep = self.context.closing.is_set()  # otherwise the rule no longer has this action
         self._sender.finish()
         self._queue.drain(keep)
         self._keeping.close(keep)
 
 
-def _target(parameters: api.NotifyAction, setting: Setting, field: str) -> Target:
+def _target(parameters: api.NotifyAction, context: ActionContext, field: str) -> Target:
     if parameters.http is not None:
         return HttpTarget(parameters.http, f"{field}.http")
     if parameters.zenoh is not None:
-        return ZenohTarget(parameters.zenoh, setting.messenger)
+        return ZenohTarget(parameters.zenoh, context.messenger)
     raise ValueError("the model requires a target")

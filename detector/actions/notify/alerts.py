@@ -13,12 +13,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from detector.actions.base import Setting
+from detector.actions.base import ActionContext
 from detector.actions.episode import Episode, Outcome, OutcomeState
 from detector.actions.notify.events import FULL, UNDELIVERED, remarked
-from detector.actions.notify.keeping import Keeping
 from detector.actions.notify.notice import Notice, NoticeTexts
-from detector.actions.notify.outbox import FIRST, LONGEST, LONGEST_RETRY_AFTER, Delivery, Fate
+from detector.actions.notify.outbox import FIRST, LONGEST, LONGEST_RETRY_AFTER, AttemptResult, Delivery
+from detector.actions.notify.storage import NotifyStore
 from detector.actions.notify.targets import Poster
 from wayside.api.actions.notify import NotifyAction, NotifyAlertmanager
 from wayside.process.backoff import Backoff
@@ -125,7 +125,7 @@ class Alerts:
 
         Firing alerts stay: after a refusal they are sent again when they are next due.
         """
-        if delivery.fate is Fate.AGAIN:
+        if delivery.fate is AttemptResult.AGAIN:
             self._paused_until = now + max(min(delivery.retry_after, LONGEST_RETRY_AFTER), self._pause.fail())
         else:
             self._pause.succeed()
@@ -134,13 +134,13 @@ class Alerts:
         for alert in sent.alerts:
             alert.attempts += 1
             if alert.episode in sent.over:
-                if delivery.fate is Fate.DELIVERED:
+                if delivery.fate is AttemptResult.DELIVERED:
                     ended.append(alert)
-                elif delivery.fate is Fate.REFUSED or now - alert.since >= self._give_up_after:
+                elif delivery.fate is AttemptResult.REFUSED or now - alert.since >= self._give_up_after:
                     given_up.append(alert)
                 continue
-            alert.delivered |= delivery.fate is Fate.DELIVERED
-            if alert.ends_at is None and delivery.fate is not Fate.AGAIN:
+            alert.delivered |= delivery.fate is AttemptResult.DELIVERED
+            if alert.ends_at is None and delivery.fate is not AttemptResult.AGAIN:
                 alert.due = now + self._repeat
         for alert in (*ended, *given_up):
             self._alerts.pop(alert.episode, None)
@@ -160,10 +160,10 @@ class AlertQueue:
     """Firing and resolved alerts. Guarded by the lock of the sender."""
 
     def __init__(
-        self, notify: NotifyAction, alertmanager: NotifyAlertmanager, setting: Setting, keeping: Keeping
+        self, notify: NotifyAction, alertmanager: NotifyAlertmanager, context: ActionContext, keeping: NotifyStore
     ) -> None:
         self._alerts = Alerts(alertmanager.repeat.seconds, notify.give_up_after.seconds, notify.waiting)
-        self._setting = setting
+        self._setting = context
         self._keeping = keeping
         self._episodes: dict[str, tuple[Episode, NoticeTexts]] = {}
 
@@ -204,7 +204,7 @@ class AlertQueue:
     def settle(self, sent: AlertBatch, delivery: Delivery, now: float) -> None:
         """Apply the result of a request."""
         ended, given_up = self._alerts.settle(sent, delivery, now)
-        if delivery.fate is Fate.REFUSED:
+        if delivery.fate is AttemptResult.REFUSED:
             self._setting.lose("alerts rejected by the Alertmanager", len(sent.alerts), delivery.why)
         for alert in given_up:
             self._lose(alert, delivery.why)
@@ -213,7 +213,7 @@ class AlertQueue:
         done = {alert.episode for alert in (*ended, *given_up)}
         for alert in sent.alerts:
             if alert.episode not in done and alert.episode in self._episodes:
-                text = "fires" if delivery.fate is Fate.DELIVERED else f"not delivered yet: {delivery.why}"
+                text = "fires" if delivery.fate is AttemptResult.DELIVERED else f"not delivered yet: {delivery.why}"
                 self._report(alert, OutcomeState.RUNNING, text)
 
     def drain(self, keep: bool) -> None:

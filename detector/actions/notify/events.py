@@ -7,13 +7,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from detector.actions.base import Setting
+from detector.actions.base import ActionContext
 from detector.actions.episode import Episode, Outcome, OutcomeState
-from detector.actions.notify.keeping import Keeping
 from detector.actions.notify.notice import Notice, NoticeTexts, event_of, event_of_group
-from detector.actions.notify.outbox import Delivery, Fate, Outbox, OutboxMessage, RateLimit
+from detector.actions.notify.outbox import AttemptResult, Delivery, Outbox, OutboxMessage, RateLimit
+from detector.actions.notify.storage import NotifyStore
 from detector.actions.notify.targets import event_json
-from wayside.api.actions.notify import Moment, NotifyAction
+from wayside.api.actions.notify import NotifiedEvent, NotifyAction
 
 
 @dataclass(slots=True)
@@ -117,17 +117,17 @@ FULL = "the queue is full (waiting)"
 class EventQueue:
     """The events of one action, up to their delivery. Guarded by the lock of the sender."""
 
-    def __init__(self, notify: NotifyAction, setting: Setting, keeping: Keeping) -> None:
+    def __init__(self, notify: NotifyAction, context: ActionContext, keeping: NotifyStore) -> None:
         rate, grouping = notify.rate, notify.grouping
         budget = None if rate is None else RateLimit(rate.messages, rate.per.seconds)
         self._outbox = Outbox(notify.waiting, notify.give_up_after.seconds, budget)
         self._grouping = grouping
         self._groups = None if grouping is None else Groups(grouping.by, grouping.wait.seconds)
-        self._action = setting.action
+        self._action = context.action
         self._moments = notify.moments
         self._keeping = keeping
         self._hurrying = False
-        self.ledger = DeliveryLedger(setting.report)
+        self.ledger = DeliveryLedger(context.report)
         for notice in keeping.waiting():
             self._admit(notice, time.monotonic())
 
@@ -135,18 +135,18 @@ class EventQueue:
         """Register the episode, and enqueue its start."""
         self.ledger.open(episode)
         if not episode.resumed:
-            self._add(Moment.STARTED, episode, episode.started, rendered)
+            self._add(NotifiedEvent.STARTED, episode, episode.started, rendered)
 
     def over(self, episode: Episode, rendered: NoticeTexts) -> None:
         """Enqueue the end of the episode."""
         if episode.ended is not None:
-            self._add(Moment.ENDED, episode, episode.ended, rendered)
+            self._add(NotifiedEvent.ENDED, episode, episode.ended, rendered)
 
     def completed(self, episode: Episode) -> None:
         """No further events of the episode follow."""
         self.ledger.close(episode.id)
 
-    def _add(self, moment: Moment, episode: Episode, event: Mapping[str, Any], rendered: NoticeTexts) -> None:
+    def _add(self, moment: NotifiedEvent, episode: Episode, event: Mapping[str, Any], rendered: NoticeTexts) -> None:
         if moment in self._moments:
             notice = Notice(episode.id, event, rendered, time.time())
             self._keeping.keep(notice)
@@ -188,13 +188,13 @@ class EventQueue:
     def settle(self, sent: OutboxMessage, delivery: Delivery, now: float) -> None:
         """Apply the result of an attempt."""
         fate = self._outbox.settle(sent, delivery, now, time.time())
-        if fate is Fate.DELIVERED:
+        if fate is AttemptResult.DELIVERED:
             size = len(event_json(sent.event))
             for notice in sent.notices:
                 self.ledger.delivered(notice.episode, size)
             self._keeping.delivered(sent.notices)
-        elif fate is Fate.REFUSED:
-            attempts = f"after {sent.attempts} attempts, " if delivery.fate is Fate.AGAIN else ""
+        elif fate is AttemptResult.REFUSED:
+            attempts = f"after {sent.attempts} attempts, " if delivery.fate is AttemptResult.AGAIN else ""
             self._lose(sent, f"{attempts}{delivery.why}")
         else:
             for episode in sent.episodes:

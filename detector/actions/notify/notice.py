@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from wayside.api.actions.notify import Moment
+from wayside.api.actions.notify import NotifiedEvent
 
 GROUP_TYPE = "dev.wayside.event.group"
 """The type of a CloudEvent that combines several events."""
@@ -63,9 +63,9 @@ class Notice:
         return str(self.event["id"])
 
     @property
-    def moment(self) -> Moment:
+    def moment(self) -> NotifiedEvent:
         """Whether an episode started or ended."""
-        return Moment.STARTED if str(self.event["type"]).endswith(".started") else Moment.ENDED
+        return NotifiedEvent.STARTED if str(self.event["type"]).endswith(".started") else NotifiedEvent.ENDED
 
     def to_json(self) -> dict[str, Any]:
         """As a JSON object for the journal."""
@@ -112,7 +112,7 @@ def event_of_group(notices: Sequence[Notice], action: str, by: Sequence[str], ma
     notification = NoticeTexts(
         first.texts.title, f"{text} (and {more} more)" if text and more else text, labels
     ).to_json()
-    starts = sum(notice.moment is Moment.STARTED for notice in notices)
+    starts = sum(notice.moment is NotifiedEvent.STARTED for notice in notices)
     return {
         "specversion": "1.0",
         "id": f"group.{hashlib.sha256(ids.encode()).hexdigest()[:32]}",

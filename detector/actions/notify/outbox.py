@@ -21,7 +21,7 @@ LONGEST_RETRY_AFTER = 3600.0
 """Maximum seconds of a Retry-After that are respected."""
 
 
-class Fate(Enum):
+class AttemptResult(Enum):
     """The result of an attempt for the message."""
 
     DELIVERED = "delivered"
@@ -34,7 +34,7 @@ class Fate(Enum):
 class Delivery:
     """The result of an attempt."""
 
-    fate: Fate
+    fate: AttemptResult
     why: str = ""
     retry_after: float = 0.0
     """Minimum seconds until the next attempt, as the endpoint requests."""
@@ -144,19 +144,19 @@ class Outbox:
         wait = max(0.0, due - now, self._paused_until - now)
         return wait if self._budget is None else max(wait, self._budget.wait(now))
 
-    def settle(self, message: OutboxMessage, delivery: Delivery, now: float, wall: float) -> Fate:
+    def settle(self, message: OutboxMessage, delivery: Delivery, now: float, wall: float) -> AttemptResult:
         """Apply the result for the message from `take`: DELIVERED or REFUSED remove it; AGAIN queues it again."""
         if not delivery.whole:
             self._pause.succeed()
         fate = delivery.fate
-        if fate is Fate.AGAIN:
+        if fate is AttemptResult.AGAIN:
             wait = min(delivery.retry_after, LONGEST_RETRY_AFTER)
             message.due = now + max(wait, message.backoff.fail())
             if delivery.whole:
                 self._paused_until = now + max(wait, self._pause.fail())
             if wall - message.created >= self._give_up_after:
-                fate = Fate.REFUSED
-        if fate is not Fate.AGAIN:
+                fate = AttemptResult.REFUSED
+        if fate is not AttemptResult.AGAIN:
             self._waiting.remove(message)
         return fate
 

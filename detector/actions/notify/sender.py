@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Generic, Protocol, TypeVar
 
-from detector.actions.notify.outbox import Delivery, Fate
+from detector.actions.notify.outbox import AttemptResult, Delivery
 
 _log = logging.getLogger(__name__)
 
@@ -75,7 +75,7 @@ class Sender(Generic[T]):
                 delivery = self._send(parcel, self._over)
             except Exception as error:  # noqa: BLE001  a message that cannot be sent must not end the thread
                 _log.error("cannot send a notification", exc_info=error)
-                delivery = Delivery(Fate.AGAIN, f"{type(error).__name__}: {error}")
+                delivery = Delivery(AttemptResult.AGAIN, f"{type(error).__name__}: {error}")
             with self._changed:
                 self._queue.settle(parcel, delivery, time.monotonic())
 

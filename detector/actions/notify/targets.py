@@ -15,7 +15,7 @@ from detector.access.mounted import AccessError, secret_text
 from detector.actions.base import Messenger
 from detector.actions.http import Disposition, HttpClient, HttpError, judge
 from detector.actions.http.answer import retry_after_seconds
-from detector.actions.notify.outbox import Delivery, Fate
+from detector.actions.notify.outbox import AttemptResult, Delivery
 from wayside.api.actions.http import HttpAccess
 from wayside.api.actions.notify import ContentMode, NotifyHttp, NotifyZenoh
 
@@ -67,14 +67,17 @@ class Poster:
         try:
             answer = self._client.send("POST", url, headers, body, give_up=give_up)
         except HttpError as error:
-            return Delivery(Fate.AGAIN, str(error), whole=True)
+            return Delivery(AttemptResult.AGAIN, str(error), whole=True)
         verdict, why = judge(answer)
         if verdict is Disposition.DONE:
-            return Delivery(Fate.DELIVERED, why)
+            return Delivery(AttemptResult.DELIVERED, why)
         if verdict is Disposition.FINAL:
-            return Delivery(Fate.REFUSED, why)
+            return Delivery(AttemptResult.REFUSED, why)
         return Delivery(
-            Fate.AGAIN, why, retry_after=retry_after_seconds(answer.retry_after, time.time()), whole=answer.busy
+            AttemptResult.AGAIN,
+            why,
+            retry_after=retry_after_seconds(answer.retry_after, time.time()),
+            whole=answer.busy,
         )
 
 
@@ -90,11 +93,11 @@ class HttpTarget:
         try:
             headers, body = structured(event) if self._http.mode is ContentMode.STRUCTURED else binary(event)
         except ValueError as error:
-            return Delivery(Fate.REFUSED, f"cannot send the event as JSON: {error}")
+            return Delivery(AttemptResult.REFUSED, f"cannot send the event as JSON: {error}")
         try:
             url = self._url()
         except AccessError as error:
-            return Delivery(Fate.AGAIN, str(error), whole=True)
+            return Delivery(AttemptResult.AGAIN, str(error), whole=True)
         return self._poster.post(url, headers, body, give_up)
 
     def _url(self) -> str:
@@ -119,5 +122,5 @@ class ZenohTarget:
         try:
             self._messenger.publish(self._key, event_json(event), STRUCTURED)
         except ValueError as error:
-            return Delivery(Fate.REFUSED, f"cannot send the event as JSON: {error}")
-        return Delivery(Fate.DELIVERED)
+            return Delivery(AttemptResult.REFUSED, f"cannot send the event as JSON: {error}")
+        return Delivery(AttemptResult.DELIVERED)

@@ -13,10 +13,10 @@ from typing import ClassVar
 
 from pydantic import BaseModel
 
-from detector.actions.base import Action, ActionError, Setting, Surroundings
+from detector.actions.base import Action, ActionContext, ActionError, DetectorConfiguration
 from detector.actions.episode import Completion, Episode, EpisodeSample, Outcome, OutcomeState
 from detector.actions.record.description import Description
-from detector.actions.record.destination import Destination, Kept, NoRoomError, destination
+from detector.actions.record.destination import Destination, FinishedRecording, NoRoomError, destination
 from detector.actions.record.folder import RecordingFolder
 from detector.actions.record.recording import Recording, reason
 from detector.actions.record.recovery import REASON, recover
@@ -45,27 +45,27 @@ class Record(Action[api.RecordAction]):
 
     Parameters: ClassVar[type[BaseModel]] = api.RecordAction
 
-    def __init__(self, parameters: api.RecordAction, setting: Setting) -> None:
-        super().__init__(parameters, setting)
+    def __init__(self, parameters: api.RecordAction, context: ActionContext) -> None:
+        super().__init__(parameters, context)
         self._open: dict[str, _Open] = {}
         self._flushed = self._expired = -math.inf
 
     def started(self, episode: Episode) -> None:
         """Begins a recording. Raises ActionError if there is no room, unless another attempt follows later."""
-        surroundings = self.setting.surroundings()
+        configuration = self.context.configuration()
         renew = self.parameters.renew_after
         start = None if episode.resumed else episode.onset_time - self.parameters.before.ns
         try:
             series = RecordedSeries(
                 self._begin,
-                self._description(episode, surroundings),
+                self._description(episode, configuration),
                 start=start,
                 renew_after=None if renew is None else renew.ns,
             )
         except (NoRoomError, OSError) as error:
             raise ActionError(f"cannot start the recording: {reason(error)}") from error
         self._open[episode.id] = _Open(series, episode, time.monotonic())
-        self.setting.report(episode, Outcome(OutcomeState.RUNNING, series.problem))
+        self.context.report(episode, Outcome(OutcomeState.RUNNING, series.problem))
 
     def samples(self, episode: Episode, samples: Sequence[EpisodeSample]) -> None:
         """Adds them to the recording. An error ends the recording, which is kept as cut."""
@@ -73,7 +73,7 @@ class Record(Action[api.RecordAction]):
         if current is None:  # its recording ended early, which was reported
             self._lose(len(samples))
             return
-        current.series.take(samples, self.setting.surroundings())
+        current.series.take(samples, self.context.configuration())
         self._settle(current)
 
     def ended(self, episode: Episode) -> None:
@@ -121,7 +121,7 @@ class Record(Action[api.RecordAction]):
         self._settle(current)
         if now - current.reported >= _REPORT_SECONDS and not current.series.over:
             current.reported = now
-            self.setting.report(current.episode, current.series.outcome(OutcomeState.RUNNING))
+            self.context.report(current.episode, current.series.outcome(OutcomeState.RUNNING))
 
     def _settle(self, current: _Open, *, over: bool = False) -> None:
         """Reports the outcome of a finished recording: done if it is complete, otherwise failed."""
@@ -133,24 +133,24 @@ class Record(Action[api.RecordAction]):
         del self._open[episode.id]
         if series.problem:
             log.error("rule %s, episode %s: the recording is cut: %s", episode.rule, episode.id, series.problem)
-        self.setting.report(episode, series.outcome(OutcomeState.FAILED if series.problem else OutcomeState.DONE))
+        self.context.report(episode, series.outcome(OutcomeState.FAILED if series.problem else OutcomeState.DONE))
 
     def _lose(self, samples: int) -> None:
         if samples:
-            self.setting.lose("samples to record", samples, "the recording ended early")
+            self.context.lose("samples to record", samples, "the recording ended early")
 
     def _begin(self, description: Description, start: int | None) -> Recording:
         """A new recording. Raises NoRoomError, OSError."""
-        surroundings = self.setting.surroundings()
+        configuration = self.context.configuration()
         folder = RecordingFolder.create(
-            self._destination(surroundings), description.rule, description.name, self._dropped
+            self._destination(configuration), description.rule, description.name, self._dropped
         )
-        return Recording(folder, description.fields(), self.parameters, surroundings, start=start)
+        return Recording(folder, description.fields(), self.parameters, configuration, start=start)
 
     def _tidy(self) -> None:
         """Completes the recordings of earlier runs, on another thread, and deletes those that are too old."""
         try:
-            place = self._destination(self.setting.surroundings())
+            place = self._destination(self.context.configuration())
             if left := place.take_left():
                 thread = threading.Thread(
                     target=self._recover, args=(place, left), name="recordings-recovery", daemon=True
@@ -158,38 +158,38 @@ class Record(Action[api.RecordAction]):
                 thread.start()
             self._dropped(place.expire(), "older than spec.recordings.age")
         except (ActionError, OSError) as error:
-            log.error("rule %s: cannot use the folder of recordings: %s", self.setting.rule.name, error)
+            log.error("rule %s: cannot use the folder of recordings: %s", self.context.rule.name, error)
 
     def _recover(self, place: Destination, left: Sequence[Path]) -> None:
         try:
             kept = recover(place, left)
         except Exception as error:  # remains of a kill may be malformed, and must not prevent new recordings
             log.exception("cannot complete interrupted recordings")
-            self.setting.lose("times interrupted recordings could not be completed", 1, str(error))
+            self.context.lose("times interrupted recordings could not be completed", 1, str(error))
             return
         if kept:
-            self.setting.lose("recordings cut short", len(kept), REASON)
+            self.context.lose("recordings cut short", len(kept), REASON)
 
-    def _destination(self, surroundings: Surroundings) -> Destination:
-        recordings = surroundings.detector.spec.recordings
+    def _destination(self, configuration: DetectorConfiguration) -> Destination:
+        recordings = configuration.detector.spec.recordings
         if recordings is None:
-            raise ActionError(f"Detector {surroundings.detector.name} has no spec.recordings: add it")
+            raise ActionError(f"Detector {configuration.detector.name} has no spec.recordings: add it")
         return destination(recordings)
 
-    def _dropped(self, dropped: Sequence[Kept], why: str = "deleted to make room for newer ones") -> None:
+    def _dropped(self, dropped: Sequence[FinishedRecording], why: str = "deleted to make room for newer ones") -> None:
         for each in dropped:
             log.warning("%s: deleted the recording: %s", each.path, why)
         if dropped:
-            self.setting.lose("recordings", len(dropped), why)
+            self.context.lose("recordings", len(dropped), why)
 
-    def _description(self, episode: Episode, surroundings: Surroundings) -> Description:
-        setting = self.setting
+    def _description(self, episode: Episode, configuration: DetectorConfiguration) -> Description:
+        context = self.context
         return Description(
-            holder=setting.holder,
-            detector=surroundings.detector.name,
-            rule=setting.rule.name,
-            generation=setting.rule.metadata.generation,
-            action=setting.action,
+            holder=context.holder,
+            detector=configuration.detector.name,
+            rule=context.rule.name,
+            generation=context.rule.metadata.generation,
+            action=context.action,
             episode=episode,
             continued=episode.resumed,
             part=0 if self.parameters.renew_after is None else 1,

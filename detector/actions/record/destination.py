@@ -33,7 +33,7 @@ class NoRoomError(Exception):
 
 
 @dataclass(frozen=True, slots=True, order=True)
-class Kept:
+class FinishedRecording:
     """A complete recording under its final name."""
 
     ended: float
@@ -74,7 +74,7 @@ class Destination:
         with self._lock:
             return self._total
 
-    def claim(self, now: int, later: int, files: int = 0, *, forced: bool = False) -> list[Kept]:
+    def claim(self, now: int, later: int, files: int = 0, *, forced: bool = False) -> list[FinishedRecording]:
         """Reserve room for the bytes that are written now, and for those that complete the recording later.
 
         Negative numbers release room; `forced` ignores the limits. Returns the recordings that were dropped for it.
@@ -82,7 +82,7 @@ class Destination:
         """
         with self._lock:
             needed = now + later
-            dropped: list[Kept] = []
+            dropped: list[FinishedRecording] = []
             while not forced and (needed > 0 or files > 0) and (short := self._short(needed, files)):
                 if time.monotonic() - self._scanned > _SCAN_SECONDS:  # files may have been deleted manually
                     self._scan()
@@ -97,7 +97,7 @@ class Destination:
             self._ahead += later
             return dropped
 
-    def settle(self, claimed: tuple[int, int, int], kept: Kept | None) -> None:
+    def settle(self, claimed: tuple[int, int, int], kept: FinishedRecording | None) -> None:
         """A recording is no longer in progress: replace its claims by its actual size, or by nothing."""
         now, later, files = claimed
         with self._lock:
@@ -107,7 +107,7 @@ class Destination:
             if kept is not None and all(each.path != kept.path for each in self._kept):
                 self._keep([*self._kept, kept])
 
-    def expire(self) -> list[Kept]:
+    def expire(self) -> list[FinishedRecording]:
         """Drops recordings that have exceeded their maximum age, and returns them. Raises OSError."""
         with self._lock:
             age = self._limits.age
@@ -137,7 +137,7 @@ class Destination:
         stat = os.statvfs(self.path)
         return stat.f_bavail * stat.f_frsize
 
-    def _drop(self, kept: Kept) -> Kept:
+    def _drop(self, kept: FinishedRecording) -> FinishedRecording:
         """Delete a recording; during deletion its name is hidden, so it never looks complete."""
         self._keep(each for each in self._kept if each is not kept)
         hidden = hidden_path(kept.path, DROPPED)
@@ -148,7 +148,7 @@ class Destination:
         shutil.rmtree(hidden)
         return kept
 
-    def _keep(self, recordings: Iterable[Kept]) -> None:
+    def _keep(self, recordings: Iterable[FinishedRecording]) -> None:
         self._kept = sorted(recordings)
         self._kept_bytes = sum(each.bytes for each in self._kept)
         self._kept_files = sum(each.files for each in self._kept)
@@ -163,7 +163,7 @@ def hidden_path(path: Path, ending: str) -> Path:
     return path.with_name(f".{path.name}{ending}")
 
 
-def finished_recordings(path: Path) -> Iterator[Kept]:
+def finished_recordings(path: Path) -> Iterator[FinishedRecording]:
     """The complete recordings in a folder. Other files are left alone."""
     for rule in _folders(path):
         for folder in _folders(rule):
@@ -184,7 +184,7 @@ def _folders(path: Path) -> list[Path]:
         return []
 
 
-def _kept(folder: Path) -> Kept | None:
+def _kept(folder: Path) -> FinishedRecording | None:
     description = folder / DESCRIPTION
     try:
         fields = json.loads(description.read_bytes())
@@ -194,7 +194,7 @@ def _kept(folder: Path) -> Kept | None:
     except (OSError, ValueError):
         return None
     files = sum(name.endswith(".mcap") for name in stats)
-    return Kept(stats[DESCRIPTION].st_mtime, folder, sum(stat.st_size for stat in stats.values()), files)
+    return FinishedRecording(stats[DESCRIPTION].st_mtime, folder, sum(stat.st_size for stat in stats.values()), files)
 
 
 _PLACES: dict[str, Destination] = {}

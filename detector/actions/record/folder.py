@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from detector.actions.record.description import DESCRIPTION, BagFile, as_text, metadata_yaml
-from detector.actions.record.destination import PARTIAL, Destination, Kept, hidden_path
+from detector.actions.record.destination import PARTIAL, Destination, FinishedRecording, hidden_path
 from wayside.process.files import replace_file, sync_folder
 
 CUT = "_cut"
@@ -24,7 +24,7 @@ _ROOM = ".room"
 """A file that reserves disk space for completing the recording."""
 _ROOM_BYTES = 64 * 1024
 
-Dropped = Callable[[Sequence[Kept]], None]
+Dropped = Callable[[Sequence[FinishedRecording]], None]
 """Receives the recordings that were deleted to make room."""
 
 
@@ -97,7 +97,7 @@ class RecordingFolder:
             return None
         return fields if isinstance(fields, dict) else None
 
-    def publish(self, parts: Sequence[BagFile], fields: Mapping[str, Any]) -> Kept:
+    def publish(self, parts: Sequence[BagFile], fields: Mapping[str, Any]) -> FinishedRecording:
         """Renames the folder to its final name, after syncing it to disk. Raises OSError: then it is unchanged."""
         replace_file(self.path / "metadata.yaml", metadata_yaml(parts, as_text(fields)), durable=True)
         self.describe(fields)
@@ -106,7 +106,7 @@ class RecordingFolder:
         self.path.rename(final)
         sync_folder(final.parent)
         size = sum(each.stat().st_size for each in final.iterdir())
-        kept = Kept(time.time(), final, size, len(parts))
+        kept = FinishedRecording(time.time(), final, size, len(parts))
         self._settle(kept)
         return kept
 
@@ -119,7 +119,7 @@ class RecordingFolder:
         """Leave it for the next start of the detector; its room stays claimed."""
         os.close(self._lock)
 
-    def _settle(self, kept: Kept | None) -> None:
+    def _settle(self, kept: FinishedRecording | None) -> None:
         self._destination.settle(self._claimed, kept)
         os.close(self._lock)
 

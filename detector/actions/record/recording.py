@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from detector.actions.base import Surroundings
+from detector.actions.base import DetectorConfiguration
 from detector.actions.episode import EpisodeSample
 from detector.actions.record.channels import ChannelFormat, FileChannels, Owners, Place, channel_format
 from detector.actions.record.description import (
@@ -24,7 +24,7 @@ from detector.actions.record.description import (
     ending,
     with_ending,
 )
-from detector.actions.record.destination import Kept, NoRoomError
+from detector.actions.record.destination import FinishedRecording, NoRoomError
 from detector.actions.record.folder import RecordingFolder
 from detector.actions.record.mcap_file import McapFile, SyncError, compressor
 from detector.engine.buffering.lanes import latched_topics
@@ -50,7 +50,7 @@ class Recording:
         folder: RecordingFolder,
         description: Mapping[str, Any],
         parameters: RecordAction,
-        surroundings: Surroundings,
+        configuration: DetectorConfiguration,
         *,
         start: int | None,
     ) -> None:
@@ -73,7 +73,7 @@ class Recording:
         self._closed_bytes = self._taken = self._lost = 0
         self.given = 0
         """Samples that it received, each message counted once."""
-        self.follow(surroundings)
+        self.follow(configuration)
         try:
             folder.describe(description)
             self._open()
@@ -82,24 +82,24 @@ class Recording:
             folder.remove()
             raise
 
-    def follow(self, surroundings: Surroundings) -> None:
+    def follow(self, configuration: DetectorConfiguration) -> None:
         """Use this Detector from now on: a stream whose format changed continues in another channel."""
-        spec, wanted = surroundings.detector.spec, self._parameters.streams
+        spec, wanted = configuration.detector.spec, self._parameters.streams
         streams = {s.name: s for s in spec.streams if wanted is None or s.latched or s.name in wanted}
-        self._surroundings = surroundings
-        self._stamps = Stamps(surroundings)
+        self._surroundings = configuration
+        self._stamps = Stamps(configuration)
         self._owners = Owners(streams)
-        self._topics = latched_topics(surroundings.detector, surroundings.decoders)
+        self._topics = latched_topics(configuration.detector, configuration.decoders)
         old, self._readings = self._readings, {}
         for name, stream in streams.items():
-            self._readings[name] = channel_format(stream, surroundings.types)
+            self._readings[name] = channel_format(stream, configuration.types)
         if self._file is not None:
             self._channels.keep({name for name, each in self._readings.items() if old.get(name) == each})
 
-    def take(self, samples: Sequence[EpisodeSample], surroundings: Surroundings) -> None:
+    def take(self, samples: Sequence[EpisodeSample], configuration: DetectorConfiguration) -> None:
         """Add samples. Raises NoRoomError, OSError: then it accepts no more, and `finish` keeps what was written."""
-        if surroundings.detector is not self._surroundings.detector:
-            self.follow(surroundings)
+        if configuration.detector is not self._surroundings.detector:
+            self.follow(configuration)
         mine = [sample for sample in samples if self._owners.owns(sample.stream, sample.key)]
         self.given += len(mine)
         for sample in mine:
@@ -143,7 +143,9 @@ class Recording:
         """Whether there are samples to flush."""
         return self._file is not None and self._file.waiting > 0
 
-    def finish(self, description: Mapping[str, Any], cut: str, missing: int) -> tuple[Kept | None, dict[str, Any]]:
+    def finish(
+        self, description: Mapping[str, Any], cut: str, missing: int
+    ) -> tuple[FinishedRecording | None, dict[str, Any]]:
         """Completes the recording under its final name; also returns its last description.
 
         Args:
@@ -300,9 +302,9 @@ _LATEST = 2**63 - 1
 class Stamps:
     """Reads the stamps of messages, as defined by the Detector for each stream."""
 
-    def __init__(self, surroundings: Surroundings) -> None:
-        self._surroundings = surroundings
-        self._data = surroundings.detector.spec.clock is Clock.DATA
+    def __init__(self, configuration: DetectorConfiguration) -> None:
+        self._surroundings = configuration
+        self._data = configuration.detector.spec.clock is Clock.DATA
         self._stamps: dict[str, _Stamp] = {}
 
     def publish_time(self, sample: EpisodeSample) -> int:

@@ -23,7 +23,7 @@ from mcap.reader import SeekingReader
 from mcap.records import Channel, Chunk, ChunkIndex, Header, Metadata, MetadataIndex, Schema
 
 from detector.actions.record.description import METADATA_CUT, METADATA_END, BagFile, ending, with_ending
-from detector.actions.record.destination import DROPPED, PARTIAL, Destination, Kept, hidden
+from detector.actions.record.destination import DROPPED, PARTIAL, Destination, FinishedRecording, hidden
 from detector.actions.record.folder import RecordingFolder
 from detector.actions.record.mcap_file import (
     LIBRARY,
@@ -44,7 +44,7 @@ REASON = "the detector was killed while it recorded"
 """The reason that such recordings are marked with."""
 
 
-def recover(destination: Destination, left: Iterable[Path]) -> list[Kept]:
+def recover(destination: Destination, left: Iterable[Path]) -> list[FinishedRecording]:
     """Completes the recordings in these hidden folders; one that another process has locked is in progress and left
     alone.
 
@@ -67,7 +67,7 @@ def recover(destination: Destination, left: Iterable[Path]) -> list[Kept]:
     return kept
 
 
-def _recovered(destination: Destination, path: Path) -> Kept | None:
+def _recovered(destination: Destination, path: Path) -> FinishedRecording | None:
     name = path.name.removeprefix(".").removesuffix(PARTIAL)
     folder = RecordingFolder(destination, path, name, lambda dropped: None, forced=True)
     files = sorted(path.glob("*.mcap"), key=lambda each: int(each.stem.rpartition("_")[2]))

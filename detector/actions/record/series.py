@@ -8,10 +8,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from detector.actions.base import Surroundings
+from detector.actions.base import DetectorConfiguration
 from detector.actions.episode import EpisodeSample, Outcome, OutcomeState
 from detector.actions.record.description import Description, with_ending
-from detector.actions.record.destination import Kept, NoRoomError
+from detector.actions.record.destination import FinishedRecording, NoRoomError
 from detector.actions.record.recording import Recording, reason
 
 _AGAIN = 10 * 10**9
@@ -32,7 +32,7 @@ class RecordedSeries:
         self._latched: list[EpisodeSample] = []
         self._again = 0
         self._recording: Recording | None = None
-        self._kept: Kept | None = None
+        self._kept: FinishedRecording | None = None
         self._files: list[str] = []
         self._count = self._samples = self._bytes = self._missing = 0
         self.problem = ""
@@ -56,12 +56,12 @@ class RecordedSeries:
         """Whether there are samples to flush."""
         return self._recording is not None and self._recording.waiting
 
-    def take(self, samples: Sequence[EpisodeSample], surroundings: Surroundings) -> None:
+    def take(self, samples: Sequence[EpisodeSample], configuration: DetectorConfiguration) -> None:
         """Add samples."""
         while samples:
             recording = self._recording
             if recording is None:
-                self._try_again(samples, surroundings)
+                self._try_again(samples, configuration)
                 recording = self._recording
                 if recording is None:
                     self.lost += len(samples)
@@ -69,14 +69,14 @@ class RecordedSeries:
             now, rest = self._parted(recording, samples)
             samples = rest
             try:
-                recording.take(now, surroundings)
+                recording.take(now, configuration)
             except (NoRoomError, OSError) as error:
                 self._again = max(sample.time for sample in now) + _AGAIN
                 self._end(recording, reason(error), 0)
                 continue
             if rest:
                 self._end(recording, "", 0, continues=True)
-                self._next(surroundings)
+                self._next(configuration)
 
     def flush(self) -> None:
         """Passes queued samples to the kernel."""
@@ -117,19 +117,19 @@ class RecordedSeries:
         now = [sample for sample in samples if sample.time < seam]
         return (now, ()) if len(now) == len(samples) else (now, [each for each in samples if each.time >= seam])
 
-    def _try_again(self, samples: Sequence[EpisodeSample], surroundings: Surroundings) -> None:
+    def _try_again(self, samples: Sequence[EpisodeSample], configuration: DetectorConfiguration) -> None:
         newest = max(sample.time for sample in samples)
         if self._renew_after is not None and newest >= self._again:
             self._again = newest + _AGAIN
-            self._next(surroundings)
+            self._next(configuration)
 
-    def _next(self, surroundings: Surroundings) -> None:
+    def _next(self, configuration: DetectorConfiguration) -> None:
         """Begins the next recording, with the last samples of latched streams."""
         description = self.description
         self.description = replace(description, part=description.part + 1, continued=True)
         try:
             self._recording = self._begin(self.description, None)
-            self._recording.take(self._latched, surroundings)
+            self._recording.take(self._latched, configuration)
         except (NoRoomError, OSError) as error:
             self.problem = self.problem or reason(error)
             if self._recording is not None:

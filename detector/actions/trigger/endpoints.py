@@ -26,7 +26,7 @@ from detector.actions.trigger.requests import (
     short,
     write_request,
 )
-from detector.streams.answering import status_key
+from detector.streams.query_handler import status_key
 from wayside.api.actions.trigger import HttpCall, TriggerAction
 from wayside.api.actions.window import WindowClients
 from wayside.api.base import Duration

@@ -62,7 +62,7 @@ def order_from(document: Mapping[str, Any]) -> Order:
     return Order(**document)
 
 
-class System(Protocol):
+class RecordingSystem(Protocol):
     """Another system that records. Its methods wait for the network, and raise ActionError if there is no response."""
 
     renew: float | None

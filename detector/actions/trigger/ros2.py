@@ -27,7 +27,7 @@ from detector.streams.codecs.ros import RosTypes, types_with
 from wayside.api import Detector
 from wayside.api.actions.trigger import ServiceCall, TriggerAction
 from wayside.api.stream import Layout
-from wayside.api.wording import FieldPath
+from wayside.api.validation_errors import FieldPath
 
 
 class Ros2Services:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from wayside.process.beginning import importing
 from wayside.process.commandline import refuse
+from wayside.process.startup import importing
 
 if TYPE_CHECKING:
     from detector.commands.catalog.catalog import Catalog, Read

@@ -11,13 +11,13 @@ from typing import Any
 import typer
 import zenoh
 
-from detector.assembly import DetectorError, inlets
+from detector.assembly import DetectorError, stream_readers
 from detector.commands.topics.proposal import Proposal, detector_document, proposals
 from detector.commands.topics.survey import Survey, Topic, message_paths, survey, topic_shape
 from detector.replay.gathering import Recording, intake_file_of, recordings_of
 from detector.replay.message import RecordingError
 from detector.replay.recorded_types import with_recorded_types
-from detector.streams.rmw_zenoh import MisfitError, split
+from detector.streams.rmw_zenoh import KeyMismatchError, split
 from detector.streams.session import open_session
 from wayside.api import Detector
 from wayside.api.stream import Encoding, Layout
@@ -29,7 +29,7 @@ from wayside.rules import Fields
 from wayside.times import format_time
 
 
-class NothingHeardError(InputError, ValueError):
+class NoSamplesError(InputError, ValueError):
     """No samples were received over the network."""
 
 
@@ -60,13 +60,13 @@ def list_live_topics(connect: Sequence[str], seconds: float, *, as_yaml: bool) -
 
     Raises:
         NetworkError: no endpoint can be reached.
-        NothingHeardError: nothing came.
+        NoSamplesError: nothing came.
     """
     config = Zenoh(mode=ZenohMode.CLIENT, connect=[*connect], scouting=False) if connect else Zenoh()
     found = listen(config, seconds)
     if not found.topics:
         where = ", ".join(connect) or "the local network"
-        raise NothingHeardError(
+        raise NoSamplesError(
             f"received nothing from {where} within {seconds:g} s: correct --connect, or raise --seconds"
         )
     network = config.model_dump(mode="json", by_alias=True, include={"mode", "connect"}) if connect else None
@@ -112,7 +112,7 @@ def listen(config: Zenoh, seconds: float) -> Survey:
 def _topic(key: str, encoding: str) -> Topic:
     try:
         name, kind = split(key)
-    except MisfitError:
+    except KeyMismatchError:
         recorded_as = _ENCODINGS.get(encoding)
         return Topic(key, "" if recorded_as is None else recorded_as.value, None, None)
     return Topic(name, Encoding.CDR.value, kind, None, layout=Layout.RMW_ZENOH)
@@ -169,7 +169,7 @@ def _completed(found: Sequence[Proposal], recordings: Sequence[Recording]) -> De
 def _types(found: Sequence[Proposal], recordings: Sequence[Recording]) -> dict[str, Fields]:
     """The fields of streams whose messages have a known type."""
     try:
-        return {**inlets(_completed(found, recordings)).fields}
+        return {**stream_readers(_completed(found, recordings)).fields}
     except DetectorError:
         return {}  # a type without any definition
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from detector.assembly import DetectorError, inlets
+from detector.assembly import DetectorError, stream_readers
 from detector.commands.topics.proposal import Proposal
 from detector.commands.topics.survey import MessageShape, Topic, topic_shape
 from detector.findings.checks import FIELD_NOT_RECORDED, UNMATCHED_STREAM
@@ -26,7 +26,7 @@ def topic_doubts(documents: Sequence[Document], topics: Sequence[Topic]) -> Iter
         if not isinstance(detector, Detector):
             continue
         try:
-            known = inlets(detector).fields
+            known = stream_readers(detector).fields
         except DetectorError:
             continue  # a type that the recording defines
         seen: dict[str, Fields] = {}

@@ -14,7 +14,7 @@ import msgspec
 from detector.engine.samples.sample import DecodeError
 from detector.replay.batches import Batch, Channel
 from detector.replay.gathering import Recording
-from detector.replay.message import Cut
+from detector.replay.message import Truncation
 from detector.replay.recordings import open_recordings
 from detector.streams.codecs.cbor import CborDecoder
 from wayside.api.stream import Encoding, Layout
@@ -171,13 +171,13 @@ class Survey:
 
     topics: Sequence[Topic]
     """In order of their keys."""
-    cuts: Sequence[Cut]
+    cuts: Sequence[Truncation]
 
 
 def survey(recordings: Iterable[Recording]) -> Survey:
     """Survey recordings, each a sequence of files. Raises RecordingError."""
     topics: dict[tuple[str, str, str | None], Topic] = {}
-    cuts: list[Cut] = []
+    cuts: list[Truncation] = []
     for recording in recordings:
         for topic in topics.values():
             topic.begin()

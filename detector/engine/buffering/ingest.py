@@ -16,7 +16,15 @@ from detector.engine.buffering.messages import KeyReader
 from detector.engine.buffering.naming import MAXIMUM_ITEMS, MessageClients
 from detector.engine.counters import Counters
 from detector.engine.samples.liveliness import LIVELINESS, TokenState
-from detector.engine.samples.sample import SAMPLE_OVERHEAD, Arrival, Before, Item, Linked, Sample, Stamped
+from detector.engine.samples.sample import (
+    SAMPLE_OVERHEAD,
+    Arrival,
+    Item,
+    LinkedSample,
+    PreviousSample,
+    Sample,
+    StampedSample,
+)
 from wayside.api import Detector
 
 MAXIMUM_CLIENTS = 100_000
@@ -102,9 +110,9 @@ class Ingest:
             if lane is not None:
                 self._number += 1
                 if stream in self.linked:
-                    self._put(lane, Linked(time, self._number, payload, key, self._before(lane, time)))
+                    self._put(lane, LinkedSample(time, self._number, payload, key, self._before(lane, time)))
                 else:
-                    self._put(lane, arrival if times is None else Stamped(time, self._number, payload, key))
+                    self._put(lane, arrival if times is None else StampedSample(time, self._number, payload, key))
 
     def size_of(self, arrivals: Sequence[Arrival]) -> int:
         """The maximum memory that these take in the buffer, in bytes: their items take less."""
@@ -126,7 +134,7 @@ class Ingest:
                 before = self._before(lane, time) if stream in self.linked else None
                 self._put(lane, Item(time, self._number, payload, key, place, share, before))
 
-    def _before(self, lane: Lane, time: int) -> Before | None:
+    def _before(self, lane: Lane, time: int) -> PreviousSample | None:
         """The newest sample in the buffer up to a time; None if it is stale at that time."""
         newest = lane.newest
         if newest is not None and newest.time > time:
@@ -134,7 +142,7 @@ class Ingest:
         limit = self._stale_after[lane.stream]
         if newest is None or (limit is not None and time - newest.time > limit):
             return None
-        return Before(newest.payload, newest.place if isinstance(newest, Item) else -1)
+        return PreviousSample(newest.payload, newest.place if isinstance(newest, Item) else -1)
 
     def _put(self, lane: Lane, sample: Sample) -> None:
         self._buffer.grew(lane.insert(sample))

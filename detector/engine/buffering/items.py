@@ -17,7 +17,7 @@ _MAXIMUM_BYTES = 4 * 2**20
 """Maximum size of the payloads of cached messages; the oldest are removed first."""
 
 
-class Listed(NamedTuple):
+class DecodedList(NamedTuple):
     """A decoded message, and the list in it."""
 
     message: Any
@@ -32,23 +32,23 @@ class Items:
         self._lists = {
             name: (stream.items, stream.items.path) for name, stream in streams.items() if stream.items is not None
         }
-        self._cached: dict[tuple[str, bytes], Listed] = {}
+        self._cached: dict[tuple[str, bytes], DecodedList] = {}
         self._bytes = 0
 
     def __contains__(self, stream: str) -> bool:
         """Whether the messages of the stream are lists of items."""
         return stream in self._lists
 
-    def read(self, stream: str, payload: bytes) -> Listed:
+    def read(self, stream: str, payload: bytes) -> DecodedList:
         """A message and its list. Raises DecodeError, and EvaluationError if there is no list."""
         listed = self._cached.get((stream, payload))
         if listed is None:
             message = self._decoders[stream].decode(payload)
-            listed = Listed(message, _list(*self._lists[stream], message))
+            listed = DecodedList(message, _list(*self._lists[stream], message))
             self._keep(stream, payload, listed)
         return listed
 
-    def _keep(self, stream: str, payload: bytes, listed: Listed) -> None:
+    def _keep(self, stream: str, payload: bytes, listed: DecodedList) -> None:
         self._bytes += len(payload)
         while self._bytes > _MAXIMUM_BYTES and self._cached:
             oldest = next(iter(self._cached))

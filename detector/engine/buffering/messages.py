@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 from detector.engine.buffering.items import Items
 from detector.engine.counters import Counters
-from detector.engine.samples.sample import Before, DecodeError, Decoder, Item, Linked, NearDecoder, Sample
+from detector.engine.samples.sample import DecodeError, Decoder, Item, LinkedSample, NearDecoder, PreviousSample, Sample
 from wayside.expressions import UNKNOWN, EvaluationError
 from wayside.rules import CompiledStream
 
@@ -63,7 +63,7 @@ class Messages:
             return message
         return self.items.read(stream, sample.payload).items[sample.place]
 
-    def _before(self, stream: str, before: Before | None) -> Any:
+    def _before(self, stream: str, before: PreviousSample | None) -> Any:
         """The client's previous data; UNKNOWN: there is none, or it cannot be read, which was counted before."""
         if before is None:
             return UNKNOWN
@@ -107,7 +107,7 @@ class Messages:
             values["msg"] = message
         if "item" in names:
             values["item"] = self.content(stream, sample)
-        if "before" in names and isinstance(sample, Linked | Item):
+        if "before" in names and isinstance(sample, LinkedSample | Item):
             before = self._before(stream, sample.before)
             if before is not UNKNOWN:
                 values["before"] = before

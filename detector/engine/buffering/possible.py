@@ -8,7 +8,7 @@ from wayside.api.stream import Stream
 from wayside.keys import KeyPattern
 
 
-class Possible:
+class PossibleStreams:
     """Whether a client can ever have samples of a stream, by the stream's key and `client`."""
 
     def __init__(self, streams: Iterable[Stream]) -> None:

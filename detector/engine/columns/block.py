@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from detector.engine.buffering.clients import Clients
-from detector.engine.buffering.possible import Possible
-from detector.engine.columns.past import Past
+from detector.engine.buffering.possible import PossibleStreams
+from detector.engine.columns.earlier import EarlierValues
 from detector.engine.columns.table import Integers, Truths
 from detector.engine.columns.tables import Tables
 from detector.engine.columns.verdicts import Ternary
@@ -20,7 +20,7 @@ from detector.engine.counters import RuleCounters
 from detector.engine.episodes.subjects import FLEET, Subject
 from detector.engine.scoping.positions import PositionLookup
 from detector.engine.signals.signals import Signals as OfStarts
-from detector.engine.signals.starts import Starts
+from detector.engine.signals.starts import EpisodeStarts
 from wayside.expressions import UNKNOWN
 from wayside.expressions.columns.values import Column, value_at
 from wayside.rules import CompiledElement, CompiledRule
@@ -35,9 +35,9 @@ class Context(NamedTuple):
     tables: Tables
     clients: Clients
     stale_after: Mapping[str, int | None]
-    possible: Possible
+    possible: PossibleStreams
     positions: PositionLookup
-    starts: Starts
+    starts: EpisodeStarts
     of_starts: OfStarts
     """Computes signals over other rules' episodes."""
     exact: bool
@@ -54,7 +54,7 @@ class Track:
         counters: RuleCounters,
         place: Mapping[str, str],
         row: int,
-        past: Past,
+        past: EarlierValues,
     ) -> None:
         """`place`: by condition, the text about its inputs that errors contain. `row`: the track's index in its group.
 

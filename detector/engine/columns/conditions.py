@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detector.engine.columns.block import Block, Context, Track
-from detector.engine.columns.leaves import ClientLeaves
+from detector.engine.columns.client_values import ClientValues
 from detector.engine.columns.table import Truths
 from detector.engine.columns.verdicts import Ternary
 from detector.engine.episodes.episodes import FALSE, TRUE, UNSURE
@@ -84,7 +84,7 @@ class Conditions:
         self._context = context
         self._tracks = tracks
         self._chosen = chosen
-        self._leaves = ClientLeaves(context, tracks)
+        self._leaves = ClientValues(context, tracks)
         self._graph = Graph()
         self._of: list[dict[str, ClientCondition]] = [self._conditions(track) for track in tracks]
         """By track and field."""

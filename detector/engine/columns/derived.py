@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from detector.engine.columns.block import Block, Context, Track
+from detector.engine.columns.client_values import ClientValues
+from detector.engine.columns.earlier import Evaluations
 from detector.engine.columns.formulas import Formula, Rows
-from detector.engine.columns.leaves import ClientLeaves
-from detector.engine.columns.past import Evaluations
 from detector.engine.columns.table import Integers
 from wayside.expressions import Path, Reason
 from wayside.expressions.columns.lowering import Constant
@@ -59,7 +59,7 @@ class ClientDerived:
                 if not signal.episode:
                     track.signals[signal.name] = first
                     first += 1
-        self._leaves = ClientLeaves(context, tracks)
+        self._leaves = ClientValues(context, tracks)
         self._of = [(track, DerivedColumns(track, self._leaf(track), context)) for track in tracks]
 
     def _leaf(self, track: Track) -> Callable[[Path], Hashable | Constant | None]:

@@ -10,14 +10,14 @@ import numpy as np
 from detector.engine.buffering.items import Items
 from detector.engine.samples.sample import (
     MISSING,
-    Before,
     DecodeError,
     Decoder,
     FieldDecoder,
     FieldReader,
     Fields,
     Item,
-    Linked,
+    LinkedSample,
+    PreviousSample,
     Sample,
 )
 from wayside.expressions import Path
@@ -67,7 +67,7 @@ class SampleFields:
             items = [(sample.payload, sample.place) if isinstance(sample, Item) else None for sample in samples]
             found["item"] = [column_of(values, texts) for values in self._walked(items, self._of["item"], odd)]
         if self._of["before"]:
-            before = [sample.before if isinstance(sample, Linked | Item) else None for sample in samples]
+            before = [sample.before if isinstance(sample, LinkedSample | Item) else None for sample in samples]
             odd.update(at for at, each in enumerate(before) if each is None)  # CEL defines that it is unknown
             if shared:
                 items = [None if each is None else (each.payload, each.place) for each in before]
@@ -78,7 +78,7 @@ class SampleFields:
         ready = {name: iter(columns) for name, columns in found.items()}
         return FoundFields([next(ready[str(path[0])]) for path in self._paths], errors, frozenset(odd))
 
-    def _read_before(self, before: Sequence[Before | None], odd: set[int]) -> list[list[Any]]:
+    def _read_before(self, before: Sequence[PreviousSample | None], odd: set[int]) -> list[list[Any]]:
         """The fields of the previous messages, if there are some and they can be read."""
         there = [at for at, each in enumerate(before) if each is not None]
         fields = self._before([each.payload for each in before if each is not None])

@@ -14,16 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detector.engine.columns.block import Block, Context, Track
+from detector.engine.columns.client_values import ClientValues
 from detector.engine.columns.conditions import Conditions
 from detector.engine.columns.group import present
-from detector.engine.columns.leaves import ClientLeaves
 from detector.engine.columns.reading import constant
 from detector.engine.columns.signals import SignalColumns
 from detector.engine.columns.table import Integers, Truths
 from detector.engine.columns.verdicts import Codes, Ternary, observed
 from detector.engine.episodes.subjects import FLEET, Subject
 from wayside.expressions import Expression, Path
-from wayside.expressions.columns.folds import Fold, How, folded
+from wayside.expressions.columns.folds import Fold, FoldKind, folded
 from wayside.expressions.columns.lowering import Constant, Graph
 from wayside.expressions.columns.program import Program, Results
 from wayside.expressions.columns.values import Column, Tag, stacked
@@ -44,7 +44,7 @@ class FleetCondition(NamedTuple):
     expression: Expression
     node: int | None
     """Its truth over the ticks; None: CEL evaluates it."""
-    folds: Mapping[str, tuple[How, int | None]]
+    folds: Mapping[str, tuple[FoldKind, int | None]]
     """By leaf, how it is folded, and the truth of its predicate over the points; None: all members count."""
 
 
@@ -89,7 +89,7 @@ class FleetGroup:
         self._signals = SignalColumns(context, tracks)
         if any(_reads_streams(track.rule) for track in tracks):
             self._signals.watch_all_streams()
-        self._leaves = ClientLeaves(context, tracks)
+        self._leaves = ClientValues(context, tracks)
         self._members = Conditions(context, tracks, _members)
         self._of_points, self._of_ticks = Graph(), Graph()
         self._of = [
@@ -112,7 +112,7 @@ class FleetGroup:
     def _condition(self, track: Track, field: str, expression: Expression) -> FleetCondition:
         rest, folds = folded(expression, _MEMBERS)
         of_points, of_ticks = len(self._of_points.nodes), len(self._of_ticks.nodes)
-        found: dict[str, tuple[How, int | None]] = {}
+        found: dict[str, tuple[FoldKind, int | None]] = {}
         for name, fold in folds.items():
             node = None
             if fold.predicate is not None:
@@ -193,9 +193,9 @@ class FleetGroup:
             all_true, all_false = (each[0].reshape(members.shape) for each in inner.truths([node]))
             true, unknown = members & all_true, members & ~(all_true | all_false)
         some, unsure = true.any(axis=0), unknown.any(axis=0)
-        if how is How.COUNT:
+        if how is FoldKind.COUNT:
             values, tag = true.sum(axis=0).astype(float), Tag.NUMBER
-        elif how is How.ANY:
+        elif how is FoldKind.ANY:
             values, tag, unsure = some.astype(float), Tag.BOOLEAN, unsure & ~some
         else:
             against = (members & ~true & ~unknown).any(axis=0)

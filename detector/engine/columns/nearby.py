@@ -31,7 +31,7 @@ class Nearby(NamedTuple):
     """How many pairs within reach were left out."""
 
 
-class Crowd(NamedTuple):
+class ClientPositions(NamedTuple):
     """Clients, in order of their names."""
 
     names: Sequence[str]
@@ -43,9 +43,9 @@ class Crowd(NamedTuple):
     second: Truths
 
 
-def nearby(crowd: Crowd, subject: PairSubject) -> Nearby:
+def nearby(clients: ClientPositions, subject: PairSubject) -> Nearby:
     """The pairs within reach; if they exceed the subject's maximum, the nearest ones, then by names."""
-    first, second = np.flatnonzero(crowd.first), np.flatnonzero(crowd.second)
+    first, second = np.flatnonzero(clients.first), np.flatnonzero(clients.second)
     if len(first) * len(second) <= FEW:
         i, j = np.repeat(first, len(second)), np.tile(second, len(first))
     else:
@@ -54,14 +54,14 @@ def nearby(crowd: Crowd, subject: PairSubject) -> Nearby:
 
         radius, same = reach(subject.within), np.array_equal(first, second)
         # Trees that are not balanced are built in half the time, and searched as fast where points are spread.
-        one = cKDTree(crowd.points(first), balanced_tree=False, compact_nodes=False)
-        other = one if same else cKDTree(crowd.points(second), balanced_tree=False, compact_nodes=False)
-        points = crowd.points(np.flatnonzero(crowd.first | crowd.second))
+        one = cKDTree(clients.points(first), balanced_tree=False, compact_nodes=False)
+        other = one if same else cKDTree(clients.points(second), balanced_tree=False, compact_nodes=False)
+        points = clients.points(np.flatnonzero(clients.first | clients.second))
         if _most(points, radius) > max(subject.maximum * ROOM, _MANY):
-            themselves = int((crowd.first & crowd.second).sum())
+            themselves = int((clients.first & clients.second).sum())
             found = (int(one.count_neighbors(other, radius)) - themselves) // (1 if subject.ordered else 2)
             if found > subject.maximum * ROOM:
-                return _crowded(crowd, subject, first, second)
+                return _crowded(clients, subject, first, second)
         if not subject.ordered:
             pairs = one.query_pairs(radius, output_type="ndarray")
             i, j = first[pairs[:, 0]], first[pairs[:, 1]]
@@ -71,7 +71,7 @@ def nearby(crowd: Crowd, subject: PairSubject) -> Nearby:
         else:
             matrix = one.sparse_distance_matrix(other, radius, output_type="ndarray")
             i, j = first[matrix["i"]], second[matrix["j"]]
-    distance = crowd.distances(i, j)
+    distance = clients.distances(i, j)
     near = (distance <= subject.within) & (i != j if subject.ordered else i < j)
     i, j, distance = i[near], j[near], distance[near]
     found = len(i)
@@ -95,23 +95,23 @@ def _most(points: Doubles, radius: float) -> int:
     return int(3**axes * (counts @ counts))
 
 
-def _crowded(crowd: Crowd, subject: PairSubject, first: Integers, second: Integers) -> Nearby:
+def _crowded(clients: ClientPositions, subject: PairSubject, first: Integers, second: Integers) -> Nearby:
     """Far more pairs than the subject's maximum: avoids creating them all."""
-    names = crowd.names
+    names = clients.names
     index = {names[at]: at for at in np.union1d(first, second).tolist()}
 
     def between(a: str, b: str) -> float:
-        return float(crowd.distances(np.array([index[a]]), np.array([index[b]]))[0])
+        return float(clients.distances(np.array([index[a]]), np.array([index[b]]))[0])
 
     everybody = np.array([*index.values()], np.int64)
-    points = {name: _point(*each) for name, each in zip(index, crowd.points(everybody).tolist(), strict=True)}
+    points = {name: _point(*each) for name, each in zip(index, clients.points(everybody).tolist(), strict=True)}
     roles = ([names[at] for at in first.tolist()], [names[at] for at in second.tolist()])
     found = near_pairs(
         Search(points, between, *(roles if subject.ordered else (None, None))), subject.within, subject.maximum
     )
     i = np.array([index[a] for a, _ in found.pairs], np.int64)
     j = np.array([index[b] for _, b in found.pairs], np.int64)
-    return _in_order(i, j, crowd.distances(i, j), found.left_out)
+    return _in_order(i, j, clients.distances(i, j), found.left_out)
 
 
 def _point(x: float, y: float, z: float = 0.0) -> Point:

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from detector.engine.columns.block import Block, Context, Track
+from detector.engine.columns.client_values import ClientValues
 from detector.engine.columns.derived import DerivedColumns
+from detector.engine.columns.earlier import Evaluations
 from detector.engine.columns.formulas import Formulas, Rows
-from detector.engine.columns.leaves import ClientLeaves
-from detector.engine.columns.nearby import Crowd, Nearby, nearby
-from detector.engine.columns.past import Evaluations
-from detector.engine.columns.places import Places, Whereabouts
+from detector.engine.columns.nearby import ClientPositions, Nearby, nearby
+from detector.engine.columns.places import Places, PositionColumns
 from detector.engine.columns.reading import constant
 from detector.engine.columns.signals import SignalColumns
 from detector.engine.columns.table import Integers, Truths, find_rows, sorted_rows
@@ -88,8 +88,8 @@ class PairColumns:
         self._plain = not rule.has_actions
         """Its events contain only signals, and it renders nothing."""
         self._reads_streams = bool(rule.signals) or _reads_streams(rule)
-        self._where_abouts = Whereabouts(rule.subject.position, context, track.counters, self._signals.ages)
-        self._leaves = ClientLeaves(context, [track])
+        self._where_abouts = PositionColumns(rule.subject.position, context, track.counters, self._signals.ages)
+        self._leaves = ClientValues(context, [track])
         self._derived_names = frozenset(signal.name for signal in rule.derived if not signal.episode)
         texts = context.tables.texts
         self._roles = {
@@ -194,13 +194,13 @@ class PairColumns:
 
     def _near(self, block: Block, places: Places, roles: Mapping[str, Ternary]) -> Nearby:
         possible = [places.known & ~roles[role].false if role in roles else places.known for role in _ROLES]
-        crowd = Crowd(
+        clients = ClientPositions(
             block.clients,
             lambda at: self._where_abouts.points(places, at),
             lambda one, other: self._distances(places, one, other),
             *possible,
         )
-        return nearby(crowd, self._subject)
+        return nearby(clients, self._subject)
 
     def _measure_closing(self, these: PairBlock, newest: Integers, floor: int | None) -> None:
         """By how much the distances shrank in the last second for which both clients sent places: see `Views`."""

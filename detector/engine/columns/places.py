@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from detector.engine.columns.block import Block, Context
-from detector.engine.columns.reading import Reading
+from detector.engine.columns.reading import SampleExpression
 from detector.engine.columns.table import Integers, Table, Truths, sorted_rows
 from detector.engine.columns.watching import SampleAges
 from detector.engine.counters import RuleCounters
@@ -33,13 +33,13 @@ class Places(NamedTuple):
         return tuple(self.axes[:, at].tolist())
 
 
-class Whereabouts:
+class PositionColumns:
     """Looks up a position of many clients in the table of its stream."""
 
     def __init__(self, position: CompiledPosition, context: Context, counters: RuleCounters, ages: SampleAges) -> None:
         """`ages` are those of the rule's signals, if they are measured."""
         reader = context.tables.add(position.stream)
-        uses = [reader.use(Reading(each, position.parameters, None), None) for each in position.axes.values()]
+        uses = [reader.use(SampleExpression(each, position.parameters, None), None) for each in position.axes.values()]
         self._columns = [use.value for use in uses if use.value is not None]
         self._limits = np.array([[LIMITS.get(axis, FARTHEST)] for axis in position.axes])
         self._position = position

@@ -28,7 +28,7 @@ from wayside.rules.parameters import Parameters
 _CONSTANTS = (bool, float, str)
 
 
-class Reading(NamedTuple):
+class SampleExpression(NamedTuple):
     """An expression over one sample, as written in a rule."""
 
     expression: Expression
@@ -46,7 +46,7 @@ class Failure(NamedTuple):
     samples: int
 
 
-class Used(NamedTuple):
+class UsedColumns(NamedTuple):
     """The columns of a table that a signal uses: those of its `value` and its `where`; None: it has none."""
 
     value: int | None
@@ -74,10 +74,10 @@ class Reader:
         self._names = names
         self._graph = Graph()
         self._index: dict[Hashable, int] = {}
-        self._readings: list[Reading] = []
+        self._readings: list[SampleExpression] = []
         """By column; the first of equal ones."""
         self._nodes: list[int | None] = []
-        self._used: dict[Used, None] = {}
+        self._used: dict[UsedColumns, None] = {}
         self._paths: list[Path] = []
         self._fields_at: dict[int, int] = {}
         """For nodes that are a plain field, its index among the paths."""
@@ -89,13 +89,15 @@ class Reader:
         """Number of columns."""
         return len(self._readings)
 
-    def use(self, value: Reading | None, where: Reading | None) -> Used:
+    def use(self, value: SampleExpression | None, where: SampleExpression | None) -> UsedColumns:
         """The columns that a signal needs."""
-        used = Used(None if value is None else self._column(value), None if where is None else self._column(where))
+        used = UsedColumns(
+            None if value is None else self._column(value), None if where is None else self._column(where)
+        )
         self._used.setdefault(used)
         return used
 
-    def read(self, table: Table, rows: Integers) -> Mapping[Used, Sequence[Failure]]:
+    def read(self, table: Table, rows: Integers) -> Mapping[UsedColumns, Sequence[Failure]]:
         """Fill these rows of the table, which are not filled yet. Returns the rows without a value, for each use."""
         if self._program is None:
             self._prepare()
@@ -109,7 +111,7 @@ class Reader:
             _store(table.columns[at], rows, done[at][0])
         return {used: found for used in self._used if (found := [*self._failures(batch, used, done)])}
 
-    def failures(self, table: Table, rows: Integers, used: Used) -> Iterator[Failure]:
+    def failures(self, table: Table, rows: Integers, used: UsedColumns) -> Iterator[Failure]:
         """Which of these filled rows have no value for a use, and why."""
         for at in (used.where, used.value):
             if at is None:
@@ -124,7 +126,7 @@ class Reader:
             if at == used.where:
                 rows = rows[(tags == Tag.BOOLEAN) & (values == 1)]
 
-    def _column(self, reading: Reading) -> int:
+    def _column(self, reading: SampleExpression) -> int:
         node = self._graph.add(reading.expression, lambda path: _leaf(path, reading))
         key: Hashable = node
         if node is None:
@@ -215,7 +217,7 @@ class Reader:
     def _failures(
         self,
         batch: _Batch,
-        used: Used,
+        used: UsedColumns,
         done: Mapping[int, tuple[Column, Mapping[int, tuple[Reason, str]]]],
     ) -> Iterator[Failure]:
         """The samples without a value for a use: first those whose `where` has none, then those selected whose `value`
@@ -289,7 +291,7 @@ class _Batch(NamedTuple):
     leaves: _Leaves
 
 
-def _leaf(path: Path, reading: Reading) -> Hashable | Constant | None:
+def _leaf(path: Path, reading: SampleExpression) -> Hashable | Constant | None:
     """The column of a path in an expression over one sample: a field, or a constant for all samples."""
     name, below = path[0], path[1:]
     if name in OF_A_SAMPLE:

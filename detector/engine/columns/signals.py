@@ -11,7 +11,7 @@ from detector.engine.buffering.buffer import NEVER
 from detector.engine.columns.block import Block, Context, Track
 from detector.engine.columns.episodes import of_episodes
 from detector.engine.columns.named import NamedSignals
-from detector.engine.columns.reading import Reading, Used
+from detector.engine.columns.reading import SampleExpression, UsedColumns
 from detector.engine.columns.table import Integers, Truths, rows_between, sorted_rows
 from detector.engine.columns.watching import SampleAges
 from detector.engine.columns.windows import EXTREMES, Ranges, aggregated_ranges, extremes, misfits
@@ -28,7 +28,7 @@ class Key(NamedTuple):
     """The definition of a signal without its name: equal ones are computed once."""
 
     stream: str
-    used: Used
+    used: UsedColumns
     over: int | None
     aggregate: Aggregate
     quantile: float | None = None
@@ -115,8 +115,8 @@ class SignalColumns:
         reader = self._context.tables.add(signal.stream)
         element = signal.element
         used = reader.use(
-            None if signal.value is None else Reading(signal.value, signal.parameters, element),
-            None if signal.where is None else Reading(signal.where, signal.parameters, element),
+            None if signal.value is None else SampleExpression(signal.value, signal.parameters, element),
+            None if signal.where is None else SampleExpression(signal.where, signal.parameters, element),
         )
         key = Key(signal.stream, used, signal.over_ns, signal.aggregate, signal.quantile)
         at = self._keys.setdefault(key, len(self._users))
@@ -228,7 +228,7 @@ class SignalColumns:
         """Count samples without a value that are new in a window; high and low are those of the last tick."""
         tables = self._context.tables
         table = tables.table(key.stream)
-        if key.used == Used(None, None) or not len(table.keys):
+        if key.used == UsedColumns(None, None) or not len(table.keys):
             return
         if not _needs_all(key):
             if key.aggregate is Aggregate.FIRST:
@@ -354,7 +354,7 @@ class SignalColumns:
 
 def _nested(keys: Mapping[Key, int]) -> Mapping[str, Sequence[Sequence[tuple[int, Key]]]]:
     """By stream, the signals that are Min or Max of the same column over several lengths."""
-    families: dict[tuple[str, Used, Aggregate], list[tuple[int, Key]]] = {}
+    families: dict[tuple[str, UsedColumns, Aggregate], list[tuple[int, Key]]] = {}
     for key, at in sorted(keys.items(), key=lambda each: each[0].over or 0):
         if key.aggregate in EXTREMES and key.used.where is None and key.over is not None:
             families.setdefault((key.stream, key.used, key.aggregate), []).append((at, key))

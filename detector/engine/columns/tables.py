@@ -12,7 +12,7 @@ import numpy as np
 
 from detector.engine.buffering.buffer import NEVER, Buffer, Lane
 from detector.engine.buffering.messages import Messages
-from detector.engine.columns.reading import Failure, Reader, Used
+from detector.engine.columns.reading import Failure, Reader, UsedColumns
 from detector.engine.columns.table import LONGEST, MAXIMUM_CLIENTS, Integers, Table
 from detector.engine.counters import Counters, RuleCounters
 from detector.engine.samples.sample import Decoder, Sample
@@ -45,7 +45,7 @@ class Tables:
         self._used: set[tuple[str, Hashable]] = set()
         """The marks requested since the rules were set, by stream and owner."""
         self._marks: dict[tuple[str, Hashable], int] = {}
-        self.users: dict[tuple[str, Used], list[tuple[RuleCounters, CompiledSignal]]] = {}
+        self.users: dict[tuple[str, UsedColumns], list[tuple[RuleCounters, CompiledSignal]]] = {}
         """The users of a stream's columns."""
         self.version = 0
         """Changes when tables are rebuilt, which invalidates earlier indices and numbers."""
@@ -164,7 +164,7 @@ class Tables:
             for stream, table in self._tables.items():
                 table.expire(now - self._durations[stream])
 
-    def note_failures(self, stream: str, failures: Mapping[Used, Sequence[Failure]]) -> None:
+    def note_failures(self, stream: str, failures: Mapping[UsedColumns, Sequence[Failure]]) -> None:
         """Count samples without a value, for every rule that has the signal."""
         for used, found in failures.items():
             for counters, signal in self.users.get((stream, used), ()):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from detector.engine.buffering.buffer import HOUSEKEEPING
 from detector.engine.columns.table import Integers, Table, Truths
-from detector.engine.counters.ages import Ages, Use
+from detector.engine.counters.ages import Ages, StreamUse
 
 _POWERS = 10 ** np.arange(19, dtype=np.int64)
 
@@ -75,7 +75,7 @@ class SampleAges:
                 newest[points.clients[at]] = int(seen[at].max())
         counted: set[int] = set()
         for each in rules:
-            use = each.uses.setdefault(stream, Use())
+            use = each.uses.setdefault(stream, StreamUse())
             use.ages.update(ages)
             if id(each) not in counted:
                 counted.add(id(each))

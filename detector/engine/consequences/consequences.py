@@ -14,7 +14,7 @@ import msgspec
 
 from detector.engine.buffering.buffer import Buffer
 from detector.engine.consequences.excerpts import EpisodeSample, Excerpt, Excerpts
-from detector.engine.episodes.episodes import Ending
+from detector.engine.episodes.episodes import EndReason
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.rendering import Rendered
 from wayside.rules import CompiledAction, CompiledRule, CompiledWindow
@@ -26,7 +26,7 @@ _WATCHED_FOR = 10 * 10**9
 REPLACED = "the action was changed or removed"
 
 
-class Run(NamedTuple):
+class ActionRun(NamedTuple):
     """One action at work for one episode."""
 
     rule: str
@@ -35,10 +35,10 @@ class Run(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Begun:
+class RunStarted:
     """The action has an episode."""
 
-    run: Run
+    run: ActionRun
     event: Event
     """The start event."""
     rendered: Rendered
@@ -47,32 +47,32 @@ class Begun:
 
 
 @dataclass(frozen=True, slots=True)
-class Sampled:
+class RunSamples:
     """The next samples of the window."""
 
-    run: Run
+    run: ActionRun
     samples: list[EpisodeSample]
 
 
 @dataclass(frozen=True, slots=True)
-class Over:
+class EpisodeOver:
     """The episode ended."""
 
-    run: Run
+    run: ActionRun
     event: Event
     """The end event."""
 
 
 @dataclass(frozen=True, slots=True)
-class Completed:
+class RunCompleted:
     """No more messages of the run follow."""
 
-    run: Run
+    run: ActionRun
     cut: str = ""
     """Why the window ended early; empty if it did not."""
 
 
-Consequence = Begun | Sampled | Over | Completed
+Consequence = RunStarted | RunSamples | EpisodeOver | RunCompleted
 
 
 class Consequences:
@@ -82,9 +82,9 @@ class Consequences:
         self.wanted = False
         """Whether anybody takes the messages; otherwise none are queued, as in a replay."""
         self._excerpts = Excerpts(buffer)
-        self._running: dict[Run, Excerpt | None] = {}
+        self._running: dict[ActionRun, Excerpt | None] = {}
         """With the excerpt, if the action has a window."""
-        self._requested: dict[Run, Event] = {}
+        self._requested: dict[ActionRun, Event] = {}
         """The runs that were requested from outside, with the event that began each."""
         self._noted: list[Consequence] = []
         self._complete_ones: deque[Excerpt] = deque()
@@ -108,29 +108,35 @@ class Consequences:
         if rule.dry_run or not self.wanted:
             return
         for action in actions:
-            run = Run(rule.name, action.name, event.episode.id)
+            run = ActionRun(rule.name, action.name, event.episode.id)
             window = action.window
             excerpt = None
-            self._noted.append(Begun(run, event, event.rendered.get(action.name, Rendered()), resumed))
+            self._noted.append(RunStarted(run, event, event.rendered.get(action.name, Rendered()), resumed))
             if window is not None:
                 clients = None if window.clients is None else window.clients | frozenset(event.episode.clients)
                 excerpt = self._excerpts.begin(window, clients, event.episode.onset_time - window.before_ns)
             self._running[run] = excerpt
 
     def request(
-        self, run: Run, event: Event, window: CompiledWindow, clients: frozenset[str] | None, begin: int, until: int
+        self,
+        run: ActionRun,
+        event: Event,
+        window: CompiledWindow,
+        clients: frozenset[str] | None,
+        begin: int,
+        until: int,
     ) -> None:
         """Begin a run that was requested from outside and belongs to no rule's episode. Times are nanoseconds.
 
         `event` describes it; `clients` None: all. It ends at `until` at the latest.
         """
-        self._noted.append(Begun(run, event, Rendered(), resumed=False))
+        self._noted.append(RunStarted(run, event, Rendered(), resumed=False))
         excerpt = self._excerpts.begin(window, clients, begin)
         excerpt.until = until
         self._running[run] = excerpt
         self._requested[run] = event
 
-    def release(self, run: Run, until: int) -> None:
+    def release(self, run: ActionRun, until: int) -> None:
         """End the run's window at `until`; a run that is already over is left unchanged."""
         excerpt = self._running.get(run)
         if excerpt is not None and excerpt.until is not None:
@@ -155,7 +161,7 @@ class Consequences:
             for run, excerpt in list(self._running.items()):
                 if excerpt is not None:
                     if samples := excerpt.take(now):
-                        self._noted.append(Sampled(run, samples))
+                        self._noted.append(RunSamples(run, samples))
                     if excerpt.until is not None and now >= excerpt.until:
                         self._complete(run, "")
         if self._complete_ones:
@@ -180,27 +186,29 @@ class Consequences:
         return noted + self.take(now)
 
     @property
-    def running(self) -> Mapping[Run, Excerpt | None]:
+    def running(self) -> Mapping[ActionRun, Excerpt | None]:
         """The runs that are not complete yet."""
         return self._running
 
-    def _end(self, run: Run, event: Event) -> None:
+    def _end(self, run: ActionRun, event: Event) -> None:
         excerpt = self._running[run]
         if excerpt is not None and excerpt.until is not None:
             return  # it has ended already; its window is still open
-        self._noted.append(Over(run, event))
+        self._noted.append(EpisodeOver(run, event))
         if excerpt is None or event.end_time is None:
             self._complete(run, "")
         else:
             excerpt.until = event.end_time + excerpt.window.after_ns
 
-    def _complete(self, run: Run, cut: str) -> None:
+    def _complete(self, run: ActionRun, cut: str) -> None:
         excerpt = self._running.pop(run)
         begun = self._requested.pop(run, None)
         if begun is not None and excerpt is not None and not cut:
-            self._noted.append(Over(run, msgspec.structs.replace(begun, end_time=excerpt.until, reason=Ending.UNTIL)))
+            self._noted.append(
+                EpisodeOver(run, msgspec.structs.replace(begun, end_time=excerpt.until, reason=EndReason.UNTIL))
+            )
         if excerpt is not None and self.watch_late and not cut:
             self._complete_ones.append(excerpt)
         elif excerpt is not None:
             self._excerpts.stop(excerpt)
-        self._noted.append(Completed(run, cut))
+        self._noted.append(RunCompleted(run, cut))

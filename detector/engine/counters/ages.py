@@ -43,7 +43,7 @@ class AgedLane(Protocol):
 
 
 @dataclass(slots=True)
-class Use:
+class StreamUse:
     """The samples of one stream that one rule used."""
 
     ages: Counter[int] = field(default_factory=Counter)
@@ -80,11 +80,11 @@ class Ages:
     """The samples that a rule used, by stream."""
 
     def __init__(self) -> None:
-        self.uses: dict[str, Use] = {}
+        self.uses: dict[str, StreamUse] = {}
 
     def used(self, lane: AgedLane, now: int) -> None:
         """Note that a value was computed from the lane's newest sample and earlier ones, at the tick `now` (ns)."""
-        use = self.uses.setdefault(lane.stream, Use())
+        use = self.uses.setdefault(lane.stream, StreamUse())
         use.ages[_rounded(now - lane.latest)] += 1
         before = use.newest.get(lane.client)
         if before != lane.latest:

@@ -10,7 +10,7 @@ import msgspec
 
 from detector.engine.counters import RuleCounters
 from detector.engine.episodes.demands import Demand
-from detector.engine.episodes.episodes import Ending
+from detector.engine.episodes.episodes import EndReason
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.following import followed
 from detector.engine.episodes.identifiers import episode_id
@@ -24,7 +24,7 @@ from wayside.rules import CompiledDeploy, CompiledRule
 
 
 @dataclass(frozen=True, slots=True)
-class Identity:
+class DetectorIdentity:
     """Whose episodes they are."""
 
     detector: str
@@ -33,7 +33,7 @@ class Identity:
 
 
 def new_record(
-    rule: CompiledRule, identity: Identity, subject: Subject, onset: int, now: int, values: Mapping[str, Any]
+    rule: CompiledRule, identity: DetectorIdentity, subject: Subject, onset: int, now: int, values: Mapping[str, Any]
 ) -> EpisodeRecord:
     """The record of an episode that starts `now`; times are nanoseconds since the epoch."""
     text = subject.text
@@ -65,7 +65,7 @@ class EpisodeState(msgspec.Struct, eq=False):
     statistics: Statistics | None = None
     """None if the rule has no signals over the episode."""
 
-    def started(self, rule: CompiledRule, identity: Identity) -> Event:
+    def started(self, rule: CompiledRule, identity: DetectorIdentity) -> Event:
         """The start event, with the texts rendered for the rule's current actions."""
         rendered = (
             {action.name: render_templates(action, self.variables) for action in rule.actions} if rule.actions else {}
@@ -75,9 +75,9 @@ class EpisodeState(msgspec.Struct, eq=False):
     def ended(
         self,
         rule: CompiledRule,
-        identity: Identity,
+        identity: DetectorIdentity,
         now: int,
-        reason: Ending,
+        reason: EndReason,
         values: Mapping[str, Any],
         variables: Mapping[str, Any],
     ) -> Event:
@@ -111,7 +111,7 @@ class EpisodeState(msgspec.Struct, eq=False):
             self.demands.pop(action, None)
         self.outdated = (self.outdated | set(changed)) - set(gone)
 
-    def render(self, rule: CompiledRule, identity: Identity, counters: RuleCounters) -> int:
+    def render(self, rule: CompiledRule, identity: DetectorIdentity, counters: RuleCounters) -> int:
         """Render demands that are missing or outdated; failed ones are retried at the next tick.
 
         Returns the number of demands that changed.
@@ -142,7 +142,7 @@ class EpisodeState(msgspec.Struct, eq=False):
                     changes += 1
         return changes
 
-    def _demand(self, identity: Identity, deploy: CompiledDeploy, parameters: Any) -> Demand:
+    def _demand(self, identity: DetectorIdentity, deploy: CompiledDeploy, parameters: Any) -> Demand:
         return Demand(
             self.record,
             action=deploy.action,
@@ -158,11 +158,11 @@ class EpisodeState(msgspec.Struct, eq=False):
     def _event(
         self,
         rule: CompiledRule,
-        identity: Identity,
+        identity: DetectorIdentity,
         values: Mapping[str, Any],
         rendered: Mapping[str, Rendered],
         end: int | None = None,
-        reason: Ending | None = None,
+        reason: EndReason | None = None,
     ) -> Event:
         return Event(
             holder=identity.holder,

@@ -19,7 +19,7 @@ from wayside.expressions import UNKNOWN, Unknown
 Truth = bool | Unknown
 
 
-class Ending(StrEnum):
+class EndReason(StrEnum):
     """Why an episode ended."""
 
     UNTIL = "Until"
@@ -68,10 +68,10 @@ class Started(NamedTuple):
 class Ended(NamedTuple):
     """The open episode ended."""
 
-    reason: Ending
+    reason: EndReason
 
 
-_UNTIL, _OUT_OF_SCOPE, _UNKNOWN = map(Ended, (Ending.UNTIL, Ending.OUT_OF_SCOPE, Ending.UNKNOWN))
+_UNTIL, _OUT_OF_SCOPE, _UNKNOWN = map(Ended, (EndReason.UNTIL, EndReason.OUT_OF_SCOPE, EndReason.UNKNOWN))
 
 FALSE, UNSURE, TRUE = 0, 1, 2
 """Whether an episode may start: the lower two bits of an observation that is one byte."""

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from detector.engine.episodes.episodes import Ending
+from detector.engine.episodes.episodes import EndReason
 from detector.engine.episodes.plain import plain_text, quote, to_text
 from detector.engine.episodes.record import EpisodeRecord
 from detector.engine.episodes.rendering import Rendered
@@ -27,7 +27,7 @@ class Event(msgspec.Struct, frozen=True, gc=False):
     values: Mapping[str, JsonValue]
     """The rule's variables at the start or at the end; unknown ones are left out."""
     end_time: int | None = None
-    reason: Ending | None = None
+    reason: EndReason | None = None
     models: Mapping[str, str] = msgspec.field(default_factory=dict)
     """By signal, the sha256 of the model that computes it."""
     dry_run: bool = False
@@ -108,7 +108,7 @@ def _text_once(constant: Mapping[str, JsonValue]) -> str:
     return found[1]
 
 
-class Happened(NamedTuple):
+class OrderedEvent(NamedTuple):
     """An event, and where it belongs in the order of all."""
 
     time: int

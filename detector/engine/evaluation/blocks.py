@@ -13,12 +13,12 @@ from detector.engine.columns.block import Context
 from detector.engine.columns.fleets import FleetGroup, fits_fleet
 from detector.engine.columns.group import ClientGroup, fit_signals, fits_clients, signals_of
 from detector.engine.columns.pairs import fits_pairs
-from detector.engine.episodes.events import Happened
+from detector.engine.episodes.events import OrderedEvent
 from detector.engine.evaluation.groups import RuleGroup
 from detector.engine.evaluation.observing import Observer
 from detector.engine.evaluation.pairs import PairGroup
 from detector.engine.evaluation.rule import RuleRun
-from detector.engine.timing.schedule import Only
+from detector.engine.timing.schedule import SubjectFilter
 from wayside.rules import CompiledRule, episode_stream
 
 _POINTS = 2_000_000
@@ -40,7 +40,7 @@ class Blocks:
         """Groups by depth: first those whose rules read no episodes of other rules, then those that read episodes of
         these, …"""
         self._groups: list[RuleGroup | PairGroup] = []
-        self._ahead: list[Happened] = []
+        self._ahead: list[OrderedEvent] = []
         """Events at ticks for which other groups have not been evaluated yet."""
         self._on_sample: dict[str, RuleGroup] = {}
         self.with_samples: Mapping[str, Sequence[RuleRun]] = {}
@@ -148,12 +148,12 @@ class Blocks:
                 ticks, group.waiting = group.waiting, []
                 self._ahead += self._noted(self._evaluated(group, ticks, clients, stopwatch))
 
-    def run(self, stopwatch: Callable[[], int]) -> list[Happened]:
+    def run(self, stopwatch: Callable[[], int]) -> list[OrderedEvent]:
         """Evaluate all queued ticks; returns what happened, in order."""
         happened, self._ahead = self._ahead, []
         clients = [*self._context.clients]
         for groups in self._depths:
-            found: list[Happened] = []
+            found: list[OrderedEvent] = []
             for group in groups:
                 if group.waiting:
                     ticks, group.waiting = group.waiting, []
@@ -162,7 +162,7 @@ class Blocks:
         happened.sort(key=_place)
         return happened
 
-    def _noted(self, happened: list[Happened]) -> list[Happened]:
+    def _noted(self, happened: list[OrderedEvent]) -> list[OrderedEvent]:
         """The same, after making them visible to rules that read episodes of other rules."""
         if self._context.starts.needed:
             happened.sort(key=_place)
@@ -175,9 +175,9 @@ class Blocks:
         stream: str,
         time: int,
         clients: Sequence[str],
-        only: Mapping[str, Only],
+        only: Mapping[str, SubjectFilter],
         stopwatch: Callable[[], int],
-    ) -> list[Happened]:
+    ) -> list[OrderedEvent]:
         """Evaluate the rules that are triggered by the samples of a stream, about these clients; `only` has the
         subjects of each rule."""
         group = self._on_sample[stream]
@@ -189,8 +189,8 @@ class Blocks:
         ticks: Sequence[int],
         clients: Sequence[str],
         stopwatch: Callable[[], int],
-        only: Mapping[str, Only] | None = None,
-    ) -> list[Happened]:
+        only: Mapping[str, SubjectFilter] | None = None,
+    ) -> list[OrderedEvent]:
         """What happens at these ticks; the time spent is divided among the rules."""
         begin = stopwatch()
         found = group.evaluate(ticks, clients, self._floor(), only)

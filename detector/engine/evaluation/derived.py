@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from detector.engine.columns.past import Evaluations, Past
+from detector.engine.columns.earlier import EarlierValues, Evaluations
 from detector.engine.counters import RuleCounters
 from detector.engine.scoping.scopes import Candidate, evaluated
 from wayside.expressions import UNKNOWN
@@ -16,7 +16,7 @@ from wayside.rules import CompiledRule
 
 
 def with_derived(
-    rule: CompiledRule, past: Past, now: int, candidates: Iterable[Candidate], counters: RuleCounters
+    rule: CompiledRule, past: EarlierValues, now: int, candidates: Iterable[Candidate], counters: RuleCounters
 ) -> Iterator[Candidate]:
     """The subjects with these signals among their variables, and with the values that statistics of episodes
     aggregate."""
@@ -28,7 +28,12 @@ def with_derived(
 
 
 def _of_one(
-    rule: CompiledRule, past: Past, now: int, element: str | None, candidates: list[Candidate], counters: RuleCounters
+    rule: CompiledRule,
+    past: EarlierValues,
+    now: int,
+    element: str | None,
+    candidates: list[Candidate],
+    counters: RuleCounters,
 ) -> Iterator[Candidate]:
     texts = Texts()
     variables: list[dict[str, Any]] = [dict(candidate.variables) for candidate in candidates]

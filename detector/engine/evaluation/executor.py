@@ -10,18 +10,18 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from detector.engine.buffering.buffer import HOUSEKEEPING
 from detector.engine.columns.table import LONGEST
 from detector.engine.consequences.consequences import Consequences
-from detector.engine.episodes.events import Event, Happened
+from detector.engine.episodes.events import Event, OrderedEvent
 from detector.engine.episodes.subjects import Subject
 from detector.engine.evaluation.blocks import Blocks
 from detector.engine.evaluation.groups import RuleGroup
-from detector.engine.evaluation.knowledge import Knowledge
-from detector.engine.evaluation.observing import Instruments
+from detector.engine.evaluation.inputs import RuleInputs
+from detector.engine.evaluation.observing import Observers
 from detector.engine.evaluation.pairs import PairGroup
 from detector.engine.evaluation.rule import RuleRun
 from detector.engine.samples.sample import Arrival
 from detector.engine.scoping.plugins import PluginSignals
-from detector.engine.signals.starts import Starts
-from detector.engine.timing.schedule import Only, Schedule
+from detector.engine.signals.starts import EpisodeStarts
+from detector.engine.timing.schedule import Schedule, SubjectFilter
 from detector.engine.timing.steps import Gap, Insert, Step, Tick
 from detector.engine.timing.ticks import Ticks
 from wayside.rules import CompiledRule
@@ -32,13 +32,13 @@ class Executor:
 
     def __init__(
         self,
-        known: Knowledge,
+        known: RuleInputs,
         ticks: Ticks,
         schedule: Schedule,
-        starts: Starts,
+        starts: EpisodeStarts,
         plugins: PluginSignals,
         consequences: Consequences,
-        instruments: Instruments,
+        observers: Observers,
         now: Callable[[], int],
     ) -> None:
         """`now`: up to there all ticks have run; nanoseconds on the engine's time axis."""
@@ -49,7 +49,7 @@ class Executor:
         self._starts = starts
         self._plugins = plugins
         self._consequences = consequences
-        self._instruments = instruments
+        self._instruments = observers
         self._now = now
         self._runs: Mapping[str, RuleRun] = {}
         self._blocks = Blocks(known.context, lambda: known.floor)
@@ -150,7 +150,7 @@ class Executor:
                 self._consequences.note(self._runs[event.episode.rule].rule, event)
         return events
 
-    def _in_columns(self) -> list[Happened]:
+    def _in_columns(self) -> list[OrderedEvent]:
         """Evaluate the queued ticks, and sort what happened."""
         journal = self._instruments.journal
         noted = self._unsorted if self._unsorted is not None else len(journal or ())
@@ -239,7 +239,7 @@ class Executor:
         """What happens to the rules in columns that samples trigger, by rule."""
         happened: dict[str, list[Event]] = {}
         for stream, runs in self._blocks.with_samples.items():
-            chosen: dict[str, Only] = {}
+            chosen: dict[str, SubjectFilter] = {}
             named: set[str] = set()
             for run in runs:
                 name = run.rule.name
@@ -292,7 +292,7 @@ class Executor:
             self._wake(run, time, run.looked_at)
         return sorted(events, key=lambda event: event.episode.subject)
 
-    def _evaluated(self, run: RuleRun, time: int, only: Only | None = None) -> list[Event]:
+    def _evaluated(self, run: RuleRun, time: int, only: SubjectFilter | None = None) -> list[Event]:
         begin = self._instruments.stopwatch()
         events = run.tick(time, self._known.views(run, time), self._clients, self._plugins, only)
         run.counters.timed(time, self._instruments.stopwatch() - begin)

@@ -16,12 +16,12 @@ from detector.engine.columns.group import ClientGroup
 from detector.engine.columns.table import Integers, Truths
 from detector.engine.columns.verdicts import Codes
 from detector.engine.episodes.episodes import NO_WAKE, TRUE, UNSEEN, UNTIL, UNTIL_UNSURE
-from detector.engine.episodes.events import Happened
+from detector.engine.episodes.events import OrderedEvent
 from detector.engine.episodes.subjects import Subject
 from detector.engine.evaluation.observing import Observer
 from detector.engine.evaluation.rule import RuleRun
 from detector.engine.scoping.scopes import Candidate
-from detector.engine.timing.schedule import Only
+from detector.engine.timing.schedule import SubjectFilter
 from wayside.rules import ClientSubject
 
 _NOTHING, _START, _END, _UNSURE_END = range(4)
@@ -84,11 +84,15 @@ class RuleGroup:
         """Which subjects have a state. This array and the next ones have a row per track and a column per client."""
 
     def evaluate(
-        self, ticks: Sequence[int], clients: Sequence[str], floor: int | None, only: Mapping[str, Only] | None = None
-    ) -> list[Happened]:
+        self,
+        ticks: Sequence[int],
+        clients: Sequence[str],
+        floor: int | None,
+        only: Mapping[str, SubjectFilter] | None = None,
+    ) -> list[OrderedEvent]:
         """Evaluate these ticks; returns what happened. `only`: by rule, the subjects to evaluate; the others are
         skipped."""
-        happened: list[Happened] = []
+        happened: list[OrderedEvent] = []
         if not clients and self.columns.needs_clients:
             return happened
         looked = None if only is None else self._looked(clients, only)
@@ -119,7 +123,7 @@ class RuleGroup:
             run.budget.expire(last)
         return happened
 
-    def _looked(self, clients: Sequence[str], only: Mapping[str, Only]) -> Truths | None:
+    def _looked(self, clients: Sequence[str], only: Mapping[str, SubjectFilter]) -> Truths | None:
         """Which track evaluates which client; None: each track all clients."""
         chosen = [only.get(run.rule.name) for run in self._of]
         first = chosen[0]
@@ -211,7 +215,7 @@ class RuleGroup:
             yield row, at, (ticks[begin:end], observations[begin:end])
 
     def _step(
-        self, block: Block | FleetBlock, row: int, at: int, changes: Changes, happened: list[Happened]
+        self, block: Block | FleetBlock, row: int, at: int, changes: Changes, happened: list[OrderedEvent]
     ) -> tuple[bool, int]:
         """Advance one subject's state over all ticks of the block, and note what happened.
 
@@ -237,7 +241,7 @@ class RuleGroup:
                     candidate = self._candidate(block, track, subject, at * count + happened_at)
                     event = run.happened(ticks[happened_at], what, candidate)
                     if event is not None:
-                        happened.append(Happened(ticks[happened_at], self._orders[row], event))
+                        happened.append(OrderedEvent(ticks[happened_at], self._orders[row], event))
                     happened_at += 1
                 elif one_by_one:
                     self._measure_until(block, row, at, subject, first)

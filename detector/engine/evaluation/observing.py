@@ -31,7 +31,7 @@ class Observer(Protocol):
 
 
 @dataclass
-class Instruments:
+class Observers:
     """The observers; all are off by default."""
 
     stopwatch: Callable[[], int] = int

@@ -12,17 +12,17 @@ from detector.engine.columns.block import Block, Context, Track
 from detector.engine.columns.pairs import PairBlock, PairColumns
 from detector.engine.columns.table import Integers, Truths, find_rows
 from detector.engine.episodes.episodes import NO_WAKE, TRUE, UNSEEN
-from detector.engine.episodes.events import Happened
+from detector.engine.episodes.events import OrderedEvent
 from detector.engine.episodes.subjects import Subject
 from detector.engine.evaluation.observing import Observer
 from detector.engine.evaluation.rule import RuleRun
 from detector.engine.scoping.scopes import Candidate
-from detector.engine.timing.schedule import Only
+from detector.engine.timing.schedule import SubjectFilter
 
 _SHIFT = 32
 
 
-class Watched(NamedTuple):
+class TrackedPairs(NamedTuple):
     """The pairs that have a state, in any order."""
 
     keys: Integers
@@ -36,15 +36,15 @@ class Watched(NamedTuple):
     matters: NDArray[np.uint8]
     """The bits of an observation that count: those that end an open episode, else those that start one."""
 
-    def of(self, at: Integers | Truths) -> Watched:
+    def of(self, at: Integers | Truths) -> TrackedPairs:
         """Select these."""
-        return Watched(self.keys[at], self.last[at], self.wakes[at], self.in_progress[at], self.matters[at])
+        return TrackedPairs(self.keys[at], self.last[at], self.wakes[at], self.in_progress[at], self.matters[at])
 
 
 Entry = tuple[int, int, int, bool, int]
-"""One pair of `Watched`."""
+"""One pair of `TrackedPairs`."""
 
-_NOBODY = Watched(
+_NOBODY = TrackedPairs(
     np.zeros(0, np.int64), np.zeros(0, np.uint8), np.zeros(0, np.int64), np.zeros(0, bool), np.zeros(0, np.uint8)
 )
 
@@ -78,15 +78,19 @@ class PairGroup:
         self._numbered = -1
 
     def evaluate(
-        self, ticks: Sequence[int], clients: Sequence[str], floor: int | None, only: Mapping[str, Only] | None = None
-    ) -> list[Happened]:
+        self,
+        ticks: Sequence[int],
+        clients: Sequence[str],
+        floor: int | None,
+        only: Mapping[str, SubjectFilter] | None = None,
+    ) -> list[OrderedEvent]:
         """Evaluate these ticks; returns what happened. Such a rule evaluates all pairs."""
         assert only is None  # noqa: S101  it is not evaluated with samples
         happened = [each for tick in ticks for each in self._tick(tick, clients, floor)]
         self._run.budget.expire(ticks[-1])
         return happened
 
-    def _tick(self, tick: int, clients: Sequence[str], floor: int | None) -> Iterator[Happened]:
+    def _tick(self, tick: int, clients: Sequence[str], floor: int | None) -> Iterator[OrderedEvent]:
         block = self._block(tick, clients)
         self._follow()
         watched, count = self._watched, len(block.clients)
@@ -172,7 +176,7 @@ class PairGroup:
         ]
         return np.array(needed, bool)
 
-    def _step(self, tick: int, these: PairBlock, row: int, kept: list[Entry]) -> Iterator[Happened]:
+    def _step(self, tick: int, these: PairBlock, row: int, kept: list[Entry]) -> Iterator[OrderedEvent]:
         """Advance one pair's state, and add it to the kept ones if it is still needed."""
         run, key, code = self._run, self._key(these, row), these.codes.item(row)
         subject = self._subject(key)
@@ -186,7 +190,7 @@ class PairGroup:
             if what is None:
                 run.stays(tick, candidate)
             elif (event := run.happened(tick, what, candidate)) is not None:
-                yield Happened(tick, self._order, event)
+                yield OrderedEvent(tick, self._order, event)
         if state.idle_at(tick):
             del run.states[subject]
             return
@@ -196,11 +200,11 @@ class PairGroup:
         kept.append((key, code, NO_WAKE if wake is None else wake, in_progress, matters))
 
 
-def _joined(watched: Watched, more: Sequence[Entry]) -> Watched:
+def _joined(watched: TrackedPairs, more: Sequence[Entry]) -> TrackedPairs:
     if not more:
         return watched
     keys, last, wakes, in_progress, matters = zip(*more, strict=True)
-    return Watched(
+    return TrackedPairs(
         np.append(watched.keys, np.array(keys, np.int64)),
         np.append(watched.last, np.array(last, np.uint8)),
         np.append(watched.wakes, np.array(wakes, np.int64)),

@@ -9,12 +9,21 @@ from typing import Any
 import msgspec
 
 from detector.engine.buffering.clients import Clients
-from detector.engine.columns.past import Past
+from detector.engine.columns.earlier import EarlierValues
 from detector.engine.counters import RuleCounters
 from detector.engine.episodes.budget import Budget
-from detector.engine.episodes.current import EpisodeState, Identity, new_record
+from detector.engine.episodes.current import DetectorIdentity, EpisodeState, new_record
 from detector.engine.episodes.demands import Demand, DemandChange
-from detector.engine.episodes.episodes import Ended, Ending, Observation, Started, SubjectState, Timing, Truth, negation
+from detector.engine.episodes.episodes import (
+    Ended,
+    EndReason,
+    Observation,
+    Started,
+    SubjectState,
+    Timing,
+    Truth,
+    negation,
+)
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.open_episodes import OpenEpisode
 from detector.engine.episodes.record import EpisodeRecord
@@ -24,7 +33,7 @@ from detector.engine.evaluation.derived import with_derived
 from detector.engine.scoping.plugins import PluginSignals
 from detector.engine.scoping.scopes import Candidate, Evaluated, Views, candidates, condition
 from detector.engine.scoping.snapshots import signals_read, snapshot
-from detector.engine.timing.schedule import Only
+from detector.engine.timing.schedule import SubjectFilter
 from wayside.api.base import JsonValue
 from wayside.expressions import Expression, Unknown
 from wayside.rules import CompiledRule
@@ -46,7 +55,7 @@ class OnDemandResult:
 class RuleRun:
     """A rule and the states of its subjects."""
 
-    def __init__(self, rule: CompiledRule, identity: Identity, counters: RuleCounters) -> None:
+    def __init__(self, rule: CompiledRule, identity: DetectorIdentity, counters: RuleCounters) -> None:
         self.rule = rule
         self.read = {field: signals_read(rule, each) for field, each in (("when", rule.when), ("until", rule.until))}
         """By condition, the signals and streams that it reads, as a text for errors."""
@@ -54,7 +63,7 @@ class RuleRun:
         self._identity = identity
         self.timing = Timing(rule.for_ns, rule.cooldown_ns, rule.unknown_timeout_ns)
         self._follows = any(deploy.follow for deploy in rule.deploys)
-        self.past = Past()
+        self.past = EarlierValues()
         """Earlier values for signals over other signals."""
         self.witness: Callable[[Evaluated], None] | None = None
         """If set, called with each evaluation. It influences no result."""
@@ -76,7 +85,7 @@ class RuleRun:
         """Changes of demands, in time order; None while nobody reads them."""
 
     def tick(
-        self, now: int, views: Views, clients: Clients, plugins: PluginSignals, only: Only | None = None
+        self, now: int, views: Views, clients: Clients, plugins: PluginSignals, only: SubjectFilter | None = None
     ) -> list[Event]:
         """Evaluate the rule for all subjects, or for `only` these; returns what started and ended, in order of
         subjects."""
@@ -200,7 +209,7 @@ class RuleRun:
             episode.change(rule, changed, gone)
             self._render(episode)
 
-    def end_all(self, now: int, reason: Ending) -> Iterator[Event]:
+    def end_all(self, now: int, reason: EndReason) -> Iterator[Event]:
         """End every open episode, in order of the subjects, and discard pending ones."""
         self.disturbed = True
         for subject in sorted(self._open, key=lambda each: each.text):
@@ -230,11 +239,11 @@ class RuleRun:
                 if subject in self._muted:
                     self._muted.discard(subject)
                 else:
-                    yield self._cut_off(now, self._open.pop(subject), Ending.CLIENT_LOST)
+                    yield self._cut_off(now, self._open.pop(subject), EndReason.CLIENT_LOST)
             else:
                 state.gap()
 
-    def _cut_off(self, now: int, episode: EpisodeState, reason: Ending) -> Event:
+    def _cut_off(self, now: int, episode: EpisodeState, reason: EndReason) -> Event:
         """End an episode without an evaluation: only the statistics of the episode are known."""
         known = {} if episode.statistics is None else episode.statistics.values(now)
         return self._ended(now, episode, reason, known, known)
@@ -352,7 +361,12 @@ class RuleRun:
         return episode.started(rule, self._identity)
 
     def _ended(
-        self, now: int, episode: EpisodeState, reason: Ending, values: Mapping[str, Any], variables: Mapping[str, Any]
+        self,
+        now: int,
+        episode: EpisodeState,
+        reason: EndReason,
+        values: Mapping[str, Any],
+        variables: Mapping[str, Any],
     ) -> Event:
         self.counters.ended += 1
         self.version += 1

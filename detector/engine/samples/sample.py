@@ -36,7 +36,7 @@ class Arrival(msgspec.Struct, frozen=True, gc=False, order=True):
         return self.received
 
 
-class Stamped(msgspec.Struct, frozen=True, gc=False, order=True):
+class StampedSample(msgspec.Struct, frozen=True, gc=False, order=True):
     """One message in the buffer, with clock Data, where its time is the sender's stamp."""
 
     received: int
@@ -54,7 +54,7 @@ class Stamped(msgspec.Struct, frozen=True, gc=False, order=True):
         return self.received
 
 
-class Before(msgspec.Struct, frozen=True, gc=False, order=True):
+class PreviousSample(msgspec.Struct, frozen=True, gc=False, order=True):
     """The previous sample of the same client and stream."""
 
     payload: bytes
@@ -63,7 +63,7 @@ class Before(msgspec.Struct, frozen=True, gc=False, order=True):
     """The item's index in the message's list; -1: the stream has no items."""
 
 
-class Linked(msgspec.Struct, frozen=True, gc=False, order=True):
+class LinkedSample(msgspec.Struct, frozen=True, gc=False, order=True):
     """One message in the buffer, for a stream where a rule reads `before`."""
 
     received: int
@@ -74,7 +74,7 @@ class Linked(msgspec.Struct, frozen=True, gc=False, order=True):
     """The message as received, undecoded."""
     key: str
     """The full key of the message."""
-    before: Before | None
+    before: PreviousSample | None
     """None: this is the first sample, or the previous one was stale."""
 
     @property
@@ -98,7 +98,7 @@ class Item(msgspec.Struct, frozen=True, gc=False, order=True):
     """The item's index in the message's list."""
     share: int
     """Its share of the payload's memory, in bytes."""
-    before: Before | None
+    before: PreviousSample | None
     """As in a linked message; also None if no rule reads it."""
 
     @property
@@ -107,7 +107,7 @@ class Item(msgspec.Struct, frozen=True, gc=False, order=True):
         return self.received
 
 
-Sample = Arrival | Stamped | Linked | Item
+Sample = Arrival | StampedSample | LinkedSample | Item
 """One sample in the buffer. With clock Wall this is the queued arrival itself, without a copy."""
 
 

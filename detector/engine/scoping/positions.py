@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from detector.engine.buffering.buffer import Buffer
 from detector.engine.buffering.clients import is_fresh
 from detector.engine.buffering.messages import Messages
-from detector.engine.buffering.possible import Possible
+from detector.engine.buffering.possible import PossibleStreams
 from detector.engine.counters import RuleCounters
 from detector.engine.samples.sample import Sample
 from wayside.expressions import UNKNOWN, Expression, Unknown, Value
@@ -36,7 +36,7 @@ class PositionLookup:
         buffer: Buffer,
         messages: Messages,
         stale_after: Mapping[str, int | None],
-        possible: Possible,
+        possible: PossibleStreams,
         floor: int | None,
     ) -> None:
         """`floor`: samples up to this time are ignored, in nanoseconds.

@@ -15,7 +15,7 @@ from detector.engine.scoping.nearness import Search, near_pairs
 from detector.engine.scoping.positions import Place, PositionLookup, described, distance, distance_of_order_1, point
 from detector.engine.signals.models import add_models
 from detector.engine.signals.signals import Signals
-from detector.engine.timing.schedule import Only
+from detector.engine.timing.schedule import SubjectFilter
 from wayside.expressions import UNKNOWN, Expression, Path, Reason, Unknown, Value
 from wayside.rules import ClientSubject, CompiledElement, CompiledRule, CompiledSignal, FleetSubject, PairSubject
 
@@ -204,7 +204,7 @@ def evaluated(
 
 
 def candidates(
-    rule: CompiledRule, views: Views, clients: Clients, pending: Iterable[Subject], only: Only | None = None
+    rule: CompiledRule, views: Views, clients: Clients, pending: Iterable[Subject], only: SubjectFilter | None = None
 ) -> Iterator[Candidate]:
     """The subjects to evaluate: all that may start an episode, and those with an open or pending one.
 
@@ -255,7 +255,7 @@ def _pairs(
     views: Views,
     clients: Clients,
     pending: Iterable[Subject],
-    only: Only | None,
+    only: SubjectFilter | None,
 ) -> Iterator[Candidate]:
     places = {client: place for client in clients if (place := views.place(subject, client)) is not None}
     points = {client: point(subject.position, place) for client, place in places.items()}

@@ -8,11 +8,11 @@ from typing import Final, cast
 from detector.engine.buffering.buffer import NEVER, Buffer, Lane
 from detector.engine.buffering.clients import Clients, is_fresh
 from detector.engine.buffering.messages import Messages
-from detector.engine.buffering.possible import Possible
+from detector.engine.buffering.possible import PossibleStreams
 from detector.engine.counters import RuleCounters
 from detector.engine.samples.sample import Sample
 from detector.engine.signals.aggregates import Timed, calculated, distinct, is_number
-from detector.engine.signals.starts import Starts
+from detector.engine.signals.starts import EpisodeStarts
 from wayside.api.eventrule import Aggregate
 from wayside.expressions import UNKNOWN, Expression, Reason, Unknown, Value
 from wayside.rules import CompiledSignal
@@ -27,8 +27,8 @@ class Signals:
         clients: Clients,
         messages: Messages,
         stale_after: Mapping[str, int | None],
-        starts: Starts,
-        possible: Possible,
+        starts: EpisodeStarts,
+        possible: PossibleStreams,
         floor: int | None = None,
     ) -> None:
         """`starts` has the samples of signals over rules; windows start after `floor` (ns).

@@ -15,7 +15,7 @@ from detector.engine.buffering.buffer import HOUSEKEEPING, NEVER, Buffer, Lane
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.plain import plain, to_text
 from detector.engine.episodes.subjects import FLEET
-from detector.engine.samples.sample import Sample, Stamped
+from detector.engine.samples.sample import Sample, StampedSample
 from wayside.rules import CompiledRule, episode_stream
 
 MAXIMUM_BYTES = 64 * 2**20
@@ -25,7 +25,7 @@ ALWAYS: Final = 2**63 - 1
 """Later than all times: the end of an open episode."""
 
 
-class Starts:
+class EpisodeStarts:
     """The starts, ends and open episodes of the rules that signals of other rules name."""
 
     def __init__(self) -> None:
@@ -112,7 +112,7 @@ class Starts:
             if lane is None:
                 lane = self.buffer.add(Lane(client, stream, self._durations[stream]))
             self._number += 1
-            sample = Stamped(time, self._number, payload, event.key)
+            sample = StampedSample(time, self._number, payload, event.key)
             self.buffer.grew(lane.insert(sample))
 
     def settle(self, now: int) -> None:

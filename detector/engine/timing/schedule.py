@@ -39,7 +39,7 @@ def thinning(level: int, priorities: Collection[int]) -> Mapping[int, int]:
     return found
 
 
-class Only(NamedTuple):
+class SubjectFilter(NamedTuple):
     """A selection of subjects: those that one of the clients belongs to, and these subjects."""
 
     clients: frozenset[str]
@@ -75,7 +75,7 @@ class Schedule:
         """By rule, the number of samples that triggered it."""
         self._priorities: frozenset[int] = frozenset()
         self._thinning: Mapping[int, int] = {}
-        self._only = Only(_NOBODY, frozenset())
+        self._only = SubjectFilter(_NOBODY, frozenset())
         """The last selection without single subjects: mostly that of all rules."""
         self.paused: frozenset[str] = frozenset()
         """The names of paused rules."""
@@ -114,7 +114,9 @@ class Schedule:
             return False
         return now % (rule.every_ns * self.thinning(rule)) != 0
 
-    def selection(self, rule: CompiledRule, now: int, sampled: Mapping[str, frozenset[str]]) -> tuple[Only, bool]:
+    def selection(
+        self, rule: CompiledRule, now: int, sampled: Mapping[str, frozenset[str]]
+    ) -> tuple[SubjectFilter, bool]:
         """The subjects for which a rule with onSample is evaluated, and whether samples were skipped.
 
         `sampled` has, by stream, the clients with samples at this time.
@@ -127,12 +129,12 @@ class Schedule:
         wakes = self._wakes.get(rule.name)
         if not wakes and not thinned:
             if clients is not self._only.clients:
-                self._only = Only(clients, frozenset())
+                self._only = SubjectFilter(clients, frozenset())
             return self._only, False
         due = frozenset(subject for subject, time in wakes.items() if time <= now) if wakes else frozenset()
         for subject in due:  # an evaluation sets the next wake; a subject that no longer exists needs none
             del self._wakes[rule.name][subject]
-        return Only(_NOBODY if thinned else clients, due), thinned
+        return SubjectFilter(_NOBODY if thinned else clients, due), thinned
 
     def forget(self, rule: str) -> None:
         """The rule was removed or has changed its meaning: remove the wakes of its subjects."""

@@ -1,5 +1,5 @@
 """Recordings requested over Zenoh."""
 
-from detector.live.requested.serving import Requested, with_requested
+from detector.live.requested.serving import RequestedRecordings, with_requested
 
-__all__ = ["Requested", "with_requested"]
+__all__ = ["RequestedRecordings", "with_requested"]

@@ -9,9 +9,9 @@ from concurrent.futures import Future
 from typing import Any
 
 from detector.actions.episode import Outcome, OutcomeState
-from detector.actions.outcomes import Which
+from detector.actions.outcomes import ActionKey
 from detector.actions.trigger.requests import RecordingReport, RecordingRequest, read_request, write_reports
-from detector.engine.consequences.consequences import Consequences, Run
+from detector.engine.consequences.consequences import ActionRun, Consequences
 from detector.engine.engine import Engine
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.identifiers import identifier
@@ -21,7 +21,7 @@ from wayside.api import API_VERSION, Detector, EventRule
 from wayside.names import FLEET, parse_subject
 from wayside.rules.actions import window_of
 
-REQUESTED = Which("_requested", "record")
+REQUESTED = ActionKey("_requested", "record")
 """The rule and the action under which they run: no EventRule in a cluster can have that name."""
 
 
@@ -45,9 +45,9 @@ def with_requested(rules: Sequence[EventRule], detector: Detector) -> list[Event
     return [*rules, rule]
 
 
-def run_of(identity: str) -> Run:
+def run_of(identity: str) -> ActionRun:
     """The run of a recording; its episode is a short name derived from the id, which may be long."""
-    return Run(REQUESTED.rule, REQUESTED.action, identifier(identity.encode()))
+    return ActionRun(REQUESTED.rule, REQUESTED.action, identifier(identity.encode()))
 
 
 def begin_recording(
@@ -102,7 +102,7 @@ Call = Callable[[Callable[[], None]], Future[Any]]
 """Runs a function on the thread of the evaluation."""
 
 
-class Requested:
+class RequestedRecordings:
     """Recordings requested by others. Thread-safe."""
 
     def __init__(self, engine: Engine, call: Call) -> None:
@@ -121,7 +121,7 @@ class Requested:
                 return write_reports(self._index.status(request.id))
         return write_reports(self._start(request) if request.do == "start" else self._stop(request))
 
-    def on_outcome(self, which: Which, episode: str, outcome: Outcome) -> None:
+    def on_outcome(self, which: ActionKey, episode: str, outcome: Outcome) -> None:
         """Handle an outcome of an action; only recordings on request matter here."""
         if which != REQUESTED:
             return

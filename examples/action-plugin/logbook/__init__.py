@@ -10,6 +10,7 @@ from pydantic import Field
 
 from detector.actions import (
     Action,
+    ActionContext,
     ActionError,
     ActionParameters,
     Completion,
@@ -17,7 +18,6 @@ from detector.actions import (
     EpisodeSample,
     Outcome,
     OutcomeState,
-    Setting,
 )
 
 
@@ -33,8 +33,8 @@ class Logbook(Action[LogbookParameters]):
 
     Parameters = LogbookParameters
 
-    def __init__(self, parameters: LogbookParameters, setting: Setting) -> None:
-        super().__init__(parameters, setting)
+    def __init__(self, parameters: LogbookParameters, context: ActionContext) -> None:
+        super().__init__(parameters, context)
         self.counts: dict[str, int] = {}
 
     def started(self, episode: Episode) -> None:
@@ -63,6 +63,6 @@ class Logbook(Action[LogbookParameters]):
                 size = file.write(line + "\n")
         except OSError as error:
             raise ActionError(f"the logbook cannot be written: {error}") from error
-        self.setting.report(
+        self.context.report(
             episode, Outcome(OutcomeState.DONE, samples=count, bytes=size, files=(self.parameters.path,))
         )

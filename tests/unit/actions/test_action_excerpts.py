@@ -12,7 +12,15 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from detector.engine.consequences.consequences import REPLACED, Begun, Completed, Consequence, Over, Run, Sampled
+from detector.engine.consequences.consequences import (
+    REPLACED,
+    ActionRun,
+    Consequence,
+    EpisodeOver,
+    RunCompleted,
+    RunSamples,
+    RunStarted,
+)
 from detector.engine.engine import Engine
 from detector.engine.samples.sample import Arrival
 from tests.driving import START, a_detector, a_rule, a_stream, arrival, at, compiled
@@ -59,11 +67,11 @@ def run(engine: Engine, batches: Sequence[Sequence[Arrival]], until: float) -> l
     return reported + engine.consequences.take(engine.now)
 
 
-def collected(reported: Sequence[Consequence], run: Run) -> list[tuple[str, str, int, bytes]]:
+def collected(reported: Sequence[Consequence], run: ActionRun) -> list[tuple[str, str, int, bytes]]:
     return [
         (sample.client, sample.stream, sample.time, sample.payload)
         for each in reported
-        if isinstance(each, Sampled) and each.run == run
+        if isinstance(each, RunSamples) and each.run == run
         for sample in each.samples
     ]
 
@@ -117,10 +125,10 @@ def test_each_sample_of_a_window_is_passed_on_once_and_no_other(
     engine = an_engine(DATA if on_data else WALL, RULE)
     reported = run(engine, batches, 12.0)
     assert engine.consequences.running.keys() == {
-        each.run for each in reported if isinstance(each, Begun) and not completed(reported, each.run)
+        each.run for each in reported if isinstance(each, RunStarted) and not completed(reported, each.run)
     }
-    begun = [each for each in reported if isinstance(each, Begun)]
-    ends = {each.run: each.event.end_time for each in reported if isinstance(each, Over)}
+    begun = [each for each in reported if isinstance(each, RunStarted)]
+    ends = {each.run: each.event.end_time for each in reported if isinstance(each, EpisodeOver)}
     for each in begun:
         end = ends.get(each.run)
         expected = [
@@ -133,7 +141,7 @@ def test_each_sample_of_a_window_is_passed_on_once_and_no_other(
         assert sorted(collected(reported, each.run)) == sorted(expected)
 
 
-def in_window(begun: Begun, client: str, stream: str, time: int, end: int | None) -> bool:
+def in_window(begun: RunStarted, client: str, stream: str, time: int, end: int | None) -> bool:
     until = 2**63 if end is None else end
     if begun.run.action == "all":
         return stream == "load" and begun.event.episode.onset_time < time <= until + 200_000_000
@@ -142,8 +150,8 @@ def in_window(begun: Begun, client: str, stream: str, time: int, end: int | None
     )
 
 
-def completed(reported: Sequence[Consequence], run: Run) -> bool:
-    return any(isinstance(each, Completed) and each.run == run for each in reported)
+def completed(reported: Sequence[Consequence], run: ActionRun) -> bool:
+    return any(isinstance(each, RunCompleted) and each.run == run for each in reported)
 
 
 def order(reported: Sequence[Consequence]) -> list[str]:
@@ -160,9 +168,9 @@ PLAIN = a_detector(a_stream("speed"), a_stream("map", latched=True), buffer=BUFF
 def test_a_run_is_passed_on_in_order_and_completed_once_time_has_passed_its_window() -> None:
     engine = an_engine(PLAIN, fast(an_action(before="1s", after="1s")))
     reported = run(engine, speeds((0.55, 0.0), (1.05, 1.0), (2.05, 0.0), (2.55, 0.0)), 3.0)
-    assert order(reported) == ["Begun", "Sampled", "Over", "Sampled"]
+    assert order(reported) == ["RunStarted", "RunSamples", "EpisodeOver", "RunSamples"]
     engine.advance((), at(3.1))
-    assert order(engine.consequences.take(engine.now)) == ["Completed"]
+    assert order(engine.consequences.take(engine.now)) == ["RunCompleted"]
     assert not engine.consequences.running
     assert all(lane.came is None for lane in engine.buffer), "nobody keeps what comes any more"
 
@@ -171,7 +179,7 @@ def test_what_was_latched_comes_with_the_window_however_old_it_is() -> None:
     engine = an_engine(PLAIN, fast(an_action(streams=["speed"], before="500ms")))
     first = [arrival(0.5, "car1", {"m": 1}, "map"), arrival(0.6, "car2", {"m": 2}, "map")]
     reported = run(engine, [first, *speeds((9.05, 1.0))], 9.2)
-    [sampled] = [each for each in reported if isinstance(each, Sampled)]
+    [sampled] = [each for each in reported if isinstance(each, RunSamples)]
     assert [(sample.stream, sample.client) for sample in sampled.samples] == [("map", "car1"), ("speed", "car1")]
 
 
@@ -181,7 +189,7 @@ def test_what_a_cap_pushes_out_in_between_is_reported_all_the_same() -> None:
     engine.advance([arrival(0.05, "car1", {"v": 1})], at(0.2))
     engine.advance([arrival(0.2 + each / 1000, "car1", {"v": 1}) for each in range(1, 50)], at(0.3))
     reported = engine.consequences.take(engine.now)
-    assert sum(len(each.samples) for each in reported if isinstance(each, Sampled)) == 49
+    assert sum(len(each.samples) for each in reported if isinstance(each, RunSamples)) == 49
 
 
 def test_a_dry_run_notifies_nobody() -> None:
@@ -193,7 +201,7 @@ def test_the_end_of_the_detector_cuts_what_is_open() -> None:
     engine = an_engine(PLAIN, fast(an_action()))
     run(engine, speeds((0.05, 1.0)), 1.0)
     reported = engine.consequences.cut(engine.now, "it stops")
-    assert [each for each in reported if isinstance(each, Completed)] == reported[-1:]
+    assert [each for each in reported if isinstance(each, RunCompleted)] == reported[-1:]
     assert reported[-1].cut == "it stops"
 
 
@@ -202,8 +210,8 @@ def test_open_episodes_go_over_to_actions_that_change() -> None:
     run(engine, speeds((0.05, 1.0)), 1.0)
     engine.set_rules(compiled(PLAIN, fast(an_action("b"), an_action("c"))))
     reported = engine.consequences.take(engine.now)
-    assert [(each.run.action, each.cut) for each in reported if isinstance(each, Completed)] == [("a", REPLACED)]
-    assert [(each.run.action, each.resumed) for each in reported if isinstance(each, Begun)] == [("c", True)]
+    assert [(each.run.action, each.cut) for each in reported if isinstance(each, RunCompleted)] == [("a", REPLACED)]
+    assert [(each.run.action, each.resumed) for each in reported if isinstance(each, RunStarted)] == [("c", True)]
 
 
 def test_an_action_that_is_the_same_with_other_parameters_is_another() -> None:
@@ -211,7 +219,7 @@ def test_an_action_that_is_the_same_with_other_parameters_is_another() -> None:
     engine = an_engine(PLAIN, fast({"name": "keep", "plugin": {"name": "keeper"}}))
     run(engine, speeds((0.05, 1.0)), 1.0)
     engine.set_rules(compiled(PLAIN, fast(other)))
-    assert order(engine.consequences.take(engine.now)) == ["Completed", "Begun"]
+    assert order(engine.consequences.take(engine.now)) == ["RunCompleted", "RunStarted"]
 
 
 def test_a_changed_rule_ends_its_episodes_and_their_windows_go_on() -> None:
@@ -219,8 +227,8 @@ def test_a_changed_rule_ends_its_episodes_and_their_windows_go_on() -> None:
     run(engine, speeds((0.05, 1.0)), 1.0)
     engine.set_rules([])
     reported = run(engine, speeds((1.5, 1.0), (2.5, 1.0)), 3.0)
-    assert order(reported) == ["Over", "Sampled", "Completed"]
-    assert [len(each.samples) for each in reported if isinstance(each, Sampled)] == [1]
+    assert order(reported) == ["EpisodeOver", "RunSamples", "RunCompleted"]
+    assert [len(each.samples) for each in reported if isinstance(each, RunSamples)] == [1]
 
 
 def test_what_comes_when_its_window_is_complete_is_counted() -> None:
@@ -235,7 +243,7 @@ def test_what_comes_when_its_window_is_complete_is_counted() -> None:
         ],
         4.0,
     )
-    assert order(reported)[-1] == "Completed"
+    assert order(reported)[-1] == "RunCompleted"
     assert engine.consequences.too_late == 1, "the second of them is in no window"
     run(engine, [[message(20.0, "car1", "speed", 0.0)]], 21.0)
     assert all(lane.came is None for lane in engine.buffer), "nobody waits for late ones any more"
@@ -245,7 +253,7 @@ def test_what_is_rendered_for_an_action_is_of_the_start_and_each_by_itself() -> 
     values = {"text": "${client} at ${v}", "missing": "${labels.plate}"}
     engine = an_engine(PLAIN, fast({"name": "n", "plugin": {"name": "teller", "values": values}}))
     [begun, *_] = run(engine, speeds((0.05, 1.0)), 1.0)
-    assert isinstance(begun, Begun)
+    assert isinstance(begun, RunStarted)
     assert begun.rendered.values == {"text": "car1 at 1"}
     assert list(begun.rendered.problems) == ["missing"]
 

@@ -15,17 +15,17 @@ from detector.actions import (
     ActionError,
     ActionParameters,
     Completion,
+    DetectorConfiguration,
     Episode,
     EpisodeSample,
     Outcome,
     OutcomeState,
-    Surroundings,
     registry,
 )
 from detector.actions.host import ActionHost
-from detector.actions.outcomes import ActionTally, Which
+from detector.actions.outcomes import ActionCounts, ActionKey
 from detector.actions.worker import SILENT
-from detector.assembly import inlets
+from detector.assembly import stream_readers
 from detector.engine.engine import Engine
 from tests.driving import a_detector, a_rule, a_stream, an_engine, arrival, at, compiled
 from wayside.api import EventRule
@@ -43,7 +43,7 @@ class Recorded(Action[ActionParameters]):
     after: ClassVar[Callable[[str, Episode], None]] = staticmethod(lambda what, episode: None)
 
     def note(self, what: str, episode: Episode) -> None:
-        self.reported.append(f"{self.setting.action} {what} {episode.subject}")
+        self.reported.append(f"{self.context.action} {what} {episode.subject}")
         type(self).after(what, episode)
 
     def started(self, episode: Episode) -> None:
@@ -58,10 +58,10 @@ class Recorded(Action[ActionParameters]):
 
     def completed(self, episode: Episode, completion: Completion) -> None:
         self.note(f"completed {completion.cut or 'in time'}", episode)
-        self.setting.report(episode, Outcome(OutcomeState.DONE, missing=completion.missing))
+        self.context.report(episode, Outcome(OutcomeState.DONE, missing=completion.missing))
 
     def close(self) -> None:
-        self.reported.append(f"{self.setting.action} closed")
+        self.reported.append(f"{self.context.action} closed")
 
 
 class Raises(Recorded):
@@ -147,8 +147,8 @@ class Site:
         raise ActionError("nobody")
 
     def follow(self, *rules: EventRule) -> None:
-        entries = inlets(DETECTOR)
-        self.host.follow(rules, Surroundings(DETECTOR, entries.decoders, entries.types))
+        entries = stream_readers(DETECTOR)
+        self.host.follow(rules, DetectorConfiguration(DETECTOR, entries.decoders, entries.types))
         self.engine.set_rules(compiled(DETECTOR, *rules))
         self.host.dispatch(self.engine.consequences.take(self.engine.now))
 
@@ -156,13 +156,17 @@ class Site:
         self.engine.advance([arrival(seconds, client, {"v": v}) for seconds, client, v in speeds], at(until))
         self.host.dispatch(self.engine.consequences.take(self.engine.now))
 
-    def tally(self, action: str) -> ActionTally:
-        return self.host.outcomes.tallies()[Which("fast", action)]
+    def counts(self, action: str) -> ActionCounts:
+        return self.host.outcomes.counts_by_action()[ActionKey("fast", action)]
 
     def when(self, true: Callable[[], bool]) -> None:
         end = time.monotonic() + 60
         while not true():
-            assert time.monotonic() < end, (Recorded.reported, self.host.outcomes.tallies(), self.host.outcomes.lost())
+            assert time.monotonic() < end, (
+                Recorded.reported,
+                self.host.outcomes.counts_by_action(),
+                self.host.outcomes.lost(),
+            )
             time.sleep(0.005)
 
 
@@ -195,7 +199,7 @@ def test_an_action_receives_an_episode_in_order_and_closed_at_last() -> None:
         "a completed in time car1",
         "a closed",
     ]
-    assert site.tally("a").done == 1
+    assert site.counts("a").done == 1
 
 
 def test_what_one_raises_fails_that_episode_and_no_other() -> None:
@@ -203,9 +207,14 @@ def test_what_one_raises_fails_that_episode_and_no_other() -> None:
     one_episode(site)
     one_episode(site, "car2", begin=2.0)
     site.host.close()
-    tally = site.tally("a")
-    assert (tally.done, tally.failed, tally.running, tally.last_failure) == (1, 1, 0, "the ink is dry")
-    assert site.tally("b").done == 2
+    counts = site.counts("a")
+    assert (counts.done, counts.failed, counts.running, counts.last_failure) == (
+        1,
+        1,
+        0,
+        "the ink is dry",
+    )
+    assert site.counts("b").done == 2
     assert [text for text in Recorded.reported if text.startswith("a") and "car1" in text] == ["a started car1"]
 
 
@@ -213,8 +222,8 @@ def test_one_that_cannot_be_made_fails_its_episodes_with_the_reason() -> None:
     site = Site(fast(a="impossible", b="recorded"))
     one_episode(site)
     site.host.close()
-    assert site.tally("a").last_failure == "cannot create the action: OSError: no paper"
-    assert site.tally("b").done == 1
+    assert site.counts("a").last_failure == "cannot create the action: OSError: no paper"
+    assert site.counts("b").done == 1
 
 
 def test_one_that_hangs_holds_up_nobody_and_what_finds_its_queue_full_is_counted() -> None:
@@ -223,13 +232,13 @@ def test_one_that_hangs_holds_up_nobody_and_what_finds_its_queue_full_is_counted
     for step in range(40):
         site.take((0.6 + step / 10, "car1", 1.0), until=0.65 + step / 10)
     site.take((5.0, "car1", 0.0), until=5.5)
-    site.when(lambda: site.tally("b").done == 1 and site.tally("a").running == 1)
+    site.when(lambda: site.counts("b").done == 1 and site.counts("a").running == 1)
     SLOW.set()
-    site.when(lambda: site.tally("a").done == 1)
+    site.when(lambda: site.counts("a").done == 1)
     [lost] = [each for each in site.host.outcomes.lost() if each.which.action == "a"]
     assert lost.what == "samples left out because the action is too slow"
     counted = sum(int(text.split()[1]) for text in Recorded.reported if text.startswith("a ") and "samples" in text)
-    assert site.tally("a").missing == lost.count == 42 - counted > 0
+    assert site.counts("a").missing == lost.count == 42 - counted > 0
     site.host.close()
 
 
@@ -264,8 +273,8 @@ def test_one_that_reports_nothing_has_failed_at_the_end() -> None:
     site = Site(fast(a="silent"))
     one_episode(site)
     site.host.close()
-    tally = site.tally("a")
-    assert (tally.running, tally.failed, tally.last_failure) == (0, 1, SILENT)
+    counts = site.counts("a")
+    assert (counts.running, counts.failed, counts.last_failure) == (0, 1, SILENT)
 
 
 def test_each_outcome_is_reported_once() -> None:

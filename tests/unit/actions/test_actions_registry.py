@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from detector.actions import Action
 from detector.actions.registry import OFFERS, action_problems, prepare_action
-from detector.assembly import RuleIndex, inlets
+from detector.assembly import RuleIndex, stream_readers
 from detector.assembly.checking import findings
 from detector.plugins import entrypoints
 from tests.driving import a_detector, a_rule
@@ -93,8 +93,8 @@ def test_check_reports_line_and_column(tmp_path: Path) -> None:
 
 def test_a_rule_whose_action_is_refused_continues_as_it_last_was() -> None:
     index, detector = RuleIndex(), a_detector()
-    index.compile([rule("lamp", colour="red")], detector, inlets(detector).fields)
-    (kept,), (refusal,) = index.compile([rule("lamp")], detector, inlets(detector).fields)
+    index.compile([rule("lamp", colour="red")], detector, stream_readers(detector).fields)
+    (kept,), (refusal,) = index.compile([rule("lamp")], detector, stream_readers(detector).fields)
     assert kept.name == "r"
     assert refusal.kept
     assert "plugin.parameters.colour" in str(refusal)

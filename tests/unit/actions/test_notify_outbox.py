@@ -13,16 +13,20 @@ from detector.actions.notify.notice import GROUP_TYPE, Notice, NoticeTexts, even
 from detector.actions.notify.outbox import (
     LONGEST,
     LONGEST_RETRY_AFTER,
+    AttemptResult,
     Delivery,
-    Fate,
     Outbox,
     OutboxMessage,
     RateLimit,
 )
 from tests.notifying import an_episode
 
-DELIVERED, AGAIN, REFUSED = Delivery(Fate.DELIVERED), Delivery(Fate.AGAIN), Delivery(Fate.REFUSED)
-AWAY = Delivery(Fate.AGAIN, whole=True)
+DELIVERED, AGAIN, REFUSED = (
+    Delivery(AttemptResult.DELIVERED),
+    Delivery(AttemptResult.AGAIN),
+    Delivery(AttemptResult.REFUSED),
+)
+AWAY = Delivery(AttemptResult.AGAIN, whole=True)
 
 
 def notice(episode: str, what: str = "started", **labels: str) -> Notice:
@@ -54,7 +58,7 @@ def test_each_message_is_settled_once_and_each_episode_in_order(
         now += wait
         taken = box.take(now)
         assert taken is not None, "what wait promises is there"
-        if box.settle(taken, answer, now, wall=0.0) is not Fate.AGAIN:
+        if box.settle(taken, answer, now, wall=0.0) is not AttemptResult.AGAIN:
             settled.append(taken)
     assert sorted(map(id, settled)) == sorted(map(id, waiting))
     for episode in "abc":
@@ -103,7 +107,7 @@ def test_what_an_endpoint_requests_is_heeded_within_reason(retry_after: float, w
     box.add(message("a"))
     taken = box.take(0.0)
     assert taken is not None
-    box.settle(taken, Delivery(Fate.AGAIN, retry_after=retry_after, whole=True), 0.0, wall=0.0)
+    box.settle(taken, Delivery(AttemptResult.AGAIN, retry_after=retry_after, whole=True), 0.0, wall=0.0)
     assert box.wait(0.0) == waited
 
 
@@ -112,10 +116,10 @@ def test_what_is_too_old_is_given_up_after_an_attempt() -> None:
     box.add(message("a"))
     taken = box.take(0.0)
     assert taken is not None
-    assert box.settle(taken, AWAY, 0.0, wall=59.0) is Fate.AGAIN
+    assert box.settle(taken, AWAY, 0.0, wall=59.0) is AttemptResult.AGAIN
     again = box.take(10.0)
     assert again is taken
-    assert box.settle(taken, AWAY, 10.0, wall=60.0) is Fate.REFUSED
+    assert box.settle(taken, AWAY, 10.0, wall=60.0) is AttemptResult.REFUSED
     assert len(box) == 0
 
 

@@ -6,8 +6,8 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from detector.actions.trigger.course import FOREVER, Course, CourseStep, Timeouts
 from detector.actions.trigger.orders import Order, Progress, Report
+from detector.actions.trigger.state_machine import FOREVER, NextRequest, RemoteRecording, Timeouts
 
 RECORDING, DONE = Report(Progress.RECORDING), Report(Progress.DONE, files=("a",))
 ENDING, UNKNOWN = Report(Progress.ENDING), Report(Progress.UNKNOWN)
@@ -15,22 +15,22 @@ ENDING, UNKNOWN = Report(Progress.ENDING), Report(Progress.UNKNOWN)
 
 def a_course(
     *, maximum: float = FOREVER, give_up: float = 60, renew: float | None = 10, resumed: bool = False
-) -> Course:
-    return Course(Order("x", {}), Timeouts(maximum, give_up, renew), 0, -1, resumed=resumed)
+) -> RemoteRecording:
+    return RemoteRecording(Order("x", {}), Timeouts(maximum, give_up, renew), 0, -1, resumed=resumed)
 
 
 def test_a_recording_is_started_again_stopped_and_awaited() -> None:
     course = a_course()
-    assert course.look(0) is CourseStep.START
+    assert course.look(0) is NextRequest.START
     course.answered(0, RECORDING)
     assert course.look(9) is None
-    assert course.look(10) is CourseStep.HOLD
+    assert course.look(10) is NextRequest.HOLD
     course.answered(10, RECORDING)
     course.end(15, 14)
-    assert course.look(15) is CourseStep.STOP
+    assert course.look(15) is NextRequest.STOP
     course.answered(15, ENDING)
     assert course.look(15) is None
-    assert course.look(16) is CourseStep.AWAIT
+    assert course.look(16) is NextRequest.AWAIT
     course.answered(16, DONE)
     assert course.finished
     assert course.problem == ""
@@ -42,9 +42,9 @@ def test_an_episode_that_is_over_before_the_start_is_confirmed_is_recorded_never
     course.failed(0, "silence", silent=True)
     course.end(0.1, 0.1)
     assert course.look(0.2) is None
-    assert course.look(0.5) is CourseStep.START
+    assert course.look(0.5) is NextRequest.START
     course.answered(0.5, RECORDING)
-    assert course.look(0.5) is CourseStep.STOP
+    assert course.look(0.5) is NextRequest.STOP
 
 
 def test_what_is_not_confirmed_is_requested_later_and_later_and_given_up() -> None:
@@ -52,10 +52,10 @@ def test_what_is_not_confirmed_is_requested_later_and_later_and_given_up() -> No
     times = []
     for tenth in range(2000):
         step = course.look(tenth / 10)
-        if step is CourseStep.START:
+        if step is NextRequest.START:
             times.append(tenth / 10)
             course.failed(tenth / 10, "silence", silent=True)
-        if step is CourseStep.STOP:
+        if step is NextRequest.STOP:
             break
     assert times == [0, 0.5, 1.5, 3.5, 7.5, 15.5, 30.5, 45.5, 60.5]
     assert course.problem == "gave up starting it: silence"
@@ -67,7 +67,7 @@ def test_a_stop_that_is_given_up_is_reported() -> None:
     course.answered(0, RECORDING)
     course.end(1, 1)
     for second in range(1, 20):
-        if course.look(second) is CourseStep.STOP:
+        if course.look(second) is NextRequest.STOP:
             course.failed(second, "silence", silent=True)
     assert course.finished
     assert course.lost_stop
@@ -77,7 +77,7 @@ def test_a_stop_that_is_given_up_is_reported() -> None:
 def test_what_is_refused_is_requested_again_and_then_needs_no_stop() -> None:
     course = a_course(give_up=1)
     for now in (0.0, 0.5, 1.5):
-        assert course.look(now) is CourseStep.START
+        assert course.look(now) is NextRequest.START
         course.answered(now, Report(Progress.REFUSED, "too many"))
     assert course.finished
     assert course.problem == "gave up starting it: too many"
@@ -88,9 +88,9 @@ def test_a_system_that_was_restarted_continues_with_the_next_start() -> None:
     course.answered(0, RECORDING)
     assert course.confirmed
     for now in (10, 10.5, 11.5, 200):  # it is away for long: as long as the episode lasts, nothing is given up
-        assert course.look(now) is CourseStep.HOLD
+        assert course.look(now) is NextRequest.HOLD
         course.failed(now, "silence", silent=True)
-    assert course.look(300) is CourseStep.HOLD
+    assert course.look(300) is NextRequest.HOLD
     course.answered(300, RECORDING)
     course.end(301, 301)
     course.answered(301, UNKNOWN)  # restarted once more, just now
@@ -103,7 +103,7 @@ def test_a_system_that_does_not_count_the_time_is_stopped_after_it() -> None:
     course.answered(0, RECORDING)
     assert course.next_look() == 30
     assert course.look(29.9) is None
-    assert course.look(30) is CourseStep.STOP
+    assert course.look(30) is NextRequest.STOP
     course.answered(30, DONE)
     assert course.note == "its maximumDuration ended it before the episode ended"
 

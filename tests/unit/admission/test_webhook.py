@@ -12,8 +12,8 @@ import aiohttp
 import pytest
 import yaml
 
-from application_manager.admission.issuing import make_certificates
-from application_manager.admission.reviewing import AT_ONCE, LARGEST, ReviewHandler, Serving, webhook
+from application_manager.admission.issuer import make_certificates
+from application_manager.admission.webhook import AT_ONCE, LARGEST, ReviewHandler, WebhookOptions, webhook
 from application_manager.cli import EXPECTED, app
 from application_manager.core.findings.reviews import ReviewError
 from application_manager.core.findings.webhooks import PATH
@@ -44,7 +44,7 @@ def served(
             ):
                 return response.status, await response.text()
 
-        async with asyncio.timeout(120), webhook(Serving(port, folder), {PATH: handler}):
+        async with asyncio.timeout(120), webhook(WebhookOptions(port, folder), {PATH: handler}):
             await scenario(ask)
 
     asyncio.run(run())
@@ -171,7 +171,7 @@ def test_a_port_that_is_taken_is_reported(folder: Path) -> None:
     handler = ReviewHandler(review, lambda: True, Measures())
 
     async def run() -> None:
-        serving = Serving(free_port(), folder)
+        serving = WebhookOptions(free_port(), folder)
         async with webhook(serving, {PATH: handler}):
             with pytest.raises(ConfigurationError, match=f"--admission-port {serving.port}: .*give another port"):
                 async with webhook(serving, {PATH: handler}):

@@ -9,7 +9,7 @@ import sys
 import pytest
 
 from tests.guides import ROOT
-from wayside.process.beginning import importing
+from wayside.process.startup import importing
 
 EXAMPLE = ROOT / "examples" / "cooperative-recording"
 FILES = [str(EXAMPLE / name) for name in ("detector.yaml", "rules.yaml", "templates.yaml")]

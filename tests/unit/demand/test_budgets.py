@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from application_manager.cache.budget_index import BudgetIndex
-from application_manager.core.claims.operations import Standing
+from application_manager.core.claims.operations import VerdictKind
 from application_manager.core.holders.policies import HolderPolicy, TaskPolicy
 from tests.unit.manager_objects import task
 from wayside.api import ApplicationTask
@@ -68,7 +68,7 @@ def test_one_beyond_them_waits_and_reports_for_what() -> None:
         index.enter(made(name))
     verdict = index.verdict((made("t0").namespace, "t0"))
     assert verdict is not None
-    assert verdict.standing is Standing.WAITING
+    assert verdict.kind is VerdictKind.WAITING
     assert "a1 has reached the limit of 2 unfinished tasks" in verdict.message
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from application_manager.core.claims.operations import Standing
+from application_manager.core.claims.operations import VerdictKind
 from application_manager.core.demand.demand import NamespaceOutcome, demand
 from application_manager.core.holders.leases import LeaseView
 from tests.unit.manager_objects import NOW, instance, task, template
@@ -61,7 +61,7 @@ def test_a_list_as_key_is_its_json() -> None:
 def test_a_key_without_a_value_is_refused_with_the_remedy() -> None:
     spec = {"parameters": {"region": {"type": "string"}}, "key": "${parameters.region}"}
     verdict = of(task("a"), templates=[template(**spec)]).verdicts["a"]
-    assert (verdict.standing, verdict.reason) == (Standing.REFUSED, "InvalidKey")
+    assert (verdict.kind, verdict.reason) == (VerdictKind.REFUSED, "InvalidKey")
     assert "is null for this task" in verdict.message
     assert "give the parameters" in verdict.message
 
@@ -103,7 +103,7 @@ def test_a_task_that_differs_where_all_must_agree_contributes_nothing_at_all() -
         "mode": "plain",
     }
     verdict = outcome.verdicts["later"]
-    assert (verdict.standing, verdict.reason, verdict.instance) == (Standing.REFUSED, "Conflict", None)
+    assert (verdict.kind, verdict.reason, verdict.instance) == (VerdictKind.REFUSED, "Conflict", None)
     for part in ("spec.parameters.model", '"large"', '"small"', "task first", "give the same value"):
         assert part in verdict.message
 
@@ -155,7 +155,7 @@ def test_a_value_that_does_not_fit_is_refused_with_field_value_and_remedy(
 ) -> None:
     outcome = of(task("a", parameters), task("good", {"region": "n"}))
     verdict = outcome.verdicts["a"]
-    assert (verdict.standing, verdict.reason) == (Standing.REFUSED, "InvalidParameters")
+    assert (verdict.kind, verdict.reason) == (VerdictKind.REFUSED, "InvalidParameters")
     for part in parts:
         assert part in verdict.message
     assert only(outcome).tasks == ("good",)
@@ -165,7 +165,7 @@ def test_more_than_64_kib_are_refused() -> None:
     spec = {"parameters": {"text": {"type": "string"}}}
     room = 64 * 1024 - len('{"text":""}')
     fits = of(task("a", {"text": "x" * room}), templates=[template(**spec)])
-    assert fits.verdicts["a"].standing is Standing.COUNTS
+    assert fits.verdicts["a"].kind is VerdictKind.COUNTS
     over = of(task("a", {"text": "x" * (room + 1)}), templates=[template(**spec)])
     assert over.verdicts["a"].reason == "InvalidParameters"
     assert "65537 bytes" in over.verdicts["a"].message
@@ -228,7 +228,7 @@ def test_a_holder_counts_until_its_lease_was_unchanged_for_its_duration_and_afte
     assert only(before).tasks == ("a",)
     assert only(before).next_change == pytest.approx(NOW + 0.1)
     verdict = lost(25).verdicts["a"]
-    assert (verdict.standing, verdict.reason) == (Standing.LAPSED, "HolderLost")
+    assert (verdict.kind, verdict.reason) == (VerdictKind.LAPSED, "HolderLost")
     assert lost(25).instances == {}
 
 
@@ -239,15 +239,15 @@ def test_policy_hold_and_a_person_never_lapse() -> None:
 
 def test_after_a_restart_a_lost_holder_stays_lost_until_it_renews() -> None:
     held = task("a", holder="det", accepted_condition=("False", "HolderLost", NOW - 60))
-    assert lost(0, held=held, renewed=False).verdicts["a"].standing is Standing.LAPSED
-    assert lost(0, held=held, renewed=True).verdicts["a"].standing is Standing.COUNTS
+    assert lost(0, held=held, renewed=False).verdicts["a"].kind is VerdictKind.LAPSED
+    assert lost(0, held=held, renewed=True).verdicts["a"].kind is VerdictKind.COUNTS
 
 
 def test_a_holder_lost_for_over_an_hour_finishes_its_tasks_until_it_returns() -> None:
     held = task("a", holder="det", accepted_condition=("False", "HolderLost", NOW - 3600))
     verdict = lost(3700, held=held).verdicts["a"]
-    assert (verdict.standing, verdict.reason) == (Standing.FINISHED, "DetectorLost")
-    assert lost(0, held=held).verdicts["a"].standing is Standing.COUNTS
+    assert (verdict.kind, verdict.reason) == (VerdictKind.FINISHED, "DetectorLost")
+    assert lost(0, held=held).verdicts["a"].kind is VerdictKind.COUNTS
 
 
 def test_a_lost_holder_takes_no_part_in_merging() -> None:

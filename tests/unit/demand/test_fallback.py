@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from application_manager.core.claims.claims import instance_name
-from application_manager.core.claims.operations import Standing
+from application_manager.core.claims.operations import VerdictKind
 from application_manager.core.demand.demand import NamespaceOutcome, demand
-from application_manager.core.demand.fallback import aspects, overdue
+from application_manager.core.demand.fallback import fallback_conditions, overdue
 from application_manager.core.holders.leases import LeaseView
 from tests.unit.demand.test_manager_places import Manager
 from tests.unit.manager_objects import NOW, instance, task, template
@@ -142,7 +142,7 @@ def test_the_fallback_serves_with_what_it_knows_and_the_first_one_tries_on() -> 
     assert outcome.instances[LITE_NORTH].parameters == {"region": "north"}
     assert outcome.instances[LITE_NORTH].template == "lite"
     verdict = outcome.verdicts["a"]
-    assert (verdict.standing, verdict.reason, verdict.instance) == (Standing.COUNTS, "FallenBack", LITE_NORTH)
+    assert (verdict.kind, verdict.reason, verdict.instance) == (VerdictKind.COUNTS, "FallenBack", LITE_NORTH)
     assert verdict.message == (
         f"instance {NORTH} is not ready; until it is, instance {LITE_NORTH} of template lite serves the task"
     )
@@ -151,10 +151,10 @@ def test_the_fallback_serves_with_what_it_knows_and_the_first_one_tries_on() -> 
 def test_both_instances_report_it() -> None:
     outcome = of(wants())
     first, other = outcome.instances[NORTH], outcome.instances[LITE_NORTH]
-    (timed_out,) = aspects([], first.overdue, first.fallback, first.stands_in_for)
+    (timed_out,) = fallback_conditions([], first.overdue, first.fallback, first.stands_in_for)
     assert (timed_out.type, timed_out.holds, timed_out.reason) == ("TimedOut", True, "ReadyTimeout")
     assert f"served by {LITE_NORTH} of template lite until it has been ready for 60s" in timed_out.message
-    (stands_in,) = aspects([], other.overdue, other.fallback, other.stands_in_for)
+    (stands_in,) = fallback_conditions([], other.overdue, other.fallback, other.stands_in_for)
     assert (stands_in.type, stands_in.holds) == ("StandsIn", True)
     assert NORTH in stands_in.message
 
@@ -187,7 +187,7 @@ def test_own_tasks_of_the_fallback_and_those_that_turn_to_it_share_it() -> None:
 )
 def test_where_the_fallback_cannot_serve_the_task_reports_why_and_stays(other: Any, shows: str) -> None:
     verdict = of(wants(), templates=[template(**FULL), *other]).verdicts["a"]
-    assert (verdict.standing, verdict.reason, verdict.instance) == (Standing.COUNTS, "FallbackFailed", NORTH)
+    assert (verdict.kind, verdict.reason, verdict.instance) == (VerdictKind.COUNTS, "FallbackFailed", NORTH)
     assert shows in verdict.message
 
 

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from application_manager.core.claims.claims import instance_name
-from application_manager.core.claims.operations import Standing
+from application_manager.core.claims.operations import VerdictKind
 from application_manager.core.demand.demand import NamespaceOutcome, demand
 from application_manager.core.demand.drafting import draft
 from tests.unit.manager_objects import NOW, instance, task, template
@@ -78,7 +78,7 @@ def test_of_equal_priority_the_older_runs_and_the_other_waits_visibly() -> None:
     outcome = of(wants("b", created=1), wants("a", created=2))
     assert running(outcome) == {"b"}
     verdict = outcome.verdicts["a"]
-    assert (verdict.standing, verdict.reason, verdict.instance) == (Standing.WAITING, "LimitReached", None)
+    assert (verdict.kind, verdict.reason, verdict.instance) == (VerdictKind.WAITING, "LimitReached", None)
     for part in ("template app is at its limit of 1 instance (spec.maxInstances)", "a priority of 1 or more"):
         assert part in verdict.message
 
@@ -163,7 +163,7 @@ def test_what_a_person_made_takes_no_place() -> None:
 def test_what_acts_on_an_instance_without_a_place_waits_with_it() -> None:
     tasks = [wants("a"), wants("b", created=1), task("stop", {"region": "b"}, operation="Suspend")]
     verdict = of(*tasks).verdicts["stop"]
-    assert (verdict.standing, verdict.reason) == (Standing.WAITING, "NothingRuns")
+    assert (verdict.kind, verdict.reason) == (VerdictKind.WAITING, "NothingRuns")
     assert "does not run" in verdict.message
 
 

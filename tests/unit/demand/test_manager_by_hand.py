@@ -6,15 +6,15 @@ from typing import Any
 
 import pytest
 
-from application_manager.core.conditions import Aspect
+from application_manager.core.conditions import ConditionState
 from application_manager.core.demand.decisions import Decision
-from application_manager.core.demand.demand import Standing, demand
+from application_manager.core.demand.demand import VerdictKind, demand
 from application_manager.core.demand.lingering import (
     HOLD_ANNOTATION,
     PAUSE_ANNOTATION,
     is_held,
     is_paused,
-    manual_aspects,
+    manual_conditions,
 )
 from application_manager.core.statuses.status import instance_status
 from tests.unit.manager_objects import NOW, instance, task, template
@@ -53,7 +53,7 @@ def test_a_paused_instance_keeps_its_values_and_is_not_released() -> None:
     assert (decided(paused).release_time, decided(paused).paused, decided(paused).withheld) == (None, True, False)
     decision = decided(paused, task("a", {"rate": 5}))
     assert (decision.parameters, decision.paused, decision.withheld) == (None, True, True)
-    assert decision.verdicts["a"].standing is Standing.COUNTS
+    assert decision.verdicts["a"].kind is VerdictKind.COUNTS
     assert not decided(paused, task("a", {"rate": 3})).withheld
 
 
@@ -62,12 +62,12 @@ def test_a_persons_instance_can_be_paused_too() -> None:
 
 
 def test_the_status_reports_who_keeps_it_and_once_more_when_that_is_over() -> None:
-    assert list(manual_aspects(instance())) == []
+    assert list(manual_conditions(instance())) == []
     held = annotated(HOLD_ANNOTATION, "anna, measuring")
-    (aspect,) = manual_aspects(held)
-    assert (aspect.type, aspect.holds) == ("Held", True)
-    assert "anna, measuring" in aspect.message
-    well = Aspect("Applied", True, "Applied"), Aspect("Ready", True, "Ready")
+    (state,) = manual_conditions(held)
+    assert (state.type, state.holds) == ("Held", True)
+    assert "anna, measuring" in state.message
+    well = ConditionState("Applied", True, "Applied"), ConditionState("Ready", True, "Ready")
     status = instance_status(held, decided(held), *well, (), None, NOW)
     assert {each.type: each.status for each in status.conditions} == {
         "Applied": "True",
@@ -75,5 +75,5 @@ def test_the_status_reports_who_keeps_it_and_once_more_when_that_is_over() -> No
         "Held": "True",
     }
     later = instance().model_copy(update={"status": ApplicationInstanceStatus.model_validate(status)})
-    (aspect,) = manual_aspects(later)
-    assert (aspect.type, aspect.holds, aspect.reason) == ("Held", False, "NotHeld")
+    (state,) = manual_conditions(later)
+    assert (state.type, state.holds, state.reason) == ("Held", False, "NotHeld")

@@ -15,7 +15,7 @@ from wayside.api.base import API_VERSION
 NAME = ("site", "app")
 
 
-def world_with(existing: ApplicationInstance) -> ClusterCache:
+def cache_with(existing: ApplicationInstance) -> ClusterCache:
     cache = ClusterCache(Policy())
     see(cache, template(lifecycle={"linger": "30s"}), "1")
     see(cache, existing, "2")
@@ -40,14 +40,14 @@ def decided(cache: ClusterCache, at: float) -> Decision:
 
 
 def test_a_deadline_holds_from_when_it_was_decided_though_no_status_reports_it_yet() -> None:
-    cache = world_with(instance())
+    cache = cache_with(instance())
     assert decided(cache, 0).release_time == NOW + 30
     assert decided(cache, 20).release_time == NOW + 30
     assert decided(cache, 31).release_time == NOW + 30
 
 
 def test_a_demand_that_came_and_went_restarts_the_linger_though_the_status_has_the_old_deadline() -> None:
-    cache = world_with(instance(release_at=NOW + 10))
+    cache = cache_with(instance(release_at=NOW + 10))
     assert decided(cache, 0).release_time == NOW + 10
     claim(cache, task("a"))
     assert decided(cache, 5).release_time is None
@@ -56,11 +56,11 @@ def test_a_demand_that_came_and_went_restarts_the_linger_though_the_status_has_t
 
 
 def test_after_a_restart_the_status_is_what_is_known() -> None:
-    assert decided(world_with(instance(release_at=NOW + 10)), 5).release_time == NOW + 10
+    assert decided(cache_with(instance(release_at=NOW + 10)), 5).release_time == NOW + 10
 
 
 def test_the_deadline_of_a_namesake_is_worth_nothing() -> None:
-    cache = world_with(instance())
+    cache = cache_with(instance())
     assert decided(cache, 0).release_time == NOW + 30
     successor = instance()
     successor = successor.model_copy(update={"metadata": successor.metadata.model_copy(update={"uid": "another"})})
@@ -70,7 +70,7 @@ def test_the_deadline_of_a_namesake_is_worth_nothing() -> None:
 
 
 def test_the_deadline_of_what_is_gone_is_forgotten() -> None:
-    cache = world_with(instance(release_at=NOW + 10))
+    cache = cache_with(instance(release_at=NOW + 10))
     decided(cache, 0)
     entry = cache.store.get(INSTANCE, NAME)
     assert entry is not None

@@ -6,11 +6,11 @@ from typing import Any
 
 from application_manager.cache.claim_index import ClaimIndex
 from application_manager.cache.store import Entry
-from application_manager.core.claims.claims import Claim, Refused
-from application_manager.core.claims.operations import Standing, Verdict
+from application_manager.core.claims.claims import Claim, RefusalReason
+from application_manager.core.claims.operations import Verdict, VerdictKind
 from application_manager.core.demand.demand import claim_or_verdict
 from application_manager.workers.answers import Exceeded
-from application_manager.workers.claiming import Claiming
+from application_manager.workers.claiming import ClaimEvaluator
 from wayside.api import ApplicationTask, ApplicationTemplate
 
 NAME = ("site", "a")
@@ -47,7 +47,7 @@ class Answers:
 
 
 def index_of(answers: Answers) -> ClaimIndex:
-    return ClaimIndex(Claiming(answers, lambda _: None))  # type: ignore[arg-type]  it has what is used
+    return ClaimIndex(ClaimEvaluator(answers, lambda _: None))  # type: ignore[arg-type]  it has what is used
 
 
 def test_a_key_that_only_reads_parameters_is_worked_out_at_once_and_all_else_elsewhere() -> None:
@@ -82,7 +82,7 @@ def test_a_task_keeps_the_claim_that_it_had_until_the_new_one_is_known() -> None
     index.note(NAME, Entry({}, task(ended=True)), made)
     verdict = index.verdict(NAME)
     assert verdict is not None
-    assert (verdict.standing, index.claim(NAME), index.pending(OF)) == (Standing.FINISHED, None, False)
+    assert (verdict.kind, index.claim(NAME), index.pending(OF)) == (VerdictKind.FINISHED, None, False)
 
 
 def test_a_template_is_unsettled_until_all_tasks_that_were_there_are_known() -> None:
@@ -112,7 +112,7 @@ def test_a_claim_that_takes_too_much_is_refused_and_settles_nothing() -> None:
     index.note(NAME, Entry({}, task()), made)
     verdict = index.verdict(NAME)
     assert isinstance(verdict, Verdict)
-    assert (verdict.standing, verdict.reason) == (Standing.REFUSED, Refused.EXPRESSION_LIMIT)
+    assert (verdict.kind, verdict.reason) == (VerdictKind.REFUSED, RefusalReason.EXPRESSION_LIMIT)
     assert "against template app takes more than 2 s" in verdict.message
     assert index.unsettled(OF)
     index.note(NAME, Entry({}, task(ended=True)), made)

@@ -154,6 +154,6 @@ def test_what_is_being_made_has_its_place_already() -> None:
     first, other = decided[instance_name("app", "a")], decided[instance_name("app", "b")]
     assert other is not None
     assert not other.wanted
-    assert (other.verdicts["b"].standing, other.verdicts["b"].reason) == ("Waiting", "LimitReached")
+    assert (other.verdicts["b"].kind, other.verdicts["b"].reason) == ("Waiting", "LimitReached")
     assert first is not None
     assert not first.wanted

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from application_manager.core.claims.claims import claim
 from application_manager.core.claims.merging import Contribution, merge
-from application_manager.core.conditions import Aspect
+from application_manager.core.conditions import ConditionState
 from application_manager.core.demand.demand import demand
 from application_manager.core.objects.policy import Policy
 from application_manager.core.objects.rendering import Renderer, RenderError
@@ -106,7 +106,7 @@ def test_the_instance_reports_that_a_sum_is_capped_and_when_it_is_no_more() -> N
         nonlocal here
         tasks = [task(f"t{index}", {"rate": rate}) for index, rate in enumerate(rates)]
         (decision,) = demand(templates, tasks, [here], {}, NOW).instances.values()
-        applied = Aspect("Applied", True, "Applied")
+        applied = ConditionState("Applied", True, "Applied")
         status = instance_status(here, decision, applied, applied, [], None, NOW)
         here = here.model_copy(update={"status": status})
         logged = {each.type: (each.status, each.message) for each in status.conditions}.get("Capped")

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from application_manager.core.claims.claims import instance_name
-from application_manager.core.claims.operations import Standing
+from application_manager.core.claims.operations import VerdictKind
 from application_manager.core.demand.decisions import Decision
 from application_manager.core.demand.demand import NamespaceOutcome, demand
 from application_manager.core.demand.drafting import draft
@@ -66,7 +66,7 @@ def test_a_reconfiguration_lies_over_the_merged_values_and_falls_back() -> None:
     outcome = of(deploy("a", rateHz=20, sources=["a"]), deploy("b", rateHz=30, sources=["b"]), low)
     assert values(outcome) == {"rateHz": 2, "sources": ["z"]}  # below what the others merge to, and not merged with it
     assert outcome.instances[NORTH].tasks == ("a", "b")
-    assert (outcome.verdicts["low"].standing, outcome.verdicts["low"].instance) == (Standing.COUNTS, NORTH)
+    assert (outcome.verdicts["low"].kind, outcome.verdicts["low"].instance) == (VerdictKind.COUNTS, NORTH)
     ended = change("low", {"region": "north", "rateHz": 2}, ended=True)
     assert values(of(deploy("a", rateHz=20, sources=["a"]), ended)) == {"rateHz": 20, "sources": ["a"]}
 
@@ -87,7 +87,7 @@ def test_a_reconfiguration_starts_nothing_and_waits_visibly() -> None:
     for outcome in (of(change("c", {"region": "north", "rateHz": 2})), of(change("c", {"rateHz": 2}))):
         assert outcome.instances == {}
         verdict = outcome.verdicts["c"]
-        assert (verdict.standing, verdict.reason, verdict.instance) == (Standing.WAITING, "NothingRuns", None)
+        assert (verdict.kind, verdict.reason, verdict.instance) == (VerdictKind.WAITING, "NothingRuns", None)
         assert "waits until a Deploy task does" in verdict.message
 
 
@@ -95,7 +95,7 @@ def test_what_lingers_is_not_reconfigured() -> None:
     outcome = of(change("c", {"region": "north", "rateHz": 2}), instances=[instance(NORTH, key="north")])
     assert outcome.instances[NORTH].parameters is None
     assert outcome.instances[NORTH].release_time is not None
-    assert outcome.verdicts["c"].standing is Standing.WAITING
+    assert outcome.verdicts["c"].kind is VerdictKind.WAITING
 
 
 def test_without_the_keys_parameters_it_is_for_all_instances() -> None:
@@ -112,10 +112,10 @@ def test_one_for_all_reports_where_it_conflicts() -> None:
     outcome = of(deploy("a"), deploy("b", "south"), here, change("all", {"model": "tiny"}))
     assert (values(outcome)["model"], values(outcome, SOUTH)["model"]) == ("large", "tiny")
     verdict = outcome.verdicts["all"]
-    assert (verdict.standing, verdict.instance) == (Standing.COUNTS, SOUTH)
+    assert (verdict.kind, verdict.instance) == (VerdictKind.COUNTS, SOUTH)
     assert "except 1 (the first: spec.parameters.model" in verdict.message
     refused = of(deploy("a"), here, change("all", {"model": "tiny"})).verdicts["all"]
-    assert (refused.standing, refused.reason) == (Standing.REFUSED, "Conflict")
+    assert (refused.kind, refused.reason) == (VerdictKind.REFUSED, "Conflict")
 
 
 TWO = {
@@ -136,7 +136,7 @@ TWO = {
 )
 def test_what_cannot_act_on_what_runs_is_refused(wrong: Any, spec: Any, reason: str, message: str) -> None:
     verdict = of(wrong, spec=spec).verdicts["c"]
-    assert (verdict.standing, verdict.reason) == (Standing.REFUSED, reason)
+    assert (verdict.kind, verdict.reason) == (VerdictKind.REFUSED, reason)
     assert message in verdict.message
 
 
@@ -160,7 +160,7 @@ def test_a_suspension_wins_from_the_highest_priority_that_deploys(priority: int,
     assert ("which task s suspends" in outcome.verdicts["a"].message) == suspended
     if not suspended:
         verdict = outcome.verdicts["s"]
-        assert (verdict.standing, verdict.reason) == (Standing.REFUSED, "Outbid")
+        assert (verdict.kind, verdict.reason) == (VerdictKind.REFUSED, "Outbid")
         assert "spec.priority: 1 is below the priority 2 of task b" in verdict.message
 
 
@@ -173,8 +173,8 @@ def test_a_suspension_is_for_all_instances_or_for_that_of_its_key_and_starts_not
     both = [deploy("a"), deploy("b", "south")]
     assert [each.suspended for each in of(*both, stop("s")).instances.values()] == [True, True]
     assert of(*both, stop("s", {"region": "south"})).instances[NORTH].suspended is False
-    assert of(stop("s")).verdicts["s"].standing is Standing.WAITING
-    assert of(stop("s", {"region": "north"})).verdicts["s"].standing is Standing.WAITING
+    assert of(stop("s")).verdicts["s"].kind is VerdictKind.WAITING
+    assert of(stop("s", {"region": "north"})).verdicts["s"].kind is VerdictKind.WAITING
 
 
 def test_a_suspended_instance_stays_so_while_it_lingers_unless_it_is_held() -> None:
@@ -189,7 +189,7 @@ def test_a_suspended_instance_stays_so_while_it_lingers_unless_it_is_held() -> N
 def test_a_lost_holder_suspends_nothing() -> None:
     outcome = of(deploy("a"), stop("s", holder="det"), leases={"det": LeaseView(100, 15)})
     assert outcome.instances[NORTH].suspended is False
-    assert outcome.verdicts["s"].standing is Standing.LAPSED
+    assert outcome.verdicts["s"].kind is VerdictKind.LAPSED
 
 
 # --- Baseline
@@ -331,7 +331,7 @@ def test_every_task_reports_what_became_of_it_and_none_but_deploy_makes_anything
     for each in live:
         if each.spec.operation == "Deploy":
             verdict = outcome.verdicts[each.name]
-            assert (verdict.standing is Standing.COUNTS) == (each.name in serving)
+            assert (verdict.kind is VerdictKind.COUNTS) == (each.name in serving)
             assert verdict.instance == serving.get(each.name)
     deployed = {each.spec.parameters["region"] for each in live if each.spec.operation == "Deploy"}
     assert {each.key for each in outcome.instances.values()} <= deployed

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from detector.assembly import DetectorError, inlets
+from detector.assembly import DetectorError, stream_readers
 from detector.engine.samples.sample import DecodeError
 from detector.streams.codecs.etsi import DefinitionError, EtsiDecoder
 from detector.streams.codecs.etsi.messages import BY_NAME, packaged_definitions
@@ -176,7 +176,7 @@ def test_a_field_that_the_message_does_not_have_is_reported_before_any_has_come(
     detector = a_detector(STREAM)
     rule = a_rule(signals=[{"name": "x", "stream": "cam", "value": expression}], when="x == 1")
     with pytest.raises(RuleError, match=problem):
-        compile_rule(rule, detector, inlets(detector).fields)
+        compile_rule(rule, detector, stream_readers(detector).fields)
 
 
 STREAM = {"name": "cam", "key": "its/${client:*}/cam", "encoding": "uper", "type": "etsi/cam"}
@@ -189,7 +189,7 @@ def test_without_the_extra_the_error_names_the_stream_and_what_to_install(monkey
     with pytest.raises(
         DetectorError, match=r"spec.streams\[0\].type: .* CAM are not installed: pip install 'wayside\["
     ):
-        inlets(a_detector(STREAM))
+        stream_readers(a_detector(STREAM))
 
 
 def test_the_packages_of_definitions_are_imported_only_where_a_stream_needs_them() -> None:

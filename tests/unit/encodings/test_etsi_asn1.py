@@ -11,7 +11,7 @@ from typing import Any
 import asn1tools
 import pytest
 
-from detector.assembly import DetectorError, inlets
+from detector.assembly import DetectorError, stream_readers
 from detector.engine.samples.sample import DecodeError
 from detector.streams.codecs.etsi import EtsiDecoder, OwnDefinitions
 from detector.streams.codecs.etsi.bits import Bits
@@ -232,7 +232,7 @@ def test_random_bytes_are_read_or_refused_for_every_kind_of_type() -> None:
 def test_what_is_wrong_with_modules_is_reported_with_their_field(modules: list[dict[str, str]], problem: str) -> None:
     stream = {"name": "cpm", "key": "its/${client:*}/cpm", "encoding": "uper", "type": "etsi/cpm"}
     with pytest.raises(DetectorError, match=problem) as raised:
-        inlets(a_detector(stream, asn1=modules))
+        stream_readers(a_detector(stream, asn1=modules))
     assert len(raised.value.problems) == 1
 
 
@@ -240,5 +240,5 @@ def test_modules_come_from_files_and_from_the_detector_itself(tmp_path: Path) ->
     file = tmp_path / "dictionary.asn"
     file.write_text(DICTIONARY)
     stream = {"name": "cpm", "key": "its/${client:*}/cpm", "encoding": "uper", "type": "etsi/cpm"}
-    entries = inlets(a_detector(stream, asn1=[{"definition": PERCEPTION}, {"file": str(file)}]))
+    entries = stream_readers(a_detector(stream, asn1=[{"definition": PERCEPTION}, {"file": str(file)}]))
     assert entries.decoders["cpm"].decode(perception())["payload"]["parts"][0]["partData"] == {"length": 4.5}

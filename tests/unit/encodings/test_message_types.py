@@ -19,7 +19,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 from typer.testing import CliRunner
 
-from detector.assembly import DetectorError, inlets
+from detector.assembly import DetectorError, stream_readers
 from detector.assembly.checking import findings
 from detector.commands.cli import app
 from detector.engine.samples.sample import Arrival
@@ -264,7 +264,7 @@ def test_samples_of_a_type_that_is_redefined_are_not_read_by_the_new_definition(
     drive.take(Arrival(at(0.5), "tracks", "vehicles/car/tracks", cdr(store, message(store))), until=1)
     assert len(list(drive.engine.buffer)) == 1
     changed = a_detector(STREAM, messages=[{"name": TRACKS, "definition": "int32[] tracks"}])
-    entries = inlets(changed)
+    entries = stream_readers(changed)
     drive.engine.set_detector(changed, entries.decoders, entries.read_key)
     assert list(drive.engine.buffer) == []
 
@@ -272,7 +272,7 @@ def test_samples_of_a_type_that_is_redefined_are_not_read_by_the_new_definition(
 def test_an_intake_file_holds_the_definition_for_other_programs(tmp_path: Path) -> None:
     store = other_store()
     detector = a_detector(STREAM, messages=MESSAGES)
-    writer = IntakeWriter(tmp_path / "intake.mcap", detector.spec.streams, inlets(detector).types)
+    writer = IntakeWriter(tmp_path / "intake.mcap", detector.spec.streams, stream_readers(detector).types)
     raw = cdr(store, message(store))
     writer.arrivals([Arrival(10, "tracks", "vehicles/car/tracks", raw)])
     writer.close()
@@ -314,7 +314,7 @@ def test_a_recording_brings_its_definitions_along(tmp_path: Path, storage: Stora
 def test_the_definition_of_the_recording_counts_before_that_of_the_detector(tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "bag", other_store())
     other = a_detector(STREAM, messages=[{"name": TRACKS, "definition": "int32 x"}, MESSAGES[1], MESSAGES[2]])
-    fields = inlets(with_recorded_types(other, [bag])).fields["tracks"]
+    fields = stream_readers(with_recorded_types(other, [bag])).fields["tracks"]
     assert [*fields] == ["sequence", "header", "tracks", "sensor"]
     same = a_detector(STREAM, messages=MESSAGES)
     assert with_recorded_types(same, [bag]) is same
@@ -350,12 +350,12 @@ def with_recorded(*paths: Path) -> Detector:
 
 def test_definitions_in_idl_are_understood(tmp_path: Path) -> None:
     completed = with_recorded(mcap(tmp_path / "a.mcap", IDL, "ros2idl"))
-    assert [*inlets(completed).fields["tracks"]] == ["count", "places"]
+    assert [*stream_readers(completed).fields["tracks"]] == ["count", "places"]
 
 
 def test_recordings_that_define_a_type_differently_are_not_mixed(tmp_path: Path) -> None:
     same = [mcap(tmp_path / "a.mcap", "int32 x"), mcap(tmp_path / "b.mcap", "int32  x  # the same")]
-    assert [*inlets(with_recorded(*same)).fields["tracks"]] == ["x"]
+    assert [*stream_readers(with_recorded(*same)).fields["tracks"]] == ["x"]
     with pytest.raises(
         RecordingError, match=r"c\.mcap: fleet_msgs/msg/Tracks differs from its definition in .*a\.mcap"
     ):
@@ -379,7 +379,7 @@ def test_a_definition_that_cannot_be_read_is_an_error_unless_the_type_is_known(
 
 def test_a_definition_of_the_recording_that_lacks_a_part_is_reported(tmp_path: Path) -> None:
     with pytest.raises(DetectorError, match=r"spec\.messages\[0\]\.definition: line 1: x is of fleet_msgs/msg/Nowhere"):
-        inlets(with_recorded(mcap(tmp_path / "a.mcap", "Nowhere x")))
+        stream_readers(with_recorded(mcap(tmp_path / "a.mcap", "Nowhere x")))
 
 
 def test_the_documentation_s_examples_are_streams_that_run() -> None:
@@ -387,7 +387,7 @@ def test_the_documentation_s_examples_are_streams_that_run() -> None:
     streams = [each for each in blocks if "streams" in each]
     assert len(streams) >= 2
     for example in streams:
-        entries = inlets(a_detector(*example.pop("streams"), **example))
+        entries = stream_readers(a_detector(*example.pop("streams"), **example))
         assert entries.decoders
 
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from detector.assembly import inlets, make_engine
+from detector.assembly import make_engine, stream_readers
 from detector.engine.episodes.events import Event
 from detector.engine.samples.intake import Intake
 from detector.engine.samples.sample import Arrival
 from detector.live.evaluator import Evaluator
-from detector.live.state import Restored
+from detector.live.state import RestoredState
 from detector.replay.intake_file import Control
 from detector.resources.selection import RuleSet
 from tests.driving import START
@@ -18,7 +18,7 @@ from wayside.api import Detector
 
 
 class Recording:
-    """Keeps the input and output of a live engine: recorder and outlet in one."""
+    """Keeps the input and output of a live engine: recorder and event sink in one."""
 
     def __init__(self) -> None:
         self.records: list[Arrival | Control] = []
@@ -49,7 +49,7 @@ class Live:
         self.now = START
         self.recording = Recording()
         self._failures: list[BaseException] = []
-        self.engine = make_engine(detector, inlets(detector), holder="d", start=START)
+        self.engine = make_engine(detector, stream_readers(detector), holder="d", start=START)
         intake = self.intake = Intake(lambda: self.now)
         self.evaluator = Evaluator(
             self.engine,
@@ -60,7 +60,7 @@ class Live:
             on_failure=self._failures.append,
         )
         self.put = intake.putter("speed")
-        self.evaluator.start(RuleSet(detector, tuple(rules)), Restored())
+        self.evaluator.start(RuleSet(detector, tuple(rules)), RestoredState())
 
     def stop(self) -> Recording:
         self.evaluator.stop()

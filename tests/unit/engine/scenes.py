@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from random import Random
 from typing import Any, NamedTuple
 
-from detector.assembly import RuleIndex, inlets, make_engine
+from detector.assembly import RuleIndex, make_engine, stream_readers
 from detector.engine.counters import RuleCounters
 from detector.engine.engine import NotEvaluableError
 from detector.engine.samples.sample import Arrival
@@ -146,7 +146,7 @@ def driven(scene: Scene, cut: Callable[[], int], *, one_by_one: bool = False) ->
 
     `one_by_one`: every rule is evaluated by CEL, subject by subject, as if somebody watched each evaluation.
     """
-    entries, index = inlets(scene.detector), RuleIndex()
+    entries, index = stream_readers(scene.detector), RuleIndex()
     engine = make_engine(scene.detector, entries, holder="h", start=START - 1)
     engine.counters.watch_ages = True
     events: list[str] = []

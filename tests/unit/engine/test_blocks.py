@@ -10,7 +10,7 @@ import pytest
 from detector.engine.buffering import ingest
 from detector.engine.columns import tables
 from detector.engine.columns.tables import Tables
-from detector.replay.replaying import Replay, Replayed
+from detector.replay.replaying import Replay, ReplayResult
 from tests.driving import (
     SPEED,
     START,
@@ -149,7 +149,7 @@ def test_what_is_left_out_for_a_while_leaves_nothing_behind() -> None:
 
 def tasks_of(rule: Any, arrivals: list[Any], cut: int) -> dict[str, Any]:
     """The tasks of a replay that takes this number of arrivals at once."""
-    outcome = Replayed()
+    outcome = ReplayResult()
     replay = Replay(a_detector(), [rule], holder="h", start=START, outcome=outcome)
     for begin in range(0, len(arrivals), cut):
         taken = arrivals[begin : begin + cut]

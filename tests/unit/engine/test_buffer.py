@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from detector.engine.buffering.buffer import Buffer, Lane
-from detector.engine.samples.sample import SAMPLE_OVERHEAD, Sample, Stamped
+from detector.engine.samples.sample import SAMPLE_OVERHEAD, Sample, StampedSample
 from tests.driving import Drive, a_detector, a_rule, a_stream, arrival
 from wayside.api import EventRule
 
@@ -19,7 +19,7 @@ def a_lane(client: str = "car", stream: str = "s", duration: int = 10**9, maximu
 
 
 def a_sample(time: int, number: int = 0, payload: bytes = b"") -> Sample:
-    return Stamped(time, number, payload, "k")
+    return StampedSample(time, number, payload, "k")
 
 
 def held(buffer: Buffer) -> int:

@@ -13,7 +13,7 @@ from msgspec.structs import replace
 
 from detector.engine.buffering.buffer import Buffer, Lane
 from detector.engine.buffering.latched import LatchedLane, by_key
-from detector.engine.samples.sample import SAMPLE_OVERHEAD, Sample, Stamped
+from detector.engine.samples.sample import SAMPLE_OVERHEAD, Sample, StampedSample
 from detector.replay.playing import recorded_arrivals
 from detector.replay.replaying import replay_arrivals
 from detector.replay.routing import MessageRouter
@@ -35,7 +35,7 @@ def a_latched_lane(duration: int = 10) -> LatchedLane:
 
 
 def a_sample(time: int, key: str = "k", number: int = 0) -> Sample:
-    return Stamped(time, number, b"x", key)
+    return StampedSample(time, number, b"x", key)
 
 
 @given(st.lists(st.tuples(st.integers(0, 50), st.sampled_from("abc"))), st.integers(0, 70))

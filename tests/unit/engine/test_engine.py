@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from detector.assembly import inlets, make_engine
+from detector.assembly import make_engine, stream_readers
 from tests.driving import POSITION, Drive, a_detector, a_rule, a_stream, arrival, at, compiled, place, speed
 from tests.unit.engine.rules import near, speeding
 
@@ -23,7 +23,7 @@ def test_an_episode_reports_when_its_condition_began_to_hold_and_when_it_started
 def test_two_detectors_that_see_the_same_have_episodes_of_their_own() -> None:
     episodes = set()
     for holder in ("north", "south"):
-        engine = make_engine(a_detector(), inlets(a_detector()), holder=holder, start=at(0))
+        engine = make_engine(a_detector(), stream_readers(a_detector()), holder=holder, start=at(0))
         engine.set_rules(compiled(a_detector(), speeding()))
         (event,) = engine.advance([speed(0.5, 20)], at(1))
         episodes.add(event.episode.id)

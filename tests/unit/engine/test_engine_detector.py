@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from detector.assembly import inlets
+from detector.assembly import stream_readers
 from tests.driving import POSITION, SECOND, Drive, a_deploy, a_detector, a_rule, a_stream, arrival, at, compiled
 from wayside.rules import RuleError
 
@@ -17,7 +17,7 @@ RULE = a_rule(signals=[SPEED], when="v > 10", actions=[a_deploy("x")])
 def change(drive: Drive, *streams: Any, rules: Any = (RULE,), **spec: Any) -> list[str]:
     """Switch to another Detector and the rules compiled against it."""
     detector = a_detector(*streams, **spec)
-    entries = inlets(detector)
+    entries = stream_readers(detector)
     drive.engine.set_detector(detector, entries.decoders, entries.read_key)
     return drive.note(drive.engine.set_rules(compiled(detector, *rules)))
 
@@ -93,7 +93,7 @@ def test_a_detector_that_cannot_run_changes_nothing() -> None:
     drive = started()
     broken = a_detector(a_stream("pose"), a_stream("speed", stamp="msg."))
     before = drive.engine.detector
-    good = inlets(a_detector())
+    good = stream_readers(a_detector())
     with pytest.raises(RuleError, match=r"spec\.streams\[1\]\.stamp"):
         drive.engine.set_detector(broken, good.decoders, good.read_key)
     assert drive.engine.detector is before

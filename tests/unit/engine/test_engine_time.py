@@ -261,10 +261,10 @@ def test_a_detector_that_changes_its_lateness_keeps_what_waited() -> None:
     detector = a_detector(a_stream("speed", stamp="msg.t"), clock="Data", lateness="500ms")
     drive = Drive(detector, COUNT)
     drive.take(sent(10.8), sent(10.9), until=0)
-    from detector.assembly import inlets
+    from detector.assembly import stream_readers
 
     patient = a_detector(a_stream("speed", stamp="msg.t"), clock="Data", lateness="900ms")
-    entries = inlets(patient)
+    entries = stream_readers(patient)
     drive.engine.set_detector(patient, entries.decoders, entries.read_key)
     assert len([sample for lane in drive.engine.buffer for sample in lane.samples]) == 2
 
@@ -307,13 +307,13 @@ def test_after_a_step_back_of_the_clock_the_past_is_forgotten_and_time_continues
 
 
 def test_windows_do_not_reach_behind_a_gap_after_the_detector_has_changed() -> None:
-    from detector.assembly import inlets
+    from detector.assembly import stream_readers
 
     drive = Drive(a_detector(), a_rule(signals=COUNT.to_json()["spec"]["signals"], when="n >= 2"))
     drive.take(arrival(1.5, "car", {}), until=1.9)
     drive.engine.gap(at(2.1))
     changed = a_detector(a_stream("pose"), a_stream("speed"), clientTimeout="20s")
-    entries = inlets(changed)
+    entries = stream_readers(changed)
     drive.engine.set_detector(changed, entries.decoders, entries.read_key)
     assert drive.take(arrival(2.3, "car", {}), until=2.9) == []
     assert drive.take(until=3) == []

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from detector.engine.episodes.episodes import (
     Ended,
-    Ending,
+    EndReason,
     Observation,
     Started,
     SubjectState,
@@ -184,7 +184,7 @@ def test_after_a_gap_what_was_pending_restarts_and_what_is_open_stays_open() -> 
     state.step(103, timing, seen(until=UNKNOWN))
     state.gap()
     assert state.step(200, timing, seen(until=UNKNOWN)) is None
-    assert state.step(202, timing, seen(until=UNKNOWN)) == Ended(Ending.UNKNOWN)
+    assert state.step(202, timing, seen(until=UNKNOWN)) == Ended(EndReason.UNKNOWN)
 
 
 @pytest.mark.parametrize("first", TRUTHS)

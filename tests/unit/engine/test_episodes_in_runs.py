@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from detector.engine.episodes.episodes import (
     Ended,
-    Ending,
+    EndReason,
     Observation,
     Started,
     SubjectState,
@@ -35,14 +35,14 @@ def stepped(state: SubjectState, now: int, timing: Timing, seen: Observation) ->
 def open_step(state: SubjectState, now: int, timing: Timing, seen: Observation) -> Ended | None:
     reason = None
     if seen.in_scope is False:
-        reason = Ending.OUT_OF_SCOPE
+        reason = EndReason.OUT_OF_SCOPE
     elif seen.until is True:
-        reason = Ending.UNTIL
+        reason = EndReason.UNTIL
     elif seen.until is UNKNOWN:
         if state.unknown_since is None:
             state.unknown_since = now
         if now - state.unknown_since >= timing.unknown_timeout:
-            reason = Ending.UNKNOWN
+            reason = EndReason.UNKNOWN
     else:
         state.unknown_since = None
     if reason is None:

@@ -14,15 +14,15 @@ from typing import Any
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from detector.assembly import inlets
+from detector.assembly import stream_readers
 from detector.engine.engine import Engine
 from detector.engine.episodes.events import Event
 from detector.engine.samples.sample import Arrival, DecodeError
 from tests.driving import START, a_detector, a_rule, a_stream, compiled
 from tests.reference.detector import Reference, Reported
 from tests.reference.places import located
+from tests.reference.samples import SECOND, Received, Sample, listed
 from tests.reference.signals import set_places
-from tests.reference.world import SECOND, Sample, World, listed
 from tests.unit.engine.random_drives import BROKEN, HALF, PLACES, POSITION, Message, Scene, scenes
 from wayside.rules import dependency_problems
 
@@ -77,7 +77,7 @@ def by_the_engine(scene: Scene, cut: int) -> list[Event]:
     ]
     buffer = _given({"duration": "6s", "bytes": scene.all_bytes})
     detector = a_detector(*streams, clientTimeout="4s", buffer=buffer, places=[*PLACES], **clock)
-    entries = inlets(detector)
+    entries = stream_readers(detector)
     decoders = dict.fromkeys(STREAMS, Plain())
     engine = Engine(detector, holder="h", decoders=decoders, read_key=entries.read_key, start=START)
     engine.set_rules(compiled(detector, *(a_rule(name, **spec) for name, spec in scene.rules.items())))
@@ -119,10 +119,10 @@ def payload_of(time: int, message: Message) -> bytes:
 def by_the_reference(scene: Scene) -> list[Reported]:
     set_places(PLACES, POSITION)
     counts, sizes = _given({"speed": scene.count}), _given({"pose": scene.pose_bytes})
-    world = World(TIMEOUT, dict.fromkeys(STREAMS, KEPT), STREAMS, counts, sizes, scene.all_bytes, items=LISTS)
+    received = Received(TIMEOUT, dict.fromkeys(STREAMS, KEPT), STREAMS, counts, sizes, scene.all_bytes, items=LISTS)
     lateness = scene.lateness * HALF if scene.data else None
     rules = {name: located(spec, {"pose": POSITION}) for name, spec in scene.rules.items()}
-    reference = Reference(rules, world, lateness=lateness, start=START, keep_starts=KEPT)
+    reference = Reference(rules, received, lateness=lateness, start=START, keep_starts=KEPT)
     gap = scene.gap
     for number, (time, each) in enumerate(ordered(scene)):
         if gap is not None and time > START + gap[0] * HALF:

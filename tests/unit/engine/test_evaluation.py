@@ -228,7 +228,7 @@ def test_the_replay_of_pauses_questions_and_left_out_evaluations_gives_the_same_
     live = Live(a_detector(), rules)
     slow = itertools.count(0, SECOND)
     for n in range(80):
-        live.engine.instruments.stopwatch = partial(next, slow) if 10 < n < 20 else lambda: 0
+        live.engine.observers.stopwatch = partial(next, slow) if 10 < n < 20 else lambda: 0
         live.now += SECOND // 4
         payload = b'{"v": %d}' % (20 if (n // 3) % 2 else 5)
         live.put([(f"vehicles/{client}/speed", payload) for client in ("a", "b")])

@@ -16,7 +16,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from detector.engine.episodes.episodes import Ending
+from detector.engine.episodes.episodes import EndReason
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.identifiers import episode_id
 from detector.engine.episodes.plain import plain, plain_text
@@ -47,7 +47,7 @@ SCALARS = (
     | st.floats()
     | st.floats().map(Number)
     | TEXTS
-    | st.sampled_from(Ending)
+    | st.sampled_from(EndReason)
 )
 KEYS = TEXTS | st.integers(-2, 2) | st.booleans() | st.sampled_from(["1", "True", "None"]) | st.none()
 NESTED: st.SearchStrategy[Any] = st.recursive(
@@ -86,7 +86,7 @@ def events(times: st.SearchStrategy[int], values: st.SearchStrategy[dict[str, An
         ),
         values=values,
         end_time=st.none() | times,
-        reason=st.none() | st.sampled_from(Ending),
+        reason=st.none() | st.sampled_from(EndReason),
         models=st.dictionaries(TEXTS, TEXTS, max_size=2),
         dry_run=st.booleans(),
         traceparent=st.none() | TEXTS,

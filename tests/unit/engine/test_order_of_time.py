@@ -18,7 +18,7 @@ from detector.engine.samples.sample import Arrival
 from detector.replay import batches, replaying
 from detector.replay.intake_file import Control
 from detector.replay.playing import recorded_arrivals
-from detector.replay.replaying import Replayed, replay_arrivals, replay_intake
+from detector.replay.replaying import ReplayResult, replay_arrivals, replay_intake
 from detector.replay.routing import MessageRouter
 from tests.driving import (
     POSITION,
@@ -57,7 +57,7 @@ def line(step: int, client: str, stream: str, **message: float) -> str:
     return json.dumps({"t": time, "key": f"vehicles/{client}/{stream}", "value": value})
 
 
-def replayed(folder: Path, detector: Detector, rules: Sequence[Any], *recordings: Sequence[str]) -> Replayed:
+def replayed(folder: Path, detector: Detector, rules: Sequence[Any], *recordings: Sequence[str]) -> ReplayResult:
     """The replay of recordings, given as their lines."""
     paths = []
     for number, recording in enumerate(recordings):

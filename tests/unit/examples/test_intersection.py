@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from detector.assembly import RuleIndex, inlets
+from detector.assembly import RuleIndex, stream_readers
 from detector.assembly.checking import findings
 from detector.engine.engine import Engine
 from detector.engine.episodes.events import Event
@@ -39,11 +39,11 @@ def events(tracer: Tracer) -> list[Event]:
     objects = [document.object for document in DOCUMENTS]
     detector = next(each for each in objects if isinstance(each, Detector))
     rules = [each for each in objects if isinstance(each, EventRule)]
-    entries = inlets(detector)
+    entries = stream_readers(detector)
     compiled, refused = RuleIndex().compile(rules, detector, entries.fields, entries.places)
     assert refused == []
     engine = Engine(detector, holder="h", decoders=entries.decoders, read_key=entries.read_key, start=START_NS)
-    engine.instruments.observer = tracer
+    engine.observers.observer = tracer
     engine.set_rules(compiled)
     tracer.attend(engine)
     arrivals = [

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from wayside.expressions import CelType, Environment
-from wayside.expressions.columns.folds import How, folded
+from wayside.expressions.columns.folds import FoldKind, folded
 from wayside.expressions.syntax import Loop
 
 ENVIRONMENT = Environment({"members": CelType.LIST, "others": CelType.LIST, "limit": CelType.DOUBLE})
@@ -22,17 +22,17 @@ def loops(node: object) -> int:
 @pytest.mark.parametrize(
     ("source", "how"),
     [
-        ("members.exists(m, m.v > limit)", [How.ANY]),
-        ("members.all(m, m.v > limit)", [How.ALL]),
-        ("members.exists_one(m, m.v > limit)", [How.COUNT]),
-        ("size(members) > 2", [How.COUNT]),
-        ("members.size() > 2", [How.COUNT]),
-        ("size(members.filter(m, m.v > 1)) >= 2", [How.COUNT]),
+        ("members.exists(m, m.v > limit)", [FoldKind.ANY]),
+        ("members.all(m, m.v > limit)", [FoldKind.ALL]),
+        ("members.exists_one(m, m.v > limit)", [FoldKind.COUNT]),
+        ("size(members) > 2", [FoldKind.COUNT]),
+        ("members.size() > 2", [FoldKind.COUNT]),
+        ("size(members.filter(m, m.v > 1)) >= 2", [FoldKind.COUNT]),
         ("!(members.filter(m, m.v > 1).size() * 2 >= size(members)) || members.all(m, m.v > 0)",
-         [How.COUNT, How.COUNT, How.ALL]),
+         [FoldKind.COUNT, FoldKind.COUNT, FoldKind.ALL]),
     ],
 )  # fmt: skip
-def test_loops_over_the_items_become_folds(source: str, how: list[How]) -> None:
+def test_loops_over_the_items_become_folds(source: str, how: list[FoldKind]) -> None:
     rest, folds = folded(ENVIRONMENT.compile(source, result=CelType.BOOL), "members")
     assert [each.how for each in folds.values()] == how
     assert loops(rest.tree) == 0

@@ -7,13 +7,13 @@ from contextlib import suppress
 
 import pytest
 
-from wayside.kubernetes.pacing import Pacing, Share
+from wayside.kubernetes.pacing import CongestionWindow, Pacing
 
 QUICK = 0.004  # s that a write takes at an idle API server
 PERIOD = 300.0  # s for which the quickest time is remembered, at least
 
 
-def served(share: Share, cores: float, others: float, writes: int, began: float = 0.0) -> list[int]:
+def served(share: CongestionWindow, cores: float, others: float, writes: int, began: float = 0.0) -> list[int]:
     """The rooms over time, at a server that works on all requests at once: ours, and those of others."""
     rooms: list[int] = []
     for index in range(writes):
@@ -23,20 +23,20 @@ def served(share: Share, cores: float, others: float, writes: int, began: float 
 
 
 def test_the_share_grows_at_a_server_that_answers_as_quickly_and_shrinks_at_a_busy_one() -> None:
-    share = Share()
+    share = CongestionWindow()
     assert served(share, cores=32, others=0, writes=500)[-1] == 8
     assert served(share, cores=2, others=16, writes=500)[-1] == 1
     assert served(share, cores=32, others=0, writes=500)[-1] == 8
 
 
 def test_the_share_stays_where_few_requests_wait() -> None:
-    share = Share()
+    share = CongestionWindow()
     served(share, cores=3, others=0, writes=500)
     assert set(served(share, cores=3, others=0, writes=500)) == {4}
 
 
 def test_a_server_that_has_become_slower_for_good_is_the_new_measure_after_a_while() -> None:
-    share = Share()
+    share = CongestionWindow()
     served(share, cores=2, others=0, writes=100)
     assert served(share, cores=2, others=16, writes=100, began=PERIOD)[-1] == 1
     for period in (2, 4):
@@ -46,7 +46,7 @@ def test_a_server_that_has_become_slower_for_good_is_the_new_measure_after_a_whi
 
 def test_namespaces_take_turns_and_none_has_more_than_its_share() -> None:
     async def scenario() -> list[str]:
-        share = Share()
+        share = CongestionWindow()
         share.room = 2
         pacing, began, over = Pacing(4, share), list[str](), asyncio.Event()
 
@@ -72,7 +72,7 @@ def test_namespaces_take_turns_and_none_has_more_than_its_share() -> None:
 @pytest.mark.parametrize("waits", [True, False])
 def test_one_that_is_cancelled_leaves_its_place_to_the_next(waits: bool) -> None:
     async def scenario() -> None:
-        pacing = Pacing(1, Share())
+        pacing = Pacing(1, CongestionWindow())
 
         async def hang(began: asyncio.Event) -> None:
             async with pacing.turn("a"):

@@ -12,7 +12,7 @@ from application_manager.core.objects.policy import Name, Policy
 from application_manager.work.applying import Applier
 from application_manager.work.instances import InstanceWork
 from application_manager.work.recorder import Recorder
-from application_manager.work.suspending import Suspending
+from application_manager.work.scaling import WorkloadScaler
 from tests.inprocess import objects
 from wayside.api import ApplicationTask, Kind
 from wayside.api.base import API_VERSION
@@ -87,7 +87,7 @@ def work_on(cache: ClusterCache, server: object, absent: list[Name]) -> Instance
         client=client,
         applier=applier,
         recorder=Recorder(client),
-        suspending=Suspending(client, applier, cache.store.put),
+        suspending=WorkloadScaler(client, applier, cache.store.put),
         again=lambda name, at: None,
         enqueue=lambda name: None,
         done=lambda name: None,
@@ -98,7 +98,7 @@ def work_on(cache: ClusterCache, server: object, absent: list[Name]) -> Instance
     )
 
 
-def a_world(*known: Object, task: ApplicationTask) -> ClusterCache:
+def a_cache(*known: Object, task: ApplicationTask) -> ClusterCache:
     """A cache that knows these objects, and a task for template app."""
     cache = ClusterCache(Policy())
     for each in known:

@@ -8,11 +8,11 @@ from typing import Any
 import pytest
 
 from application_manager.cache.cluster_cache import ClusterCache
-from application_manager.core.objects.ownership import Applied, Known, owned, references
+from application_manager.core.objects.ownership import ApplyResult, LastApplied, owned, references
 from application_manager.core.objects.policy import Policy
 from application_manager.core.objects.rendering import Renderer
 from application_manager.work.applying import Applier
-from tests.unit.manager.memory_server import CONFIG_MAPS, MemoryServer, a_world, raw, work_on
+from tests.unit.manager.memory_server import CONFIG_MAPS, MemoryServer, a_cache, raw, work_on
 from tests.unit.manager_objects import instance, task, template
 from wayside.kubernetes.resources import Object
 
@@ -36,16 +36,18 @@ def key(name: str) -> tuple[str, str, str]:
     return "v1", "ConfigMap", name
 
 
-def applied(server: MemoryServer, *names: str, known: Known | None = None, meanwhile: Object | None = None) -> Applied:
+def applied(
+    server: MemoryServer, *names: str, known: LastApplied | None = None, meanwhile: Object | None = None
+) -> ApplyResult:
     """Apply ConfigMaps of these names; `meanwhile`: what is put into the cluster between the look and the apply."""
 
-    async def run() -> Applied:
+    async def run() -> ApplyResult:
         rendering = Renderer(template(manifests=[config(name, new="yes") for name in names]), Policy()).render(APP)
         applier = Applier(server, ClusterCache(Policy()).store, {key("")[:2]: CONFIG_MAPS})  # type: ignore[arg-type]
         looked = await applier.look("site", rendering.manifests)
         if meanwhile is not None:
             server.put(meanwhile)
-        return await applier.apply(APP, rendering, rendering.manifests, known or Known(), looked)
+        return await applier.apply(APP, rendering, rendering.manifests, known or LastApplied(), looked)
 
     return asyncio.run(run())
 
@@ -53,8 +55,8 @@ def applied(server: MemoryServer, *names: str, known: Known | None = None, meanw
 @pytest.mark.parametrize("owner", [None, OTHER])
 def test_an_object_that_is_not_the_instances_own_is_left_alone_and_nothing_is_pruned(owner: Any) -> None:
     server = MemoryServer(there("taken", owner), there("old", APP, "uid-old"))
-    found = applied(server, "taken", "free", known=Known("before", {key("old"): "uid-old"}))
-    assert (found.aspect.holds, found.aspect.reason, found.complete) == (False, "ObjectExists", False)
+    found = applied(server, "taken", "free", known=LastApplied("before", {key("old"): "uid-old"}))
+    assert (found.state.holds, found.state.reason, found.complete) == (False, "ObjectExists", False)
     assert server.written == [("apply", "ConfigMap", "free")]
     assert {each.name for each in found.objects} == {"taken", "free", "old"}
 
@@ -62,13 +64,13 @@ def test_an_object_that_is_not_the_instances_own_is_left_alone_and_nothing_is_pr
 def test_an_object_that_was_replaced_since_it_was_looked_at_is_no_victim() -> None:
     server = MemoryServer(there("a", APP, "uid-old"))
     found = applied(server, "a", meanwhile=there("a", OTHER, "uid-new"))
-    assert found.aspect.reason == "Waiting"
+    assert found.state.reason == "Waiting"
     assert server.written == []
 
 
 def test_what_the_rendering_has_no_more_is_pruned_where_it_is_still_the_instances_own() -> None:
     server = MemoryServer(there("old", APP, "uid-old"), there("taken-over", OTHER, "uid-taken"))
-    known = Known("before", {key("old"): "uid-old", key("taken-over"): "uid-taken", key("gone"): "uid-gone"})
+    known = LastApplied("before", {key("old"): "uid-old", key("taken-over"): "uid-taken", key("gone"): "uid-gone"})
     found = applied(server, "new", known=known)
     assert found.complete
     assert server.written == [("apply", "ConfigMap", "new"), ("delete", "ConfigMap", "old")]
@@ -83,7 +85,7 @@ def reconciled(*manifests: Object) -> tuple[MemoryServer, ClusterCache]:
     server = MemoryServer()
     known = [server.put(raw(template(manifests=list(manifests)), 1)), server.put(made)]
     server.put(there("a", APP, "uid-a"))
-    cache = a_world(*known, task=task("t"))
+    cache = a_cache(*known, task=task("t"))
     asyncio.run(work_on(cache, server, []).reconcile(NAME))
     return server, cache
 
@@ -106,5 +108,5 @@ def test_while_a_template_cannot_be_rendered_what_runs_stays_as_it_is_and_is_not
     server, cache = reconciled(config("a", x="${parameters.nothing}"))
     assert [each for each in server.written if each[1] == "ConfigMap"] == []
     record = cache.records[NAME]
-    assert (record.applied.aspect.reason, record.digest) == ("RenderFailed", "before")
+    assert (record.applied.state.reason, record.digest) == ("RenderFailed", "before")
     assert [(each.name, each.uid) for each in record.applied.objects] == [("a", "uid-a")]

@@ -18,8 +18,8 @@ from application_manager.observability.overview import Overview
 from application_manager.observability.pages import STALLED_AFTER, pages, stalled
 from application_manager.observability.tracing import LostSpans
 from application_manager.running.headroom import Headroom
-from application_manager.watching.pulse import Pulse
-from application_manager.work.recorder import BURST, REFILL, Allowance, EventReason
+from application_manager.watching.watch_health import WatchHealth
+from application_manager.work.recorder import BURST, REFILL, EventReason, TokenBuckets
 from tests.guides import guide
 from tests.unit.manager_objects import instance, task, template
 from wayside.kubernetes.connection import ConfigurationError
@@ -137,7 +137,7 @@ def test_pages_are_served_and_what_is_missing_is_503() -> None:
 
 
 def test_an_object_that_changes_all_the_time_is_reported_now_and_then() -> None:
-    allowance = Allowance()
+    allowance = TokenBuckets()
     assert [allowance.takes("a", 0.0) for _ in range(BURST + 2)] == [True] * BURST + [False] * 2
     assert allowance.takes("b", 0.0)
     assert not allowance.takes("a", REFILL - 1)
@@ -149,7 +149,7 @@ def test_the_guide_describes_every_metric() -> None:
     measures = Measures()
     measures.registry.register(Overview(ClusterCache(Policy()), list))
     measures.registry.register(LostSpans(cast("Tracing", SimpleNamespace(dropped=0, failed=0))))
-    measures.registry.register(Pulse(90, lambda: 0.0))
+    measures.registry.register(WatchHealth(90, lambda: 0.0))
     measures.registry.register(Headroom(1))
     names = {each.name + ("_total" if each.type == "counter" else "") for each in measures.registry.collect()}
     own = {each.removeprefix(PREFIX) for each in names if each.startswith(PREFIX)}

@@ -11,7 +11,7 @@ import kopf
 import pytest
 from kopf._cogs.clients import api, watching
 
-from application_manager.watching.pulse import NEVER, Pulse, pulsing
+from application_manager.watching.watch_health import NEVER, WatchHealth, pulsing
 
 TASKS = SimpleNamespace(plural="applicationtasks", get_url=lambda **_: "")
 
@@ -47,10 +47,10 @@ def test_kopfs_own_timeout_cancels_who_reads_and_ours_does_not(monkeypatch: pyte
         settings.watching.inactivity_timeout = 0.01
         return await asyncio.create_task(read(settings, 0.1))
 
-    async def ours() -> tuple[int, Pulse]:
+    async def ours() -> tuple[int, WatchHealth]:
         settings = kopf.OperatorSettings()
         settings.watching.inactivity_timeout = NEVER
-        pulse = Pulse(0.05, lambda: 0.0)
+        pulse = WatchHealth(0.05, lambda: 0.0)
         with pulsing(pulse):
             return await asyncio.create_task(read(settings, 0.1)), pulse
 
@@ -67,7 +67,7 @@ def test_kopfs_own_timeout_cancels_who_reads_and_ours_does_not(monkeypatch: pyte
 
 def test_only_time_in_which_the_api_server_answers_counts_against_a_watch() -> None:
     healthy = [0.0]
-    pulse = Pulse(90, lambda: healthy[0])
+    pulse = WatchHealth(90, lambda: healthy[0])
     pulse.beat(("applicationtasks", "town"))
     healthy[0] = 180
     assert pulse.dead() is None

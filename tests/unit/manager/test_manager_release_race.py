@@ -8,7 +8,7 @@ from typing import Any
 
 from application_manager.cache.cluster_cache import INSTANCE, ClusterCache
 from application_manager.core.objects.policy import Name
-from tests.unit.manager.memory_server import a_world, raw, work_on
+from tests.unit.manager.memory_server import a_cache, raw, work_on
 from tests.unit.manager_objects import NOW, instance, task, template
 from wayside.kubernetes.resources import Resource
 
@@ -40,7 +40,7 @@ class GoingServer:
 def test_an_instance_that_goes_while_its_release_is_checked_stays_gone_while_its_holder_is_lost() -> None:
     lost = task("a", {"place": "west"}, holder="town", accepted_condition=("False", "HolderLost", NOW - 100))
     going = instance(NAME[1], key="west", release_at=NOW - 1e8)
-    cache = a_world(raw(template(**KEYED), 1), raw(going, 2), task=lost)
+    cache = a_cache(raw(template(**KEYED), 1), raw(going, 2), task=lost)
     server = GoingServer(cache)
     absent: list[Name] = []
     asyncio.run(work_on(cache, server, absent).reconcile(NAME))

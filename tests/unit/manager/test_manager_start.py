@@ -8,7 +8,7 @@ import logging
 import pytest
 
 from wayside.kubernetes.errors import ApiError, Unreachable
-from wayside.kubernetes.repeating import until_answered
+from wayside.kubernetes.retrying import until_answered
 
 
 def requested(*failures: Exception) -> str:

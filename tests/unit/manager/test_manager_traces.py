@@ -16,7 +16,7 @@ from application_manager.work.recorder import Recorder
 from application_manager.work.statuses import StatusWriter
 from application_manager.work.tasks import TaskWork
 from tests.otlp import Received, Receiver
-from tests.unit.manager.memory_server import CONFIG_MAPS, MemoryServer, a_world, raw, work_on
+from tests.unit.manager.memory_server import CONFIG_MAPS, MemoryServer, a_cache, raw, work_on
 from tests.unit.manager_objects import task, template
 from wayside.api import ApplicationTask
 from wayside.kubernetes.client import Client
@@ -58,7 +58,7 @@ def spans(monkeypatch: pytest.MonkeyPatch, run: Run) -> dict[str, Received]:
 
         async def whole() -> None:
             server = Server(raw(traced(ended=False), 1))
-            cache = a_world(
+            cache = a_cache(
                 server.put(raw(template(manifests=[CONFIG]), 2)),
                 server.objects["ApplicationTask", "t"],
                 task=traced(ended=False),

@@ -12,12 +12,12 @@ from typing import Any
 import pytest
 from mcap.writer import Writer
 
-from detector.assembly import RuleIndex, inlets
+from detector.assembly import RuleIndex, stream_readers
 from detector.mining.cutting import END, START, PieceTimes, warmup_of
 from detector.mining.joining import flaw_of, joined
 from detector.mining.pieces import PieceJob, observe
 from detector.mining.sources import InputRecording
-from detector.mining.work import Mined, MiningJob, decode_mined, mine_recording
+from detector.mining.work import MiningJob, RecordingResult, decode_mined, mine_recording
 from tests.driving import a_detector, a_rule, a_stream
 from wayside.api import Detector, EventRule
 
@@ -94,7 +94,7 @@ def rule_of(chance: random.Random, name: str) -> EventRule:
     return a_rule(name, **spec)
 
 
-def cut(job: MiningJob, spans: list[PieceTimes]) -> Mined:
+def cut(job: MiningJob, spans: list[PieceTimes]) -> RecordingResult:
     pieces = [observe(PieceJob(span, job.source.files, job.detector, job.rules)) for span in spans]
     assert flaw_of(pieces) is None
     return joined(job, tuple(map(Path, job.source.files)), pieces)
@@ -109,7 +109,7 @@ def test_a_cut_recording_has_the_episodes_of_the_whole_one(seed: int, tmp_path: 
     rules = [rule_of(chance, f"rule-{number}") for number in range(6)]
     source = InputRecording("drive.mcap", (str(tmp_path / "drive.mcap"),))
     job = MiningJob(source, "c" * 32, detector, rules, frozenset(rule.name for rule in rules), None)
-    compiled, refused = RuleIndex().compile(rules, detector, inlets(detector).fields)
+    compiled, refused = RuleIndex().compile(rules, detector, stream_readers(detector).fields)
     assert not refused
     cuts = sorted({T0 + chance.randrange(seconds * 10) * SECOND // 10 + chance.randrange(3) for _ in range(4)})
     warmup = warmup_of(detector, compiled)

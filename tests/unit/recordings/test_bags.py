@@ -9,12 +9,12 @@ from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from detector.assembly import inlets
-from detector.replay.message import Cut, RecordingError
+from detector.assembly import stream_readers
+from detector.replay.message import RecordingError, Truncation
 from detector.replay.recorded_types import with_recorded_types
 from detector.sources.supervision import SourceState, SourceThread
 from detector.streams.codecs import CdrDecoder
-from detector.streams.tally import Tally
+from detector.streams.loss_counter import LossCounter
 from tests.driving import a_detector
 from tests.networks import PATIENCE, Arrivals, stream, wait_for
 from tests.recorded import messages_in
@@ -93,7 +93,7 @@ def test_a_type_of_ones_own_comes_with_the_bag(tmp_path: Path, noetic: Typestore
     read = ros2.deserialize_cdr(message.payload, "own_msgs/msg/Thing")
     assert (read.name, list(read.values), read.left.sec, read.left.nanosec) == ("a", [1, 2], 4, 5)
     things = {"name": "thing", "key": "thing", "client": "ego", "encoding": "cdr", "type": "own_msgs/msg/Thing"}
-    decoder = inlets(with_recorded_types(a_detector(things), [path])).decoders["thing"]
+    decoder = stream_readers(with_recorded_types(a_detector(things), [path])).decoders["thing"]
     assert decoder.decode(message.payload) == {
         "name": "a",
         "values": [1.0, 2.0],
@@ -135,7 +135,7 @@ def test_a_bag_that_is_cut_is_read_up_to_there(
     for size in range(100, len(raw), len(raw) // 40):
         cut = tmp_path / "cut.bag"
         cut.write_bytes(raw[:size])
-        reported: list[Cut] = []
+        reported: list[Truncation] = []
         read = list(messages_in([cut], on_cut=reported.append))
         assert read == whole[: len(read)]
         assert [(each.path, each.messages) for each in reported] == [(cut, len(read))]
@@ -159,12 +159,14 @@ def test_a_damaged_bag_is_reported(bag: Path, tmp_path: Path) -> None:
         messages_in([renamed])
 
 
-def playing(arrivals: Arrivals, tally: Tally, *, of: Stream | None = None, **parameters: object) -> SourceThread:
+def playing(
+    arrivals: Arrivals, loss_counter: LossCounter, *, of: Stream | None = None, **parameters: object
+) -> SourceThread:
     poses = of or Stream(
         name="pose", key="vehicles/${client:*}/pose", encoding=Encoding.CDR, type=POSE, source="recording"
     )
     source = DataSource(name="recording", plugin="bag", parameters=parameters)
-    thread = SourceThread(source, (poses,), arrivals.putter, tally, first_pause=0.01)
+    thread = SourceThread(source, (poses,), arrivals.putter, loss_counter, first_pause=0.01)
     thread.start()
     return thread
 
@@ -172,7 +174,7 @@ def playing(arrivals: Arrivals, tally: Tally, *, of: Stream | None = None, **par
 def test_a_bag_is_played_at_the_wanted_speed_to_its_end(bag: Path) -> None:
     arrivals = Arrivals()
     start = time.monotonic()
-    thread = playing(arrivals, Tally(), paths=[str(bag)], rate=5)
+    thread = playing(arrivals, LossCounter(), paths=[str(bag)], rate=5)
     wait_for(lambda: thread.state is SourceState.FINISHED)
     assert time.monotonic() - start >= 0.18
     assert [key for _, key, _ in arrivals.seen] == ["vehicles/car1/pose", "vehicles/car2/pose"] * 5
@@ -180,7 +182,7 @@ def test_a_bag_is_played_at_the_wanted_speed_to_its_end(bag: Path) -> None:
 
 def test_a_bag_is_played_again_and_again_until_it_is_stopped(bag: Path) -> None:
     arrivals = Arrivals()
-    thread = playing(arrivals, Tally(), paths=[str(bag)], rate=1000, loop=True)
+    thread = playing(arrivals, LossCounter(), paths=[str(bag)], rate=1000, loop=True)
     arrivals.wait_for(lambda seen: len(seen) > 25)
     thread.request_stop()
     thread.join(PATIENCE)
@@ -193,7 +195,7 @@ def test_stopping_does_not_wait_for_a_pause_in_the_recording(tmp_path: Path) -> 
         '{"t": 1, "key": "vehicles/a/pose", "value": 1}\n{"t": 9000000000000, "key": "vehicles/a/pose", "value": 2}\n'
     )
     arrivals = Arrivals()
-    thread = playing(arrivals, Tally(), of=stream(source="recording"), paths=[str(path)])
+    thread = playing(arrivals, LossCounter(), of=stream(source="recording"), paths=[str(path)])
     arrivals.wait_for(lambda seen: len(seen) == 1)
     thread.request_stop()
     thread.join(PATIENCE)  # far less than the pause
@@ -201,9 +203,9 @@ def test_stopping_does_not_wait_for_a_pause_in_the_recording(tmp_path: Path) -> 
 
 
 def test_a_recording_that_is_not_there_is_waited_for(bag: Path, tmp_path: Path) -> None:
-    arrivals, tally = Arrivals(), Tally()
+    arrivals, loss_counter = Arrivals(), LossCounter()
     later = tmp_path / "later.bag"
-    thread = playing(arrivals, tally, paths=[str(later)], rate=1000)
+    thread = playing(arrivals, loss_counter, paths=[str(later)], rate=1000)
     wait_for(lambda: "later.bag: no such file" in thread.last_error)
     later.write_bytes(bag.read_bytes())
     wait_for(lambda: thread.state is SourceState.FINISHED)

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from detector.commands import cli
-from detector.engine.episodes.episodes import Ending
+from detector.engine.episodes.episodes import EndReason
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.record import EpisodeRecord
 from detector.results.variants import compare
@@ -30,7 +30,7 @@ def episodes(rule: str, *spans: tuple[float, float | None], subject: str = "car"
         )
         for end in (None, last):
             if end is None or last is not None:
-                ended = () if end is None else (at(end), Ending.UNTIL)
+                ended = () if end is None else (at(end), EndReason.UNTIL)
                 events.append(Event("h", episode, {}, *ended))
     return events
 

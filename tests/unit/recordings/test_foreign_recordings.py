@@ -10,7 +10,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from mcap_ros2.writer import Writer
 
-from detector.assembly import inlets
+from detector.assembly import stream_readers
 from detector.engine.samples.sample import Arrival
 from detector.replay.intake_writer import IntakeWriter
 from detector.replay.playing import recorded_arrivals
@@ -81,7 +81,7 @@ def recording(tmp_path: Path) -> Path:
 
 def test_messages_of_another_encoder_read_as_they_were_written(recording: Path) -> None:
     completed = with_recorded_types(a_detector(STREAM), [recording])
-    decoder = inlets(completed).decoders["obstacles"]
+    decoder = stream_readers(completed).decoders["obstacles"]
     messages = [message.payload for message in messages_in([recording])]
     assert [decoder.decode(raw) for raw in messages] == [obstacles(second, second) for second in range(5)]
     assert [decoder.stamp(raw) for raw in messages] == [at(second) + 1 for second in range(5)]
@@ -99,7 +99,7 @@ def test_a_recording_of_another_program_replays(recording: Path, clock: str) -> 
 def test_what_is_recorded_reads_in_other_programs(tmp_path: Path) -> None:
     stream = {"name": "odom", "key": "${client:*}/odom", "encoding": "cdr", "type": "nav_msgs/msg/Odometry"}
     detector = a_detector(stream)
-    writer = IntakeWriter(tmp_path / "intake.mcap", detector.spec.streams, inlets(detector).types)
+    writer = IntakeWriter(tmp_path / "intake.mcap", detector.spec.streams, stream_readers(detector).types)
     writer.arrivals([Arrival(5, "odom", "car/odom", cdr(odometry()))])
     writer.close()
     with (tmp_path / "intake.mcap").open("rb") as file:

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from detector.replay.message import Cut, Message, RecordingError
+from detector.replay.message import Message, RecordingError, Truncation
 from detector.streams.codecs.etsi.quantities import its_ms
 from tests.driving import a_detector, a_rule, a_stream
 from tests.recorded import messages_in
 from tests.unit.encodings.its_messages import a_cam, random_message
 from tests.unit.encodings.test_etsi_packets import EXTENDED, LONG_POSITION, btp, common, packet, signed, single_hop
-from tests.unit.recordings.desk import Desk
+from tests.unit.recordings.command_line import CommandLine
 
 SECOND = 10**9
 START = 1_767_225_600 * SECOND
@@ -114,7 +114,7 @@ def test_a_capture_that_is_cut_is_read_up_to_there(write: object, tmp_path: Path
     counts = set()
     for size in range(30, len(raw)):
         path.write_bytes(raw[:size])
-        reported: list[Cut] = []
+        reported: list[Truncation] = []
         messages = list(messages_in([path], on_cut=reported.append))
         assert messages == whole[: len(messages)]
         assert all(cut.messages == len(messages) for cut in reported)
@@ -141,14 +141,14 @@ FAST = a_rule(
 
 
 @pytest.mark.parametrize(("clock", "start"), [("Wall", 1), ("Data", 0)])  # captured 3 ms after they were made
-def test_a_capture_is_replayed(clock: str, start: int, desk: Desk) -> None:
+def test_a_capture_is_replayed(clock: str, start: int, command: CommandLine) -> None:
     frames = []
     for index in range(12):
         time = START + index * SECOND // 2
         frames.append((time + 3_000_000, ethernet(packet(single_hop(a_cam(station=7, milliseconds=its_ms(time)))))))
-    (desk.folder / "capture.pcapng").write_bytes(pcapng(frames))
-    desk.write(a_detector(CAM_STREAM, clock=clock), FAST)
-    ran = desk.replay("capture.pcapng")
+    (command.folder / "capture.pcapng").write_bytes(pcapng(frames))
+    command.write(a_detector(CAM_STREAM, clock=clock), FAST)
+    ran = command.replay("capture.pcapng")
     assert ran.code == 0, ran.logged
     (event,) = ran.events
     assert event["subject"] == "its-7"

@@ -29,7 +29,7 @@ from detector.replay.batches import (
     merged_batches,
     messages_of,
 )
-from detector.replay.message import DAMAGE, Cut, Message, RecordingError
+from detector.replay.message import DAMAGE, Message, RecordingError, Truncation
 from detector.replay.recordings import open_recordings
 from detector.replay.routing import MessageRouter
 from tests.recorded import arrivals_of, messages_in
@@ -152,7 +152,7 @@ def test_a_file_that_is_cut_anywhere_is_read_up_to_there(
     path = write(tmp_path / "drive.mcap", sent, **options)
     content = path.read_bytes()
     path.write_bytes(content[: 8 + int(share * (len(content) - 8))])
-    cuts: list[Cut] = []
+    cuts: list[Truncation] = []
     found = [(each.time, f"/{each.key}", each.payload) for each in messages_in([path], on_cut=cuts.append)]
     assert found == sorted(sent[: len(found)], key=lambda each: each[0])
     assert [cut.messages for cut in cuts] == [len(found)] or (cuts == [] and len(found) == len(sent))
@@ -221,9 +221,9 @@ LINE = st.one_of(
 """A line that may be wrong, or have no end."""
 
 
-def lines_read(path: Path, block: int) -> tuple[list[Message], str, list[Cut]]:
+def lines_read(path: Path, block: int) -> tuple[list[Message], str, list[Truncation]]:
     found: list[Message] = []
-    cuts: list[Cut] = []
+    cuts: list[Truncation] = []
     with mock.patch.object(json_lines, "_BLOCK", block):
         try:
             for message in messages_in([path], lambda key: key != "unwanted", cuts.append):

@@ -14,7 +14,7 @@ from detector.testing import run
 from tests.driving import a_detector, a_rule, a_stream, at
 from tests.recorded import messages_in
 from tests.recording_bench import STREAMS, Bench, an_episode, mcap_files, pose, read_with_mcap, speed, tf_static
-from tests.unit.recordings.desk import FAST, Desk
+from tests.unit.recordings.command_line import FAST, CommandLine
 from wayside.api.documents import load_documents
 from wayside.times import parse_time
 
@@ -103,19 +103,19 @@ def test_a_window_that_reaches_further_back_than_the_buffer_is_refused(tmp_path:
     assert found[0].startswith("20:24: ")
 
 
-def test_a_replay_cuts_the_windows_of_record_actions_from_the_recording(desk: Desk) -> None:
+def test_a_replay_cuts_the_windows_of_record_actions_from_the_recording(command: CommandLine) -> None:
     """One episode is whole; the other is still open when the recording ends, so its clip is cut and marked as such."""
     window = {"before": "500ms", "after": "1s"}
     rule = a_rule("fast", **FAST, actions=[{"name": "bag", "record": {**window, "split": {"duration": "1s"}}}])
-    desk.write(a_detector(a_stream("speed"), buffer={"duration": "2s"}), rule)
+    command.write(a_detector(a_stream("speed"), buffer={"duration": "2s"}), rule)
     speeds = {k / 10: {"v": 20 if 20 <= k < 40 or k >= 90 else 1, "n": k} for k in range(100)}
-    path = desk.drive("drive.jsonl", *((time, value) for time, value in speeds.items()))
+    path = command.drive("drive.jsonl", *((time, value) for time, value in speeds.items()))
     for _ in range(2):  # clips of the replay before are replaced
-        ran = desk.replay(path, options=["--record"])
+        ran = command.replay(path, options=["--record"])
         assert (ran.code, len(ran.events)) == (0, 3), ran.logged
         assert "2 clips: out" in ran.logged
         assert "1 of 2 clips of action bag, EventRule fast, are not whole: the recording ended" in ran.logged
-        whole, cut = sorted((desk.folder / "out" / "clips" / "fast").iterdir())
+        whole, cut = sorted((command.folder / "out" / "clips" / "fast").iterdir())
         assert cut.name.endswith("_cut")
     reported = json.loads((whole / "recording.json").read_text())
     assert (reported["episode"], reported["reason"]) == (ran.events[0]["data"]["episode"], "Until")
@@ -126,13 +126,13 @@ def test_a_replay_cuts_the_windows_of_record_actions_from_the_recording(desk: De
     assert found == [value["n"] for t, value in speeds.items() if onset - 5 * 10**8 < at(t) <= end + 10**9]
 
 
-def test_a_replay_without_record_runs_no_action(desk: Desk) -> None:
-    desk.write(
+def test_a_replay_without_record_runs_no_action(command: CommandLine) -> None:
+    command.write(
         a_detector(a_stream("speed"), recordings={"path": "live"}),
         a_rule("fast", **FAST, actions=[{"name": "bag", "record": {}}]),
     )
-    path = desk.drive("drive.jsonl", (0.5, {"v": 20}), (3.5, {"v": 1}), (5.0, {"v": 1}))
-    assert len(desk.replay(path).events) == 2
-    assert len(desk.replay(path, options=["--record"]).events) == 2
-    assert not (desk.folder / "live").exists()
-    assert [each.name for each in (desk.folder / "out" / "clips").iterdir()] == ["fast"]
+    path = command.drive("drive.jsonl", (0.5, {"v": 20}), (3.5, {"v": 1}), (5.0, {"v": 1}))
+    assert len(command.replay(path).events) == 2
+    assert len(command.replay(path, options=["--record"]).events) == 2
+    assert not (command.folder / "live").exists()
+    assert [each.name for each in (command.folder / "out" / "clips").iterdir()] == ["fast"]

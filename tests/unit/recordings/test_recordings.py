@@ -12,7 +12,7 @@ from rosbags.rosbag2 import Writer as BagWriter
 from detector.engine.samples.sample import Arrival
 from detector.replay.gathering import recordings_of
 from detector.replay.intake_writer import IntakeWriter
-from detector.replay.message import Cut, Message, RecordingError
+from detector.replay.message import Message, RecordingError, Truncation
 from detector.replay.routing import MessageRouter
 from detector.streams.codecs.ros import standard
 from tests.recorded import arrivals_of, messages_in
@@ -200,7 +200,7 @@ def test_a_cut_sqlite_bag_is_an_error_that_names_it(tmp_path: Path, share: float
 
 def read_up_to_a_cut(path: Path, written: list[Message]) -> int:
     """How many messages are read: those written first, in the order of their times."""
-    reported: list[Cut] = []
+    reported: list[Truncation] = []
     read = list(messages_in([path], on_cut=reported.append))
     assert read == sorted(written[: len(read)], key=lambda message: message.time)
     assert reported or len(read) == len(written)  # where only the index is missing, nothing is
@@ -243,7 +243,7 @@ def test_an_mcap_file_whose_last_bytes_were_never_written_is_read_up_to_them(tmp
 def test_an_mcap_file_without_an_index_that_was_closed_is_whole(tmp_path: Path) -> None:
     none = IndexType.NONE
     path = write_mcap(tmp_path / "drive.mcap", MESSAGES, chunk_size=500, index_types=none, use_statistics=False)
-    reported: list[Cut] = []
+    reported: list[Truncation] = []
     assert list(messages_in([path], on_cut=reported.append)) == MESSAGES
     assert reported == []
 
@@ -263,7 +263,7 @@ def test_a_rosbag2_whose_recorder_was_killed_is_read_up_to_there(tmp_path: Path,
     path = write_bag(tmp_path / "drive", MESSAGES * 20)
     (file,) = path.glob("*.mcap")
     damage(file, share)
-    reported: list[Cut] = []
+    reported: list[Truncation] = []
     read = list(messages_in([path], on_cut=reported.append))
     assert [(cut.path, cut.messages) for cut in reported] == [(file, len(read))]
     (path / "metadata.yaml").unlink()  # it is written when the recorder ends
@@ -276,7 +276,7 @@ def test_a_last_line_that_was_not_written_to_its_end_is_a_cut(tmp_path: Path) ->
     whole = path.read_bytes()
     for size in range(len(whole) // 2, len(whole) - 1):
         path.write_bytes(whole[:size])
-        reported: list[Cut] = []
+        reported: list[Truncation] = []
         read = list(messages_in([path], on_cut=reported.append))
         lines, rest = whole[:size].count(b"\n"), whole[:size].rpartition(b"\n")[2]
         complete = rest.endswith(b"}") or not rest

@@ -16,60 +16,60 @@ from detector.replay.message import RecordingError
 from detector.replay.recordings import span_of
 from detector.replay.rosbag1 import ROSBAG1_MAGIC
 from tests.driving import a_deploy, a_detector, a_rule, a_stream, at
-from tests.unit.recordings.desk import FAST, Desk
+from tests.unit.recordings.command_line import FAST, CommandLine
 from tests.unit.recordings.test_recordings import MESSAGES, write_bag, write_mcap
 
 LEFT_OPEN = [(0.5, {"v": 20}), (4.0, {"v": 20})]
 YEAR = 365 * 24 * 3600.0
 
 
-def test_several_recordings_are_independent_of_each_other(desk: Desk) -> None:
+def test_several_recordings_are_independent_of_each_other(command: CommandLine) -> None:
     """An episode that is open at the end of the first does not continue in the second, a year later."""
-    desk.drive("a.jsonl", *LEFT_OPEN)
-    desk.drive("b.jsonl", *((YEAR + time, {"v": 4}) for time in (0.0, 2.0, 4.0)))
-    (alone,) = desk.replay("a.jsonl").events + desk.replay("b.jsonl").events
+    command.drive("a.jsonl", *LEFT_OPEN)
+    command.drive("b.jsonl", *((YEAR + time, {"v": 4}) for time in (0.0, 2.0, 4.0)))
+    (alone,) = command.replay("a.jsonl").events + command.replay("b.jsonl").events
     assert alone["type"] == "dev.wayside.event.started"
-    assert desk.replay("a.jsonl", "b.jsonl").events == [{**alone, "recording": "a.jsonl"}]
-    (second,) = desk.replay("b.jsonl", "a.jsonl").events
+    assert command.replay("a.jsonl", "b.jsonl").events == [{**alone, "recording": "a.jsonl"}]
+    (second,) = command.replay("b.jsonl", "a.jsonl").events
     assert (second["recording"], second["source"]) == ("a.jsonl", "/detectors/d.2")
     assert [second[name] for name in ("type", "subject", "time")] == [
         alone[name] for name in ("type", "subject", "time")
     ]
     assert {**second["data"], "episode": ""} == {**alone["data"], "episode": ""}
-    as_one = desk.replay("a.jsonl", "b.jsonl", options=["--as-one"]).events
+    as_one = command.replay("a.jsonl", "b.jsonl", options=["--as-one"]).events
     assert [event["type"] for event in as_one] == ["dev.wayside.event.started", "dev.wayside.event.ended"]
 
 
-def test_simulated_recordings_that_all_begin_at_the_same_time_do_not_mix(desk: Desk) -> None:
+def test_simulated_recordings_that_all_begin_at_the_same_time_do_not_mix(command: CommandLine) -> None:
     for run in range(3):
-        desk.drive(f"run_{run}.jsonl", (0.5, {"v": 20 if run == 1 else 1}), (4.0, {"v": 1}))
-    ran = desk.replay("run_0.jsonl", "run_1.jsonl", "run_2.jsonl")
+        command.drive(f"run_{run}.jsonl", (0.5, {"v": 20 if run == 1 else 1}), (4.0, {"v": 1}))
+    ran = command.replay("run_0.jsonl", "run_1.jsonl", "run_2.jsonl")
     assert "3 recordings, 6 samples, 1 episode started, 1 ended, 0 tasks" in ran.logged
-    desk.write(a_detector(a_stream("speed")), a_rule("fast", **FAST, actions=[a_deploy("help")]))
-    desk.drive("run_2.jsonl", (0.5, {"v": 20}), (4.0, {"v": 1}))
-    alone, _ = desk.replay("run_1.jsonl").events
-    ran = desk.replay("run_1.jsonl", "run_2.jsonl")
+    command.write(a_detector(a_stream("speed")), a_rule("fast", **FAST, actions=[a_deploy("help")]))
+    command.drive("run_2.jsonl", (0.5, {"v": 20}), (4.0, {"v": 1}))
+    alone, _ = command.replay("run_1.jsonl").events
+    ran = command.replay("run_1.jsonl", "run_2.jsonl")
     assert "2 recordings, 4 samples, 2 episodes started, 2 ended, 2 tasks" in ran.logged
     assert [event["recording"] for event in ran.events] == ["run_1.jsonl"] * 2 + ["run_2.jsonl"] * 2
     assert len({event["id"] for event in ran.events}) == 4
     assert ran.events[0]["id"] == alone["id"]
-    tasks = list(yaml.safe_load_all((desk.folder / "out" / "tasks.yaml").read_text()))
+    tasks = list(yaml.safe_load_all((command.folder / "out" / "tasks.yaml").read_text()))
     assert len({task["metadata"]["name"] for task in tasks}) == len(tasks) == 2
     assert {task["spec"]["requester"]["holder"] for task in tasks} == {"d", "d.2"}
-    mixed = desk.replay("run_0.jsonl", "run_1.jsonl", "run_2.jsonl", options=["--as-one"])
+    mixed = command.replay("run_0.jsonl", "run_1.jsonl", "run_2.jsonl", options=["--as-one"])
     assert "recordings" not in mixed.logged
 
 
-def test_the_files_of_a_numbered_split_are_one_recording(desk: Desk) -> None:
-    desk.drive("drive_9.jsonl", *LEFT_OPEN)
-    desk.drive("drive_10.jsonl", (4.5, {"v": 20}), (5.0, {"v": 1}), (7.0, {"v": 1}))
+def test_the_files_of_a_numbered_split_are_one_recording(command: CommandLine) -> None:
+    command.drive("drive_9.jsonl", *LEFT_OPEN)
+    command.drive("drive_10.jsonl", (4.5, {"v": 20}), (5.0, {"v": 1}), (7.0, {"v": 1}))
     for given in (["drive_9.jsonl", "drive_10.jsonl"], ["drive_10.jsonl", "drive_9.jsonl"], ["drive_*.jsonl"], ["."]):
-        ran = desk.replay(*given)
+        ran = command.replay(*given)
         assert [event["type"].rpartition(".")[2] for event in ran.events] == ["started", "ended"], given
         assert "recordings" not in ran.logged
     # Numbered alike, but an hour apart: two drives.
-    desk.drive("drive_10.jsonl", *((time + 3600, {"v": 1}) for time in (0.0, 3.0)))
-    ran = desk.replay("drive_*.jsonl")
+    command.drive("drive_10.jsonl", *((time + 3600, {"v": 1}) for time in (0.0, 3.0)))
+    ran = command.replay("drive_*.jsonl")
     assert [event["type"].rpartition(".")[2] for event in ran.events] == ["started"]
     assert "2 recordings" in ran.logged
 
@@ -134,29 +134,29 @@ def test_a_folder_stands_for_the_recordings_in_it(tmp_path: Path) -> None:
         recordings_of([empty])
 
 
-def test_a_cut_recording_is_replayed_with_a_warning_and_a_count(desk: Desk) -> None:
-    path = desk.drive("drive.jsonl", (0.5, {"v": 20}), (4.0, {"v": 20}), (6.0, {"v": 1}))
+def test_a_cut_recording_is_replayed_with_a_warning_and_a_count(command: CommandLine) -> None:
+    path = command.drive("drive.jsonl", (0.5, {"v": 20}), (4.0, {"v": 20}), (6.0, {"v": 1}))
     path.write_bytes(path.read_bytes()[:-10])
-    ran = desk.replay(path)
+    ran = command.replay(path)
     assert (ran.code, len(ran.events)) == (0, 1)
     cut = "drive.jsonl: the recording is cut (line 3 has no end): it contains 2 messages up to there\n"
     assert f"warning: {path.parent}/{cut}" in ran.logged
-    checked = desk.run("check", "detector.yaml", "rules.yaml", "--recording", str(path))
+    checked = command.run("check", "detector.yaml", "rules.yaml", "--recording", str(path))
     assert f"{cut.rstrip()} [cut-recording]" in checked.logged
-    desk.drive("other.jsonl", (0.5, {"v": 20}))
-    assert f"\nwarning: {cut}" in f"\n{desk.replay('drive.jsonl', 'other.jsonl').logged}"
+    command.drive("other.jsonl", (0.5, {"v": 20}))
+    assert f"\nwarning: {cut}" in f"\n{command.replay('drive.jsonl', 'other.jsonl').logged}"
 
 
-def test_rules_are_compared_over_all_recordings(desk: Desk) -> None:
-    desk.write(a_detector(a_stream("speed")), a_rule("fast", **FAST), a_rule("faster", **{**FAST, "when": "v > 15"}))
+def test_rules_are_compared_over_all_recordings(command: CommandLine) -> None:
+    command.write(a_detector(a_stream("speed")), a_rule("fast", **FAST), a_rule("faster", **{**FAST, "when": "v > 15"}))
     for name, speed in (("a.jsonl", 20), ("b.jsonl", 12)):
-        desk.drive(name, (0.5, {"v": speed}), (4.0, {"v": 1}), (6.0, {"v": 1}))
-    desk.replay("a.jsonl", "b.jsonl", options=["--set", "fast=faster"])
-    (comparison,) = json.loads((desk.folder / "out" / "variants.json").read_text())
+        command.drive(name, (0.5, {"v": speed}), (4.0, {"v": 1}), (6.0, {"v": 1}))
+    command.replay("a.jsonl", "b.jsonl", options=["--set", "fast=faster"])
+    (comparison,) = json.loads((command.folder / "out" / "variants.json").read_text())
     (both,), (only,) = comparison["both"], comparison["onlyFirst"]
     assert (both["recording"], both["first"]["recording"], only["recording"]) == ("a.jsonl", "a.jsonl", "b.jsonl")
-    desk.replay("a.jsonl", options=["--set", "fast=faster"])
-    assert "recording" not in (desk.folder / "out" / "variants.json").read_text()
+    command.replay("a.jsonl", options=["--set", "fast=faster"])
+    assert "recording" not in (command.folder / "out" / "variants.json").read_text()
 
 
 @pytest.mark.parametrize("place", ["summary", "footer"])
@@ -178,46 +178,48 @@ def test_the_span_of_a_damaged_ros_1_bag_is_an_error_that_names_it(tmp_path: Pat
         span_of(path)
 
 
-def test_what_cannot_be_read_is_an_error_and_the_others_are_replayed(desk: Desk) -> None:
-    desk.drive("a_0.jsonl", *LEFT_OPEN)
-    (desk.folder / "a_1.jsonl").write_text('{"t": "now"}\n')
-    (desk.folder / "empty.mcap").touch()
-    desk.drive("z.jsonl", *LEFT_OPEN)
+def test_what_cannot_be_read_is_an_error_and_the_others_are_replayed(command: CommandLine) -> None:
+    command.drive("a_0.jsonl", *LEFT_OPEN)
+    (command.folder / "a_1.jsonl").write_text('{"t": "now"}\n')
+    (command.folder / "empty.mcap").touch()
+    command.drive("z.jsonl", *LEFT_OPEN)
     given = ["a_0.jsonl", "a_1.jsonl", "empty.mcap", "z.jsonl"]
-    ran = desk.replay(*given)
+    ran = command.replay(*given)
     assert ran.code == 1
     assert [event["recording"] for event in ran.events] == ["a_0.jsonl", "z.jsonl"]
     assert "error: a_1.jsonl:1: " in ran.logged
     assert "error: empty.mcap: the file is empty" in ran.logged
-    ran = desk.run("check", "detector.yaml", "rules.yaml", *(word for each in given for word in ("--recording", each)))
+    ran = command.run(
+        "check", "detector.yaml", "rules.yaml", *(word for each in given for word in ("--recording", each))
+    )
     assert ran.code == 1
     assert "error: empty.mcap: the file is empty" in ran.logged
     assert ran.logged.count(" [unreadable-recording]") == 2
-    ran = desk.replay("a_1.jsonl", "empty.mcap")
+    ran = command.replay("a_1.jsonl", "empty.mcap")
     assert ran.code == 2
     assert "detector: a_1.jsonl:1: " in ran.logged
     assert "detector: empty.mcap: the file is empty" in ran.logged
 
 
-def test_a_recording_that_does_not_fit_a_stream_is_named(desk: Desk) -> None:
-    desk.drive("a.jsonl", *LEFT_OPEN)
-    write_mcap(desk.folder / "b.mcap", [MESSAGES[0]._replace(key="vehicles/car/speed")])
-    ran = desk.replay("a.jsonl", "b.mcap")
+def test_a_recording_that_does_not_fit_a_stream_is_named(command: CommandLine) -> None:
+    command.drive("a.jsonl", *LEFT_OPEN)
+    write_mcap(command.folder / "b.mcap", [MESSAGES[0]._replace(key="vehicles/car/speed")])
+    ran = command.replay("a.jsonl", "b.mcap")
     assert (ran.code, len(ran.events)) == (1, 1)
     assert "b.mcap: vehicles/car/speed is recorded as cdr, but streams[speed].encoding is json" in ran.logged
 
 
-def test_a_recording_without_messages_is_named(desk: Desk) -> None:
-    (desk.folder / "e.jsonl").touch()
-    (desk.folder / "tiny8.mcap").write_bytes(write_mcap(desk.folder / "whole.mcap", MESSAGES).read_bytes()[:8])
+def test_a_recording_without_messages_is_named(command: CommandLine) -> None:
+    (command.folder / "e.jsonl").touch()
+    (command.folder / "tiny8.mcap").write_bytes(write_mcap(command.folder / "whole.mcap", MESSAGES).read_bytes()[:8])
     for name, logged in (
         ("e.jsonl", "e.jsonl contains no message\n"),
         ("tiny8.mcap", "tiny8.mcap contains no message: it is cut (it ends without a footer)\n"),
     ):
-        ran = desk.replay(name)
+        ran = command.replay(name)
         assert (ran.code, ran.logged) == (2, f"detector: {logged}")
-    desk.drive("a.jsonl", *LEFT_OPEN)
-    ran = desk.replay("a.jsonl", "e.jsonl")
+    command.drive("a.jsonl", *LEFT_OPEN)
+    ran = command.replay("a.jsonl", "e.jsonl")
     assert (ran.code, "e.jsonl: it contains no message" in ran.logged) == (0, True)
 
 
@@ -232,21 +234,21 @@ def an_intake_file(path: Path) -> None:
     writer.close()
 
 
-def test_an_intake_file_in_a_folder_is_replayed_alone(desk: Desk) -> None:
-    an_intake_file(desk.folder / "fold" / "in.mcap")
+def test_an_intake_file_in_a_folder_is_replayed_alone(command: CommandLine) -> None:
+    an_intake_file(command.folder / "fold" / "in.mcap")
     for given in ("fold/in.mcap", "fold", "fold/*.mcap"):
-        ran = desk.run("replay", given, "--output", "out")
+        ran = command.run("replay", given, "--output", "out")
         assert (ran.code, [event["source"] for event in ran.events]) == (0, ["/detectors/h"]), ran.logged
-        ran = desk.run("check", "detector.yaml", "rules.yaml", "--recording", given)
+        ran = command.run("check", "detector.yaml", "rules.yaml", "--recording", given)
         assert ran.code == 0, ran.logged
 
 
-def test_an_intake_file_beside_other_recordings_is_refused_by_name(desk: Desk) -> None:
-    an_intake_file(desk.folder / "fold" / "in.mcap")
-    desk.drive("a.jsonl", *LEFT_OPEN)
-    desk.drive("fold/b.jsonl", *LEFT_OPEN)
+def test_an_intake_file_beside_other_recordings_is_refused_by_name(command: CommandLine) -> None:
+    an_intake_file(command.folder / "fold" / "in.mcap")
+    command.drive("a.jsonl", *LEFT_OPEN)
+    command.drive("fold/b.jsonl", *LEFT_OPEN)
     for given in (["a.jsonl", "fold/in.mcap"], ["fold"], ["fold/in.mcap", "a.jsonl"]):
         named = [option for each in given for option in ("--recording", each)]
-        for ran in (desk.replay(*given), desk.run("check", "detector.yaml", "rules.yaml", *named)):
+        for ran in (command.replay(*given), command.run("check", "detector.yaml", "rules.yaml", *named)):
             assert (ran.code, ran.logged) == (2, "detector: fold/in.mcap is an intake file: replay it alone\n")
-    assert not (desk.folder / "out").exists()
+    assert not (command.folder / "out").exists()

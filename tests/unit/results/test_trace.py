@@ -11,7 +11,7 @@ import pytest
 
 from detector.engine.engine import Engine
 from detector.engine.samples.sample import Arrival
-from detector.replay.replaying import Replayed, replay_arrivals
+from detector.replay.replaying import ReplayResult, replay_arrivals
 from detector.results.series import AWAY, TRUE, UNKNOWN, SubjectTrace, Trace
 from detector.results.tracing import Tracer
 from tests.driving import a_detector, a_rule, a_stream
@@ -27,18 +27,18 @@ class OneByOne(Tracer):
             run.witness = self._witnessed.setdefault(name, self._witness(run.rule)).saw
 
     def _witness(self, rule: object) -> object:
-        from detector.results.witnessing import Witnessed
+        from detector.results.recorded_values import RecordedValues
 
-        return Witnessed(rule)  # type: ignore[arg-type]
+        return RecordedValues(rule)  # type: ignore[arg-type]
 
 
-def replayed(folder: Path, tracer: Tracer, batches: Sequence[Sequence[Arrival]] | None = None) -> Replayed:
+def replayed(folder: Path, tracer: Tracer, batches: Sequence[Sequence[Arrival]] | None = None) -> ReplayResult:
     detector, rules = documents(folder)
     return replay_arrivals(batches or [arrivals()], detector, rules, onlooker=tracer)
 
 
 @pytest.fixture(scope="module")
-def seen(tmp_path_factory: pytest.TempPathFactory) -> tuple[Replayed, Trace]:
+def seen(tmp_path_factory: pytest.TempPathFactory) -> tuple[ReplayResult, Trace]:
     tracer = Tracer()
     outcome = replayed(tmp_path_factory.mktemp("trace"), tracer)
     return outcome, tracer.trace()
@@ -48,7 +48,7 @@ def subject(trace: Trace, rule: str, name: str) -> SubjectTrace:
     return next(each for each in trace.subjects if (each.rule, each.subject) == (rule, name))
 
 
-def test_the_values_at_the_start_of_an_episode_are_those_of_its_event(seen: tuple[Replayed, Trace]) -> None:
+def test_the_values_at_the_start_of_an_episode_are_those_of_its_event(seen: tuple[ReplayResult, Trace]) -> None:
     outcome, trace = seen
     started = [event for event in outcome.events if event.started]
     assert {event.episode.rule for event in started} == {"too-fast", "harsh", "close", "slow-one"}
@@ -62,7 +62,7 @@ def test_the_values_at_the_start_of_an_episode_are_those_of_its_event(seen: tupl
         assert found.conditions["when"].at(np.array([event.episode.onset_time])).tolist() == [TRUE]
 
 
-def test_a_condition_changes_at_the_tick_at_which_an_episode_starts_or_ends(seen: tuple[Replayed, Trace]) -> None:
+def test_a_condition_changes_at_the_tick_at_which_an_episode_starts_or_ends(seen: tuple[ReplayResult, Trace]) -> None:
     outcome, trace = seen
     for event in outcome.events:
         conditions = subject(trace, event.episode.rule, event.episode.subject).conditions
@@ -74,7 +74,9 @@ def test_a_condition_changes_at_the_tick_at_which_an_episode_starts_or_ends(seen
             assert event.end_time in conditions["when"].times
 
 
-def test_an_unknown_stretch_begins_when_the_stream_is_stale_and_has_its_reason(seen: tuple[Replayed, Trace]) -> None:
+def test_an_unknown_stretch_begins_when_the_stream_is_stale_and_has_its_reason(
+    seen: tuple[ReplayResult, Trace],
+) -> None:
     when = subject(seen[1], "too-fast", "car2").conditions["when"]
     at = int(np.flatnonzero(when.codes == UNKNOWN)[0])
     begin = (int(when.times[at]) - START) / SECOND
@@ -83,7 +85,7 @@ def test_an_unknown_stretch_begins_when_the_stream_is_stale_and_has_its_reason(s
     assert (int(when.times[at + 1]) - START) / SECOND == SILENT[1]
 
 
-def test_a_pair_out_of_reach_is_away_and_has_no_distance(seen: tuple[Replayed, Trace]) -> None:
+def test_a_pair_out_of_reach_is_away_and_has_no_distance(seen: tuple[ReplayResult, Trace]) -> None:
     pairs = [each for each in seen[1].subjects if each.rule == "close"]
     away = [each for each in pairs if (each.conditions["when"].codes == AWAY).any()]
     assert away
@@ -93,7 +95,7 @@ def test_a_pair_out_of_reach_is_away_and_has_no_distance(seen: tuple[Replayed, T
         assert np.isnan(each.signals["distance"].at(times)).all()
 
 
-def test_the_cut_into_batches_changes_nothing(tmp_path: Path, seen: tuple[Replayed, Trace]) -> None:
+def test_the_cut_into_batches_changes_nothing(tmp_path: Path, seen: tuple[ReplayResult, Trace]) -> None:
     chance = random.Random(7)
 
     def cut() -> Iterator[list[Arrival]]:
@@ -109,7 +111,7 @@ def test_the_cut_into_batches_changes_nothing(tmp_path: Path, seen: tuple[Replay
     assert_alike(tracer.trace(), seen[1])
 
 
-def test_rules_in_columns_and_one_by_one_have_the_same_trace(tmp_path: Path, seen: tuple[Replayed, Trace]) -> None:
+def test_rules_in_columns_and_one_by_one_have_the_same_trace(tmp_path: Path, seen: tuple[ReplayResult, Trace]) -> None:
     tracer = OneByOne()
     replayed(tmp_path, tracer)
     alone = tracer.trace()
@@ -127,7 +129,7 @@ def test_rules_in_columns_and_one_by_one_have_the_same_trace(tmp_path: Path, see
             assert mine == [other.signals[name].plain(value) for value in other.signals[name].at(times).tolist()]
 
 
-def test_nobody_who_looks_on_changes_an_event(tmp_path: Path, seen: tuple[Replayed, Trace]) -> None:
+def test_nobody_who_looks_on_changes_an_event(tmp_path: Path, seen: tuple[ReplayResult, Trace]) -> None:
     detector, rules = documents(tmp_path)
     plain = replay_arrivals([arrivals()], detector, rules)
     assert [event.to_json() for event in plain.events] == [event.to_json() for event in seen[0].events]

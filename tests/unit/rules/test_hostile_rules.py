@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from detector.actions.registry import secret_problems
-from detector.assembly import RuleIndex, inlets
+from detector.assembly import RuleIndex, stream_readers
 from tests.driving import Drive, a_detector, a_rule, arrival
 from wayside.expressions import CelType, Environment, ExpressionError
 from wayside.rules import RuleError
@@ -98,6 +98,6 @@ def test_a_rule_cannot_have_the_detectors_own_secret_sent_anywhere(http: dict[st
     assert [*secret_problems(rule, a_detector(**OWN, mode="Standalone", pod={"secretNames": ["own"]}))] == []
     assert [*secret_problems(rule, a_detector())] == []
     detector = a_detector(**OWN)
-    evaluated, (refusal,) = RuleIndex().compile([rule], detector, inlets(detector).fields)
+    evaluated, (refusal,) = RuleIndex().compile([rule], detector, stream_readers(detector).fields)
     assert evaluated == []
     assert "the Secret own contains the network credentials of the Detector" in str(refusal)

@@ -13,7 +13,7 @@ import lanelet2.projection
 import numpy as np
 import pytest
 
-from detector.assembly import DetectorError, inlets
+from detector.assembly import DetectorError, stream_readers
 from tests.driving import a_detector, a_rule, a_stream
 from wayside.geo.geometry import Shape
 from wayside.geo.positions import positions_at
@@ -61,7 +61,7 @@ def osm(folder: Path) -> str:
 
 
 def shapes(*maps: dict[str, Any], **spec: Any) -> dict[str, Shape]:
-    return dict(inlets(a_detector(a_stream("pose"), maps=[*maps], **spec)).places.shapes)
+    return dict(stream_readers(a_detector(a_stream("pose"), maps=[*maps], **spec)).places.shapes)
 
 
 def at(value: float) -> Any:
@@ -121,7 +121,7 @@ def test_rules_name_places_of_maps_and_the_manager_accepts_any(tmp_path: Path) -
     stream = a_stream("pose", position={"x": "msg.x", "y": "msg.y"})
     detector = a_detector(stream, maps=[{"file": osm(tmp_path), "origin": ORIGIN}])
     rule = a_rule(signals=[{"name": "s", "stream": "pose", "value": 'at(position, "4711").inside'}], when="s")
-    places = inlets(detector).places
+    places = stream_readers(detector).places
     assert [shape.name for shape in compile_rule(rule, detector, places=places).places] == ["4711"]
     wrong = a_rule(signals=[{"name": "s", "stream": "pose", "value": 'at(position, "4712").inside'}], when="s")
     with pytest.raises(RuleError, match=r"there is no place 4712 \(did you mean 4711"):
@@ -164,6 +164,6 @@ def test_what_is_wrong_with_a_map_is_located(tmp_path: Path, name: str, content:
         path.write_text(content)
     places = [{"name": "own", "line": [[0, 0], [1, 0]]}]
     with pytest.raises(DetectorError) as error:
-        inlets(a_detector(a_stream("pose"), maps=[{"file": str(path)}], places=places))
+        stream_readers(a_detector(a_stream("pose"), maps=[{"file": str(path)}], places=places))
     assert "spec.maps[0].file: " in str(error.value)
     assert message.format(path) in str(error.value)

@@ -15,7 +15,7 @@ import pytest
 from detector.commands.cli import main
 from detector.engine.samples.sample import Arrival
 from detector.findings.losses import Losses
-from detector.replay.replaying import Replayed, replay_arrivals
+from detector.replay.replaying import ReplayResult, replay_arrivals
 from tests.driving import Drive, a_detector, a_rule, a_stream, arrival, at
 
 EDGE = 60.0
@@ -118,7 +118,7 @@ def recorded(users: list[User], seconds: float) -> Iterator[Arrival]:
                 yield arrival(number * PERIOD, user.name, sample, "track")
 
 
-def replayed(users: list[User], rule: dict[str, Any], **stream: Any) -> Replayed:
+def replayed(users: list[User], rule: dict[str, Any], **stream: Any) -> ReplayResult:
     detector = a_detector(a_stream("track", **stream))
     return replay_arrivals([[*recorded(users, 60)]], detector, [a_rule("near-miss", **rule)])
 

@@ -13,7 +13,7 @@ import yaml
 from onnx import helper
 from rosbags.typesys import Stores, get_typestore
 
-from detector.assembly import RuleIndex, inlets, make_engine
+from detector.assembly import RuleIndex, make_engine, stream_readers
 from detector.assembly.checking import findings
 from detector.engine.samples.sample import Arrival
 from tests import onnx_models
@@ -39,7 +39,7 @@ class Driven(Drive):
 
     def __init__(self, detector: Detector, *rules: EventRule) -> None:
         super().__init__(detector)
-        entries = inlets(detector)
+        entries = stream_readers(detector)
         compiled, refused = RuleIndex().compile(rules, detector, entries.fields)
         assert not refused, [str(each) for each in refused]
         self.engine = make_engine(detector, entries, holder="h", start=at(0))
@@ -320,7 +320,7 @@ def test_a_rule_with_another_model_is_another_rule(tmp_path: Path) -> None:
     file = onnx_models.weighted(tmp_path / "m.onnx", [1.0])
     detector = a_detector()
     rule = always(SPEED, risk(file, x(signals=["speed"])))
-    index, fields = RuleIndex(), inlets(detector).fields
+    index, fields = RuleIndex(), stream_readers(detector).fields
     drive = Driven(detector, rule)
     drive.take(arrival(0.5, "car", {"v": 1}), until=1)
     assert drive.note(drive.engine.set_rules(index.compile([rule], detector, fields)[0])) == []

@@ -6,7 +6,7 @@ import re
 from typing import Any
 
 from application_manager.commands.explanationtext import explanation_text
-from application_manager.core.statuses.explaining import Found, explanation_of, serving
+from application_manager.core.statuses.explaining import NamespaceSnapshot, explanation_of, serving
 from application_manager.core.statuses.explanation import Explanation
 from tests.guides import guide
 from tests.unit.manager_objects import NOW, instance, task, template
@@ -77,7 +77,7 @@ TASKS = [
 
 
 def explained(about: str | None = "scene-a", tasks: Any = TASKS, **more: Any) -> Explanation:
-    found = Found([template(**FUSION)], tasks, more.pop("instances", [running()]), **more)
+    found = NamespaceSnapshot([template(**FUSION)], tasks, more.pop("instances", [running()]), **more)
     requested = next((each for each in tasks if each.name == about), None)
     return explanation_of(found, task=about, instance=serving(found, requested, NOW) if requested else NAME, now=NOW)
 
@@ -112,7 +112,7 @@ def test_a_default_and_a_value_that_is_kept_are_distinguished_from_what_tasks_gi
 def test_a_refused_task_has_no_instance_and_reports_why() -> None:
     found = explained("wrong")
     assert found.task is not None
-    assert (found.task.standing, found.task.reason, found.instance) == ("Refused", "InvalidParameters", None)
+    assert (found.task.verdict, found.task.reason, found.instance) == ("Refused", "InvalidParameters", None)
     assert "'fast' is not of type number" in found.task.message
 
 
@@ -122,7 +122,7 @@ def test_a_task_that_differs_where_all_must_agree_is_reported_among_those_of_the
         task("first", {"region": "north", "model": "a"}),
         task("other", {"region": "north", "model": "b"}, created=1),
     ]
-    found = explanation_of(Found([template(**spec)], tasks, []), task="other", instance=NAME, now=NOW)
+    found = explanation_of(NamespaceSnapshot([template(**spec)], tasks, []), task="other", instance=NAME, now=NOW)
     assert {each.name: each.reason for each in found.tasks} == {"first": "Accepted", "other": "Conflict"}
     assert contributions(found, "model") == {"first": "decides", "other": "none"}
     assert found.instance is not None
@@ -133,11 +133,11 @@ def test_a_holder_that_the_manager_counts_as_lost_is_lost_in_the_explanation() -
     lost = task("a", {"region": "north"}, holder="town", accepted_condition=("False", "HolderLost", NOW - 5))
     found = explained("a", [lost])
     assert found.task is not None
-    assert (found.task.standing, found.task.holder_is_lost) == ("Lapsed", True)
+    assert (found.task.verdict, found.task.holder_is_lost) == ("Lapsed", True)
 
 
 def test_a_missing_template_ends_the_chain() -> None:
-    found = explanation_of(Found([], [TASKS[0]], []), task="scene-a", instance=None, now=NOW)
+    found = explanation_of(NamespaceSnapshot([], [TASKS[0]], []), task="scene-a", instance=None, now=NOW)
     assert found.template.problem == "does not exist"
     assert found.task is not None
     assert found.task.reason == "TemplateNotFound"
@@ -171,16 +171,16 @@ def test_the_text_shows_what_each_task_does_and_whose_values_lost_and_why() -> N
 
 def test_who_has_no_place_under_a_limit_waits_though_nobody_has_written_it() -> None:
     one, two = task("one", {"region": "north"}), task("two", {"region": "south"}, created=1)
-    found = Found([template(**FUSION, maxInstances=1)], [one, two], [running()])
+    found = NamespaceSnapshot([template(**FUSION, maxInstances=1)], [one, two], [running()])
     reported = explanation_of(found, task="two", instance=serving(found, two, NOW), now=NOW)
     assert reported.task is not None
-    assert (reported.task.standing, reported.task.reason) == ("Waiting", "LimitReached")
+    assert (reported.task.verdict, reported.task.reason) == ("Waiting", "LimitReached")
 
 
 def test_a_sum_that_is_held_at_its_bound_reports_what_it_would_be() -> None:
     spec = {"parameters": {"uplink": {"type": "number", "maximum": 100, "merge": "Sum"}}}
     tasks = [task("one", {"uplink": 60}), task("two", {"uplink": 70})]
-    found = Found([template(**spec)], tasks, [])
+    found = NamespaceSnapshot([template(**spec)], tasks, [])
     reported = explanation_text(explanation_of(found, task="one", instance=serving(found, tasks[0], NOW), now=NOW))
     assert "  uplink = 100 (merge Sum): the sum of 2 values, 130, is capped at the maximum of 100\n" in reported
 

@@ -11,9 +11,9 @@ from kubernetes.aio.client import Configuration
 from application_manager.cache.cluster_cache import ClusterCache
 from application_manager.core.objects.policy import Policy
 from application_manager.core.statuses.rulestatus import detector_status, rule_status
-from application_manager.work.judging import RuleWork
 from application_manager.work.recorder import Recorder
 from application_manager.work.statuses import StatusWriter
+from application_manager.work.validating import RuleWork
 from tests.inprocess import InProcess
 from tests.unit.manager_objects import NOW
 from wayside.api import API_VERSION, Detector, EventRule

@@ -8,14 +8,14 @@ import pytest
 
 from application_manager.cache.claim_index import ClaimIndex
 from application_manager.cache.store import Entry
-from application_manager.core.claims.operations import Standing, Verdict
-from application_manager.core.conditions import Aspect, changed, updated
-from application_manager.core.statuses.status import Service, difference, finished_since, task_status
+from application_manager.core.claims.operations import Verdict, VerdictKind
+from application_manager.core.conditions import ConditionState, changed, updated
+from application_manager.core.statuses.status import InstanceProgress, difference, finished_since, task_status
 from tests.unit.manager_objects import NOW, task, template
 from wayside.api.applicationtask import TaskPhase
 from wayside.times import format_seconds, parse_seconds
 
-COUNTS = Verdict(Standing.COUNTS, "Accepted", "counts", "app")
+COUNTS = Verdict(VerdictKind.COUNTS, "Accepted", "counts", "app")
 
 
 def logged(status: Any) -> dict[str, str]:
@@ -23,24 +23,29 @@ def logged(status: Any) -> dict[str, str]:
 
 
 def test_a_condition_keeps_its_time_while_its_status_stays() -> None:
-    first = updated((), [Aspect("Ready", False, "NotReady", "0 of 1")], 1, NOW)
-    second = updated(first, [Aspect("Ready", False, "NotReady", "0 of 2")], 2, NOW + 5)
-    third = updated(second, [Aspect("Ready", True, "Ready")], 2, NOW + 9)
+    first = updated((), [ConditionState("Ready", False, "NotReady", "0 of 1")], 1, NOW)
+    second = updated(first, [ConditionState("Ready", False, "NotReady", "0 of 2")], 2, NOW + 5)
+    third = updated(second, [ConditionState("Ready", True, "Ready")], 2, NOW + 9)
     assert second[0].last_transition_time == format_seconds(NOW)
     assert (second[0].message, second[0].observed_generation) == ("0 of 2", 2)
     assert third[0].last_transition_time == format_seconds(NOW + 9)
 
 
 def test_only_a_change_of_status_or_reason_is_worth_an_event() -> None:
-    first = updated((), [Aspect("Ready", False, "NotReady", "0 of 1")], 1, NOW)
+    first = updated((), [ConditionState("Ready", False, "NotReady", "0 of 1")], 1, NOW)
     assert changed((), first) == list(first)
-    assert changed(first, updated(first, [Aspect("Ready", False, "NotReady", "0 of 2")], 2, NOW)) == []
+    assert changed(first, updated(first, [ConditionState("Ready", False, "NotReady", "0 of 2")], 2, NOW)) == []
 
 
 def test_a_tasks_phases_follow_its_instance() -> None:
     phases = [
         task_status(task("a"), COUNTS, service, NOW).phase
-        for service in (None, Service("app", False, False), Service("app", True, False), Service("app", True, True))
+        for service in (
+            None,
+            InstanceProgress("app", False, False),
+            InstanceProgress("app", True, False),
+            InstanceProgress("app", True, True),
+        )
     ]
     assert phases == [TaskPhase.PENDING, TaskPhase.PENDING, TaskPhase.ACTIVE, TaskPhase.READY]
 
@@ -48,54 +53,56 @@ def test_a_tasks_phases_follow_its_instance() -> None:
 def test_a_task_is_not_ready_while_its_instance_is_not_made_and_keeps_what_was_known_of_it_afterwards() -> None:
     pending = task_status(task("a"), COUNTS, None, NOW)
     assert logged(pending) == {"Accepted": "True", "Ready": "False"}
-    ready = task_status(task("a"), COUNTS, Service("app", True, True), NOW)
+    ready = task_status(task("a"), COUNTS, InstanceProgress("app", True, True), NOW)
     later = task_status(task("a").model_copy(update={"status": ready}), COUNTS, None, NOW + 1)
     assert logged(later) == {"Accepted": "True", "Applied": "True", "Ready": "True"}
 
 
 def test_a_task_is_no_more_applied_or_ready_than_its_instance_and_keeps_since_when_it_once_was() -> None:
-    ready = task_status(task("a"), COUNTS, Service("app", True, True), NOW)
+    ready = task_status(task("a"), COUNTS, InstanceProgress("app", True, True), NOW)
     served = task("a").model_copy(update={"status": ready})
-    later = task_status(served, COUNTS, Service("app", False, False, "broken"), NOW + 1)
+    later = task_status(served, COUNTS, InstanceProgress("app", False, False, "broken"), NOW + 1)
     assert logged(later) == {"Accepted": "True", "Applied": "False", "Ready": "False"}
     assert later.phase is TaskPhase.PENDING
     assert later.applied_time == later.ready_time == format_seconds(NOW)
     over = task_status(
-        task("a").model_copy(update={"status": later}), Verdict(Standing.FINISHED, "Ended", "ended"), None, NOW + 2
+        task("a").model_copy(update={"status": later}), Verdict(VerdictKind.FINISHED, "Ended", "ended"), None, NOW + 2
     )
     assert logged(over) == {"Accepted": "True", "Finished": "True"}
     assert over.ready_time == format_seconds(NOW)
 
 
 @pytest.mark.parametrize(
-    ("standing", "stalled"), [(Standing.REFUSED, True), (Standing.WAITING, False), (Standing.LAPSED, False)]
+    ("kind", "stalled"), [(VerdictKind.REFUSED, True), (VerdictKind.WAITING, False), (VerdictKind.LAPSED, False)]
 )
-def test_a_task_that_does_not_count_is_not_ready_for_the_same_reason(standing: Standing, stalled: bool) -> None:
-    served = task("a").model_copy(update={"status": task_status(task("a"), COUNTS, Service("app", True, True), NOW)})
-    status = task_status(served, Verdict(standing, "Because", "why"), None, NOW + 1)
+def test_a_task_that_does_not_count_is_not_ready_for_the_same_reason(kind: VerdictKind, stalled: bool) -> None:
+    served = task("a").model_copy(
+        update={"status": task_status(task("a"), COUNTS, InstanceProgress("app", True, True), NOW)}
+    )
+    status = task_status(served, Verdict(kind, "Because", "why"), None, NOW + 1)
     found = {each.type: (each.status, each.reason) for each in status.conditions}
     assert found["Ready"] == ("False", "Because")
     assert "Applied" not in found
     assert ("Stalled" in found) is stalled
-    again = task_status(
-        task("a").model_copy(update={"status": status}), Verdict(standing, "Because", "why"), None, NOW + 9
-    )
+    again = task_status(task("a").model_copy(update={"status": status}), Verdict(kind, "Because", "why"), None, NOW + 9)
     assert again == status
 
 
 def test_a_tasks_conditions_name_the_trouble_of_its_instance_before_and_after_it_was_ready() -> None:
-    pulling = Service("app", True, False, "cannot pull image app:1: not found", "ImagePullFailed")
+    pulling = InstanceProgress("app", True, False, "cannot pull image app:1: not found", "ImagePullFailed")
     waiting = task_status(task("a"), COUNTS, pulling, NOW)
     ready = next(each for each in waiting.conditions if each.type == "Ready")
     assert (ready.status, ready.reason, ready.message) == ("False", "ImagePullFailed", pulling.problem)
-    served = task("a").model_copy(update={"status": task_status(task("a"), COUNTS, Service("app", True, True), NOW)})
+    served = task("a").model_copy(
+        update={"status": task_status(task("a"), COUNTS, InstanceProgress("app", True, True), NOW)}
+    )
     later = next(each for each in task_status(served, COUNTS, pulling, NOW).conditions if each.type == "Ready")
     assert (later.status, later.reason, later.message) == ("False", "ImagePullFailed", pulling.problem)
 
 
 def test_a_finished_task_keeps_its_instance_and_reports_since_when() -> None:
     served = task("a").model_copy(update={"status": task_status(task("a"), COUNTS, None, NOW)})
-    done = task_status(served, Verdict(Standing.FINISHED, "Ended", "ended"), None, NOW + 7)
+    done = task_status(served, Verdict(VerdictKind.FINISHED, "Ended", "ended"), None, NOW + 7)
     assert (done.phase, done.instance_name) == (TaskPhase.FINISHED, "app")
     assert finished_since(served.model_copy(update={"status": done})) == NOW + 7
     assert finished_since(served) is None
@@ -115,7 +122,7 @@ def test_a_task_that_ends_before_its_status_is_written_still_reports_what_served
 
 
 def test_a_holder_that_returns_takes_back_that_its_task_is_finished() -> None:
-    lost = task_status(task("a"), Verdict(Standing.FINISHED, "DetectorLost", "lost"), None, NOW)
+    lost = task_status(task("a"), Verdict(VerdictKind.FINISHED, "DetectorLost", "lost"), None, NOW)
     back = task_status(task("a").model_copy(update={"status": lost}), COUNTS, None, NOW + 1)
     assert logged(back)["Finished"] == "False"
     assert finished_since(task("a").model_copy(update={"status": back})) is None

@@ -15,7 +15,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from detector.status.metrics import DETECTOR, RULE, STREAM, Metrics
 from detector.status.model import Status
 from detector.status.server import PagesAddress, StatusServer
-from detector.streams.tally import Cause
+from detector.streams.loss_counter import Cause
 from tests.driving import Drive, a_detector, a_rule, a_stream, arrival, at
 from tests.guides import guide
 from tests.unit.statuses.test_status import FAST, Kept

@@ -16,11 +16,11 @@ from detector.engine.samples.intake import Intake
 from detector.engine.samples.sample import Arrival
 from detector.findings.losses import Losses
 from detector.live.evaluator import Evaluator
-from detector.status.explaining import Watching
-from detector.status.keeping import StatusKeeper
+from detector.status.explaining import RuleWatch
 from detector.status.model import CertificateStatus, RuleExplanation, RuleState, Status, read_status, to_json
 from detector.status.table import status_view
-from detector.streams.answering import Answering, NoAnswerError, query_detectors
+from detector.status.updating import StatusUpdater
+from detector.streams.query_handler import NoAnswerError, QueryHandler, query_detectors
 from detector.streams.zenoh import Network
 from tests.driving import POSITION, Drive, a_detector, a_rule, a_stream, arrival, at
 from tests.ports import free_endpoint
@@ -37,7 +37,7 @@ class Kept:
     def __init__(self, drive: Drive) -> None:
         self.drive = drive
         self.time = 0.0
-        self.keeper = StatusKeeper(drive.engine, Losses(drive.engine), lambda: at(self.time))
+        self.keeper = StatusUpdater(drive.engine, Losses(drive.engine), lambda: at(self.time))
 
     def take(self, *arrivals: object, until: float) -> Status:
         self.keeper.arrived(arrivals)  # type: ignore[arg-type]
@@ -182,7 +182,10 @@ def an_answer(what: str, given: object, payload: bytes) -> bytes:
 @pytest.fixture
 def answering(endpoint: str) -> Iterator[None]:
     network = Network(
-        Zenoh(listen=[endpoint]), [], lambda stream: print, answering=lambda session: Answering(session, "d", an_answer)
+        Zenoh(listen=[endpoint]),
+        [],
+        lambda stream: print,
+        answering=lambda session: QueryHandler(session, "d", an_answer),
     )
     network.start()
     yield
@@ -213,7 +216,7 @@ def test_the_detectors_file_contains_where_it_listens(endpoint: str, tmp_path: P
 def explained(
     drive: Drive, rule: str, subject: str | None = None, *, until: float, sent: Sequence[Arrival] = ()
 ) -> RuleExplanation:
-    watching = Watching(drive.engine, rule, subject)
+    watching = RuleWatch(drive.engine, rule, subject)
     assert not watching.is_over()
     drive.take(*sent, until=until)
     assert watching.is_over()
@@ -280,14 +283,14 @@ def test_of_a_pair_each_ones_signals_are_reported() -> None:
 
 def test_a_rule_that_is_gone_is_watched_no_more_and_one_at_a_time() -> None:
     drive = Drive(a_detector(), FAST)
-    watching = Watching(drive.engine, "fast", None)
+    watching = RuleWatch(drive.engine, "fast", None)
     with pytest.raises(ValueError, match="another request about rule fast"):
-        Watching(drive.engine, "fast", None)
+        RuleWatch(drive.engine, "fast", None)
     drive.engine.set_rules([])
     assert watching.is_over()
     assert watching.future.result(0).subjects == []
     with pytest.raises(ValueError, match="rule fast is not evaluated"):
-        Watching(drive.engine, "fast", None)
+        RuleWatch(drive.engine, "fast", None)
 
 
 def test_the_status_names_what_is_demanded_and_who_is_missing() -> None:

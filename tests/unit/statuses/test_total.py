@@ -14,7 +14,7 @@ from detector.commands.cli import app
 from detector.engine.samples.sample import Arrival
 from detector.status.model import Drops, RuleState, Status, read_status, to_json
 from detector.status.total import Total, total
-from detector.streams.answering import Answering, NoAnswerError
+from detector.streams.query_handler import NoAnswerError, QueryHandler
 from detector.streams.zenoh import Network
 from tests.driving import Drive, a_detector, a_rule, arrival
 from tests.ports import free_endpoint
@@ -103,7 +103,7 @@ class Answers:
                 Zenoh(listen=[endpoint]),
                 [],
                 lambda stream: print,
-                answering=lambda session: Answering(session, holder, lambda *_: payload),
+                answering=lambda session: QueryHandler(session, holder, lambda *_: payload),
             )
             network.start()
             self.networks.append(network)

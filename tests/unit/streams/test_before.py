@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from detector.assembly import inlets
+from detector.assembly import stream_readers
 from detector.engine.samples.sample import Arrival
 from tests.driving import SECOND, START, Drive, a_detector, a_rule, a_stream, arrival, at, place
 from tests.guides import guide
@@ -109,4 +109,4 @@ def test_messages_of_ros_are_compared_by_their_fields() -> None:
 def test_what_is_wrong_with_expressions_over_two_samples_is_found_with_its_field(rule: EventRule, problem: str) -> None:
     detector = a_detector(a_stream("pose", encoding="cdr", type="geometry_msgs/msg/PoseStamped"))
     with pytest.raises(RuleError, match=problem):
-        compile_rule(rule, detector, inlets(detector).fields)
+        compile_rule(rule, detector, stream_readers(detector).fields)

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from detector.assembly import DetectorError, inlets
+from detector.assembly import DetectorError, stream_readers
 from detector.engine.samples.sample import Arrival
 from detector.streams.codecs.etsi.quantities import its_ms
 from tests.driving import Drive, a_detector, a_rule, at
@@ -84,7 +84,7 @@ def test_a_client_named_by_its_messages_is_lost_and_comes_back() -> None:
 )
 def test_a_template_that_does_not_compile_is_reported_with_its_field(client: str, problem: str) -> None:
     with pytest.raises(DetectorError, match=r"spec.streams\[0\]." + problem):
-        inlets(a_detector(a_stream(client)))
+        stream_readers(a_detector(a_stream(client)))
 
 
 def test_a_template_that_reads_a_member_of_a_number_is_reported_with_the_number() -> None:
@@ -96,13 +96,13 @@ def test_a_template_that_reads_a_member_of_a_number_is_reported_with_the_number(
 
 def test_a_member_of_a_raw_message_is_refused() -> None:
     with pytest.raises(DetectorError, match=r"spec.streams\[0\].client: msg has no field id: it is bytes; read"):
-        inlets(a_detector(a_stream(encoding="raw")))
+        stream_readers(a_detector(a_stream(encoding="raw")))
 
 
 def test_a_field_that_the_message_type_does_not_have_is_reported() -> None:
     stream = {"name": "o", "key": "odom", "encoding": "cdr", "type": "nav_msgs/msg/Odometry", "client": "${msg.child}"}
     with pytest.raises(DetectorError, match=r"spec.streams\[0\].client: msg has no field child; it has child_frame_id"):
-        inlets(a_detector(stream))
+        stream_readers(a_detector(stream))
 
 
 EMERGENCY = {

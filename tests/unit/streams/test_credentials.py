@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from detector.access import mounted as mounted_files
-from detector.access.mounted import AccessError, Material, expiry, read_material
+from detector.access.mounted import AccessError, LoadedCredentials, expiry, read_material
 from tests.certificates import Authority
 from wayside.api.access import Access
 
@@ -68,9 +68,9 @@ def test_files_that_change_while_they_are_read_are_read_again(tmp_path: Path, mo
         return found
 
     monkeypatch.setattr(mounted_files, "_content", exchanged)
-    material = read_material(access(mounted), "spec.zenoh")
-    assert material.certificate == (mounted / "tls.crt").read_bytes()
-    assert material.key == (mounted / "tls.key").read_bytes()
+    credentials = read_material(access(mounted), "spec.zenoh")
+    assert credentials.certificate == (mounted / "tls.crt").read_bytes()
+    assert credentials.key == (mounted / "tls.key").read_bytes()
 
 
 def test_files_that_never_hold_still_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -83,5 +83,5 @@ def test_files_that_never_hold_still_are_reported(tmp_path: Path, monkeypatch: p
 
 
 def test_what_is_shown_of_it_holds_no_secret() -> None:
-    shown = repr(Material(b"ca", b"certificate", b"key", login=None, tls=True))
+    shown = repr(LoadedCredentials(b"ca", b"certificate", b"key", login=None, tls=True))
     assert "key" not in shown

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from detector.assembly import inlets
+from detector.assembly import stream_readers
 from tests.driving import Drive, a_detector, a_rule, a_stream, arrival, at, compiled
 
 AGE = {"name": "age", "stream": "speed", "aggregate": "Age"}
@@ -40,7 +40,7 @@ def test_a_client_that_is_expected_from_a_change_on_is_there_then_and_times_out_
     drive = Drive(before, silent(until="false"))
 
     def change(wanted: Any) -> None:
-        entries = inlets(wanted)
+        entries = stream_readers(wanted)
         drive.engine.set_detector(wanted, entries.decoders, entries.read_key)
         assert drive.note(drive.engine.set_rules(compiled(wanted, silent(until="false")))) == []
 

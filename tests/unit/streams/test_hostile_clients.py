@@ -6,7 +6,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from detector.assembly import inlets
+from detector.assembly import stream_readers
 from tests.driving import Drive, a_detector, a_rule, arrival
 
 RULE = a_rule("fast", signals=[{"name": "v", "stream": "speed", "value": "msg.v"}], when="v > 10")
@@ -38,5 +38,5 @@ def test_a_made_up_name_reaches_no_file_key_or_object(name: str) -> None:
 @given(st.text(max_size=80))
 @example("..")
 def test_of_any_text_only_a_name_is_taken(name: str) -> None:
-    found = inlets(a_detector()).read_key("speed", f"vehicles/{name}/speed")
+    found = stream_readers(a_detector()).read_key("speed", f"vehicles/{name}/speed")
     assert found is None or is_harmless(found[0])

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import yaml
 
-from detector.assembly import DetectorError, inlets
-from detector.engine.consequences.consequences import Sampled
+from detector.assembly import DetectorError, stream_readers
+from detector.engine.consequences.consequences import RunSamples
 from detector.engine.samples.sample import Arrival
 from detector.replay.replaying import replay_intake
 from detector.streams.codecs.definitions import Definition
@@ -151,7 +151,7 @@ def test_an_action_gets_the_message_once_for_all_its_items() -> None:
     found = drive.engine.consequences.take(drive.engine.now)
     samples: dict[str, list[Any]] = {}
     for each in found:
-        if isinstance(each, Sampled):
+        if isinstance(each, RunSamples):
             samples.setdefault(each.run.action, []).extend(each.samples)
     of_pair = [each.payload for each in samples["keep"]]
     assert of_pair == [each.payload for each in arrivals[:14]]  # up to 0.3 s after its end at 1.1 s
@@ -265,7 +265,7 @@ def test_items_need_a_client_of_each(stream: Mapping[str, Any], problem: str) ->
 )
 def test_what_is_wrong_with_items_is_found_with_its_field(stream: Mapping[str, Any], problem: str) -> None:
     with pytest.raises(DetectorError, match=r"spec.streams\[0\]\." + problem):
-        inlets(a_detector(stream, messages=MESSAGES))
+        stream_readers(a_detector(stream, messages=MESSAGES))
 
 
 def of(value: str, stream: str = "list") -> Sequence[dict[str, Any]]:
@@ -294,7 +294,7 @@ def of(value: str, stream: str = "list") -> Sequence[dict[str, Any]]:
 def test_what_is_wrong_with_expressions_over_items_is_found_with_its_field(rule: Any, problem: str) -> None:
     detector = a_detector(of_type(), a_stream("speed"), messages=MESSAGES)
     with pytest.raises(RuleError, match=problem):
-        compile_rule(rule, detector, inlets(detector).fields)
+        compile_rule(rule, detector, stream_readers(detector).fields)
 
 
 def test_the_example_of_the_guide_finds_two_kinds_of_objects_that_collide() -> None:

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 import yaml
 
-from detector.assembly import inlets
+from detector.assembly import stream_readers
 from detector.sources.registry import source_plugin_problems
 from tests.driving import a_detector
 from tests.guides import guide, yaml_blocks
@@ -17,5 +17,5 @@ SPECS = [yaml.safe_load(block)["spec"] for block in yaml_blocks(guide("sources")
 def test_an_example_has_nothing_wrong(spec: dict[str, Any]) -> None:
     streams = spec.pop("streams")
     detector = a_detector(*streams, **spec)
-    inlets(detector)
+    stream_readers(detector)
     assert [*source_plugin_problems(detector)] == []

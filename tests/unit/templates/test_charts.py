@@ -8,7 +8,7 @@ import pytest
 from pydantic import ValidationError
 
 from application_manager.core.objects.charts import ChartObjects, ChartRequest, ChartSource, parse_chart
-from application_manager.core.objects.ownership import Obstacle
+from application_manager.core.objects.ownership import ApplyProblem
 from application_manager.core.objects.policy import Policy
 from application_manager.core.objects.rendering import ChartPending, Renderer, RenderError, Rendering
 from tests.unit.manager_objects import instance, template
@@ -35,7 +35,7 @@ def objects(text: str) -> ChartObjects:
 
 def refusal(text: str) -> str:
     outcome = parse_chart(SOURCE, text)
-    assert isinstance(outcome, Obstacle), outcome
+    assert isinstance(outcome, ApplyProblem), outcome
     return outcome.message
 
 

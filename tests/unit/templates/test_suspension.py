@@ -7,16 +7,16 @@ from typing import Any
 
 import pytest
 
-from application_manager.core.claims.operations import Standing, Verdict
+from application_manager.core.claims.operations import Verdict, VerdictKind
 from application_manager.core.demand.demand import demand
 from application_manager.core.objects.policy import Policy
 from application_manager.core.objects.rendering import Renderer
-from application_manager.core.statuses.status import Service, suspension_aspect, task_status, together
+from application_manager.core.statuses.status import InstanceProgress, suspended_condition, task_status, together
 from tests.unit.manager_objects import DEPLOYMENT, NOW, instance, task, template
 from wayside.api import ApplicationInstance
 
 POD = DEPLOYMENT["spec"]["template"]
-COUNTS = Verdict(Standing.COUNTS, "Accepted", "counts", "app")
+COUNTS = Verdict(VerdictKind.COUNTS, "Accepted", "counts", "app")
 
 
 def named(kind: str, api_version: str, spec: dict[str, Any], name: str = "${instance.name}") -> dict[str, Any]:
@@ -83,8 +83,8 @@ def logged(stopped: ApplicationInstance, *objects: Any) -> tuple[str, str, str] 
     (decision,) = demand(
         [template()], [task("a"), task("night", operation="Suspend")], [stopped], {}, NOW
     ).instances.values()
-    aspect = suspension_aspect(stopped, decision, objects)
-    return None if aspect is None else (aspect.status, aspect.reason, aspect.message)
+    state = suspended_condition(stopped, decision, objects)
+    return None if state is None else (state.status, state.reason, state.message)
 
 
 def live(replicas: int, pods: int) -> dict[str, Any]:
@@ -107,17 +107,20 @@ def test_the_instance_reports_who_suspends_it_what_is_left_and_what_rests() -> N
 
 
 def test_phases_of_tasks_describe_the_suspension() -> None:
-    on, off = Service("app", True, False, suspended=True), Service("app", True, False, suspended=True, stopped=True)
+    on, off = (
+        InstanceProgress("app", True, False, suspended=True),
+        InstanceProgress("app", True, False, suspended=True, stopped=True),
+    )
     night = task("night", operation="Suspend")
     assert task_status(task("a"), COUNTS, off, NOW).phase == "Suspended"
     assert [task_status(night, COUNTS, each, NOW).phase for each in (on, off)] == ["Active", "Ready"]
-    waiting = task_status(night, Verdict(Standing.WAITING, "NothingRuns", "starts nothing"), None, NOW)
+    waiting = task_status(night, Verdict(VerdictKind.WAITING, "NothingRuns", "starts nothing"), None, NOW)
     assert (waiting.phase, waiting.conditions[0].status, waiting.conditions[0].reason) == (
         "Waiting",
         "True",
         "NothingRuns",
     )
-    both = together([off, Service("b", True, True)])
+    both = together([off, InstanceProgress("b", True, True)])
     assert (both.instance, both.applied, both.ready, both.suspended, both.stopped) == (
         "app, b",
         True,

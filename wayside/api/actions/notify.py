@@ -16,7 +16,7 @@ Template = Annotated[str, Field(min_length=1, max_length=4096)]
 """Text with ${…} over the rule's variables at the start of the episode."""
 
 
-class Moment(StrEnum):
+class NotifiedEvent(StrEnum):
     """The events that cause a notification."""
 
     STARTED = "Started"
@@ -102,7 +102,7 @@ class NotifyAction(Model):
     """An Alertmanager. An alert fires while the episode lasts."""
     zenoh: NotifyZenoh | None = None
     """A Zenoh key on which the event is published."""
-    events: list[Moment] | None = Field(default=None, min_length=1, max_length=2, json_schema_extra=SET_LIST)
+    events: list[NotifiedEvent] | None = Field(default=None, min_length=1, max_length=2, json_schema_extra=SET_LIST)
     """The events that cause a notification. Default: Started and Ended."""
     title: Template | None = None
     """The title of the message, or the summary of an alert. It can contain ${…}."""
@@ -129,9 +129,9 @@ class NotifyAction(Model):
         return self
 
     @property
-    def moments(self) -> frozenset[Moment]:
+    def moments(self) -> frozenset[NotifiedEvent]:
         """The events that cause a notification."""
-        return frozenset(Moment if self.events is None else self.events)
+        return frozenset(NotifiedEvent if self.events is None else self.events)
 
     @property
     def templates(self) -> Mapping[str, JsonValue]:

@@ -17,7 +17,7 @@ from wayside.expressions.columns.lowering import Part
 from wayside.expressions.syntax import Call, Collection, Loop, Name, Node, Scalar, Select
 
 
-class How(enum.Enum):
+class FoldKind(enum.Enum):
     """The result of a fold over the truths of its rows."""
 
     ANY = enum.auto()
@@ -29,7 +29,7 @@ class How(enum.Enum):
 class Fold(NamedTuple):
     """A fold of a predicate over the items."""
 
-    how: How
+    how: FoldKind
     variable: str
     """The name of an item in the predicate."""
     predicate: Part | None
@@ -44,7 +44,7 @@ class Folded(NamedTuple):
     folds: dict[str, Fold]
 
 
-_KINDS: Final = {How.ANY: CelType.BOOL, How.ALL: CelType.BOOL, How.COUNT: CelType.DOUBLE}
+_KINDS: Final = {FoldKind.ANY: CelType.BOOL, FoldKind.ALL: CelType.BOOL, FoldKind.COUNT: CelType.DOUBLE}
 
 
 def folded(expression: Expression, items: str) -> Folded:
@@ -76,7 +76,7 @@ def _without_loops(node: Node, items: str, whole: Expression, folds: dict[str, F
     return node
 
 
-_Found = tuple[How, str, Node | None, bool]
+_Found = tuple[FoldKind, str, Node | None, bool]
 """How, the variable, the predicate, and whether the result is that the count is one."""
 
 
@@ -95,7 +95,7 @@ def _found(node: Node, items: str) -> _Found | None:
 def _count(counted: Node, items: str) -> _Found | None:
     match counted:
         case Name(name) if name == items:
-            return How.COUNT, "", None, False
+            return FoldKind.COUNT, "", None, False
         case Loop(
             Name(over),
             (variable,),
@@ -104,7 +104,7 @@ def _count(counted: Node, items: str) -> _Found | None:
             (Scalar(True), Call("_?_:_", None, (predicate, Call("_+_", None, (Name(one), added)), Name(other)))),
             Name(result),
         ) if over == items and one == other == result == total and added == Collection(False, (Name(variable),)):
-            return How.COUNT, variable, predicate, False
+            return FoldKind.COUNT, variable, predicate, False
     return None
 
 
@@ -112,14 +112,14 @@ def _of_loop(variable: str, total: str, start: Node, stop: Node, step: Node, end
     so_far = Name(total)
     match start, step:
         case Scalar(False), Call("_||_", None, (before, predicate)) if (before, end) == (so_far, so_far):
-            return How.ANY, variable, predicate, False
+            return FoldKind.ANY, variable, predicate, False
         case Scalar(True), Call("_&&_", None, (before, predicate)) if (before, end) == (so_far, so_far):
-            return How.ALL, variable, predicate, False
+            return FoldKind.ALL, variable, predicate, False
         case Scalar(0), Call("_?_:_", None, (predicate, more, other)) if (
             other == so_far
             and stop == Scalar(True)
             and more == Call("_+_", None, (so_far, Scalar(1)))
             and end == Call("_==_", None, (so_far, Scalar(1)))
         ):
-            return How.COUNT, variable, predicate, True
+            return FoldKind.COUNT, variable, predicate, True
     return None

@@ -14,7 +14,7 @@ import numpy as np
 
 from wayside.expressions.columns.values import Bools, Doubles
 from wayside.expressions.functions import FUNCTIONS, OF_FIELDS
-from wayside.expressions.functions.declaring import Takes, Yields
+from wayside.expressions.functions.declaring import ArgumentType, ResultType
 from wayside.geo.geometry import Shape
 from wayside.geo.positions import AT, positions_at
 
@@ -71,8 +71,8 @@ def _scalar_functions() -> dict[tuple[str, int], Callable[..., float]]:
     for function in (*FUNCTIONS.values(), *OF_FIELDS.values()):
         for signature in function.signatures:
             alone = sum(len(each.parameters) == len(signature.parameters) for each in function.signatures) == 1
-            numbers = all(parameter.takes is Takes.NUMBER for parameter in signature.parameters)
-            if function.yields is Yields.NUMBER and alone and numbers:
+            numbers = all(parameter.takes is ArgumentType.NUMBER for parameter in signature.parameters)
+            if function.yields is ResultType.NUMBER and alone and numbers:
                 found[function.name, len(signature.parameters)] = signature.implementation  # type: ignore[assignment]
     return found
 

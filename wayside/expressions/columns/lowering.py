@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 
 from wayside.expressions.cel import CelType, Expression
 from wayside.expressions.columns.functions import about_place, takes_columns
-from wayside.expressions.columns.nodes import Holds, Nodes, Op
+from wayside.expressions.columns.nodes import Nodes, NodeType, Op
 from wayside.expressions.columns.values import Tag
 from wayside.expressions.projection import integer
 from wayside.expressions.syntax import Call, Collection, Node, Path, Scalar, Select, path_of
@@ -68,17 +68,17 @@ class _Lowering:
         found = self._lower(self._tree)
         holds = self._holds(found)
         match self._expression.result, holds:
-            case (CelType.DYN, _) | (CelType.DOUBLE, Holds.NUMBERS) | (CelType.STRING, Holds.TEXTS):
+            case (CelType.DYN, _) | (CelType.DOUBLE, NodeType.NUMBERS) | (CelType.STRING, NodeType.TEXTS):
                 return found
             case CelType.BOOL, _:
                 return self._graph.truth(found)
-            case CelType.DOUBLE, Holds.ANY:
-                return self._graph.node(Op.NUMBER, Holds.NUMBERS, (found,))
-            case CelType.STRING, Holds.ANY:
-                return self._graph.node(Op.TEXT, Holds.ANY, (found,))
+            case CelType.DOUBLE, NodeType.ANY:
+                return self._graph.node(Op.NUMBER, NodeType.NUMBERS, (found,))
+            case CelType.STRING, NodeType.ANY:
+                return self._graph.node(Op.TEXT, NodeType.ANY, (found,))
         raise LoweringError
 
-    def _holds(self, node: int) -> Holds:
+    def _holds(self, node: int) -> NodeType:
         return self._graph.nodes[node].holds
 
     def _lower(self, node: Node) -> int:
@@ -92,14 +92,14 @@ class _Lowering:
                 return self._has(path)
             case Call("_&&_" | "_||_" as name, None, (a, b)):
                 return self._graph.node(
-                    Op.AND if name == "_&&_" else Op.OR, Holds.TRUTHS, (self._truth(a), self._truth(b))
+                    Op.AND if name == "_&&_" else Op.OR, NodeType.TRUTHS, (self._truth(a), self._truth(b))
                 )
             case Call("!_", None, (a,)):
                 return self._not(self._truth(a))
             case Call("-_", None, (a,)):
-                return self._graph.node(Op.NEGATE, Holds.NUMBERS, (self._number(a),))
+                return self._graph.node(Op.NEGATE, NodeType.NUMBERS, (self._number(a),))
             case Call(name, None, (a, b)) if name in _ARITHMETIC:
-                return self._graph.node(_ARITHMETIC[name], Holds.NUMBERS, (self._number(a), self._number(b)))
+                return self._graph.node(_ARITHMETIC[name], NodeType.NUMBERS, (self._number(a), self._number(b)))
             case Call(name, None, (a, b)) if name in _ORDER:
                 return self._order(name, a, b)
             case Call("_==_", None, (a, b)):
@@ -113,13 +113,13 @@ class _Lowering:
             case Call(name, None, (*given, Scalar(str() as key))) if about_place(name):
                 return self._graph.node(
                     Op.CALL,
-                    Holds.NUMBERS,
+                    NodeType.NUMBERS,
                     tuple(self._number(each) for each in given),
                     (name, len(given), shape_of(key)),
                 )
             case Call(name, None, given) if takes_columns(name, len(given)):
                 return self._graph.node(
-                    Op.CALL, Holds.NUMBERS, tuple(self._number(each) for each in given), (name, len(given))
+                    Op.CALL, NodeType.NUMBERS, tuple(self._number(each) for each in given), (name, len(given))
                 )
         raise LoweringError
 
@@ -136,7 +136,7 @@ class _Lowering:
             return node
         if kind not in _DECLARED:
             raise LoweringError
-        return self._graph.node(Op.EXPECT, Holds.ANY, (node,), _DECLARED[kind])
+        return self._graph.node(Op.EXPECT, NodeType.ANY, (node,), _DECLARED[kind])
 
     def _named(self, path: Path) -> Hashable | Constant:
         found = self._leaf(path)
@@ -156,33 +156,33 @@ class _Lowering:
         if isinstance(found, Constant):
             return self._graph.constant(True)
         # Bytes that the expression also orders are absent in all of it; that comparison makes their rows foreign.
-        return self._graph.node(Op.HAS, Holds.TRUTHS, (self._graph.leaf(found),))
+        return self._graph.node(Op.HAS, NodeType.TRUTHS, (self._graph.leaf(found),))
 
     def _number(self, node: Node) -> int:
         found = self._lower(node)
-        if self._holds(found) not in (Holds.NUMBERS, Holds.ANY):
+        if self._holds(found) not in (NodeType.NUMBERS, NodeType.ANY):
             raise LoweringError
         return found
 
     def _truth(self, node: Node) -> int:
         found = self._lower(node)
-        return found if self._holds(found) in (Holds.TRUTHS, Holds.ANY) else self._graph.truth(found)
+        return found if self._holds(found) in (NodeType.TRUTHS, NodeType.ANY) else self._graph.truth(found)
 
     def _not(self, node: int) -> int:
-        return self._graph.node(Op.NOT, Holds.TRUTHS, (node,))
+        return self._graph.node(Op.NOT, NodeType.TRUTHS, (node,))
 
     def _order(self, name: str, a: Node, b: Node) -> int:
         op, turned = _ORDER[name]
         first, second = self._lower(a), self._lower(b)
         kinds = {self._holds(first), self._holds(second)}
-        if Holds.TEXTS in kinds or kinds == {Holds.NUMBERS, Holds.TRUTHS}:
+        if NodeType.TEXTS in kinds or kinds == {NodeType.NUMBERS, NodeType.TRUTHS}:
             raise LoweringError
-        return self._graph.node(op, Holds.TRUTHS, (second, first) if turned else (first, second))
+        return self._graph.node(op, NodeType.TRUTHS, (second, first) if turned else (first, second))
 
     def _equal(self, a: Node, b: Node) -> int:
         self._check_not_null(a)
         self._check_not_null(b)
-        return self._graph.node(Op.EQUAL, Holds.TRUTHS, (self._lower(a), self._lower(b)))
+        return self._graph.node(Op.EQUAL, NodeType.TRUTHS, (self._lower(a), self._lower(b)))
 
     def _in(self, sought: Node, elements: tuple[Node, ...]) -> int:
         literals = [each.value for each in elements if isinstance(each, Scalar)]
@@ -194,17 +194,19 @@ class _Lowering:
         for value in literals:
             if not isinstance(value, bool | float | str):
                 raise LoweringError
-            found.append(self._graph.node(Op.EQUAL, Holds.TRUTHS, (what, self._constant(value))))
+            found.append(self._graph.node(Op.EQUAL, NodeType.TRUTHS, (what, self._constant(value))))
         while len(found) > 1:  # as a tree, so that it is not deep
             rest = found[len(found) & ~1 :]
-            found = [self._graph.node(Op.OR, Holds.TRUTHS, pair) for pair in zip(found[::2], found[1::2], strict=False)]
+            found = [
+                self._graph.node(Op.OR, NodeType.TRUTHS, pair) for pair in zip(found[::2], found[1::2], strict=False)
+            ]
             found += rest
         return found[0]
 
     def _choose(self, condition: Node, a: Node, b: Node) -> int:
         test, first, second = self._truth(condition), self._lower(a), self._lower(b)
         kinds = {self._holds(first), self._holds(second)}
-        holds = kinds.pop() if kinds in ({Holds.NUMBERS}, {Holds.TRUTHS}) else Holds.ANY
+        holds = kinds.pop() if kinds in ({NodeType.NUMBERS}, {NodeType.TRUTHS}) else NodeType.ANY
         return self._graph.node(Op.CHOOSE, holds, (test, first, second))
 
     def _check_not_null(self, node: Node) -> None:

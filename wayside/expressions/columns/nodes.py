@@ -10,7 +10,7 @@ from typing import NamedTuple
 from wayside.expressions.columns.values import Tag
 
 
-class Holds(enum.Enum):
+class NodeType(enum.Enum):
     """The type of a node's result, as far as it is known without rows."""
 
     NUMBERS = enum.auto()
@@ -61,7 +61,7 @@ class Node:
     """One operation. Its operands have smaller numbers than itself."""
 
     op: Op
-    holds: Holds
+    holds: NodeType
     operands: tuple[int, ...]
     detail: Hashable = None
     """A leaf's name, a constant's value, the tag that is expected, a function's name, count of arguments and place."""
@@ -77,26 +77,26 @@ class Nodes:
 
     def leaf(self, name: Hashable) -> int:
         """The node of a leaf itself."""
-        return self.node(Op.LEAF, Holds.ANY, detail=name)
+        return self.node(Op.LEAF, NodeType.ANY, detail=name)
 
     def truth(self, node: int) -> int:
         """The node's rows as truths: a row that is no boolean is unknown."""
         match self.nodes[node]:
-            case Node(Op.CONSTANT, Holds.TRUTHS) | Node(holds=Holds.ANY):
-                return self.node(Op.TRUTH, Holds.TRUTHS, (node,))
-            case Node(holds=Holds.TRUTHS):
+            case Node(Op.CONSTANT, NodeType.TRUTHS) | Node(holds=NodeType.ANY):
+                return self.node(Op.TRUTH, NodeType.TRUTHS, (node,))
+            case Node(holds=NodeType.TRUTHS):
                 return node
-        return self.node(Op.NEVER, Holds.TRUTHS, (node,))
+        return self.node(Op.NEVER, NodeType.TRUTHS, (node,))
 
     def constant(self, value: bool | float | str) -> int:
         """The node of a literal."""
         if isinstance(value, bool):
-            return self.node(Op.CONSTANT, Holds.TRUTHS, detail=value)
+            return self.node(Op.CONSTANT, NodeType.TRUTHS, detail=value)
         if isinstance(value, str):
-            return self.node(Op.CONSTANT, Holds.TEXTS, detail=value)
-        return self.node(Op.CONSTANT, Holds.NUMBERS, detail=float(value))
+            return self.node(Op.CONSTANT, NodeType.TEXTS, detail=value)
+        return self.node(Op.CONSTANT, NodeType.NUMBERS, detail=float(value))
 
-    def node(self, op: Op, holds: Holds, operands: Sequence[int] = (), detail: Hashable = None) -> int:
+    def node(self, op: Op, holds: NodeType, operands: Sequence[int] = (), detail: Hashable = None) -> int:
         """The number of this node, a new one if there is none yet."""
         operands = tuple(sorted(operands) if op in COMMUTATIVE else operands)
         named = detail.hex() if isinstance(detail, float) and op is Op.CONSTANT else detail  # 0.0 is not -0.0
@@ -113,19 +113,19 @@ class Nodes:
         del self.nodes[count:]
         self._numbers = {key: number for key, number in self._numbers.items() if number < count}
 
-    def watches(self, node: int) -> tuple[Watch, ...]:
+    def checks(self, node: int) -> tuple[CelCheck, ...]:
         """The rows that the columns cannot decide because of this node alone."""
         here = self.nodes[node]
         if here.op is Op.EXPECT and isinstance(here.detail, Tag):
-            return (Watch(Concern.UNEXPECTED, here.operands, here.detail),)
-        anything = [self._leaf_of(each) for each in here.operands if self.nodes[each].holds is Holds.ANY]
+            return (CelCheck(RowsForCel.UNEXPECTED, here.operands, here.detail),)
+        anything = [self._leaf_of(each) for each in here.operands if self.nodes[each].holds is NodeType.ANY]
         found = (
             []
             if here.op in (Op.CHOOSE, Op.HAS)
-            else [Watch(Concern.OTHER, (each,)) for each in dict.fromkeys(anything)]
+            else [CelCheck(RowsForCel.OTHER, (each,)) for each in dict.fromkeys(anything)]
         )
         if here.op in (Op.ADD, Op.LESS, Op.LESS_EQUAL) and len(anything) == 2:
-            found.append(Watch(Concern.TEXTS, (anything[0], anything[1])))
+            found.append(CelCheck(RowsForCel.TEXTS, (anything[0], anything[1])))
         return tuple(found)
 
     def _leaf_of(self, node: int) -> int:
@@ -134,7 +134,7 @@ class Nodes:
         return here.operands[0] if here.op is Op.EXPECT else node
 
 
-class Concern(enum.Enum):
+class RowsForCel(enum.Enum):
     """Which rows CEL has to decide."""
 
     OTHER = enum.auto()
@@ -145,9 +145,9 @@ class Concern(enum.Enum):
     """Those with anything but what is declared: CEL converts some of it."""
 
 
-class Watch(NamedTuple):
-    """A concern about the rows of one or two nodes."""
+class CelCheck(NamedTuple):
+    """Rows of one or two nodes that CEL has to decide."""
 
-    concern: Concern
+    rows: RowsForCel
     nodes: tuple[int, ...]
     expected: Tag = Tag.NUMBER

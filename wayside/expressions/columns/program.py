@@ -12,14 +12,14 @@ from typing import Final, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from wayside.expressions.columns.foreign import Foreign, Found
+from wayside.expressions.columns.cel_fallback import CelChecks, CelRows
 from wayside.expressions.columns.frame import ABSENT, NUMBER, Array, Frame, Memory, Operand, Rows, Sizes
 from wayside.expressions.columns.functions import Called
-from wayside.expressions.columns.nodes import GIVEN, Holds, Node, Nodes, Op
+from wayside.expressions.columns.nodes import GIVEN, Node, Nodes, NodeType, Op
 from wayside.expressions.columns.operations import UNKNOWN_OF_NUMBERS, Step
 from wayside.expressions.columns.values import Bools, Bytes, Column, Doubles, Tag, Texts
 
-_SOURCES: Final = {Holds.NUMBERS: Array.NUMBERS, Holds.TRUTHS: Array.TRUTHS, Holds.ANY: Array.MIXED}
+_SOURCES: Final = {NodeType.NUMBERS: Array.NUMBERS, NodeType.TRUTHS: Array.TRUTHS, NodeType.ANY: Array.MIXED}
 _NO_DOUBLES: Final = np.zeros((0, 1))
 _CACHE_SIZE: Final = 256
 _Scalar = TypeVar("_Scalar", bound=np.generic)
@@ -48,7 +48,7 @@ class Program:
             elif node.op is Op.EXPECT:
                 self._places[number] = self._places[node.operands[0]]
         self._steps, self._sizes = self._put_into_steps(wanted)
-        self._foreign = Foreign(graph, roots, self._places)
+        self._foreign = CelChecks(graph, roots, self._places)
         self._memory = Memory()
         self._rows: dict[tuple[int, ...], Operand] = {}
 
@@ -90,11 +90,11 @@ class Program:
         operands = [self._nodes[each].holds for each in node.operands]
         match node.op:
             case Op.CHOOSE:
-                typed = node.holds is not Holds.ANY and operands[0] is Holds.TRUTHS
+                typed = node.holds is not NodeType.ANY and operands[0] is NodeType.TRUTHS
             case Op.AND | Op.OR | Op.NOT:
-                typed = Holds.ANY not in operands
+                typed = NodeType.ANY not in operands
             case Op.LESS | Op.LESS_EQUAL:
-                typed = set(operands) != {Holds.ANY, Holds.TRUTHS}
+                typed = set(operands) != {NodeType.ANY, NodeType.TRUTHS}
             case _:
                 typed = True
         return not typed or any(self._partial[each] for each in node.operands)
@@ -197,11 +197,11 @@ class Results:
 
     __slots__ = ("_foreign", "_found", "_frame", "_program")
 
-    def __init__(self, program: Program, frame: Frame, foreign: Foreign) -> None:
+    def __init__(self, program: Program, frame: Frame, foreign: CelChecks) -> None:
         self._program = program
         self._frame = frame
         self._foreign = foreign
-        self._found: Found | None = None
+        self._found: CelRows | None = None
 
     def truths(self, roots: Sequence[int]) -> tuple[Bools, Bools]:
         """bool[len(roots), n] twice: where each root is true, and where it is false; neither: unknown.

@@ -17,8 +17,8 @@ from wayside.expressions.functions import (
     numbers,
     octets,
     places,
+    position_fields,
     preparing,
-    whereabouts,
 )
 from wayside.expressions.functions.declaring import Function
 
@@ -31,7 +31,7 @@ FUNCTIONS: Final[Mapping[str, Function]] = MappingProxyType(
 )
 """By name."""
 
-OF_FIELDS: Final[Mapping[str, Function]] = MappingProxyType({each.name: each for each in whereabouts.FUNCTIONS})
+OF_FIELDS: Final[Mapping[str, Function]] = MappingProxyType({each.name: each for each in position_fields.FUNCTIONS})
 """Not for authors: the functions that fields of `at` and `seenFrom` become (see `expanding`)."""
 
 DECLARATIONS: Final = [

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 
-from wayside.expressions.functions.declaring import Yields, function
+from wayside.expressions.functions.declaring import ResultType, function
 from wayside.expressions.functions.members import member, number
 
 Quaternion = tuple[float, float, float, float]
@@ -69,19 +69,19 @@ _WAYS = "quaternion:map", "x y z w"
 FUNCTIONS = (
     function(
         "headingDifference",
-        Yields.NUMBER,
+        ResultType.NUMBER,
         "the turn from one heading to another, degrees in (-180, 180]; compass headings: positive to the right",
         (heading_difference, "from to"),
     ),
     function(
         "angleDifference",
-        Yields.NUMBER,
+        ResultType.NUMBER,
         "the turn from one angle to another, radians in (-π, π]; counter-clockwise angles: positive to the left",
         (angle_difference, "from to"),
     ),
-    function("yaw", Yields.NUMBER, "rotation about z, radians in [-π, π]", *((yaw, way) for way in _WAYS)),
-    function("pitch", Yields.NUMBER, "rotation about y, radians in [-π/2, π/2]", *((pitch, way) for way in _WAYS)),
-    function("roll", Yields.NUMBER, "rotation about x, radians in [-π, π]", *((roll, way) for way in _WAYS)),
-    function("degrees", Yields.NUMBER, "radians converted to degrees", (math.degrees, "radians")),
-    function("radians", Yields.NUMBER, "degrees converted to radians", (math.radians, "degrees")),
+    function("yaw", ResultType.NUMBER, "rotation about z, radians in [-π, π]", *((yaw, way) for way in _WAYS)),
+    function("pitch", ResultType.NUMBER, "rotation about y, radians in [-π/2, π/2]", *((pitch, way) for way in _WAYS)),
+    function("roll", ResultType.NUMBER, "rotation about x, radians in [-π, π]", *((roll, way) for way in _WAYS)),
+    function("degrees", ResultType.NUMBER, "radians converted to degrees", (math.degrees, "radians")),
+    function("radians", ResultType.NUMBER, "degrees converted to radians", (math.radians, "degrees")),
 )

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_left, bisect_right
 
-from wayside.expressions.functions.declaring import Yields, function
+from wayside.expressions.functions.declaring import ResultType, function
 from wayside.expressions.functions.members import Place, place, sequence
 
 
@@ -47,21 +47,21 @@ def _has_neighbour(here: Place, by_x: list[Place], xs: list[float], within: floa
 FUNCTIONS = (
     function(
         "unmatched",
-        Yields.LIST,
+        ResultType.LIST,
         "the indices of the items that have none of the others within this distance, metres",
         (unmatched, "items:list others:list within"),
         (unmatched, "items:list others:list within path:string"),
     ),
     function(
         "countUnmatched",
-        Yields.NUMBER,
+        ResultType.NUMBER,
         "the number of such items",
         (count_unmatched, "items:list others:list within"),
         (count_unmatched, "items:list others:list within path:string"),
     ),
     function(
         "nearest",
-        Yields.NUMBER,
+        ResultType.NUMBER,
         "metres from (x, y) to the nearest item of a list; infinite if the list is empty",
         (nearest, "items:list x y"),
         (nearest, "items:list x y path:string"),

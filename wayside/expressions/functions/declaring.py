@@ -19,7 +19,7 @@ from wayside.expressions.functions.calls import Arguments, called_by_cel
 from wayside.expressions.handles import value_of
 
 
-class Takes(enum.Enum):
+class ArgumentType(enum.Enum):
     """The type of a parameter, as errors name it."""
 
     NUMBER = "number"
@@ -29,7 +29,7 @@ class Takes(enum.Enum):
     MAP = "map"
 
 
-class Yields(enum.Enum):
+class ResultType(enum.Enum):
     """The type of a function's result."""
 
     NUMBER = "number"
@@ -39,18 +39,18 @@ class Yields(enum.Enum):
 
 
 _TAKES = {
-    Takes.NUMBER: (cel.Type.DOUBLE,),
-    Takes.TEXT: (cel.Type.STRING,),
-    Takes.BYTES: (cel.Type.BYTES, cel.Type.UINT),
-    Takes.LIST: (cel.Type.List(cel.Type.DYN), cel.Type.UINT),
-    Takes.MAP: (cel.Type.Map(cel.Type.STRING, cel.Type.DYN), cel.Type.UINT),
+    ArgumentType.NUMBER: (cel.Type.DOUBLE,),
+    ArgumentType.TEXT: (cel.Type.STRING,),
+    ArgumentType.BYTES: (cel.Type.BYTES, cel.Type.UINT),
+    ArgumentType.LIST: (cel.Type.List(cel.Type.DYN), cel.Type.UINT),
+    ArgumentType.MAP: (cel.Type.Map(cel.Type.STRING, cel.Type.DYN), cel.Type.UINT),
 }
-_UNREAD = frozenset({Takes.BYTES, Takes.LIST, Takes.MAP})
+_UNREAD = frozenset({ArgumentType.BYTES, ArgumentType.LIST, ArgumentType.MAP})
 _YIELDS = {
-    Yields.NUMBER: cel.Type.DOUBLE,
-    Yields.BOOLEAN: cel.Type.BOOL,
-    Yields.TEXT: cel.Type.STRING,
-    Yields.LIST: cel.Type.List(cel.Type.DYN),
+    ResultType.NUMBER: cel.Type.DOUBLE,
+    ResultType.BOOLEAN: cel.Type.BOOL,
+    ResultType.TEXT: cel.Type.STRING,
+    ResultType.LIST: cel.Type.List(cel.Type.DYN),
 }
 
 
@@ -59,7 +59,7 @@ class FunctionParameter:
     """A parameter. Its name contains the unit if its meaning does not imply it."""
 
     name: str
-    takes: Takes
+    takes: ArgumentType
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +75,7 @@ class Function:
     """A function of expressions."""
 
     name: str
-    yields: Yields
+    yields: ResultType
     summary: str
     """The meaning of the result, with its unit."""
     signatures: tuple[Signature, ...]
@@ -116,22 +116,22 @@ def _called(function: Function, signature: Signature) -> Callable[..., object]:
             if isinstance(value, float) and math.isnan(value):
                 raise ValueError(f"no value for {parameter.name} of {function.name}: it is not a number")
             if parameter.takes in _UNREAD and not _fits(parameter.takes, value):
-                article = "" if parameter.takes is Takes.BYTES else "a "
+                article = "" if parameter.takes is ArgumentType.BYTES else "a "
                 raise ValueError(f"{function.name}: {parameter.name} must be {article}{parameter.takes.value}")
         return signature.implementation(*values)
 
     return called_by_cel(call)
 
 
-def _fits(takes: Takes, value: object) -> bool:
-    if takes is Takes.BYTES:
+def _fits(takes: ArgumentType, value: object) -> bool:
+    if takes is ArgumentType.BYTES:
         return isinstance(value, bytes | bytearray | memoryview)
-    if takes is Takes.LIST:
+    if takes is ArgumentType.LIST:
         return isinstance(value, list | tuple) or hasattr(value, "tolist")  # numpy's: a list in all that matters
     return isinstance(value, Mapping) or dataclasses.is_dataclass(value)
 
 
-def function(name: str, yields: Yields, summary: str, *ways: tuple[Callable[..., object], str]) -> Function:
+def function(name: str, yields: ResultType, summary: str, *ways: tuple[Callable[..., object], str]) -> Function:
     """A function by its ways to be called: an implementation, and the parameters as in `x y polygon:list`."""
     return Function(
         name,
@@ -145,4 +145,4 @@ def function(name: str, yields: Yields, summary: str, *ways: tuple[Callable[...,
 
 def _parameter(text: str) -> FunctionParameter:
     name, _, takes = text.partition(":")
-    return FunctionParameter(name, Takes(takes) if takes else Takes.NUMBER)
+    return FunctionParameter(name, ArgumentType(takes) if takes else ArgumentType.NUMBER)

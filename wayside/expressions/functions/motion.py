@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from wayside.expressions.functions.declaring import Yields, function
+from wayside.expressions.functions.declaring import ResultType, function
 
 
 def time_to_collision(gap: float, closing_speed: float) -> float:
@@ -64,7 +64,7 @@ def _direction(vx: float, vy: float) -> tuple[float, float]:
 FUNCTIONS = (
     function(
         "timeToCollision",
-        Yields.NUMBER,
+        ResultType.NUMBER,
         "seconds until the gap (m) is closed at closingSpeed (m/s), or until two bodies on straight paths are "
         "radius (m) apart, where dx, dy (m) and vx, vy (m/s) are the relative position and velocity; infinite if "
         "that never happens",
@@ -73,13 +73,13 @@ FUNCTIONS = (
     ),
     function(
         "closing",
-        Yields.NUMBER,
+        ResultType.NUMBER,
         "how fast two bodies approach each other, m/s; negative if they separate; arguments as for timeToCollision",
         (closing, "dx dy vx vy"),
     ),
     function(
         "closestApproach",
-        Yields.NUMBER,
+        ResultType.NUMBER,
         "the smallest distance that two bodies on straight paths will have, metres; arguments as for timeToCollision",
         (closest_approach, "dx dy vx vy"),
     ),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from wayside.expressions.functions.declaring import Yields, function
+from wayside.expressions.functions.declaring import ResultType, function
 from wayside.expressions.functions.members import number, sequence
 
 
@@ -45,16 +45,16 @@ def _mean(values: list[float]) -> float:
 
 
 FUNCTIONS = (
-    function("abs", Yields.NUMBER, "the absolute value", (abs, "x")),
-    function("sqrt", Yields.NUMBER, "the square root; x ≥ 0", (square_root, "x")),
-    function("hypot", Yields.NUMBER, "√(x² + y²), √(x² + y² + z²)", (math.hypot, "x y"), (math.hypot, "x y z")),
-    function("sin", Yields.NUMBER, "the sine", (math.sin, "radians")),
-    function("cos", Yields.NUMBER, "the cosine", (math.cos, "radians")),
-    function("atan2", Yields.NUMBER, "the angle of (x, y), radians in [-π, π]", (math.atan2, "y x")),
-    function("smaller", Yields.NUMBER, "the smaller of two numbers", (min, "x y")),
-    function("larger", Yields.NUMBER, "the larger of two numbers", (max, "x y")),
-    function("minimum", Yields.NUMBER, "the smallest number of a list", (of_list(min), "values:list")),
-    function("maximum", Yields.NUMBER, "the largest number of a list", (of_list(max), "values:list")),
-    function("mean", Yields.NUMBER, "the mean of a list", (of_list(_mean), "values:list")),
-    function("sum", Yields.NUMBER, "the sum of a list", (of_list(_sum), "values:list")),
+    function("abs", ResultType.NUMBER, "the absolute value", (abs, "x")),
+    function("sqrt", ResultType.NUMBER, "the square root; x ≥ 0", (square_root, "x")),
+    function("hypot", ResultType.NUMBER, "√(x² + y²), √(x² + y² + z²)", (math.hypot, "x y"), (math.hypot, "x y z")),
+    function("sin", ResultType.NUMBER, "the sine", (math.sin, "radians")),
+    function("cos", ResultType.NUMBER, "the cosine", (math.cos, "radians")),
+    function("atan2", ResultType.NUMBER, "the angle of (x, y), radians in [-π, π]", (math.atan2, "y x")),
+    function("smaller", ResultType.NUMBER, "the smaller of two numbers", (min, "x y")),
+    function("larger", ResultType.NUMBER, "the larger of two numbers", (max, "x y")),
+    function("minimum", ResultType.NUMBER, "the smallest number of a list", (of_list(min), "values:list")),
+    function("maximum", ResultType.NUMBER, "the largest number of a list", (of_list(max), "values:list")),
+    function("mean", ResultType.NUMBER, "the mean of a list", (of_list(_mean), "values:list")),
+    function("sum", ResultType.NUMBER, "the sum of a list", (of_list(_sum), "values:list")),
 )

@@ -6,7 +6,7 @@ import struct
 import zlib
 from typing import Final
 
-from wayside.expressions.functions.declaring import Yields, function
+from wayside.expressions.functions.declaring import ResultType, function
 
 _FORMATS: Final = {
     name: struct.Struct(code)
@@ -54,15 +54,15 @@ def utf8(data: bytes) -> str:
 
 
 FUNCTIONS = (
-    function("allZero", Yields.BOOLEAN, "whether all bytes are 0", (all_zero, "data:bytes")),
-    function("checksum", Yields.NUMBER, "the CRC-32 of the bytes", (checksum, "data:bytes")),
-    function("byteCount", Yields.NUMBER, "the number of bytes", (byte_count, "data:bytes")),
+    function("allZero", ResultType.BOOLEAN, "whether all bytes are 0", (all_zero, "data:bytes")),
+    function("checksum", ResultType.NUMBER, "the CRC-32 of the bytes", (checksum, "data:bytes")),
+    function("byteCount", ResultType.NUMBER, "the number of bytes", (byte_count, "data:bytes")),
     function(
         "numberAt",
-        Yields.NUMBER,
+        ResultType.NUMBER,
         "the number that begins at byte offset (counted from 0), as u8, i8, or u16, i16, u32, i32, f32, f64 followed "
         "by le or be",
         (number_at, "data:bytes offset format:string"),
     ),
-    function("utf8", Yields.TEXT, "the bytes as a UTF-8 string", (utf8, "data:bytes")),
+    function("utf8", ResultType.TEXT, "the bytes as a UTF-8 string", (utf8, "data:bytes")),
 )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 
-from wayside.expressions.functions.declaring import Yields, function
+from wayside.expressions.functions.declaring import ResultType, function
 from wayside.expressions.functions.members import pair, place, sequence
 from wayside.geo import geodesy
 from wayside.geo.geometry import Point, contains
@@ -80,31 +80,31 @@ def _check(latitude: float, longitude: float) -> None:
 FUNCTIONS = (
     function(
         "wgs84Distance",
-        Yields.NUMBER,
+        ResultType.NUMBER,
         "the distance along the Earth's surface (ellipsoid WGS 84), metres",
         (wgs84_distance, "latitude1 longitude1 latitude2 longitude2"),
     ),
     function(
         "wgs84Bearing",
-        Yields.NUMBER,
+        ResultType.NUMBER,
         "the direction from the first place to the second, degrees in [0, 360) clockwise from north",
         (wgs84_bearing, "latitude1 longitude1 latitude2 longitude2"),
     ),
     function(
         "inside",
-        Yields.BOOLEAN,
+        ResultType.BOOLEAN,
         "whether the place lies inside the polygon or on its edge; same unit for all",
         (inside, "x y polygon:list"),
     ),
     function(
         "insideWgs84",
-        Yields.BOOLEAN,
+        ResultType.BOOLEAN,
         "the same, degrees; corners are [latitude, longitude]",
         (inside_wgs84, "latitude longitude polygon:list"),
     ),
     function(
         "countInside",
-        Yields.NUMBER,
+        ResultType.NUMBER,
         "how many objects of a list lie inside the polygon or on its edge",
         (count_inside, "items:list polygon:list"),
         (count_inside, "items:list polygon:list path:string"),

@@ -32,7 +32,7 @@ Watch = tuple[str, str]
 log = logging.getLogger(__name__)
 
 
-class Pulse(Collector):
+class WatchHealth(Collector):
     """When each watch last gave a sign of life; also as metrics. Any thread may read."""
 
     def __init__(self, limit: float, healthy: Callable[[], float]) -> None:
@@ -84,7 +84,7 @@ class Pulse(Collector):
 
 
 @contextmanager
-def pulsing(pulse: Pulse) -> Iterator[None]:
+def pulsing(pulse: WatchHealth) -> Iterator[None]:
     """Have kopf's watches give their signs of life while the block runs, and restart those that give none."""
     original = watching.watch_objs
 

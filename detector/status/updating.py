@@ -22,7 +22,7 @@ from detector.engine.evaluation.rule import RuleRun
 from detector.engine.samples.sample import Arrival
 from detector.engine.timing.schedule import Schedule
 from detector.findings.losses import Losses
-from detector.status.explaining import Watching
+from detector.status.explaining import RuleWatch
 from detector.status.model import (
     ClientStatus,
     Drops,
@@ -64,7 +64,7 @@ class _Latencies:
         return Histogram(BOUNDS, tuple(self._counts), self._sum)
 
 
-class StatusKeeper:
+class StatusUpdater:
     """The latest status, and the data for the next one. Everything except `latest` is for the evaluation thread."""
 
     def __init__(self, engine: Engine, losses: Losses, now: Callable[[], int]) -> None:
@@ -86,7 +86,7 @@ class StatusKeeper:
         self._stream_latencies: dict[str, _Latencies] = {}
         self._rule_latencies: dict[str, _Latencies] = {}
         self._version = version("wayside")
-        self._watching: list[Watching] = []
+        self._watching: list[RuleWatch] = []
         self.gaps = 0
         self.demands: Collection[str] = ()
         """The names of the currently demanded tasks."""
@@ -109,7 +109,7 @@ class StatusKeeper:
 
     def watch(self, rule: str, subject: str | None) -> Future[RuleExplanation]:
         """The values that the rule's next evaluation reads: for a subject, or for the first ones. Raises ValueError."""
-        watching = Watching(self._engine, rule, subject)
+        watching = RuleWatch(self._engine, rule, subject)
         self._watching.append(watching)
         return watching.future
 

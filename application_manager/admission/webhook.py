@@ -38,7 +38,7 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class Serving:
+class WebhookOptions:
     """Where the webhook is served, and the folder with its certificate and key.
 
     `service` and `webhooks`: where this manager makes the certificate itself, the Service for which it does, as
@@ -93,7 +93,7 @@ class ReviewHandler:
 
 
 @asynccontextmanager
-async def webhook(serving: Serving | None, handlers: Mapping[str, ReviewHandler]) -> AsyncIterator[None]:
+async def webhook(serving: WebhookOptions | None, handlers: Mapping[str, ReviewHandler]) -> AsyncIterator[None]:
     """Serve the handlers, by their paths, on all addresses while the block runs; nothing where `serving` is None.
 
     Raises ConfigurationError where the port is taken, CertificateError where there is no valid certificate.

@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable
 from typing import Final
 
-from wayside.expressions.functions.declaring import Yields, function
+from wayside.expressions.functions.declaring import ResultType, function
 from wayside.geo import geodesy
 
 OF_PLACES: Final = {
@@ -79,12 +79,12 @@ def _finite(number: float) -> float:
 _SEEN = "u v yaw other_u other_v"
 
 FUNCTIONS = (
-    *(function(name, Yields.NUMBER, "at", (_at(name), parameters)) for name, parameters in OF_PLACES.items()),
-    function("seen_ahead", Yields.NUMBER, "seenFrom", (_ahead, _SEEN)),
-    function("seen_left", Yields.NUMBER, "seenFrom", (_left, _SEEN)),
-    function("seen_aheadWgs84", Yields.NUMBER, "seenFrom", (_ahead_wgs84, _SEEN)),
-    function("seen_leftWgs84", Yields.NUMBER, "seenFrom", (_left_wgs84, _SEEN)),
-    function("seen_speedAhead", Yields.NUMBER, "seenFrom", (_speed_ahead, "yaw speed other_yaw other_speed")),
-    function("seen_speedLeft", Yields.NUMBER, "seenFrom", (_speed_left, "yaw speed other_yaw other_speed")),
-    function("seen_heading", Yields.NUMBER, "seenFrom", (_turned, "yaw other_yaw")),
+    *(function(name, ResultType.NUMBER, "at", (_at(name), parameters)) for name, parameters in OF_PLACES.items()),
+    function("seen_ahead", ResultType.NUMBER, "seenFrom", (_ahead, _SEEN)),
+    function("seen_left", ResultType.NUMBER, "seenFrom", (_left, _SEEN)),
+    function("seen_aheadWgs84", ResultType.NUMBER, "seenFrom", (_ahead_wgs84, _SEEN)),
+    function("seen_leftWgs84", ResultType.NUMBER, "seenFrom", (_left_wgs84, _SEEN)),
+    function("seen_speedAhead", ResultType.NUMBER, "seenFrom", (_speed_ahead, "yaw speed other_yaw other_speed")),
+    function("seen_speedLeft", ResultType.NUMBER, "seenFrom", (_speed_left, "yaw speed other_yaw other_speed")),
+    function("seen_heading", ResultType.NUMBER, "seenFrom", (_turned, "yaw other_yaw")),
 )

@@ -39,7 +39,7 @@ def status_key(holder: str, what: str) -> str:
     return f"wayside/detectors/{holder}/{what}"
 
 
-class Answering:
+class QueryHandler:
     """Handles the queries of one session until that is closed."""
 
     def __init__(self, session: zenoh.Session, holder: str, answer: Answer) -> None:

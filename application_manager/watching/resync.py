@@ -17,14 +17,14 @@ from application_manager.measures import Measures
 from application_manager.watching.router import Router
 from wayside.kubernetes.client import Client
 from wayside.kubernetes.errors import RequestError
-from wayside.kubernetes.repeating import until_answered
 from wayside.kubernetes.resources import LEASES, Resource
+from wayside.kubernetes.retrying import until_answered
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class Listing:
+class Resync:
     """Lists our own kinds and those of instances' objects, in these namespaces, everywhere where there are none.
 
     `every`: seconds between two resyncs.

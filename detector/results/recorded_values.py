@@ -52,7 +52,7 @@ class _Subject:
     last: int = 0
 
 
-class Witnessed:
+class RecordedValues:
     """The recorded values of one rule."""
 
     def __init__(self, rule: CompiledRule) -> None:

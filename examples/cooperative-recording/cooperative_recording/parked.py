@@ -23,7 +23,7 @@ _CLOUD_EVERY = 5
 _BY_NAME = {vehicle.name: vehicle for vehicle in LIDAR_VEHICLES}
 
 
-class Standing:
+class ParkedVehicles:
     """Inside the `with`, vehicles with a lidar stand on one line, from west to east."""
 
     def __init__(self, connect: Sequence[str] | zenoh.Session, wait_s: float = 10.0) -> None:
@@ -43,7 +43,7 @@ class Standing:
         with self._lock:
             self._places[vehicle] = x
 
-    def __enter__(self) -> Standing:
+    def __enter__(self) -> ParkedVehicles:
         self._thread.start()
         return self
 

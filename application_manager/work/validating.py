@@ -7,9 +7,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 
-from application_manager.cache.cluster_cache import EVENT_RULE, OWN, TEMPLATE, TEMPLATES, ClusterCache, surroundings
+from application_manager.cache.cluster_cache import EVENT_RULE, OWN, TEMPLATE, TEMPLATES, ClusterCache, rule_context
 from application_manager.cache.detector_index import DetectorIndex
-from application_manager.cache.overlap_index import Turn
+from application_manager.cache.overlap_index import NamespaceRole
 from application_manager.cache.store import Entry
 from application_manager.core.claims.claims import InvalidTemplate
 from application_manager.core.findings.findings import Findings
@@ -66,7 +66,7 @@ class RuleWork:
         if kind == EVENT_RULE:
             old, reason, what = EventRuleStatus.model_validate(written), RULE_INVALID, "rule"
             if isinstance(entry.model, EventRule):
-                job = partial(surroundings(self.cache, entry.model).status, entry.model, now)
+                job = partial(rule_context(self.cache, entry.model).status, entry.model, now)
         else:
             old, reason, what = DetectorStatus.model_validate(written), DETECTOR_INVALID, "detector"
             if isinstance(entry.model, Detector):
@@ -99,9 +99,9 @@ class TemplateWork:
         old = ApplicationTemplateStatus.model_validate(entry.raw.get("status") or {})
         own = self.cache.overlap.own()
         turn, when = self.cache.overlap.turn(name, now)
-        if turn is not Turn.ACT:
+        if turn is not NamespaceRole.ACT:
             self.again(name, when)
-            if turn is Turn.CHALLENGE and own is not None:
+            if turn is NamespaceRole.CHALLENGE and own is not None:
                 await self._challenge(regarding, own, now)
             return
         findings = await self._findings(name)

@@ -25,13 +25,13 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from application_manager.admission.reviewing import Serving
+from application_manager.admission.webhook import WebhookOptions
 from application_manager.core.findings.webhooks import WebhookClientConfig
 from wayside.kubernetes.client import Client
 from wayside.kubernetes.connection import ConfigurationError
 from wayside.kubernetes.errors import ApiError
-from wayside.kubernetes.repeating import repeatedly, until_answered
 from wayside.kubernetes.resources import Object, Resource
+from wayside.kubernetes.retrying import repeatedly, until_answered
 from wayside.process.servingcertificate import CERTIFICATE, KEY
 
 EVERY = 10.0  # s between two looks at the Secret
@@ -52,14 +52,14 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class Issuing:
+class CertificateIssuer:
     """Keeps the certificate valid, the files in the folder as in the Secret, which exists, and the webhooks' authority.
 
     `client` writes also while this manager is not the active one.
     """
 
     client: Client
-    serving: Serving
+    serving: WebhookOptions
 
     async def look(self) -> None:
         """Look once: make a certificate where one is due, give the API server its authority, and write the files."""
@@ -120,7 +120,7 @@ def _trusted(secret: Object, now: datetime.datetime) -> bytes:
 
 
 @asynccontextmanager
-async def issuing(client: Client, serving: Serving | None) -> AsyncIterator[None]:
+async def issuing(client: Client, serving: WebhookOptions | None) -> AsyncIterator[None]:
     """Keep the webhook's certificate valid while the block runs, where the manager makes it.
 
     First it waits for a certificate, however long the API server takes to answer. Raises ConfigurationError where the
@@ -129,7 +129,7 @@ async def issuing(client: Client, serving: Serving | None) -> AsyncIterator[None
     if serving is None or not serving.service:
         yield
         return
-    look = Issuing(client, serving).look
+    look = CertificateIssuer(client, serving).look
     await until_answered(look)
     renewing = repeatedly(look, EVERY, "cannot renew the webhook's certificate")
     following = asyncio.create_task(renewing, name="issuing")

@@ -26,7 +26,7 @@ class Evaluations(NamedTuple):
     """Evaluations of subjects; those of one subject are in time order."""
 
     keys: Integers
-    """The subjects, see `Past.key`."""
+    """The subjects, see `EarlierValues.key`."""
     times: Integers
     last: int
     """The last tick of the block; nanoseconds, as all times."""
@@ -46,7 +46,7 @@ class _Kept(NamedTuple):
 _NOTHING = _Kept(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0), np.zeros(0, np.uint8), None)
 
 
-class Past:
+class EarlierValues:
     """The earlier values of one rule's signals."""
 
     def __init__(self) -> None:

@@ -14,7 +14,7 @@ from wayside.expressions.columns.lowering import Constant
 from wayside.expressions.columns.values import MISSING, Column, Tag, column_of
 
 
-class ClientLeaves:
+class ClientValues:
     """The leaves of programs over the clients of a block."""
 
     def __init__(self, context: Context, tracks: Sequence[Track]) -> None:

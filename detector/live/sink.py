@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from detector.actions.base import ActionError, Surroundings
+from detector.actions.base import ActionError, DetectorConfiguration
 from detector.actions.deploy.reconciler import DemandReconciler
 from detector.actions.host import ActionHost
 from detector.actions.tracing import EpisodeTraces
@@ -24,7 +24,7 @@ from wayside.api import EventRule
 _log = logging.getLogger(__name__)
 
 
-class LiveOutlet:
+class LiveSink:
     """Sends events to Zenoh and to the log, demands to the reconciler; nothing here waits."""
 
     def __init__(
@@ -81,9 +81,9 @@ class LiveOutlet:
         if self._state is not None:
             self._state.save(episodes())
 
-    def follow(self, rules: Sequence[EventRule], surroundings: Surroundings) -> None:
+    def follow(self, rules: Sequence[EventRule], configuration: DetectorConfiguration) -> None:
         """Run the actions of these rules."""
-        self.actions.follow(with_requested(rules, surroundings.detector), surroundings)
+        self.actions.follow(with_requested(rules, configuration.detector), configuration)
 
     def consequences(self, consequences: Sequence[Consequence]) -> None:
         """Pass the consequences to the actions."""

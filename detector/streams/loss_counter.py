@@ -20,7 +20,7 @@ class Cause(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class TallyEntry:
+class LossCount:
     """How often something happened."""
 
     cause: Cause
@@ -36,7 +36,7 @@ class TallyEntry:
         return self.cause.value.format(self.name)
 
 
-class Tally:
+class LossCounter:
     """Counters, thread-safe. There is an entry for each cause and each stream or source, so their number is bounded."""
 
     def __init__(self) -> None:
@@ -49,7 +49,7 @@ class Tally:
             before, _ = self._counts.get((cause, name), (0, ""))
             self._counts[cause, name] = before + count, last
 
-    def entries(self) -> list[TallyEntry]:
+    def entries(self) -> list[LossCount]:
         """All entries, in order of cause and name."""
         with self._lock:
-            return [TallyEntry(*key, *value) for key, value in sorted(self._counts.items())]
+            return [LossCount(*key, *value) for key, value in sorted(self._counts.items())]

@@ -1,4 +1,4 @@
-"""The state machine of one recording elsewhere: what is confirmed, and the next request and its time.
+"""The state machine of one recording on another system: what is confirmed, and the next request and its time.
 
 Level-triggered: the other system should record as long as the episode lasts, and not afterwards. Unconfirmed requests
 are retried with backoff until they are given up. A start is requested even if the episode has ended in the meantime,
@@ -24,7 +24,7 @@ _POLL = 1.0
 FOREVER = float("inf")
 
 
-class CourseStep(Enum):
+class NextRequest(Enum):
     """The next request."""
 
     START = "start"
@@ -46,8 +46,8 @@ class Timeouts:
     """Until a start is repeated."""
 
 
-class Course:
-    """One recording elsewhere."""
+class RemoteRecording:
+    """One recording on another system."""
 
     def __init__(self, order: Order, limits: Timeouts, now: float, onset: float, *, resumed: bool = False) -> None:
         """`onset`: when the condition began; `resumed`: an earlier run of the detector may have requested it."""
@@ -56,7 +56,7 @@ class Course:
         self.onset = onset
         self.ended: float | None = None
         """When the episode ended."""
-        self.step = CourseStep.START
+        self.step = NextRequest.START
         self.due = now
         """Time of the next request."""
         self.failures = 0
@@ -79,67 +79,67 @@ class Course:
     @property
     def finished(self) -> bool:
         """Whether no request is left."""
-        return self.step is CourseStep.FINISHED
+        return self.step is NextRequest.FINISHED
 
     def end(self, now: float, ended: float) -> None:
         """The episode has `ended`, or the recording is no longer wanted."""
         if self.ended is None:
             self.ended = ended
-            if self.step is CourseStep.HOLD:
-                self._to(CourseStep.STOP, now)
+            if self.step is NextRequest.HOLD:
+                self._to(NextRequest.STOP, now)
 
-    def look(self, now: float) -> CourseStep | None:
+    def look(self, now: float) -> NextRequest | None:
         """The request to send now; None: none is due."""
-        if self.step is CourseStep.HOLD and now >= self._limit:
+        if self.step is NextRequest.HOLD and now >= self._limit:
             self.note = "its maximumDuration ended it before the episode ended" if self.ended is None else self.note
-            self._to(CourseStep.STOP, now)
+            self._to(NextRequest.STOP, now)
         return self.step if now >= self.due and not self.finished else None
 
     def next_look(self) -> float:
         """When `look` may return something, if nothing happens before."""
         if self.finished:
             return FOREVER
-        return min(self.due, self._limit) if self.step is CourseStep.HOLD else self.due
+        return min(self.due, self._limit) if self.step is NextRequest.HOLD else self.due
 
     def failed(self, now: float, why: str, *, silent: bool) -> None:
         """The request was not confirmed; `silent`: there was no response, so it may have arrived nevertheless."""
         self.failures += 1
         self.unanswered = self.unanswered or silent
         self.due = now + min(_FIRST_WAIT * 2 ** min(self.failures - 1, 10), _LONGEST_WAIT)
-        if now - self._since < self._limits.give_up or self.step is CourseStep.HOLD:
+        if now - self._since < self._limits.give_up or self.step is NextRequest.HOLD:
             return
-        if self.step is CourseStep.START:
+        if self.step is NextRequest.START:
             self.problem = f"gave up starting it: {why}"
             if self.unanswered:
-                self._to(CourseStep.STOP, now)  # otherwise it might record for nothing
+                self._to(NextRequest.STOP, now)  # otherwise it might record for nothing
             else:
-                self.step = CourseStep.FINISHED
-        elif self.step is CourseStep.STOP:
+                self.step = NextRequest.FINISHED
+        elif self.step is NextRequest.STOP:
             self.lost_stop = True
             self.problem = self.problem or f"gave up waiting for the confirmation of the stop: {why}"
-            self.step = CourseStep.FINISHED
+            self.step = NextRequest.FINISHED
         else:
             self.note = self.note or f"its result is unknown: {why}"
-            self.step = CourseStep.FINISHED
+            self.step = NextRequest.FINISHED
 
     def answered(self, now: float, report: Report) -> None:
         """The other system responded to the request that `look` returned."""
-        if report.progress is Progress.REFUSED and self.step in (CourseStep.START, CourseStep.STOP):
+        if report.progress is Progress.REFUSED and self.step in (NextRequest.START, NextRequest.STOP):
             self.failed(now, report.message, silent=False)
             return
         before = self.report
         if report.progress is not Progress.UNKNOWN:
             self.report = report
-        if self.step in (CourseStep.START, CourseStep.HOLD):
+        if self.step in (NextRequest.START, NextRequest.HOLD):
             self._started(now, report)
         elif report.progress is Progress.UNKNOWN:
             if self.confirmed and not self.problem:
                 self.problem = "the other system no longer knows the recording: it restarted, and the recording is cut"
-            self.step = CourseStep.FINISHED
+            self.step = NextRequest.FINISHED
         elif report.progress.over:
             self._over(report)
-        elif self.step is CourseStep.STOP:
-            self._to(CourseStep.AWAIT, now)
+        elif self.step is NextRequest.STOP:
+            self._to(NextRequest.AWAIT, now)
             self.due = now + _POLL
         else:
             if (report.samples, report.progress) != (before.samples, before.progress):
@@ -156,20 +156,20 @@ class Course:
         self.failures, self._since = 0, now
         self.confirmed, self.unanswered = True, False
         if self.ended is not None:
-            self._to(CourseStep.STOP, now)
+            self._to(NextRequest.STOP, now)
         else:
-            self.step = CourseStep.HOLD
+            self.step = NextRequest.HOLD
             self.due = FOREVER if self._limits.renew is None else now + self._limits.renew
 
     def _over(self, report: Report) -> None:
         """The recording has ended there."""
         if report.progress is not Progress.DONE:
             self.problem = self.problem or report.message or "it failed on the other system"
-        elif self.step in (CourseStep.START, CourseStep.HOLD):
+        elif self.step in (NextRequest.START, NextRequest.HOLD):
             self.note = report.message or "it ended on the other system before the episode ended"
         else:
             self.note = self.note or report.message
-        self.step = CourseStep.FINISHED
+        self.step = NextRequest.FINISHED
 
-    def _to(self, step: CourseStep, now: float) -> None:
+    def _to(self, step: NextRequest, now: float) -> None:
         self.step, self.due, self.failures, self._since = step, now, 0, now

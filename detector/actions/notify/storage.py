@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from detector.actions.base import Setting
+from detector.actions.base import ActionContext
 from detector.actions.journal import Journal
 from detector.actions.notify.notice import Notice, NoticeTexts, notice_from, texts
 from wayside.times import format_seconds
@@ -21,12 +21,12 @@ _NOTICE, _OPEN = "notice/", "open/"
 _LOST = "events not delivered to any target"
 
 
-class Keeping:
+class NotifyStore:
     """Not thread-safe."""
 
-    def __init__(self, setting: Setting) -> None:
-        self._setting = setting
-        self._journal = Journal(setting, "notify", "events that would not survive a restart")
+    def __init__(self, context: ActionContext) -> None:
+        self._setting = context
+        self._journal = Journal(context, "notify", "events that would not survive a restart")
         path = self._journal.path
         self._letters = None if path is None else DeadLetters(path.with_name(f"{path.name}.dead.jsonl"))
         self._claimed: set[str] = set()

@@ -22,7 +22,7 @@ class Ran(NamedTuple):
     events: list[dict[str, Any]]
 
 
-class Desk:
+class CommandLine:
     """A folder with a Detector, a rule and recordings, and the command."""
 
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,40 +7,39 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from wayside.expressions.columns.frame import Array, Frame
-from wayside.expressions.columns.nodes import Concern, Holds, Nodes, Op, Watch
+from wayside.expressions.columns.nodes import CelCheck, Nodes, NodeType, Op, RowsForCel
 from wayside.expressions.columns.values import Bools, Bytes, Tag
 
 Places = Mapping[int, tuple[Array, int]]
-Found = Mapping[int, Bools]
-"""bool[n] by the number of a watch: the rows that it found, if any."""
+CelRows = Mapping[int, Bools]
+"""bool[n] by the number of a check: the rows that it found, if any."""
 
 
-class Foreign:
-    """The watches below each root of a program. Nearly always none finds anything, and that costs next to nothing."""
+class CelChecks:
+    """The checks below each root of a program. Nearly always, none finds a row, and that costs next to nothing."""
 
     def __init__(self, graph: Nodes, roots: Sequence[int], places: Places) -> None:
         self._places = places
-        numbers: dict[Watch, int] = {}
+        numbers: dict[CelCheck, int] = {}
         self._below = {
-            root: frozenset(numbers.setdefault(watch, len(numbers)) for watch in _watches(graph, root))
-            for root in roots
+            root: frozenset(numbers.setdefault(check, len(numbers)) for check in _checks(graph, root)) for root in roots
         }
         self._of_others: dict[int, int] = {}
-        """For the row of a leaf the watch that looks for what is OTHER."""
+        """By the row of a leaf: the check that looks for the tag OTHER."""
         self._of_texts: dict[tuple[int, int], int] = {}
-        """For the rows of two leaves the watch that looks for texts in both."""
-        self._rest: list[tuple[int, Watch]] = []
-        for watch, number in numbers.items():
-            rows = [places[node][1] for node in watch.nodes]
-            if watch.concern is Concern.UNEXPECTED or any(places[n][0] is not Array.LEAVES for n in watch.nodes):
-                self._rest.append((number, watch))
-            elif watch.concern is Concern.OTHER:
+        """By the rows of two leaves: the check that looks for texts in both."""
+        self._rest: list[tuple[int, CelCheck]] = []
+        for check, number in numbers.items():
+            rows = [places[node][1] for node in check.nodes]
+            if check.rows is RowsForCel.UNEXPECTED or any(places[n][0] is not Array.LEAVES for n in check.nodes):
+                self._rest.append((number, check))
+            elif check.rows is RowsForCel.OTHER:
                 self._of_others[rows[0]] = number
             else:
                 self._of_texts[rows[0], rows[1]] = number
 
-    def find(self, frame: Frame) -> Found:
-        """The rows that all watches find in one run."""
+    def find(self, frame: Frame) -> CelRows:
+        """The rows that all checks find in one run."""
         return dict(self._find(frame))
 
     def _find(self, frame: Frame) -> Iterator[tuple[int, Bools]]:
@@ -51,30 +50,30 @@ class Foreign:
             for (one, other), number in self._of_texts.items() if texts else ():
                 if one in texts and other in texts:
                     yield number, _holds(frame.leaf_tags[one], Tag.TEXT) & _holds(frame.leaf_tags[other], Tag.TEXT)
-        for number, watch in self._rest:
-            found = self._found(watch, frame)
+        for number, check in self._rest:
+            found = self._found(check, frame)
             if found is not None and found.any():
                 yield number, found
 
-    def rows(self, root: int, found: Found) -> Bools | None:
-        """bool[n]: the rows that some watch below the root found; None: none. Raises KeyError for what is no root."""
-        watches = self._below[root]
+    def rows(self, root: int, found: CelRows) -> Bools | None:
+        """bool[n]: the rows that the checks below the root found; None if none. Raises KeyError for other nodes."""
+        checks = self._below[root]
         rows: Bools | None = None
         for number, here in found.items():
-            if number in watches:
+            if number in checks:
                 rows = here if rows is None else rows | here
         return rows if rows is not None and rows.any() else None
 
-    def _found(self, watch: Watch, frame: Frame) -> Bools | None:
-        tags = [self._tags(each, frame) for each in watch.nodes]
+    def _found(self, check: CelCheck, frame: Frame) -> Bools | None:
+        tags = [self._tags(each, frame) for each in check.nodes]
         first = tags[0]
-        if watch.concern is Concern.UNEXPECTED:
-            if watch.expected is Tag.NUMBER and not frame.odd:
+        if check.rows is RowsForCel.UNEXPECTED:
+            if check.expected is Tag.NUMBER and not frame.odd:
                 return None
             if first is None:
                 return np.ones(frame.leaves.shape[1], bool)
-            return ~(_holds(first, watch.expected) | _holds(first, Tag.ABSENT) | _holds(first, Tag.UNREACHABLE))
-        wanted = Tag.OTHER if watch.concern is Concern.OTHER else Tag.TEXT
+            return ~(_holds(first, check.expected) | _holds(first, Tag.ABSENT) | _holds(first, Tag.UNREACHABLE))
+        wanted = Tag.OTHER if check.rows is RowsForCel.OTHER else Tag.TEXT
         rows = [None if each is None else _holds(each, wanted) for each in tags]
         if len(rows) == 1:
             return rows[0]
@@ -94,14 +93,14 @@ def _holds(tags: Bytes, tag: Tag) -> Bools:
     return found
 
 
-def _watches(graph: Nodes, root: int) -> tuple[Watch, ...]:
-    found: dict[Watch, None] = {}
-    if graph.nodes[root].holds is Holds.ANY and graph.nodes[root].op is Op.CHOOSE:
-        found[Watch(Concern.OTHER, (root,))] = None
+def _checks(graph: Nodes, root: int) -> tuple[CelCheck, ...]:
+    found: dict[CelCheck, None] = {}
+    if graph.nodes[root].holds is NodeType.ANY and graph.nodes[root].op is Op.CHOOSE:
+        found[CelCheck(RowsForCel.OTHER, (root,))] = None
     seen, pending = {root}, [root]
     while pending:
         number = pending.pop()
-        found.update(dict.fromkeys(graph.watches(number)))
+        found.update(dict.fromkeys(graph.checks(number)))
         for each in graph.nodes[number].operands:
             if each not in seen:
                 seen.add(each)

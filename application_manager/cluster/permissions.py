@@ -11,11 +11,11 @@ import asyncio
 import logging
 from collections.abc import Callable, Collection, Iterable
 
-from application_manager.core.objects.rights import REMEDY, Right, granting
+from application_manager.core.objects.rights import REMEDY, PolicyRule, granting
 from wayside.kubernetes.client import Client
 from wayside.kubernetes.connection import ConfigurationError
-from wayside.kubernetes.repeating import repeatedly
 from wayside.kubernetes.resources import Resource
+from wayside.kubernetes.retrying import repeatedly
 
 _REVIEWS = Resource("authorization.k8s.io/v1", "SelfSubjectAccessReview", "selfsubjectaccessreviews", namespaced=False)
 LOOK_EVERY = 5.0  # s between two questions about a namespace, while something is to be written there
@@ -23,11 +23,11 @@ _SHOWN = 10  # of rights that lack, in one message
 
 log = logging.getLogger(__name__)
 
-Lack = tuple[Right, str, str | None]
+Lack = tuple[PolicyRule, str, str | None]
 """A right, the verb of it that is not allowed, and the namespace; None: all namespaces together."""
 
 
-async def missing_rights(client: Client, needed: Iterable[Right], namespaces: Collection[str]) -> list[Lack]:
+async def missing_rights(client: Client, needed: Iterable[PolicyRule], namespaces: Collection[str]) -> list[Lack]:
     """What of the rights the account has not, in the namespaces; none given: in all of them together.
 
     Raises ApiError or Unreachable where the API server does not answer.
@@ -55,7 +55,7 @@ def _text(lack: Lack) -> str:
     return right.lack(verb, f"in namespace {namespace}" if namespace else "in all namespaces")
 
 
-async def may(client: Client, right: Right, verb: str, namespace: str | None) -> bool:
+async def may(client: Client, right: PolicyRule, verb: str, namespace: str | None) -> bool:
     """Whether the account has this verb of the right; `namespace` None: in all namespaces together."""
     resource, _, subresource = right.resource.partition("/")
     attributes = {
@@ -77,7 +77,7 @@ async def may(client: Client, right: Right, verb: str, namespace: str | None) ->
     return bool(answer["status"]["allowed"])
 
 
-class Grants:
+class NamespacePermissions:
     """Queries the API server once for each namespace, and again while the answer is no."""
 
     def __init__(self, client: Client, changed: Callable[[], None]) -> None:

@@ -14,7 +14,7 @@ from detector.engine.buffering.items import Items
 from detector.engine.buffering.lanes import lane_makers
 from detector.engine.buffering.messages import KeyReader, Messages
 from detector.engine.buffering.naming import MessageClients
-from detector.engine.buffering.possible import Possible
+from detector.engine.buffering.possible import PossibleStreams
 from detector.engine.columns.block import Context
 from detector.engine.columns.tables import Tables
 from detector.engine.counters import Counters
@@ -25,7 +25,7 @@ from detector.engine.samples.sample import Arrival, Decoder, Sample
 from detector.engine.scoping.positions import PositionLookup
 from detector.engine.scoping.scopes import Views
 from detector.engine.signals.signals import Signals
-from detector.engine.signals.starts import Starts
+from detector.engine.signals.starts import EpisodeStarts
 from wayside.api import Detector
 from wayside.api.stream import Encoding, Stream
 from wayside.rules import compile_stream
@@ -36,7 +36,7 @@ _DEFINED = (Encoding.CDR, Encoding.UPER)
 """Encodings that need message definitions."""
 
 
-class Knowledge:
+class RuleInputs:
     """The buffer, the clients, and the signals and positions that rules read."""
 
     def __init__(
@@ -46,7 +46,7 @@ class Knowledge:
         read_key: KeyReader,
         start: int,
         counters: Counters,
-        starts: Starts,
+        starts: EpisodeStarts,
         *,
         exact: bool = True,
     ) -> None:
@@ -106,7 +106,7 @@ class Knowledge:
         self.messages = Messages(decoders, compiled, read_key, items, self._counters)
         self.transforms = Transforms(_transform_streams(detector), self.buffer, self.messages, self._counters)
         self._stale_after = {stream.name: spec.stale_after_ns(stream) for stream in spec.streams}
-        possible = Possible(spec.streams)
+        possible = PossibleStreams(spec.streams)
         self.signals = Signals(
             self.buffer, self.clients, self.messages, self._stale_after, self._starts, possible, self._floor
         )

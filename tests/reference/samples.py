@@ -1,4 +1,4 @@
-"""What there is to look at: all samples that ever came, and who is known."""
+"""The input of the reference engine: all samples received so far, and the known clients."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import Any
 SECOND = 10**9
 
 OVERHEAD = 160
-"""What a sample counts for beside its payload, in bytes."""
+"""The size of a sample beyond its payload, in bytes."""
 
 
 @dataclass(frozen=True)
 class Sample:
-    """One message, None where it cannot be read. `number` is the order of arrival."""
+    """One message; None if it cannot be decoded. `number` is the order of arrival."""
 
     time: int
     number: float
@@ -24,15 +24,15 @@ class Sample:
     payload: bytes
     received: int
     item: Any = None
-    """The client's item of the message's list, where the stream has items."""
+    """The client's item in the message's list, if the stream has items."""
     before: Any = None
-    """What the client sent before, unless that was stale by then."""
+    """The client's previous message, unless it was stale by then."""
     share: int | None = None
-    """How many bytes of the payload count for it; None: all."""
+    """The number of payload bytes attributed to it; None: all."""
 
 
 def listed(message: Any) -> dict[str, Any]:
-    """The items of a message by the names of their clients: of items of one name the first."""
+    """The items of a message by client name; the first one if several have the same name."""
     items = message.get("list") if isinstance(message, dict) else None
     found: dict[str, Any] = {}
     for item in items if isinstance(items, list) else []:
@@ -43,35 +43,35 @@ def listed(message: Any) -> dict[str, Any]:
 
 
 @dataclass
-class Known:
-    """A client that is there."""
+class KnownClient:
+    """A known client."""
 
     since: int
     last: int
     items: bool
-    """Whether it is nothing but an item of lists."""
+    """Whether it is known only as an item of lists."""
 
 
 @dataclass
-class World:
-    """All that came until now; times are nanoseconds."""
+class Received:
+    """All samples received so far; times are nanoseconds."""
 
     timeout: int
     durations: dict[str, int]
-    """How long each stream is kept."""
+    """The buffer duration of each stream."""
     stale_after: dict[str, int | None]
     counts: dict[str, int] = field(default_factory=dict)
-    """Of some streams, how many samples of a client are kept at most."""
+    """The maximum number of samples per client, for some streams."""
     sizes: dict[str, int] = field(default_factory=dict)
-    """Of some streams, how many bytes of a client are kept at most."""
+    """The maximum number of bytes per client, for some streams."""
     size: int | None = None
-    """How many bytes are kept at most over all."""
+    """The maximum number of bytes in total."""
     samples: list[Sample] = field(default_factory=list)
-    known: dict[str, Known] = field(default_factory=dict)
+    known: dict[str, KnownClient] = field(default_factory=dict)
     floor: int | None = None
-    """Windows reach back to the last gap at most."""
+    """Windows start after the last gap."""
     gone: dict[float, int] = field(default_factory=dict)
-    """The numbers of the samples that the buffer has no more, and since when."""
+    """The samples that left the buffer, by number, and when they left."""
     items: frozenset[str] = frozenset()
     """The streams with items."""
 
@@ -83,7 +83,7 @@ class World:
         if earlier and (limit is None or sample.time - earlier[-1].time <= limit):
             sample = replace(sample, before=earlier[-1].item if of_items else earlier[-1].message)
         self.samples.append(sample)
-        known = self.known.setdefault(sample.client, Known(sample.time, sample.time, of_items))
+        known = self.known.setdefault(sample.client, KnownClient(sample.time, sample.time, of_items))
         known.last = max(known.last, sample.time)
         known.items = known.items and of_items
         held = self._held(sample.client, sample.stream)

@@ -54,7 +54,7 @@ class _Look:
         return found
 
 
-class FailedPodsLook:
+class FailedPodsPoll:
     """The Events FailedCreate of workloads."""
 
     def __init__(self, client: Client) -> None:
@@ -69,7 +69,7 @@ class FailedPodsLook:
         return await self._look.objects(namespace, f"regarding.uid={uid},reason={FAILED_CREATE}", _NEWEST) or []
 
 
-class NodeLook:
+class NodePoll:
     """The labels of all nodes, a few seconds old at most."""
 
     def __init__(self, client: Client) -> None:

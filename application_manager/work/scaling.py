@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class Suspending:
+class WorkloadScaler:
     """Scales the workloads of instances."""
 
     client: Client

@@ -36,7 +36,7 @@ _ECHO = 5.0
 """Seconds after the exchange in which the new session may still repeat samples of the old one."""
 
 
-class Inlet:
+class StreamInput:
     """Samples of one stream. `bursts` is for its thread, everything else for the thread that exchanges sessions."""
 
     def __init__(self, subscription: Subscription, *, history: bool = False) -> None:

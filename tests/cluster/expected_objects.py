@@ -15,7 +15,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from application_manager.core.claims.claims import InvalidTemplate
-from application_manager.core.claims.operations import Standing
+from application_manager.core.claims.operations import VerdictKind
 from application_manager.core.demand.decisions import is_managed
 from application_manager.core.demand.demand import NamespaceOutcome, demand
 from application_manager.core.demand.lingering import is_held
@@ -173,7 +173,7 @@ def _tasks(tasks: list[ApplicationTask], outcome: NamespaceOutcome) -> Iterator[
         should = task_status(task, verdict, None, time.time())
         if task.status.instance_name != should.instance_name:
             yield f"task {task.name}: instance {task.status.instance_name}, not {should.instance_name}"
-        if verdict.standing is not Standing.COUNTS and task.status.phase != should.phase:
+        if verdict.kind is not VerdictKind.COUNTS and task.status.phase != should.phase:
             yield f"task {task.name}: phase {task.status.phase}, not {should.phase}"
         logged = {each.type: (each.status, each.reason) for each in task.status.conditions}
         for each in should.conditions:

@@ -11,9 +11,17 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from detector.actions import Completion, Episode, EpisodeSample, Outcome, OutcomeState, Setting, Surroundings
+from detector.actions import (
+    ActionContext,
+    Completion,
+    DetectorConfiguration,
+    Episode,
+    EpisodeSample,
+    Outcome,
+    OutcomeState,
+)
 from detector.actions.database import Database
-from detector.assembly import inlets
+from detector.assembly import stream_readers
 from tests.driving import START, a_detector, a_rule, a_stream, at
 from wayside.api.actions.database import DatabaseAction
 
@@ -31,7 +39,7 @@ class Nobody:
         raise AssertionError("the database action sends no queries")
 
 
-class Desk:
+class Harness:
     """One action, driven by hand."""
 
     def __init__(self, database: dict[str, Any], name: str, streams: Sequence[Any] = (), **parameters: Any) -> None:
@@ -40,21 +48,21 @@ class Desk:
         self.outcomes: dict[str, list[Outcome]] = {}
         self.losses: Counter[str] = Counter()
         self._changed = threading.Condition()
-        entries = inlets(self.detector)
-        self.surroundings = Surroundings(self.detector, entries.decoders, entries.types)
+        entries = stream_readers(self.detector)
+        self.configuration = DetectorConfiguration(self.detector, entries.decoders, entries.types)
         self.closing = threading.Event()
-        setting = Setting(
+        context = ActionContext(
             rule=self.rule,
             action="keep",
             holder="d",
-            surroundings=lambda: self.surroundings,
+            configuration=lambda: self.configuration,
             messenger=Nobody(),
             report=self._report,
             lose=self._lose,
             closing=self.closing,
         )
         self.name = name
-        self.action = Database(DatabaseAction(database=name, **parameters), setting)
+        self.action = Database(DatabaseAction(database=name, **parameters), context)
         self.action.wake()
 
     def _report(self, episode: Episode, outcome: Outcome) -> None:
@@ -114,8 +122,8 @@ class Desk:
         self.action.close()
 
 
-MakeDesk = Callable[..., Desk]
-"""The fixture `desk`: makes a desk, and closes it at the end of the test."""
+MakeHarness = Callable[..., Harness]
+"""The fixture `harness`: makes a harness, and closes it at the end of the test."""
 
 
 def numbers(database: Any, scenario: str = "e1.keep", collection: str = SPEEDS) -> list[float]:
