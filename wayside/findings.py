@@ -52,6 +52,10 @@ class Finding:
     def __str__(self) -> str:
         return self.text
 
+    def as_warning(self) -> str:
+        """The text of a warning."""
+        return f"warning: {self.text}"
+
 
 UNREADABLE_FILE = Check("unreadable-file", Severity.ERROR, "a file is not YAML, or an object does not fit its kind")
 INVALID_DETECTOR = Check("invalid-detector", Severity.ERROR, "a field of a Detector cannot be used")

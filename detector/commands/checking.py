@@ -48,7 +48,7 @@ def check_files(files: Sequence[Path], recordings: Sequence[Path], ignore: Seque
         from detector.commands.replay import doubts_of  # noqa: PLC0415  a replay loads much more than a check
 
         doubts, unread = doubts_of(documents, recordings)
-        shown = [f"warning: {each} [{each.check}]" for each in doubts if each.check not in ignored]
+        shown = [f"{each.as_warning()} [{each.check}]" for each in doubts if each.check not in ignored]
         for line in shown:
             typer.echo(line, err=True)
         warnings += shown

@@ -126,7 +126,7 @@ def refusal(api: Api, name: str) -> str:
     return " ".join(each["message"] for each in wrong if each.get("status") == "False")
 
 
-def test_nothing_that_a_template_may_not_make_comes_into_being(api: Api, attacked: Process) -> None:
+def test_no_forbidden_object_is_created(api: Api, attacked: Process) -> None:
     mine = {each["metadata"]["uid"] for each in api.list("ConfigMap", namespace="kube-system")}
     for name, (manifest, _) in BY_TEMPLATE.items():
         api.create(template(name, parameters=ANYTHING, manifests=[manifest]))

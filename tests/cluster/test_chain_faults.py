@@ -33,7 +33,7 @@ SECOND = 10**9  # ns
 RUNS = f"Detector {HOLDER} runs with"
 
 
-def test_a_detector_killed_during_an_episode_takes_it_up_again(chain: Chain, vehicles: Vehicles) -> None:
+def test_a_detector_killed_during_an_episode_continues_it(chain: Chain, vehicles: Vehicles) -> None:
     running = chain.start()
     vehicles.place(CARS, NEAR)
     deployed = chain.wait_deployed(CARS)

@@ -160,7 +160,7 @@ KEYS = (
 
 
 @pytest.mark.parametrize("who", MAY)
-def test_of_all_that_can_be_tried_each_gets_its_own_alone(guarded: Guarded, who: str) -> None:
+def test_each_client_reaches_only_its_own_keys(guarded: Guarded, who: str) -> None:
     """Watched from within the router, to which no access control applies."""
     inside, session = guarded.router, guarded.connect(who)
     reached: dict[str, set[str]] = {each: set() for each in ("publishes", "token", "receives", "queries", "answers")}
@@ -197,7 +197,7 @@ def test_of_all_that_can_be_tried_each_gets_its_own_alone(guarded: Guarded, who:
 
 
 @pytest.mark.parametrize("who", [{"name": None}, {"name": "car1", "foreign": True}])
-def test_who_has_no_certificate_of_the_authority_does_not_get_in(connect: Connect, who: dict[str, Any]) -> None:
+def test_a_client_without_a_certificate_is_refused(connect: Connect, who: dict[str, Any]) -> None:
     connect("car1")
     with pytest.raises(zenoh.ZError):
         connect(who["name"], foreign=who.get("foreign", False))

@@ -146,7 +146,7 @@ def verbs(manifests: list[Object]) -> Iterator[tuple[Object, Verb]]:
                 yield rule, each
 
 
-def test_a_whole_life_needs_all_that_is_printed_and_nothing_more(
+def test_a_life_cycle_needs_exactly_the_printed_rights(
     api: Api, processes: Processes, namespace: str, account: Path, kubelet: None
 ) -> None:
     manifests = printed("--namespace", namespace, "--account", f"{namespace}/manager", *ALLOWED)
@@ -223,7 +223,7 @@ def test_a_whole_life_needs_all_that_is_printed_and_nothing_more(
 
 
 @pytest.mark.own_control_plane
-def test_where_it_looks_after_all_namespaces_it_writes_in_those_that_are_granted_and_can_grant_nothing_else(
+def test_a_manager_of_all_namespaces_writes_only_in_granted_ones(
     api: Api, processes: Processes, namespace: str, account: Path, control_plane: ControlPlane
 ) -> None:
     other = control_plane.api(new_namespace(control_plane.api(), "other"))

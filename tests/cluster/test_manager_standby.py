@@ -117,7 +117,7 @@ def cut_off(pair: Pair) -> None:
     pair.old.cut = True
 
 
-def test_the_standby_takes_over_what_a_killed_one_was_doing(api: Api, pair: Pair) -> None:
+def test_the_standby_continues_the_work_of_a_killed_manager(api: Api, pair: Pair) -> None:
     interrupted(api, pair, lambda pair: pair.active.kill9())
 
 

@@ -190,7 +190,7 @@ def test_a_detector_that_was_applied_a_moment_before_its_pod_is_found(api: Api, 
         assert len(sidecars(api.create(one))) == 1
 
 
-def test_a_manager_that_hangs_or_is_gone_keeps_no_pod_from_being_made(
+def test_pods_start_without_a_manager(
     api: Api, processes: Processes, tmp_path: Path, accounts: None
 ) -> None:
     api.create(sidecar_detector("vehicle"))

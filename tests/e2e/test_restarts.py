@@ -22,7 +22,7 @@ def town(node: Node, api: Api, image: str) -> NodeTown:
     return NodeTown(node, api, image)
 
 
-def test_while_kubelet_and_containerd_are_away_episodes_go_on_and_pods_follow_afterwards(town: NodeTown) -> None:
+def test_episodes_continue_while_kubelet_and_containerd_restart(town: NodeTown) -> None:
     town.start()
     with town.vehicles() as vehicles:
         for pair in (CARS, VANS):

@@ -252,7 +252,7 @@ def test_a_killed_detector_leaves_what_it_wrote_and_continues_in_another_recordi
     assert json.loads((more / "recording.json").read_text())["continued"] is True
 
 
-def test_a_full_disk_costs_the_recording_and_not_the_events(process: Process) -> None:
+def test_a_full_disk_ends_the_recording_but_not_the_events(process: Process) -> None:
     disk = process.folder / "recordings"
     disk.mkdir()
     mount = f"mount -t tmpfs -o size=6m tmpfs {disk}"

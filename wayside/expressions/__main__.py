@@ -26,10 +26,10 @@ def tables() -> dict[str, dict[str, str]]:
     of_places = {field: (_kinds_with(field), text) for field, text in FIELDS_AT.items()}
     seen = {field: (text,) for field, text in FIELDS_SEEN.items()}
     return {
-        "rules.md": {"function": _table(("function", "is"), functions)},
+        "rules.md": {"function": _table(("function", "value"), functions)},
         "places.md": {
-            "field of at": _table(("field of at", "of", "is"), of_places),
-            "field of seenFrom": _table(("field of seenFrom", "is"), seen),
+            "field of at": _table(("field of at", "of", "value"), of_places),
+            "field of seenFrom": _table(("field of seenFrom", "value"), seen),
         },
     }
 

@@ -244,7 +244,7 @@ def test_without_a_mode_folders_are_the_machines() -> None:
     assert detector(mode=None, state={"path": "state"}).spec.folders == {"state.path": "state"}
 
 
-def test_the_manager_has_all_that_it_hands_on() -> None:
+def test_the_manager_has_every_right_that_it_grants() -> None:
     def verbs(rules: list[dict[str, Any]]) -> set[tuple[str, str, str]]:
         return {
             (group, resource, verb)

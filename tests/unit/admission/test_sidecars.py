@@ -156,7 +156,7 @@ def test_nothing_of_the_pod_waits_for_it() -> None:
     ]
 
 
-def test_it_holds_for_its_pod_with_a_token_of_its_own_under_the_restricted_standard() -> None:
+def test_the_sidecar_uses_its_own_token_and_passes_the_restricted_standard() -> None:
     made = injected(pod(automountServiceAccountToken=False), detector())
     mine = sidecar(made)
     assert mine["command"] == [

@@ -88,7 +88,7 @@ def test_the_command_prints_the_table() -> None:
         (["--namespace", "a", "--grant", "b"], "has no effect with --namespace"),
     ],
 )
-def test_what_cannot_be_is_refused(arguments: list[str], logged: str) -> None:
+def test_invalid_combinations_are_refused(arguments: list[str], logged: str) -> None:
     done = CliRunner().invoke(app, ["rbac", *arguments])
     assert done.exit_code == 2
     assert logged in " ".join(done.output.replace("│", " ").split())

@@ -83,7 +83,7 @@ def of_the_good_ones_alone() -> list[str]:
 @settings(max_examples=40, deadline=None)
 @given(st.lists(st.tuples(st.integers(1, 5999), names, st.sampled_from(["pose", "speed"]), messages), max_size=30))
 @example([(n * 10, f"bad{n % 2 + 1}", "pose", b'{"x": 1e308, "y": -1e308, "z": 0}') for n in range(30)])
-def test_whatever_else_comes_in_the_events_of_the_others_are_the_same(
+def test_bad_input_of_one_client_changes_no_event_of_another(
     bad: list[tuple[int, str, str, bytes]],
 ) -> None:
     hostile = [arrival(time / 1000, name, payload, stream) for time, name, stream, payload in bad]
@@ -210,7 +210,7 @@ def test_of_lost_clients_a_bounded_number_is_remembered(monkeypatch: pytest.Monk
     assert sorted(lane.client for lane in drive.engine.buffer) == ["later2", "later3", "made7"]
 
 
-def test_ever_new_keys_of_one_client_do_not_pile_up(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_new_keys_of_one_client_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ingest, "MAXIMUM_KEYS", 10)
     detector = a_detector({"name": "s", "key": "v/${client:*}/${part:*}", "encoding": "json"})
     rule = a_rule(signals=[{"name": "n", "stream": "s", "aggregate": "Count", "over": "9s"}], when="n == 100")

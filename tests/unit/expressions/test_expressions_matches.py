@@ -22,7 +22,7 @@ ENVIRONMENT = Environment({"s": CelType.STRING, "msg": CelType.DYN, "items": Cel
         "s.matches(r'^[a]{1,63}$')",
     ],
 )
-def test_a_literal_pattern_matches_as_ever_and_a_long_text_has_no_answer(source: str) -> None:
+def test_a_literal_pattern_matches_and_a_long_string_is_unknown(source: str) -> None:
     expression = ENVIRONMENT.compile(source, result=CelType.BOOL)
 
     def outcome(text: str) -> object:

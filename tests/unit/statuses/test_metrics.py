@@ -52,7 +52,7 @@ def test_a_scrape_has_the_values_of_the_status() -> None:
     assert found["losses_total", "undecodable", "", "speed"] == 1
 
 
-def test_clients_are_no_labels() -> None:
+def test_metrics_have_no_client_label() -> None:
     kept = Kept(Drive(a_detector(), FAST))
     few = len(samples(kept.take(arrival(0.5, "car", {"v": 20}), until=1)))
     many = kept.take(*(arrival(1.1 + n / 1000, f"car{n}", {"v": 20}) for n in range(100)), until=2)

@@ -25,7 +25,7 @@ def is_harmless(name: str) -> bool:
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_a_made_up_name_reaches_no_file_key_or_object(name: str) -> None:
+def test_an_invented_name_appears_in_no_file_key_or_object(name: str) -> None:
     drive = Drive(a_detector(), RULE)
     drive.take(arrival(0.5, name, {"v": 20}), arrival(0.6, "car", {"v": 20}), until=1)
     assert "car" in drive.engine.clients

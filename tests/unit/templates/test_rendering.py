@@ -162,7 +162,7 @@ def making_pods(api_version: str, kind: str, where: str, pod: dict[str, Any]) ->
 
 
 @pytest.mark.parametrize(("api_version", "kind", "where"), ANYWHERE)
-def test_a_pod_is_judged_by_its_shape_whatever_kind_it_is_in(api_version: str, kind: str, where: str) -> None:
+def test_pod_specs_are_checked_in_any_kind(api_version: str, kind: str, where: str) -> None:
     policy = Policy(kinds=frozenset({(api_version, kind)}))
     containers = [{"name": "main", "image": "app:1"}]
     manifest = making_pods(api_version, kind, where, {"containers": containers, "serviceAccountName": "admin"})

@@ -87,13 +87,13 @@ FUNCTIONS = (
     function(
         "wgs84Bearing",
         ResultType.NUMBER,
-        "the direction from the first place to the second, degrees in [0, 360) clockwise from north",
+        "the direction from the first position to the second, degrees in [0, 360) clockwise from north",
         (wgs84_bearing, "latitude1 longitude1 latitude2 longitude2"),
     ),
     function(
         "inside",
         ResultType.BOOLEAN,
-        "whether the place lies inside the polygon or on its edge; same unit for all",
+        "whether the position lies inside the polygon or on its edge; same unit for all",
         (inside, "x y polygon:list"),
     ),
     function(
