@@ -67,7 +67,7 @@ class Error:
     thing: str
     start_s: float
     end_s: float
-    taken_for: str = ""
+    mistaken_for: str = ""
     """Overlooked where empty."""
 
 
@@ -128,17 +128,17 @@ def _track(rng: np.random.Generator, thing: Thing, t: float) -> dict[str, object
     """What stands about the thing in the list; None where nothing does."""
     ahead = thing.ahead(t)
     wrong = next((each for each in TRUTH if each.thing == thing.name and each.start_s <= t < each.end_s), None)
-    overlooked = wrong is not None and not wrong.taken_for
+    overlooked = wrong is not None and not wrong.mistaken_for
     unseen = t - wrong.start_s if wrong is not None and overlooked else 0.0
     if ahead is None or unseen > GIVEN_UP_S:
         return None
     lost = any(
-        each.thing == thing.name and not each.taken_for and each.end_s - each.start_s > GIVEN_UP_S and each.end_s <= t
+        each.thing == thing.name and not each.mistaken_for and each.end_s - each.start_s > GIVEN_UP_S and each.end_s <= t
         for each in TRUTH
     )
     return {
         "id": 100 + thing.number if lost else thing.number,
-        "class": wrong.taken_for if wrong is not None and wrong.taken_for else thing.name.split()[0],
+        "class": wrong.mistaken_for if wrong is not None and wrong.mistaken_for else thing.name.split()[0],
         "score": rng.uniform(0.85, 1.0) if thing.is_sure(t) else rng.uniform(0.3, 0.6),
         "unseen": unseen,
         "x": ahead + NOISE_M * rng.standard_normal(),
@@ -166,7 +166,7 @@ def known_better() -> list[tuple[Episode, int]]:
     for error in TRUTH:
         (thing,) = (each for each in THINGS if each.name == error.thing)
         lasted = error.end_s - error.start_s
-        if not error.taken_for and not MISSED_S < lasted <= GIVEN_UP_S:
+        if not error.mistaken_for and not MISSED_S < lasted <= GIVEN_UP_S:
             continue
         last = error.end_s - PERIOD_NS / SECOND  # the last list that is wrong
         sure = [
@@ -207,10 +207,10 @@ def picture(due: list[Episode]) -> str:
     chart.curves("metres ahead of the vehicle", curves, -BEHIND, AHEAD, ("sure below", SURE_M))
     for mistaken, title in ((True, "misclassified"), (False, "overlooked")):
         rows = [
-            (each.thing, [(max(start, each.start_s), min(end, each.end_s), each.taken_for)])
+            (each.thing, [(max(start, each.start_s), min(end, each.end_s), each.mistaken_for)])
             for each in TRUTH
             for start, end in [_visible(each.thing)]
-            if bool(each.taken_for) == mistaken
+            if bool(each.mistaken_for) == mistaken
         ]
         chart.bars(title, rows, "#8e5ea2")
     known = [(each.start_s, each.end_s or DURATION_S, "") for each in due]

@@ -271,10 +271,10 @@ def test_a_sample_waits_no_longer_than_a_second(tmp_path: Path) -> None:
 def test_a_slow_disk_costs_samples_that_are_counted_and_nobody_waits(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    go_on, write = threading.Event(), os.pwritev
+    proceed, write = threading.Event(), os.pwritev
 
     def slowly(*arguments: Any) -> int:
-        go_on.wait(60)
+        proceed.wait(60)
         return write(*arguments)
 
     monkeypatch.setattr("os.pwritev", slowly)
@@ -294,7 +294,7 @@ def test_a_slow_disk_costs_samples_that_are_counted_and_nobody_waits(
         worker.enqueue(RunSamples(run, [sample]))
     worker.enqueue(RunCompleted(run))
     assert time.monotonic() - begin < 30  # the disk stands still for twice as long
-    go_on.set()
+    proceed.set()
     worker.request_close()
     assert worker.join(60)
     loss_counter = outcomes.counts_by_action()[which]

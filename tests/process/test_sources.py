@@ -175,7 +175,7 @@ def test_a_source_that_hangs_is_left_behind_and_what_it_brings_later_is_not_take
     assert arrivals.seen == []
 
 
-def test_sources_that_stay_the_same_go_on_while_others_change(arrivals: Arrivals) -> None:
+def test_unchanged_sources_continue_while_others_change(arrivals: Arrivals) -> None:
     sources = Sources(arrivals.putter, LossCounter())
     first = {"name": "first", "plugin": "lasting"}
     second = {"name": "second", "plugin": "lasting"}

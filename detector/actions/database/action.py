@@ -78,7 +78,7 @@ class ScenarioProgress:
                 self.latest[sample.client, sample.stream, sample.key] = sample
         return now, rest
 
-    def go_on(self, scenario: Scenario, documents: Documents) -> None:
+    def continue_in(self, scenario: Scenario, documents: Documents) -> None:
         """The current scenario has all its samples: switch to the next one."""
         self.messages += self.scenario.messages
         self.bytes += self.scenario.bytes
@@ -156,7 +156,7 @@ class Database(Action[DatabaseAction]):
     def _renew(self, writing: ScenarioProgress, begin: int) -> None:
         """Complete the scenario; the episode continues in the next one."""
         self._finish(writing, Completion(), continues=True)
-        writing.go_on(*self._open(writing.episode, str(begin), resumed=False))
+        writing.continue_in(*self._open(writing.episode, str(begin), resumed=False))
         self._take(writing, list(writing.latest.values()))
 
     def _add(self, scenario: Scenario, made: ConvertedDocument) -> None:

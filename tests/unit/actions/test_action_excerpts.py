@@ -222,7 +222,7 @@ def test_an_action_that_is_the_same_with_other_parameters_is_another() -> None:
     assert order(engine.consequences.take(engine.now)) == ["RunCompleted", "RunStarted"]
 
 
-def test_a_changed_rule_ends_its_episodes_and_their_windows_go_on() -> None:
+def test_a_changed_rule_ends_its_episodes_and_their_windows_continue() -> None:
     engine = an_engine(PLAIN, fast(an_action(after="1s")))
     run(engine, speeds((0.05, 1.0)), 1.0)
     engine.set_rules([])

@@ -103,21 +103,21 @@ def test_nothing_is_answered_before_everything_is_known(folder: Path) -> None:
 
 
 def test_those_beyond_the_limit_are_sent_away_at_once(folder: Path) -> None:
-    all_there, go_on = asyncio.Event(), asyncio.Event()
+    all_there, proceed = asyncio.Event(), asyncio.Event()
     waiting: list[Any] = []
 
     async def review(requested: Any) -> dict[str, Any]:
         waiting.append(requested)
         if len(waiting) == AT_ONCE:
             all_there.set()
-        await go_on.wait()
+        await proceed.wait()
         return {}
 
     async def scenario(ask: Ask) -> None:
         requested = [asyncio.create_task(ask()) for _ in range(AT_ONCE)]  # type: ignore[arg-type]
         await all_there.wait()
         assert (await ask())[0] == 503
-        go_on.set()
+        proceed.set()
         assert {status for status, _ in await asyncio.gather(*requested)} == {200}
         assert (await ask())[0] == 200
 

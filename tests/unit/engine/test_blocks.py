@@ -249,7 +249,7 @@ def test_pairs_are_evaluated_before_anybody_came_where_not_everybody_has_a_strea
     assert engine.advance([place(2.5, "car", 0), place(2.5, "zz", 10)], at(4)) == []
 
 
-def test_pairs_go_on_when_other_rules_change() -> None:
+def test_pairs_continue_when_other_rules_change() -> None:
     rule = near(signals=[SPEED], when="distance < 150 && a.speed > 10", evaluation=SECONDLY)
     detector = a_detector()
     engine = an_engine(detector, rule)

@@ -13,6 +13,11 @@ from tests.guides import ROOT, guide
 TROUBLES = guide("troubleshooting")
 DECISIONS = ROOT / "docs/decisions"
 STATUS = re.compile(r"(?:Accepted|Superseded by \[[\w.]+\]\([\w./-]+\.md\)), \d{4}-\d\d-\d\d")
+MODULE = re.compile(r"(?<![\w/])(?:\w+/)*\w+\.py\b|(?<=`)(?:\w+/)+(?=`)")
+PACKAGES = [
+    ROOT / each
+    for each in ("", "wayside", "detector", "detector/engine", "application_manager", "application_manager/core")
+]
 LINK = re.compile(r"\]\((?!https?:)([^)#\s<]+)[)#]")
 
 
@@ -57,6 +62,15 @@ def test_files_that_contributing_names_exist() -> None:
     named = re.findall(r"`((?:wayside|detector|application_manager|tests|docs|crds|benchmarks)/[\w./]*)`", text)
     assert len(named) > 20
     assert [each for each in named if not (ROOT / each).exists()] == []
+
+
+def test_modules_and_folders_that_architecture_engine_and_decisions_name_exist() -> None:
+    pages = [ROOT / "docs/architecture.md", ROOT / "docs/engine.md", *DECISIONS.glob("[0-9]*.md")]
+    texts = {page.name: page.read_text(encoding="utf-8") for page in pages}
+    current = {name: text for name, text in texts.items() if "\nStatus: Superseded" not in text}
+    named = {(name, path) for name, text in current.items() for path in MODULE.findall(text)}
+    assert len(named) > 80
+    assert [each for each in named if not any((folder / each[1]).exists() for folder in PACKAGES)] == []
 
 
 def test_what_troubleshooting_quotes_occurs_in_the_code() -> None:

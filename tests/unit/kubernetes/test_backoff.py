@@ -22,7 +22,7 @@ def test_a_wait_that_the_server_requests_is_kept_up_to_the_cap() -> None:
     assert Backoff(first=0.1, cap=5.0).fail(at_least=600.0) == 5.0
 
 
-def test_an_attempt_is_repeated_until_it_succeeds_and_after_the_pause_that_its_failure_asks_for() -> None:
+def test_an_attempt_is_repeated_until_it_succeeds_and_after_the_pause_that_its_failure_requests() -> None:
     failures, pauses = [KeyError("one"), KeyError("two")], list[float]()
 
     def attempt() -> str:
