@@ -133,7 +133,10 @@ def _track(rng: np.random.Generator, thing: Thing, t: float) -> dict[str, object
     if ahead is None or unseen > GIVEN_UP_S:
         return None
     lost = any(
-        each.thing == thing.name and not each.mistaken_for and each.end_s - each.start_s > GIVEN_UP_S and each.end_s <= t
+        each.thing == thing.name
+        and not each.mistaken_for
+        and each.end_s - each.start_s > GIVEN_UP_S
+        and each.end_s <= t
         for each in TRUTH
     )
     return {

@@ -190,9 +190,7 @@ def test_a_detector_that_was_applied_a_moment_before_its_pod_is_found(api: Api, 
         assert len(sidecars(api.create(one))) == 1
 
 
-def test_pods_start_without_a_manager(
-    api: Api, processes: Processes, tmp_path: Path, accounts: None
-) -> None:
+def test_pods_start_without_a_manager(api: Api, processes: Processes, tmp_path: Path, accounts: None) -> None:
     api.create(sidecar_detector("vehicle"))
     webhook = Webhook(processes, api, tmp_path / "certificates", patience=2, options=RUNS)
     with webhook.requested():
