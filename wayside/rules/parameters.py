@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from wayside.api import Detector, EventRule
 from wayside.api.documents import FieldPath
@@ -51,10 +51,10 @@ def kinds_of(rule: EventRule) -> Mapping[str, CelType]:
     """The kinds of the rule's parameters, by their paths in expressions, those of a pair's a and b among them."""
     prefixes = ("", "a.", "b.") if rule.spec.scope.pairs is not None else ("",)
     return {
-        f"{prefix}parameters.{name}": _KINDS[_kind(value)]
+        f"{prefix}parameters.{name}": cel_type
         for prefix in prefixes
         for name, value in rule.spec.parameters.items()
-        if _kind(value) in _KINDS
+        if (cel_type := _kind(value).cel_type) is not None
     }
 
 
@@ -83,7 +83,7 @@ def unknown_rules(detector: Detector, rules: Iterable[str]) -> Iterator[tuple[Fi
 
 def _misfits(name: str, own: object, other: object, rule: str) -> Iterator[str]:
     """The differences of type between an override and the rule's own value; for lists, the items are compared."""
-    wanted, given = _kind(own), _kind(other)
+    wanted, given = _kind(own).name, _kind(other).name
     if wanted != given:
         yield f"{name} of EventRule {rule} is a {wanted}, but the value is a {given}: {other!r:.60}"
     elif isinstance(own, list) and isinstance(other, list) and own:
@@ -94,18 +94,24 @@ def _misfits(name: str, own: object, other: object, rule: str) -> Iterator[str]:
             yield from _misfits(f"{name}.{key}", own[key], other[key], rule)
 
 
+class _Kind(NamedTuple):
+    name: str
+    cel_type: CelType | None = None
+
+
+_NUMBER: Final = _Kind("number", CelType.DOUBLE)
 _KINDS: Final = {
-    "boolean": CelType.BOOL,
-    "number": CelType.DOUBLE,
-    "text": CelType.STRING,
-    "list": CelType.LIST,
-    "map": CelType.MAP,
+    bool: _Kind("boolean", CelType.BOOL),
+    int: _NUMBER,
+    float: _NUMBER,
+    str: _Kind("string", CelType.STRING),
+    list: _Kind("list", CelType.LIST),
+    dict: _Kind("map", CelType.MAP),
 }
 
 
-def _kind(value: object) -> str:
-    kinds = {bool: "boolean", int: "number", float: "number", str: "string", list: "list", dict: "map"}
-    return kinds.get(type(value), type(value).__name__)
+def _kind(value: object) -> _Kind:
+    return _KINDS.get(type(value)) or _Kind(type(value).__name__)
 
 
 def _values(constants: Mapping[str, Any]) -> Values:

@@ -126,6 +126,11 @@ def test_a_change_of_parameters_is_a_change_of_the_rule_wherever_it_is_made() ->
         ),
         ({"when": "v > 3 &&\n parameters.maxSpeed == 'x'"}, "spec.when", ["line 2, column 22", "(double, string)"]),
         ({"when": "parameters.maxSpeed"}, "spec.when", ["must be a boolean; got a number"]),
+        (
+            {"parameters": {"maxSpeed": 10, "role": "guest"}, "when": "parameters.role > 3"},
+            "spec.when",
+            ["`>` does not take (string, double)"],
+        ),
         ({"when": "allZero(parameters.maxSpeed)"}, "spec.when", ["`allZero` does not take (double)"]),
         (
             {"signals": [{**SPEED, "where": "sample.size > 'x'"}]},
