@@ -139,8 +139,8 @@ def picture(due: Sequence[Episode]) -> str:
     times = [each / 2 for each in range(DURATION_S * 2)]
     rain = [(car, [(t, weather.rain_at(t)) for t in times]) for car, weather in TRUTH.items()]
     chart.curves("rain at the sensor, mm/h", rain, 0, 12)
-    sight = [(car, [(t, weather.visibility_at(t)) for t in times]) for car, weather in TRUTH.items()]
-    chart.curves("metres that one sees", sight, 0, 500, ("fog", 100))
+    visibility = [(car, [(t, weather.visibility_at(t)) for t in times]) for car, weather in TRUTH.items()]
+    chart.curves("metres that one sees", visibility, 0, 500, ("fog", 100))
     rows = [
         (f"{rule}, {car}", [(each.start_s + NOISE_S, (each.end_s or DURATION_S) + NOISE_S, "") for each in due
                             if (each.rule, each.subject) == (rule, car)])

@@ -207,13 +207,13 @@ def test_traces_go_to_the_endpoint_from_both_programs(helm: Helm) -> None:
 
 
 def test_the_examples_values_are_its_detector_where_vehicles_reach_it(helm: Helm) -> None:
-    desk = yaml.safe_load((EXAMPLE / "detector.yaml").read_text())["spec"]
+    example = yaml.safe_load((EXAMPLE / "detector.yaml").read_text())["spec"]
     values = yaml.safe_load((EXAMPLE / "helm" / "values.yaml").read_text())
     rendered = helm.rendered(values, "--api-versions", "wayside.dev/v1alpha1/Detector")
     spec = rendered.one("Detector", "town")["spec"]
     assert spec.pop("mode") == "Standalone"
     assert spec.pop("zenoh") == {"mode": "peer", "listen": ["tcp/0.0.0.0:7447"]}
-    assert spec == {key: value for key, value in desk.items() if key != "zenoh"}
+    assert spec == {key: value for key, value in example.items() if key != "zenoh"}
     ports = rendered.one("Service", "wayside-detector-town")["spec"]["ports"]
     assert [each["targetPort"] for each in ports] == [7447]
 

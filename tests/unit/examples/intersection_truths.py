@@ -182,7 +182,7 @@ def hard_braking() -> list[Span]:
     return clients(braking)
 
 
-def standing() -> list[Span]:
+def stationary() -> list[Span]:
     return clients(lambda user: user.held(user.within(*CROSSING) * (user.speed < 0.3)), hold=50)
 
 
@@ -271,7 +271,7 @@ def rate_drop() -> list[Span]:
 def braked_then_stood() -> list[Span]:
     ticks = np.arange(TICKS)
     rows = {name: np.zeros(TICKS) for name in USERS}
-    for stood in standing():
+    for stood in stationary():
         active = (ticks >= stood.start) & (ticks < (TICKS if stood.end is None else stood.end))
         for braked in hard_braking():
             if braked.subject == stood.subject:
@@ -311,7 +311,7 @@ TRUTHS: dict[str, Callable[[], list[Span]]] = {
     "near-miss": near_miss,
     "least-time-to-collision": lambda: near_miss(4),
     "hard-braking": hard_braking,
-    "standing": standing,
+    "standing": stationary,
     "cut-in": cut_in,
     "overtaking": overtaking,
     "wrong-way": wrong_way,

@@ -185,7 +185,7 @@ def test_a_sum_that_is_held_at_its_bound_reports_what_it_would_be() -> None:
     assert "  uplink = 100 (merge Sum): the sum of 2 values, 130, is capped at the maximum of 100\n" in reported
 
 
-def test_what_is_over_does_not_push_what_counts_out_of_sight() -> None:
+def test_ended_tasks_do_not_push_live_ones_out_of_the_limited_output() -> None:
     over = [emitted(f"over-{number:02}", {"region": "north"}, ended=True, created=-60) for number in range(30)]
     reported = explanation_text(explained(None, [*over, TASKS[0]])).splitlines()
     listed = reported.index(f"tasks of instance {NAME}")
