@@ -110,7 +110,7 @@ class OverlapIndex:
         self._written.pop(template, None)
         state = self._yielded.get(template[0])
         if state is not None and state.template == template:
-            self._resume(template[0], f"template {template[1]} is gone")
+            self._resume(template[0], f"template {template[1]} was deleted")
 
     def _yield(self, state: _Yielded) -> None:
         namespace = state.template[0]
@@ -125,7 +125,7 @@ class OverlapIndex:
 
     def _resume(self, namespace: str, why: str) -> None:
         del self._yielded[namespace]
-        log.warning("namespace %s: %s: this manager is active there", namespace, why)
+        log.warning("namespace %s: this manager becomes active there: %s", namespace, why)
         self.resumed(namespace)
 
     def _report_younger(self, namespace: str, rival: TemplateManager) -> None:

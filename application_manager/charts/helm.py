@@ -67,7 +67,7 @@ class HelmRunner:
         await self._run(arguments, PULL_TIME, environment)
         archives = [folder / name for name in os.listdir(folder) if name.endswith(".tgz")]
         if len(archives) != 1:
-            raise HelmError(f"helm pull returned {len(archives)} archives, not one")
+            raise HelmError(f"helm pull must return one archive; got {len(archives)}")
         return archives[0]
 
     async def template(self, request: ChartRequest, chart: Path) -> str:
@@ -88,8 +88,7 @@ class HelmRunner:
         program = shutil.which(self.program)
         if program is None:
             raise HelmError(
-                f"the manager cannot find the program {self.program!r}: install Helm 3.8 or newer on its PATH, or "
-                "set --helm"
+                f"cannot find the program {self.program!r}: install Helm 3.8 or newer on the PATH, or set --helm"
             )
         with _folder() as home:
             process = await asyncio.create_subprocess_exec(
@@ -108,7 +107,9 @@ class HelmRunner:
                     written, errors = await asyncio.gather(_read(process.stdout), _tail(process.stderr))
                     code = await process.wait()
             except TimeoutError:
-                raise HelmError(f"helm {arguments[0]} was stopped after {seconds:g} s", slow=True) from None
+                raise HelmError(
+                    f"helm {arguments[0]} took more than {seconds:g} s and was stopped", slow=True
+                ) from None
             finally:
                 _kill(process.pid)
                 await process.wait()
@@ -151,7 +152,7 @@ async def _read(stream: asyncio.StreamReader | None) -> bytes:
     while stream is not None and (part := await stream.read(1 << 16)):
         found += part
         if len(found) > OUTPUT:
-            raise HelmError(f"its output is larger than {OUTPUT >> 20} MiB: use a smaller chart")
+            raise HelmError(f"the output of helm is larger than {OUTPUT >> 20} MiB: use a smaller chart")
     return bytes(found)
 
 

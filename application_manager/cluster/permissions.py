@@ -94,8 +94,8 @@ class NamespacePermissions:
             if namespace not in self._granted | self._refused and not await self._is_granted(namespace):
                 self._refused.add(namespace)
                 log.warning(
-                    "namespace %s is not granted to this manager, which ignores it: apply the output of "
-                    "`application-manager rbac --grant %s`, or add it to manager.grant of the chart",
+                    "ignoring namespace %s, which is not granted to this manager: apply the output of "
+                    "`application-manager rbac --grant %s`, or add the namespace to manager.grant of the chart",
                     namespace,
                     namespace,
                 )

@@ -83,12 +83,12 @@ def _task(task: ExplainedTask) -> Iterator[str]:
 def _instance(instance: ExplainedInstance, template: str) -> Iterator[str]:
     is_json = instance.key is not None and instance.key.startswith(("[", "{"))
     key = "" if instance.key is None else f", key {instance.key if is_json else values.shown(instance.key)}"
-    state = (instance.phase or "no phase yet") if instance.exists else "not made yet"
+    state = (instance.phase or "no phase yet") if instance.exists else "not created yet"
     by = "" if instance.managed else ", created by a person"
     of = f" of template {instance.template}" if instance.template not in (None, template) else ""
     yield f"instance {instance.name}{of} ({state}{key}{by})"
     if instance.release_time is not None:
-        yield f"  it is released at {instance.release_time} unless a demand arrives"
+        yield f"  it will be released at {instance.release_time} unless a demand arrives"
     yield from _conditions(instance.conditions)
 
 

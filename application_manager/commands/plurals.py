@@ -24,7 +24,7 @@ async def _looked_up(kinds: list[KindKey]) -> dict[KindKey, str]:
         client = manager_client(await load_configuration())
     except ConfigurationError as error:
         raise ConfigurationError(
-            f"cannot look up the plural of {listed}, which roles need, without a cluster: {error}"
+            f"cannot look up the plural of {listed} for the roles without a cluster: {error}"
         ) from error
     try:
         found = {}
@@ -35,12 +35,14 @@ async def _looked_up(kinds: list[KindKey]) -> dict[KindKey, str]:
                     f"the cluster has no kind {kind_text(kind)}: {remedy}, or correct --allowed-kinds"
                 )
             if not resource.namespaced:
-                raise ConfigurationError(f"{kind_text(kind)} is not namespaced and can never be allowed")
+                raise ConfigurationError(
+                    f"--allowed-kinds: {kind_text(kind)} is not namespaced and can never be allowed: remove it"
+                )
             found[kind] = resource.plural
         return found
     except RequestError as error:
         raise ConfigurationError(
-            f"cannot look up the plural of {listed}, which roles need, in the cluster: {error}: {remedy}"
+            f"cannot look up the plural of {listed} for the roles in the cluster: {error}: {remedy}"
         ) from error
     finally:
         await client.close()

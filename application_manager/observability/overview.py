@@ -33,7 +33,9 @@ class Overview(Collector):
         statuses = (entry.raw.get("status") or {} for _, entry in self._cache.store.all(TEMPLATE))
         accepted = Counter(find_raw(each, "Accepted").get("status", "Unknown") for each in statuses)
         by_status = [(each, accepted[each]) for each in ("True", "False", "Unknown")]
-        yield gauges("templates", "ApplicationTemplates by Accepted", "accepted", by_status)
+        yield gauges(
+            "templates", "ApplicationTemplates by the status of their condition Accepted", "accepted", by_status
+        )
         queues = list(self._queues())
         depth = [(name, waiting) for name, waiting, _ in queues]
         yield gauges("queue_depth", "Keys that wait for a worker", "queue", depth)

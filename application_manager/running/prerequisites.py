@@ -70,7 +70,9 @@ async def discovered(client: Client, policy: Policy) -> dict[KindKey, Resource]:
         if kind not in found:
             log.warning("the cluster has no kind %s: templates that use it are refused", kind_text(kind))
         elif not found[kind].namespaced:
-            raise ConfigurationError(f"{kind_text(kind)} is not namespaced and can never be allowed")
+            raise ConfigurationError(
+                f"--allowed-kinds: {kind_text(kind)} is not namespaced and can never be allowed: remove it"
+            )
     return found
 
 

@@ -69,8 +69,8 @@ async def serve(options: Options) -> None:
             await Manager(work, leadership).run()
     except ApiError as error:
         raise ConfigurationError(
-            f"the API server refuses a request that the manager needs: {error}; check its service account and "
-            "permissions"
+            f"the API server refuses a request that the manager needs: {error}; check the permissions of the manager's "
+            "service account: `application-manager rbac` prints them"
         ) from error
     finally:
         await client.close()

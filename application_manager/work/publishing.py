@@ -62,8 +62,8 @@ def settings(given: Sequence[str]) -> zenoh.Config:
             config.insert_json5(path, json.dumps(value))
         except zenoh.ZError:
             raise ConfigurationError(
-                f"--zenoh: {', '.join(given)} must be endpoints such as tcp/zenoh:7447, or one Zenoh configuration "
-                "file that ends with .json5"
+                "--zenoh must be endpoints, e.g. tcp/zenoh:7447, or one Zenoh configuration file that ends with "
+                f".json5; got {', '.join(given)}"
             ) from None
     return config
 

@@ -112,9 +112,7 @@ class TemplateWork:
     async def _challenge(self, regarding: Kind, own: TemplateManager, now: float) -> None:
         """Find out by the template's status whether the other manager of the namespace is alive."""
         other = self.cache.overlap.waits_for(regarding.namespace)
-        note = (
-            f"this namespace is managed by the managers of the Leases {other} and {own.lease}: the second one stands by"
-        )
+        note = f"the managers of the Leases {other} and {own.lease} manage the same namespace: the second one stands by"
         self.statuses.recorder.event(regarding, EventReason.MANAGERS_OVERLAP, note, now, once=True)
         await self.statuses.merge(TEMPLATES, regarding, {"manager": own.to_json()})
 

@@ -95,7 +95,7 @@ BY_TEMPLATE: dict[str, tuple[Object, str]] = {
         of_kind("batch/v1", "CronJob", spec={"schedule": "* * * * *", "jobTemplate": {"spec": JOB}}),
         "'admin' is not a service account",
     ),
-    "token": (pod(automountServiceAccountToken=True), "would mount the token of the account default"),
+    "token": (pod(automountServiceAccountToken=True), "would mount the token of the service account default"),
     "owner": (
         named("${instance.name}", ownerReferences=[{"kind": "Node", "name": "n", "uid": "u", "apiVersion": "v1"}]),
         "metadata.ownerReferences",

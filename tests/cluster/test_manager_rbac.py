@@ -243,7 +243,7 @@ def test_a_manager_of_all_namespaces_writes_only_in_granted_ones(
             name = f"detector-{DETECTOR['metadata']['name']}"
             api.wait_for("Deployment", name, lambda _: True, what="the detector has its rights and its pod")
             wait_settled(api)
-            manager.wait_for_output(f"namespace {other.namespace} is not granted to this manager")
+            manager.wait_for_output(f"ignoring namespace {other.namespace}, which is not granted to this manager")
             assert not list(used(proxy.seen, other.namespace)), "it neither reads nor writes there, whatever there is"
             assert other.find("ApplicationInstance", NORTH) is None
 

@@ -188,7 +188,8 @@ def too_large(parameters: Mapping[str, Any], contributions: Sequence[Contributio
     first = sorted(given.items(), key=lambda each: (-each[1], each[0]))
     named = ", ".join(f"task {task} gives {size} bytes" for task, size in first[:_SHOWN])
     more = f" and {len(first) - _SHOWN} more tasks with smaller values" if len(first) > _SHOWN else ""
-    return f"{what}, more than the {limit} allowed ({named}{more}): end some of these tasks, or pass references"
+    remedy = "end some of these tasks, or pass references to the data"
+    return f"{what}, more than the {limit} allowed ({named}{more}): {remedy}"
 
 
 def _size(value: Any) -> int:

@@ -184,5 +184,5 @@ def gathered(claim: Claim, parts: Mapping[str, Verdict], otherwise: Verdict) -> 
     names = ", ".join(counting[:_SHOWN]) + (f" and {len(counting) - _SHOWN} more" if len(counting) > _SHOWN else "")
     message = f"{verb} instance{'s' if len(counting) > 1 else ''} {names}"
     if others:
-        message += f"; except {len(others)} (the first: {others[0].message})"
+        message += f"; refused for {len(others)} (the first: {others[0].message})"
     return Verdict(VerdictKind.COUNTS, ACCEPTED, message, counting[0] if len(counting) == 1 else None)

@@ -150,7 +150,7 @@ def mismatch(pattern: str, value: Any) -> str | None:
     for index, text in enumerate(value if isinstance(value, list) else [value]):
         which = f"item {index}, {values.shown(text)}," if isinstance(value, list) else values.shown(text)
         if (size := len(text.encode(errors="replace"))) > LONGEST_INPUT:
-            return f"{which} has {size} bytes: a pattern can match at most {LONGEST_INPUT}"
+            return f"{which} has {size} bytes: a parameter with a pattern may have at most {LONGEST_INPUT}"
         # CEL would see only what is before a NUL.
         if "\0" in text or not _matcher(pattern).evaluate({"text": text}):
             return f"{which} does not match the pattern {pattern}"

@@ -225,8 +225,8 @@ def precedence(task: ApplicationTask) -> tuple[int, str, str]:
 
 def _left_alone(instance: ApplicationInstance, claims: list[Claim]) -> Decision:
     message = (
-        f"ApplicationInstance {instance.name} was created by a person and is not changed: delete it, or give it "
-        "another name, so that tasks can be served"
+        f"ApplicationInstance {instance.name} was created by a person, so the manager does not change it: delete it, "
+        "or create it again under another name"
     )
     refused = Verdict(VerdictKind.REFUSED, RefusalReason.INSTANCE_NOT_MANAGED, message)
     verdicts = {each.task.name: refused for each in claims}

@@ -150,17 +150,19 @@ def fallback_conditions(
     """
     conditions, others, timed_out = list(known), ", ".join(stands_in_for), None
     if late:
-        message = f"it was not ready for {late}"
+        message = f"this instance was not ready for {late}"
         if turns is not None and turns.instances:
             names = ", ".join(sorted(turns.instances))
             message += (
-                f": its tasks are served by {names} of template {turns.template} until it has been ready for {late}"
+                f": template {turns.template} ({names}) serves its tasks until this instance has been ready for {late}"
             )
         elif turns is not None and turns.refused:
             message += (
                 f", and its fallback, template {turns.template}, cannot serve: {next(iter(turns.refused.values()))}"
             )
         timed_out = READY_TIMEOUT, message
-    yield from from_first(conditions, TIMED_OUT, timed_out, ("InTime", "it is ready, or still within its readyTimeout"))
-    stands_in = ("Fallback", f"it serves the tasks of {others}, which is not ready") if others else None
-    yield from from_first(conditions, "StandsIn", stands_in, ("NoFallback", "it serves only its own tasks"))
+    yield from from_first(
+        conditions, TIMED_OUT, timed_out, ("InTime", "the instance is ready, or within its readyTimeout")
+    )
+    stands_in = ("Fallback", f"this instance serves the tasks of {others}, which is not ready") if others else None
+    yield from from_first(conditions, "StandsIn", stands_in, ("NoFallback", "the instance serves only its own tasks"))

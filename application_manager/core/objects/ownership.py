@@ -103,7 +103,9 @@ def foreign(live: Mapping[str, Any], owner: Kind, what: str, recorded: str | Non
         return ApplyProblem("Waiting", f"{what} of the previous {owner.kind} {owner.name} is still being deleted")
     whose = f"is controlled by {controller['kind']} {controller['name']}" if controller else "has no controller"
     remedy = f"delete or rename it, or choose another name in {owner.kind} {owner.name}"
-    return ApplyProblem("ObjectExists", f"{what} already exists, {whose} and is not changed: {remedy}")
+    return ApplyProblem(
+        "ObjectExists", f"{what} already exists and {whose}, so the manager does not change it: {remedy}"
+    )
 
 
 def reference_key(of: ObjectReference | SuspendedReplicas) -> ObjectKey:

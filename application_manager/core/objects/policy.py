@@ -101,7 +101,9 @@ class Policy:
             return None
         same = sorted(kind_text(key) for key in self.kinds if key[1] == kind)
         choice = (
-            f"write {' or '.join(same)}" if same else f"allowed are {', '.join(sorted(map(kind_text, self.kinds)))}"
+            f"write {' or '.join(same)}"
+            if same
+            else f"the allowed kinds are {', '.join(sorted(map(kind_text, self.kinds)))}"
         )
         return f"{kind_text((api_version, kind))} is not a kind that the administrator allows: {choice}"
 
@@ -146,7 +148,10 @@ def _parse_kind(text: str) -> KindKey:
 def _token_problems(spec: dict[str, Any], where: str) -> Iterator[tuple[str, str]]:
     remedy = "remove it, or use a service account that the administrator allows"
     if spec.get("automountServiceAccountToken"):
-        yield f"{where}.automountServiceAccountToken", f"true would mount the token of the account default: {remedy}"
+        yield (
+            f"{where}.automountServiceAccountToken",
+            f"true would mount the token of the service account default: {remedy}",
+        )
     volumes = spec.get("volumes")
     for index, volume in enumerate(volumes if isinstance(volumes, list) else []):
         projected = volume.get("projected") if isinstance(volume, dict) else None
@@ -154,4 +159,4 @@ def _token_problems(spec: dict[str, Any], where: str) -> Iterator[tuple[str, str
         for number, source in enumerate(sources if isinstance(sources, list) else []):
             if isinstance(source, dict) and "serviceAccountToken" in source:
                 field = f"{where}.volumes[{index}].projected.sources[{number}].serviceAccountToken"
-                yield field, f"would mount the token of the account default: {remedy}"
+                yield field, f"would mount the token of the service account default: {remedy}"

@@ -139,12 +139,12 @@ def node_rights() -> list[PolicyRule]:
 
 
 def _own() -> Iterator[PolicyRule]:
-    yield PolicyRule(_GROUP, "applicationtemplates", ("get", *_LOOKING), "nothing can be decided", vital=True)
+    yield PolicyRule(_GROUP, "applicationtemplates", ("get", *_LOOKING), "no task is processed", vital=True)
     instances = ("get", *_LOOKING, "create", "patch", "delete")
     yield PolicyRule(
         _GROUP, "applicationinstances", instances, "no instance is created, changed or released", vital=True
     )
-    yield PolicyRule(_GROUP, "applicationtasks", _LOOKING, "nothing can be decided", vital=True)
+    yield PolicyRule(_GROUP, "applicationtasks", _LOOKING, "no task is processed", vital=True)
     yield PolicyRule(_GROUP, "applicationtasks", ("delete",), "finished tasks are never deleted")
     yield PolicyRule(_GROUP, "detectors", _LOOKING, "rules and detectors have no status", vital=True)
     yield PolicyRule(_GROUP, "eventrules", _LOOKING, "rules and detectors have no status", vital=True)

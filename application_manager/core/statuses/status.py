@@ -84,7 +84,7 @@ def task_status(
         accepted = verdict.kind in (VerdictKind.COUNTS, VerdictKind.WAITING)
         states.append(ConditionState("Accepted", accepted, verdict.reason, verdict.message))
         if find(old.conditions, "Finished") is not None:
-            states.append(ConditionState("Finished", False, "HolderReturned", "the holder is back"))
+            states.append(ConditionState("Finished", False, "HolderReturned", "the holder renews its Lease again"))
     else:
         states.append(ConditionState("Finished", True, verdict.reason, verdict.message))
     suspends = task.spec.operation is Operation.SUSPEND

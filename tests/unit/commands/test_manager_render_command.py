@@ -96,7 +96,7 @@ def test_a_template_that_cannot_be_rendered_is_reported_with_its_place(render: A
 def test_a_kind_that_is_not_allowed_is_refused(render: Any) -> None:
     result = render(TEMPLATE, task("a", parameters={"region": "n"}), options=("--allowed-kinds", "v1/ConfigMap"))
     assert result.exit_code == 1
-    assert "allowed are v1/ConfigMap" in result.stderr
+    assert "the allowed kinds are v1/ConfigMap" in result.stderr
 
 
 def test_a_task_that_waits_and_a_capped_sum_are_reported_without_an_error(render: Any) -> None:

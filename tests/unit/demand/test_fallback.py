@@ -153,7 +153,7 @@ def test_both_instances_report_it() -> None:
     first, other = outcome.instances[NORTH], outcome.instances[LITE_NORTH]
     (timed_out,) = fallback_conditions([], first.overdue, first.fallback, first.stands_in_for)
     assert (timed_out.type, timed_out.holds, timed_out.reason) == ("TimedOut", True, "ReadyTimeout")
-    assert f"served by {LITE_NORTH} of template lite until it has been ready for 60s" in timed_out.message
+    assert f"template lite ({LITE_NORTH}) serves its tasks until this instance has been ready" in timed_out.message
     (stands_in,) = fallback_conditions([], other.overdue, other.fallback, other.stands_in_for)
     assert (stands_in.type, stands_in.holds) == ("StandsIn", True)
     assert NORTH in stands_in.message

@@ -113,7 +113,7 @@ def test_one_for_all_reports_where_it_conflicts() -> None:
     assert (values(outcome)["model"], values(outcome, SOUTH)["model"]) == ("large", "tiny")
     verdict = outcome.verdicts["all"]
     assert (verdict.kind, verdict.instance) == (VerdictKind.COUNTS, SOUTH)
-    assert "except 1 (the first: spec.parameters.model" in verdict.message
+    assert "refused for 1 (the first: spec.parameters.model" in verdict.message
     refused = of(deploy("a"), here, change("all", {"model": "tiny"})).verdicts["all"]
     assert (refused.kind, refused.reason) == (VerdictKind.REFUSED, "Conflict")
 

@@ -119,7 +119,7 @@ def test_a_listed_account_keeps_its_token() -> None:
         ("spec.template.spec.containers.0.args", ["cd ${HOME}"], ["containers[0].args[0]", "HOME", "`$${`"]),
         ("spec.template.spec.containers.0.args", ["echo ${x"], ["containers[0].args[0]", "not closed", "`$${`"]),
         ("metadata.namespace", "elsewhere", ["metadata.namespace: 'elsewhere' is not the template's own", "remove"]),
-        ("kind", "ServiceAccount", ["spec.manifests[0].kind", "apps/v1/ServiceAccount", "allowed are"]),
+        ("kind", "ServiceAccount", ["spec.manifests[0].kind", "apps/v1/ServiceAccount", "the allowed kinds are"]),
         ("apiVersion", "apps/v1beta1", ["apps/v1beta1/Deployment", "write apps/v1/Deployment"]),
         ("metadata.name", 7, ["metadata.name: must be a string"]),
         ("metadata.name", None, ["metadata.name", "must be a string"]),
