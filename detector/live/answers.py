@@ -10,18 +10,33 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import asdict
 from itertools import islice
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import msgspec
 
+from detector.actions.deploy.reconciler import DemandReconciler
 from detector.actions.trigger.requests import RECORDINGS
 from detector.engine.episodes.plain import plain
 from detector.live.evaluator import Evaluator
 from detector.live.requested import RequestedRecordings
 from detector.live.sink import LiveSink
 from detector.sources.supervision import SourceThread
-from detector.status.model import ActionStatus, CertificateStatus, Drops, RuleExplanation, SourceStatus, Status, to_json
+from detector.status.model import (
+    TASK_CHANGES,
+    ActionStatus,
+    CertificateStatus,
+    Drops,
+    LeaseStatus,
+    RuleExplanation,
+    SourceStatus,
+    Status,
+    TaskStatus,
+    to_json,
+)
 from wayside.times import format_time
+
+if TYPE_CHECKING:
+    from detector.actions.deploy.lease import HolderLease
 
 Result = TypeVar("Result")
 
@@ -45,6 +60,7 @@ class Answers:
         sources: Callable[[], list[SourceThread]],
         requested: RequestedRecordings,
         pulse: Callable[[], float] = lambda: 0.0,
+        lease: HolderLease | None = None,
     ) -> None:
         """`sink` returns the event sink: its network changes with the Detector, and so do the `sources`.
 
@@ -54,7 +70,8 @@ class Answers:
         self._evaluator = evaluator
         self._sources = sources
         self._requested = requested
-        self._outlet = sink
+        self._sink = sink
+        self._lease = lease
         self._answers: Mapping[str, Callable[[Mapping[str, str]], bytes]] = {
             "status": self._status,
             "evaluate": self._evaluate,
@@ -74,7 +91,7 @@ class Answers:
 
     def status(self) -> Status:
         """The latest status, with the parts that the engine does not have."""
-        latest, sink = self._evaluator.status.latest, self._outlet()
+        latest, sink = self._evaluator.status.latest, self._sink()
         dropped = [
             Drops("event_unpublished", "events not published", sink.network.dropped_events),
             Drops("event_unwritten", "events not written to events.jsonl", sink.unwritten),
@@ -98,11 +115,13 @@ class Answers:
             drops=[*latest.drops, *dropped],
             sources=sources,
             actions=actions,
+            tasks=task_status(sink.reconciler),
+            lease=None if self._lease is None else lease_status(self._lease),
         )
 
     def healthy(self) -> tuple[bool, bytes]:
         """Whether everything runs that only a restart can repair, for /healthz."""
-        silent, hung, dead = self._evaluator.status.silence, self._pulse(), self._outlet().network.dead
+        silent, hung, dead = self._evaluator.status.silence, self._pulse(), self._sink().network.dead
         lines = [f"the last evaluation was {silent:.1f} s ago"]
         if hung >= _SILENT:
             lines.append(f"the event loop has been blocked for {hung:.1f} s: tasks and the Lease are not updated")
@@ -116,7 +135,7 @@ class Answers:
         A listening detector is ready without connections: otherwise no Service would route to it.
         """
         well, text = self.healthy()
-        network = self._outlet().network
+        network = self._sink().network
         if not network.joined:
             return False, text + b"no Zenoh session yet\n"
         if not network.listens and not network.connected:
@@ -178,6 +197,21 @@ class Answers:
         finally:
             if watching is not None:
                 watching.cancel()
+
+
+def task_status(reconciler: DemandReconciler) -> TaskStatus:
+    """What the reconciler did so far."""
+    counts = reconciler.counts
+    return TaskStatus(
+        **{name: getattr(counts, name) for name in (*TASK_CHANGES, "retried")},
+        refused=dict(counts.refused),
+        pending=reconciler.pending,
+    )
+
+
+def lease_status(lease: HolderLease) -> LeaseStatus:
+    """The state of the holder's Lease."""
+    return LeaseStatus(lease.held.is_set(), lease.attempts, lease.failures)
 
 
 def _rule(given: Mapping[str, str]) -> str:

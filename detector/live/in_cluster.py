@@ -80,7 +80,9 @@ async def _run_while_held(
     async with asyncio.TaskGroup() as group:
         group.create_task(reconciler.run())
         try:
-            with Running(first, holder, reconciler, output, record, restored, pages, state, traces, view) as running:
+            with Running(
+                first, holder, reconciler, output, record, restored, pages, state, traces, view, lease
+            ) as running:
                 following = group.create_task(running.follow(changes))
                 await running.until(stopping)
                 following.cancel()

@@ -38,6 +38,7 @@ from wayside.api.plugin import ZENOH
 from wayside.api.stream import Stream
 
 if TYPE_CHECKING:
+    from detector.actions.deploy.lease import HolderLease
     from detector.replay.intake_writer import IntakeWriter
 
 _log = logging.getLogger(__name__)
@@ -72,6 +73,7 @@ class Running:
         state: StateFile | None = None,
         traces: EpisodeTraces | None = None,
         view: EvaluationView | None = None,
+        lease: HolderLease | None = None,
     ) -> None:
         """Starts nothing yet.
 
@@ -109,7 +111,7 @@ class Running:
         self._outlet.actions.outcomes.on_outcome = requested.on_outcome
         pulse = LoopMonitor(self._loop)
         self.answers = Answers(
-            self._evaluator, lambda: self._outlet, lambda: self._sources.threads, requested, pulse.silence
+            self._evaluator, lambda: self._outlet, lambda: self._sources.threads, requested, pulse.silence, lease
         )
         self._server = None if pages is None else _server(pages, self.answers)
 

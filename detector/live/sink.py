@@ -41,7 +41,7 @@ class LiveSink:
         self.network = network
         self.actions = ActionHost(holder, self)
         self._log = log
-        self._reconciler = reconciler
+        self.reconciler = reconciler
 
     @property
     def unwritten(self) -> int:
@@ -104,7 +104,7 @@ class LiveSink:
 
     def demands(self, demands: Mapping[str, Demand], ended: Mapping[str, int]) -> None:
         """Pass the demands to the reconciler."""
-        self._reconciler.update(demands, ended)
+        self.reconciler.update(demands, ended)
 
 
 class EventLog:

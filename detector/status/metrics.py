@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from prometheus_client import CollectorRegistry, ProcessCollector, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from detector.status.model import ActionStatus, Histogram, RuleState, RuleStatus, Status, StreamStatus
+from detector.status.model import TASK_CHANGES, ActionStatus, Histogram, RuleState, RuleStatus, Status, StreamStatus
 
 _PREFIX = "wayside_detector_"
 _GAUGE, _COUNTER = GaugeMetricFamily, CounterMetricFamily
@@ -30,6 +30,25 @@ DETECTOR: tuple[tuple[str, type, str, Callable[[Status], float | None]], ...] = 
     ("buffer_bytes", _GAUGE, "Size of the buffer in bytes, overhead included", lambda s: s.buffered_bytes),
     ("buffer_limit_bytes", _GAUGE, "Maximum size of the buffer in bytes, over all streams", lambda s: s.maximum_bytes),
     ("demands", _GAUGE, "Number of tasks that are currently demanded", lambda s: s.demand_count),
+    ("tasks_pending", _GAUGE, "Number of tasks that wait for a change", lambda s: s.tasks.pending),
+    (
+        "task_retries",
+        _COUNTER,
+        "Number of changes of tasks that failed because the API server was unavailable or busy",
+        lambda s: s.tasks.retried,
+    ),
+    (
+        "lease_held",
+        _GAUGE,
+        "1 if this process holds its Lease and may emit tasks; absent without a cluster",
+        lambda s: None if s.lease is None else s.lease.held,
+    ),
+    (
+        "lease_failures",
+        _COUNTER,
+        "Number of failed attempts to acquire or renew the Lease; absent without a cluster",
+        lambda s: None if s.lease is None else s.lease.failures,
+    ),
     ("clients_missing", _GAUGE, "Number of expected clients that send nothing", lambda s: s.missing_count),
     (
         "certificate_expiry_time_seconds",
@@ -126,6 +145,14 @@ class Metrics(Collector):
         )
         acting = [((each.rule, each.action, each.kind), each) for each in status.actions]
         yield from _families(ACTION, ("rule", "action", "kind"), acting)
+        changes = {change: getattr(status.tasks, change) for change in TASK_CHANGES}
+        yield _counts("task_changes", "Number of tasks that the deploy actions changed, by change", "change", changes)
+        yield _counts(
+            "task_refusals",
+            "Number of changes of tasks that the API server rejected, by its reason",
+            "reason",
+            status.tasks.refused,
+        )
         losses = CounterMetricFamily(
             f"{_PREFIX}losses", "Number of items lost or unusable, by cause", labels=("cause", "stream", "rule")
         )
@@ -146,6 +173,13 @@ def _families(
             if value is not None:
                 family.add_metric(values, float(value))
         yield family
+
+
+def _counts(name: str, text: str, label: str, counts: Mapping[str, int]) -> Metric:
+    family = CounterMetricFamily(f"{_PREFIX}{name}", text, labels=(label,))
+    for value, count in counts.items():
+        family.add_metric((value,), count)
+    return family
 
 
 def _states(rules: Iterable[RuleStatus]) -> Metric:

@@ -175,6 +175,41 @@ class ActionStatus(msgspec.Struct, frozen=True, rename="camel"):
     """By running episode, the last message, of at most 20."""
 
 
+class TaskStatus(msgspec.Struct, frozen=True, rename="camel"):
+    """What the deploy actions did to ApplicationTasks, as numbers of tasks."""
+
+    created: int = 0
+    recreated: int = 0
+    """Recreated because another client deleted them while they were demanded."""
+    adopted: int = 0
+    """They existed when they were to be created: the response to an earlier request was lost."""
+    replaced: int = 0
+    """Deleted and recreated because the demand differs in an immutable field."""
+    patched: int = 0
+    ended: int = 0
+    retried: int = 0
+    """Attempts that failed because the API server was unavailable or busy."""
+    refused: dict[str, int] = {}
+    """Attempts that the API server rejected, by its reason."""
+    pending: int = 0
+    """Tasks that wait for a change."""
+
+
+TASK_CHANGES = ("created", "recreated", "adopted", "replaced", "patched", "ended")
+"""The counts of `TaskStatus` that are changes."""
+
+
+class LeaseStatus(msgspec.Struct, frozen=True, rename="camel"):
+    """The Lease of the holder; only in a cluster."""
+
+    held: bool
+    """Whether this process may emit tasks."""
+    attempts: int
+    """Number of attempts to acquire or renew it."""
+    failures: int
+    """Number of failed attempts."""
+
+
 class CertificateStatus(msgspec.Struct, frozen=True, rename="camel"):
     """The certificate of the detector on Zenoh."""
 
@@ -221,6 +256,9 @@ class Status(msgspec.Struct, frozen=True, rename="camel"):
     demands: list[str] = []
     """The names of the currently demanded tasks; at most 200."""
     demand_count: int = 0
+    tasks: TaskStatus = TaskStatus()
+    lease: LeaseStatus | None = None
+    """None if tasks go into files."""
     missing: list[str] = []
     """Expected clients without a token that have sent nothing for `clientTimeout`; at most 200, by name."""
     missing_count: int = 0

@@ -9,7 +9,17 @@ from collections.abc import Iterator, Sequence
 from rich.console import Group, RenderableType
 from rich.table import Table
 
-from detector.status.model import ActionStatus, Drops, Histogram, RuleExplanation, RuleStatus, Status, StreamStatus
+from detector.status.model import (
+    TASK_CHANGES,
+    ActionStatus,
+    Drops,
+    Histogram,
+    RuleExplanation,
+    RuleStatus,
+    Status,
+    StreamStatus,
+    TaskStatus,
+)
 from detector.status.total import Total
 
 _CLIENTS = 20
@@ -66,6 +76,7 @@ def _sums(total: Total) -> Iterator[RenderableType]:
     for rule in total.rules:
         yield from _remarks(rule)
     yield from _acting(total.actions)
+    yield from _tasks(total.tasks)
     yield from _lost(total.drops)
     if total.shared_clients:
         yield f"known to several: {_listed(total.shared_clients, total.shared_client_count)}"
@@ -96,6 +107,11 @@ def _parts(status: Status) -> Iterator[RenderableType]:
     yield from _acting([each for each in status.actions if each.rule in of_rules or status.explanation is None])
     if status.explanation is None and status.demand_count:
         yield f"demands: {_listed(status.demands, status.demand_count, _DEMANDS)}"
+    if status.explanation is None:
+        yield from _tasks(status.tasks)
+        if status.lease is not None:
+            held = "held" if status.lease.held else "not held: this process creates no tasks"
+            yield f"Lease {held}; {status.lease.failures} of {status.lease.attempts} renewals failed"
     if status.explanation is not None:
         yield from _explained(status.explanation)
         return
@@ -185,6 +201,15 @@ def _acting(actions: Sequence[ActionStatus]) -> Iterator[RenderableType]:
         for episode, message in each.current.items():
             if message:
                 yield f"{each.rule}/{each.action}: episode {episode}: {message}"
+
+
+def _tasks(tasks: TaskStatus) -> Iterator[RenderableType]:
+    """What the deploy actions did, if they did something."""
+    counts = {name: getattr(tasks, name) for name in (*TASK_CHANGES, "retried", "pending")}
+    if any(counts.values()):
+        yield "tasks: " + ", ".join(f"{count} {name}" for name, count in counts.items() if count)
+    if tasks.refused:
+        yield "tasks refused: " + ", ".join(f"{count} {reason}" for reason, count in sorted(tasks.refused.items()))
 
 
 def _explained(explanation: RuleExplanation) -> Iterator[RenderableType]:

@@ -8,7 +8,16 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from detector.status.model import ActionStatus, Drops, Histogram, RuleState, RuleStatus, Status, StreamStatus
+from detector.status.model import (
+    ActionStatus,
+    Drops,
+    Histogram,
+    RuleState,
+    RuleStatus,
+    Status,
+    StreamStatus,
+    TaskStatus,
+)
 
 _BY_SEVERITY = (RuleState.REFUSED, RuleState.DEGRADED, RuleState.PAUSED, RuleState.DISABLED, RuleState.ACCEPTED)
 
@@ -54,6 +63,7 @@ class Total(msgspec.Struct, frozen=True, rename="camel"):
     actions: list[ActionStatus]
     drops: list[Drops]
     demand_count: int
+    tasks: TaskStatus
     missing_count: int
     """Expected clients that send nothing."""
     gaps: int
@@ -85,6 +95,7 @@ def total(statuses: Iterable[Status], missing_detectors: Iterable[str] = ()) -> 
             ((s.holder, it) for s in each for it in s.drops), lambda it: (it.cause, it.stream, it.rule), _drops
         ),
         demand_count=sum(status.demand_count for status in each),
+        tasks=_tasks([status.tasks for status in each]),
         missing_count=sum(status.missing_count for status in each),
         gaps=sum(status.gaps for status in each),
         buffered_bytes=sum(status.buffered_bytes for status in each),
@@ -185,6 +196,13 @@ def _action(found: Sequence[tuple[str, ActionStatus]]) -> ActionStatus:
 
 def _drops(found: Sequence[tuple[str, Drops]]) -> Drops:
     return _summed([drops for _, drops in found], last=_named((holder, each.last) for holder, each in found))
+
+
+def _tasks(found: Sequence[TaskStatus]) -> TaskStatus:
+    refused: Counter[str] = Counter()
+    for each in found:
+        refused.update(each.refused)
+    return _summed(found, refused=dict(refused)) if found else TaskStatus()
 
 
 def _named(texts: Iterable[tuple[str, str]]) -> str:

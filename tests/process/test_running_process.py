@@ -18,7 +18,7 @@ from detector.status.model import RuleState, Status, read_status
 from detector.streams.query_handler import NoAnswerError, query_detectors
 from tests import programs
 from tests.certificates import Authority
-from tests.driving import a_rule, a_stream
+from tests.driving import a_deploy, a_rule, a_stream
 from tests.networks import wait_for
 from tests.process.running import PATIENCE, Process
 
@@ -66,6 +66,18 @@ def test_status_and_metrics_are_what_was_sent(process: Process) -> None:
     assert metrics["process_resident_memory_bytes",] > 0
     assert "the last evaluation" in process.page("/healthz")
     assert "the last evaluation" in process.page("/readyz")
+
+
+def test_the_tasks_that_it_created_and_ended_are_counted(process: Process) -> None:
+    process.change(
+        a_rule("fast", signals=[SPEED], when="v > 10", evaluation={"every": "100ms"}, actions=[a_deploy("d")])
+    )
+    process.send("car1", {"v": 20})
+    status = process.status_when(lambda s: s.tasks.created == 1 and s.demand_count == 1)
+    assert (status.tasks.ended, status.lease) == (0, None)
+    process.change()
+    process.status_when(lambda s: s.tasks.ended == 1)
+    assert process.metrics()["task_changes_total", "created"] == process.metrics()["task_changes_total", "ended"] == 1
 
 
 def test_a_rule_is_evaluated_paused_and_resumed_by_commands(process: Process) -> None:
