@@ -250,7 +250,7 @@ class Engine:
         Returns the episodes that started and ended, and the result for each subject.
 
         Raises:
-            NoAnswerError: the rule does not exist, has no `onDemand`, or is disabled or paused.
+            NotEvaluableError: the rule does not exist, has no `onDemand`, or is disabled or paused.
         """
         run = self._runs.get(name)
         if run is None:

@@ -187,13 +187,13 @@ class Evaluator:
         return future
 
     def ask(self, rule: str) -> Future[list[OnDemandResult]]:
-        """Evaluate a rule with onDemand now; thread-safe. The future has a result by subject, or NoAnswerError."""
+        """Evaluate a rule with onDemand now; thread-safe. The future has a result by subject, or NotEvaluableError."""
         return self.call(lambda: self._evaluate_on_demand(rule))
 
     def pause_rule(self, rule: str, paused: bool) -> Future[None]:
         """Pause the rule, or (not `paused`) resume it; thread-safe.
 
-        The future has NoAnswerError if the rule does not exist. A restarted detector has no paused rules.
+        The future has NotEvaluableError if the rule does not exist. A restarted detector has no paused rules.
         """
         return self.call(lambda: self._pause_rule(rule, paused))
 
