@@ -35,7 +35,7 @@ from application_manager.core.findings.injections import (
     injection,
     read_pod,
 )
-from application_manager.core.findings.reviews import Request, ReviewError, Weight, answer, read
+from application_manager.core.findings.reviews import OverloadedError, Request, Weight, answer, read
 from application_manager.core.findings.templatefindings import template_findings
 from application_manager.core.objects.detectors import deployment_to_try
 from application_manager.core.objects.poddefaults import PodDefaults
@@ -82,7 +82,7 @@ class Admission:
     _under_way: Counter[str] = field(default_factory=Counter)
 
     async def review(self, review: Any) -> Object:
-        """The answer to an AdmissionReview. Raises ReviewError where it is none."""
+        """The answer to an AdmissionReview. Raises ReviewError where it is none, and OverloadedError."""
         request = read(review)
         looked_after = not self.namespaces or request.namespace in self.namespaces
         findings = Findings()
@@ -99,9 +99,9 @@ class Admission:
         return response
 
     async def _in_turn(self, request: Request) -> Findings:
-        """The findings, unless the namespace has too many questions: the others' are answered all the same."""
+        """The findings. Raises OverloadedError where the namespace has too many questions: others get their answers."""
         if self._under_way[request.namespace] >= AT_ONCE:
-            raise ReviewError(f"{AT_ONCE} reviews of namespace {request.namespace} are in progress: try again")
+            raise OverloadedError(f"{AT_ONCE} reviews of namespace {request.namespace} are in progress: try again")
         self._under_way[request.namespace] += 1
         try:
             return await self._findings(request)

@@ -2,7 +2,7 @@
 
 Whatever goes wrong here is an answer that the API server counts as none, and with failurePolicy Ignore the
 object is stored, and its condition reports later what the review could not. So nothing waits in a queue: where too many
-come at once, those beyond are sent away.
+come at once, those beyond get 503 with Retry-After.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any
 import msgspec
 from aiohttp import web
 
-from application_manager.core.findings.reviews import ReviewError
+from application_manager.core.findings.reviews import OverloadedError, ReviewError
 from application_manager.core.findings.webhooks import certificate_secret
 from application_manager.measures import Measures
 from wayside.kubernetes.connection import ConfigurationError
@@ -26,6 +26,8 @@ from wayside.process.servingcertificate import ServingCertificate
 
 AT_ONCE = 32
 """Questions of one kind that are answered at the same time; those beyond get 503 at once."""
+
+_RETRY_AFTER = "1"  # s; a review takes less
 
 LARGEST = 8 * 1024 * 1024  # bytes of a question: etcd takes 1.5 MiB an object, and an update brings two
 
@@ -76,6 +78,8 @@ class ReviewHandler:
         try:
             question = msgspec.json.decode(await request.read())
             return web.json_response(body=msgspec.json.encode(await self._review(question)))
+        except OverloadedError as error:
+            return self._none(503, str(error))
         except (ReviewError, msgspec.DecodeError, UnicodeDecodeError) as error:
             return self._none(400, str(error))
         except web.HTTPException:
@@ -89,7 +93,8 @@ class ReviewHandler:
 
     def _none(self, status: int, why: str) -> web.Response:
         self._measures.reviewed("", "failed")
-        return web.Response(status=status, text=f"{why}\n")
+        headers = {"Retry-After": _RETRY_AFTER} if status == 503 else None
+        return web.Response(status=status, text=f"{why}\n", headers=headers)
 
 
 @asynccontextmanager

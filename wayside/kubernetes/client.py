@@ -24,7 +24,7 @@ from kubernetes.aio.client import ApiClient, Configuration
 
 from wayside.kubernetes.errors import ApiError, NotActive, NotGranted, Unreachable
 from wayside.kubernetes.fence import FencedRequest, writing
-from wayside.kubernetes.pacing import Pacing
+from wayside.kubernetes.pacing import LONGEST_HOLD, Pacing
 from wayside.kubernetes.resources import Object, Resource
 
 _APPLY = "application/apply-patch+yaml"
@@ -375,7 +375,7 @@ class Client:
         return {**headers, "Authorization": token} if token else headers
 
     def _error(self, code: int, raw: bytes, retry_after: str | None) -> ApiError:
-        seconds = float(retry_after) if retry_after and retry_after.isdigit() else None
+        seconds = min(float(retry_after), LONGEST_HOLD) if retry_after and retry_after.isdigit() else None
         try:
             status = self._decode(raw)
         except (msgspec.DecodeError, UnicodeDecodeError):

@@ -20,7 +20,7 @@ AT_ONCE = 24
 """Requests that are under way at the same time, of all queues together; watches are apart."""
 
 LONGEST_HOLD = 60.0
-"""Seconds that an API server's wish to be left alone is respected at the most."""
+"""The maximum seconds of a Retry-After that are respected."""
 
 MOST_WRITES = 8
 """Writes of one namespace that are under way at the same time, where the API server is quick."""
@@ -124,7 +124,7 @@ class Pacing:
 
     def hold(self, seconds: float) -> None:
         """Let no request begin for this time, as the API server requests; a shorter time shortens no longer one."""
-        self._held_until = max(self._held_until, time.monotonic() + min(seconds, LONGEST_HOLD))
+        self._held_until = max(self._held_until, time.monotonic() + seconds)
 
     @asynccontextmanager
     async def turn(self, writes_in: str = "") -> AsyncIterator[None]:

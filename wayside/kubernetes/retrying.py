@@ -9,40 +9,38 @@ from typing import TypeVar
 
 from wayside.kubernetes.connection import ConfigurationError
 from wayside.kubernetes.errors import ApiError, RequestError
-from wayside.process.backoff import retry_async
+from wayside.process.backoff import Backoff, retry_async
 
 _FAILURES = (RequestError, ConfigurationError)
 
-PAUSE = 1.0  # s between two attempts, unless the API server requests more
+FIRST_PAUSE, LONGEST_PAUSE = 1.0, 5.0  # s between two attempts, unless the API server requests more
 
 Answer = TypeVar("Answer")
 
 log = logging.getLogger(__name__)
 
 
-async def until_answered(request: Callable[[], Awaitable[Answer]], pause: float = PAUSE) -> Answer:
+async def until_answered(request: Callable[[], Awaitable[Answer]], pause: float = FIRST_PAUSE) -> Answer:
     """The answer, however long it takes; logs once that the API server is away, overloaded or starting.
 
     Args:
         request: sends the request once.
-        pause: seconds between two attempts.
+        pause: seconds until the second attempt; the pauses grow with further ones.
 
     Raises:
         ApiError: what another attempt cannot change, such as missing rights or credentials.
     """
-    waiting = False
+    backoff = Backoff(pause, LONGEST_PAUSE)
 
     def failed(error: RequestError) -> float:
-        nonlocal waiting
         if isinstance(error, ApiError) and (error.permanent or error.code == 401):
             raise error
-        if not waiting:
+        if not backoff.failures:
             log.warning("%s; retrying until the API server responds", error)
-        waiting = True
-        return max(pause, error.retry_after or 0.0)
+        return max(backoff.fail(), error.retry_after or 0.0)
 
     answer = await retry_async(request, RequestError, failed)
-    if waiting:
+    if backoff.failures:
         log.info("the API server responds")
     return answer
 
@@ -52,11 +50,12 @@ async def repeatedly(look: Callable[[], Awaitable[object]], every: float, proble
 
     Args:
         look: looks once.
-        every: seconds between two looks.
+        every: seconds between two looks, unless the API server requests more.
         problem: what cannot be done, for the log; empty where somebody else reports failures.
     """
     reported = ""
     while True:
+        pause = every
         try:
             await look()
             reported = ""
@@ -64,4 +63,6 @@ async def repeatedly(look: Callable[[], Awaitable[object]], every: float, proble
             if problem and str(error) != reported:
                 log.warning("%s: %s", problem, error)
             reported = str(error)
-        await asyncio.sleep(every)
+            if isinstance(error, RequestError):
+                pause = max(every, error.retry_after or 0.0)
+        await asyncio.sleep(pause)

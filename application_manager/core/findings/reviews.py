@@ -30,6 +30,10 @@ class ReviewError(ValueError):
     """What came is no AdmissionReview."""
 
 
+class OverloadedError(Exception):
+    """Too many reviews are in progress."""
+
+
 class Weight(Enum):
     """What findings come to."""
 

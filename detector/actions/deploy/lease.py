@@ -128,7 +128,7 @@ class HolderLease:
         if not self._backoff.failures:
             _log.warning("cannot renew the Lease %s; retrying with backoff: %s", self.name, error)
         self.failures += 1
-        return self._backoff.fail()
+        return self._backoff.fail(error.retry_after or 0.0)
 
     async def _pause(self, seconds: float) -> None:
         with suppress(TimeoutError):

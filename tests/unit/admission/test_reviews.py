@@ -10,14 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kubernetes.aio.client import Configuration
 
-from application_manager.admission.admission import Admission
+from application_manager.admission.admission import AT_ONCE, Admission
 from application_manager.cache.cluster_cache import ClusterCache
 from application_manager.core.findings.findings import Findings
-from application_manager.core.findings.reviews import LONGEST, MOST_REPORTED, ReviewError, answer, read
+from application_manager.core.findings.reviews import LONGEST, MOST_REPORTED, OverloadedError, ReviewError, answer, read
 from application_manager.core.findings.webhooks import WebhookClientConfig, webhook_configuration
 from application_manager.core.objects.policy import Policy
 from application_manager.measures import Measures
-from tests.inprocess import InProcess
+from application_manager.workers.process import Job
+from tests.inprocess import InProcess, Result
 from tests.unit.manager_objects import template
 from tests.unit.templates.test_findings import counting, deploying, detector, rule
 from wayside.api import Kind
@@ -222,6 +223,40 @@ def test_a_template_that_a_rule_names_is_looked_up_before_it_is_missed() -> None
     assert missed["allowed"]
     assert "there is no ApplicationTemplate app" in missed["warnings"][0]
     assert reviewed(deploying(), detector(), live=(detector(), template())) == {"uid": "u1", "allowed": True}
+
+
+class Held:
+    """Jobs that wait until they are let."""
+
+    def __init__(self) -> None:
+        self.waiting = 0
+        self.proceed = asyncio.Event()
+
+    async def run(self, namespace: str, job: Job[Result]) -> Result:
+        self.waiting += 1
+        await self.proceed.wait()
+        return job()
+
+
+def test_a_namespace_with_too_many_reviews_gets_no_more_and_others_get_theirs() -> None:
+    async def scenario() -> None:
+        cache, pool, client = ClusterCache(Policy()), Held(), Cluster()
+        admission = Admission(cache, client, cache.store.put, Measures(), pool)
+        wanted = question("CREATE", detector().to_json(), None, "Detector")
+        elsewhere = {**wanted, "request": {**wanted["request"], "namespace": "other"}}
+        reviews = [asyncio.create_task(admission.review(wanted)) for _ in range(AT_ONCE)]
+        while pool.waiting < AT_ONCE:  # noqa: ASYNC110
+            await asyncio.sleep(0)
+        with pytest.raises(OverloadedError, match=f"{AT_ONCE} reviews of namespace site are in progress"):
+            await admission.review(wanted)
+        reviews.append(asyncio.create_task(admission.review(elsewhere)))
+        while pool.waiting <= AT_ONCE:  # noqa: ASYNC110
+            await asyncio.sleep(0)
+        pool.proceed.set()
+        assert all(each["response"]["allowed"] for each in await asyncio.gather(*reviews))
+        await client.close()
+
+    asyncio.run(scenario())
 
 
 def test_namespaces_that_are_not_looked_after_are_not_judged() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import ssl
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ import yaml
 from application_manager.admission.issuer import make_certificates
 from application_manager.admission.webhook import AT_ONCE, LARGEST, ReviewHandler, WebhookOptions, webhook
 from application_manager.cli import EXPECTED, app
-from application_manager.core.findings.reviews import ReviewError
+from application_manager.core.findings.reviews import OverloadedError, ReviewError
 from application_manager.core.findings.webhooks import PATH
 from application_manager.measures import Measures
 from tests.ports import free_port
@@ -28,9 +28,13 @@ Ask = Callable[..., Awaitable[tuple[int, str]]]
 
 
 def served(
-    folder: Path, handler: ReviewHandler, scenario: Callable[[Ask], Awaitable[None]], authority: Path | None = None
+    folder: Path,
+    handler: ReviewHandler,
+    scenario: Callable[[Ask], Awaitable[None]],
+    authority: Path | None = None,
+    headers: list[Mapping[str, str]] | None = None,
 ) -> None:
-    """Run the scenario with a function that posts to the webhook."""
+    """Run the scenario with a function that posts to the webhook; the headers of the answers are added to `headers`."""
     port = free_port()
 
     async def run() -> None:
@@ -42,6 +46,8 @@ def served(
                 aiohttp.ClientSession(connector=aiohttp.TCPConnector(limit=0)) as session,
                 session.request(method, url, data=body, ssl=context) as response,
             ):
+                if headers is not None:
+                    headers.append(response.headers)
                 return response.status, await response.text()
 
         async with asyncio.timeout(120), webhook(WebhookOptions(port, folder), {PATH: handler}):
@@ -100,6 +106,18 @@ def test_nothing_is_answered_before_everything_is_known(folder: Path) -> None:
         assert (await ask())[0] == 200
 
     served(folder, ReviewHandler(review, lambda: bool(known), Measures()), scenario)
+
+
+def test_an_overloaded_manager_requests_a_wait(folder: Path) -> None:
+    async def review(requested: Any) -> dict[str, Any]:
+        raise OverloadedError("8 reviews are in progress: try again")
+
+    async def scenario(ask: Ask) -> None:
+        assert await ask() == (503, "8 reviews are in progress: try again\n")
+        assert headers[-1]["Retry-After"] == "1"
+
+    headers: list[Mapping[str, str]] = []
+    served(folder, ReviewHandler(review, lambda: True, Measures()), scenario, headers=headers)
 
 
 def test_those_beyond_the_limit_are_sent_away_at_once(folder: Path) -> None:

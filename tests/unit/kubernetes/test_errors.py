@@ -14,6 +14,7 @@ from kubernetes.aio.client import Configuration
 from wayside.kubernetes.client import Client
 from wayside.kubernetes.connection import ConfigurationError, connect
 from wayside.kubernetes.errors import ApiError
+from wayside.kubernetes.pacing import LONGEST_HOLD
 from wayside.kubernetes.resources import Resource
 
 PODS = Resource("v1", "Pod", "pods")
@@ -78,6 +79,11 @@ def test_an_answer_that_is_no_status_is_still_an_error(body: bytes) -> None:
 
 def test_a_wait_that_the_server_requests_is_kept() -> None:
     assert error_of(web.json_response({}, status=429, headers={"Retry-After": "7"})).retry_after == 7.0
+
+
+def test_a_wait_that_the_server_requests_is_bounded() -> None:
+    response = web.json_response({}, status=503, headers={"Retry-After": "86400"})
+    assert error_of(response).retry_after == LONGEST_HOLD
 
 
 def test_paths_of_core_and_other_groups() -> None:

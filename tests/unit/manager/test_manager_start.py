@@ -8,7 +8,7 @@ import logging
 import pytest
 
 from wayside.kubernetes.errors import ApiError, Unreachable
-from wayside.kubernetes.retrying import until_answered
+from wayside.kubernetes.retrying import repeatedly, until_answered
 
 
 def requested(*failures: Exception) -> str:
@@ -50,3 +50,22 @@ def test_an_answer_at_once_is_not_commented(caplog: pytest.LogCaptureFixture) ->
     caplog.set_level(logging.INFO)
     assert requested() == "answer"
     assert caplog.records == []
+
+
+def test_each_repeated_request_waits_as_long_as_an_overloaded_api_server_requests(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pauses: list[float] = []
+    failures = [ApiError(429, "too many", retry_after=30.0), ApiError(503, "starting"), Unreachable("refused")]
+    left = iter([*failures, *failures])
+
+    async def sleep(seconds: float) -> None:
+        pauses.append(seconds)
+
+    async def look() -> None:
+        raise next(left, asyncio.CancelledError())
+
+    monkeypatch.setattr(asyncio, "sleep", sleep)
+    with pytest.raises(asyncio.CancelledError):
+        asyncio.run(repeatedly(look, 5.0, ""))
+    assert pauses == [30.0, 5.0, 5.0] * 2
