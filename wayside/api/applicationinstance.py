@@ -37,7 +37,7 @@ class ApplicationInstanceSpec(Model):
     )
     """The merged values of the template's parameters."""
     suspended: bool = False
-    """If true, all workloads are scaled to zero regardless of Deploy tasks. status.suspendedReplicas keeps their
+    """If true, all workloads are scaled to zero, even if Deploy tasks are live. status.suspendedReplicas keeps their
     previous replica counts."""
 
     @field_validator("parameters", mode="before")
@@ -108,8 +108,8 @@ class ApplicationInstanceStatus(Model):
     release_time: Time | None = None
     """The end of the linger time. The instance is then removed, unless a new demand arrives first."""
     objects: list[ObjectReference] = Field(default_factory=list, max_length=128, json_schema_extra=ATOMIC_LIST)
-    """The objects of the instance. An object that is added later is listed before it is applied. Until the list of a
-    new instance is written, its objects are identified by label and controller reference."""
+    """The objects of the instance. Each object is listed before it is applied, except those of a new instance: until
+    the list is written, its objects are identified by label and controller reference."""
     suspended_replicas: list[SuspendedReplicas] = Field(
         default_factory=list, max_length=64, json_schema_extra=ATOMIC_LIST
     )
@@ -122,7 +122,7 @@ class ApplicationInstanceStatus(Model):
     objects were refused, or did not become ready in time. Capped: a merged Sum is limited to its parameter's maximum.
     Suspended: the workloads are scaled to zero. Paused: the annotation wayside.dev/pause stops changes to the instance.
     Held: the annotation wayside.dev/hold keeps the instance even without demand. TimedOut: the instance was not ready
-    for the template's readyTimeout. StandsIn: the instance is a fallback and serves tasks of instances that timed
+    for the template's readyTimeout. StandsIn: the instance is a fallback and serves the tasks of instances that timed
     out."""
 
 

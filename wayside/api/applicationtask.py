@@ -60,7 +60,7 @@ class TaskEvent(Model):
     subject: str = Field(max_length=512)
     """The subject of the episode, as in the event's key, e.g. car1+car2."""
     onset_time: Time
-    """The time at which the rule's condition began to hold."""
+    """The time at which the rule's condition became true."""
     start_time: Time
     """The start of the episode."""
     classification: Classification | None = None
@@ -77,7 +77,8 @@ class ApplicationTaskSpec(Model):
     """The name of the ApplicationTemplate, in the same namespace. Immutable."""
     operation: Operation = Field(default=Operation.DEPLOY, description=MEANING, json_schema_extra=immutable(_IMMUTABLE))
     priority: int = Field(default=0, ge=-1_000_000, le=1_000_000, json_schema_extra=immutable(_IMMUTABLE))
-    """The priority of the task; the highest comes first. Ties are ordered by creation time, then by name. Immutable."""
+    """The priority of the task. Higher priorities come first; among equal priorities, the older task, then the smaller
+    name. Immutable."""
     parameters: dict[Identifier, NestedValue] = Field(default_factory=dict, max_length=64)
     """The values for the template's parameters, at most 64 KiB in total. Can change while the task is live."""
     requester: Requester = Field(default=Requester(), json_schema_extra=immutable(_IMMUTABLE))
@@ -118,7 +119,7 @@ class ApplicationTaskStatus(Model):
     """The time at which the instance was first ready for the task."""
     conditions: Conditions = Field(default_factory=list)
     """Accepted: the demand counts. Applied, Ready: the current state of the task's instance. Stalled: the task is
-    refused, and waiting does not help. Finished: the task has ended; Applied and Ready are removed."""
+    refused, for the reason in its message. Finished: the task has ended; Applied and Ready are removed."""
 
 
 class ApplicationTask(Kind):

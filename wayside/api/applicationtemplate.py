@@ -71,7 +71,7 @@ class Lifecycle(Model):
     ready for the same time. Default: no limit."""
     fallback: FallbackTemplate | None = None
     """The template that serves the tasks of an instance that exceeded its readyTimeout, until that instance is ready
-    again. It receives only the task parameters that it defines. Needs readyTimeout."""
+    again. It receives only those parameters of the tasks that it defines. Needs readyTimeout."""
     on_detector_loss: OnDetectorLoss = OnDetectorLoss()
     """The policy for demands whose holder's Lease has expired."""
 
@@ -80,8 +80,8 @@ class Baseline(Model):
     """An instance that always runs, with or without tasks."""
 
     parameters: NamedData = Field(default_factory=dict)
-    """The parameter values of the baseline. With merge Same, tasks must agree with them. With any other merge, they
-    count as the values of a task of the lowest priority."""
+    """The parameter values of the baseline. With merge Same, tasks must have the same values. With any other merge,
+    they count as the values of a task of the lowest priority."""
 
 
 Manifest = Annotated[dict[str, Any], Field(json_schema_extra={"x-kubernetes-preserve-unknown-fields": True})]

@@ -50,7 +50,7 @@ class KnownClient(Model):
     )
     """Labels that rules can use, e.g. labels.role."""
     parameters: dict[ObjectName, Constants] = Field(default_factory=dict, max_length=64)
-    """Values for this client that replace a rule's parameters, by rule and parameter name. In a pairs scope,
+    """Values that replace a rule's parameters for this client, by rule name and parameter name. In a pairs scope,
     expressions read them as a.parameters or b.parameters."""
     expected: bool = False
     """If true, the client is known from the start of the detector, even without data, and is never lost. A rule can
@@ -142,8 +142,8 @@ class DetectorSpec(Model):
     buffer: BufferLimits = BufferLimits()
     """The limits of the buffer of samples."""
     client_timeout: PositiveDuration = PositiveDuration("30s")
-    """A client is lost after this time without data: its episodes end with reason ClientLost. Time before the start of
-    the detector does not count."""
+    """A client is lost after this time without data, and its episodes end with reason ClientLost. Time before the start
+    of the detector does not count."""
     clock: Clock = Clock.WALL
     """The time of a sample. Wall: the time at which it was received. Data: its stamp, for simulated time and
     recordings."""
@@ -151,8 +151,8 @@ class DetectorSpec(Model):
     """Only with clock Data: how late samples may arrive. Tick t runs when the detector has received a stamp that is
     later than t and not earlier than t + lateness."""
     max_ahead: Duration = Duration("1s")
-    """Only with clock Data: the maximum time by which a stamp may be ahead of all others. A sample further ahead is
-    dropped and counted."""
+    """Only with clock Data: how far a stamp may be ahead of all others. A sample that is further ahead is dropped and
+    counted."""
     state: State | None = None
     """Persists open episodes. Without it, a restart restores only those episodes that have a live task."""
     recordings: Recordings | None = None

@@ -141,9 +141,9 @@ class Signal(Model):
     stream: ObjectName | None = None
     """The name of a stream of the Detector."""
     rule_name: ObjectName | None = None
-    """Instead of a stream: another rule that the Detector selects. The samples are the starts (or ends, see samples) of
-    that rule's episodes in which the client is a subject. msg contains episode, subject, subjects, onsetTime and
-    startTime (seconds since the epoch), and the values at the start."""
+    """Instead of a stream: the name of another rule that the Detector selects. The samples are the starts (or ends, see
+    samples) of that rule's episodes in which the client is a subject. msg contains episode, subject, subjects,
+    onsetTime and startTime (seconds since the epoch), and the values at the start."""
     samples: Samples = Samples.STARTS
     """Only with ruleName. Starts: the samples are the starts of episodes. Ends: the samples are the ends of episodes;
     msg also contains endTime, reason and the values at the end."""
@@ -154,9 +154,9 @@ class Signal(Model):
     scope, the value belongs to the pair: expressions use its name without a or b."""
     of: Expression | None = None
     """Instead of a stream: CEL over the variables of `when`, such as another signal or the distance of a pair. Each
-    evaluation of the subject adds one sample, the value of the expression. Without over and lag, the signal is the
+    evaluation of the subject adds the value of the expression as one sample. Without over and lag, the signal is the
     value itself. In a pairs scope, the value belongs to the pair: expressions use its name without a or b. Samples are
-    kept as long as over and lag need them, with at most 25 bytes each."""
+    kept as long as over and lag need them; each takes at most 25 bytes."""
     client: ClientName | None = None
     """Only with stream or ruleName: the client whose samples or episodes the signal uses for every subject, e.g. a
     traffic light. The signal is unknown while the detector does not know this client. Default: the subject's own
@@ -166,21 +166,21 @@ class Signal(Model):
     message or item, unless it was already stale), key (the captured chunks), sample (stamp, received, latency, size)
     and parameters. Required, except with the aggregates Count, Age and Active."""
     where: Expression | None = None
-    """CEL over msg, key, sample and parameters. Only samples for which it is true count."""
+    """CEL over msg, key, sample and parameters. Samples for which it is not true are ignored."""
     over: WindowLength | None = None
     """The length of the window: at tick t the window is (t - over, t]. Required, except with the aggregates Last,
     First, Previous, Age and Active. Episode (only with of): the window is the open episode, from its start to its end.
     Such a signal is known only while an episode is open. Events and actions can use it; conditions and other signals
     cannot."""
     lag: PositiveDuration | None = None
-    """Only with of: how far in the past the window ends. At tick t the window is (t - lag - over, t - lag]."""
+    """Only with of: how long before the tick the window ends. At tick t the window is (t - lag - over, t - lag]."""
     aggregate: Aggregate = Aggregate.LAST
     """How the samples become one value. Last, Previous, First: the newest, the second newest, the oldest value. Min,
     Max, Mean, Sum, StdDev (of the population), Quantile: of numbers. Delta: last - first. Rate: Delta per second.
     Slope: the slope of the least-squares line, per second. All, Any: of booleans. Distinct: the list of distinct
-    values. Count: the number of samples. Age: seconds since the last sample was received; over an episode, since its
-    start. Active (only with ruleName): whether an episode is open. MinTime, MaxTime: the time of the first smallest or
-    largest number, in seconds since the epoch."""
+    values. Count: the number of samples. Age: seconds since the last sample was received; with over: Episode, seconds
+    since the start of the episode. Active (only with ruleName): whether an episode is open. MinTime, MaxTime: the time
+    of the first smallest or largest number, in seconds since the epoch."""
 
     quantile: float | None = Field(default=None, ge=0, le=1)
     """Only with aggregate Quantile: 0.5 for the median, 0.95 for the 95th percentile. Interpolated linearly between two
@@ -244,12 +244,12 @@ class Evaluation(Model):
     every: Duration | None = Field(
         default=None, json_schema_extra=checked("duration(self) >= duration('10ms')", "give 10ms or more")
     )
-    """Evaluate the rule at whole multiples of this period, 10ms or more. Default: 1s."""
+    """The period at whose whole multiples the rule is evaluated, 10ms or more. Default: 1s."""
     on_sample: ObjectName | None = None
-    """Evaluate the rule at each sample of this stream, for the subjects of the sample's client, and whenever a `for`, a
-    cooldown or an unknownTimeout expires."""
+    """The stream at whose samples the rule is evaluated, for the subjects of the sample's client. The rule is also
+    evaluated whenever a `for`, a cooldown or an unknownTimeout expires."""
     on_demand: bool | None = Field(default=None, json_schema_extra=checked("self", "write true, or leave it out"))
-    """If true, evaluate the rule only on request."""
+    """If true, the rule is evaluated only on request."""
     priority: int = Field(default=0, ge=-1_000, le=1_000)
     """Under overload, the detector evaluates rules of lower priority less often, the lowest first."""
 
@@ -289,30 +289,30 @@ class EventRuleSpec(Model):
     evaluation: Evaluation = Evaluation()
     """When the rule is evaluated."""
     parameters: Constants = Field(default_factory=dict)
-    """Constants for expressions, which read them as parameters.<name>: numbers, strings, booleans, and lists and maps
-    of these, such as polygons; at most 64 KiB in total. A Detector can override them per client."""
+    """Constants for expressions, e.g. parameters.limit: numbers, strings, booleans, and lists and maps of these, such
+    as polygons; at most 64 KiB in total. A Detector can override them per client."""
     signals: list[Signal] = Field(default_factory=list, max_length=64, json_schema_extra=map_list("name"))
     """The values that conditions use. In a pairs scope, each client has its own values, e.g. a.speed and b.speed."""
     when: Expression
     """CEL, boolean: the condition that starts an episode."""
     margin: dict[Identifier, Annotated[float, Field(gt=0)]] | None = Field(default=None, max_length=64)
-    """Adds a signal named margin to the rule: how far `when` is from changing. It is positive while `when` is true, and
-    negative while `when` is false. The margin of a comparison is the distance to its threshold; && takes the smaller
-    margin of its two sides, || the larger; ! negates. If `when` compares several quantities, map each signal (or
-    distance, closingSpeed) to the difference that counts as 1. The results of a replay list the ten largest margins
-    without an episode."""
+    """Adds a signal named margin to the rule: the distance of `when` from its next change, positive while `when` is
+    true and negative while it is false. The margin of a comparison is the distance from its threshold; && takes the
+    smaller margin of its two sides, || the larger one, and ! negates. If `when` compares different quantities, give the
+    scale of each signal (or of distance, closingSpeed): the difference that counts as a margin of 1. The results of a
+    replay list the ten largest margins without an episode."""
     until: Expression | None = None
     """CEL, boolean: the condition that ends an open episode. Default: the negation of `when`."""
     for_: Duration = Field(default=Duration("0s"), alias="for")
-    """How long `when` must hold before an episode starts."""
+    """How long `when` must stay true before an episode starts."""
     cooldown: Duration = Duration("0s")
-    """After an episode ends, its subject cannot have a new onset for this time."""
+    """How long after the end of an episode its subject cannot have a new onset."""
     max_episodes_per_hour: int | None = Field(default=None, ge=1, le=1_000_000)
     """The maximum number of episodes per client and hour. Further episodes are skipped and counted. Default: no
     limit."""
     unknown_timeout: Duration | None = None
-    """An open episode ends with reason Unknown after its condition has been unknown for this time. Default: the
-    Detector's clientTimeout."""
+    """How long the condition of an open episode may be unknown. After that, the episode ends with reason Unknown.
+    Default: the Detector's clientTimeout."""
     actions: list[ActionSpec] = Field(default_factory=list, max_length=16, json_schema_extra=map_list("name"))
     """The actions of an episode. Without actions, the rule only publishes events."""
 

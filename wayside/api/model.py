@@ -22,13 +22,13 @@ class ModelWindow(Model):
     """Signals of this rule that read a stream. The input consists of the values of their samples; their aggregates are
     ignored."""
     last: int | None = Field(default=None, ge=1, le=10_000)
-    """The number of newest samples. The signal is unknown while there are fewer."""
+    """The number of newest samples to use. The signal is unknown while there are fewer."""
     over: PositiveDuration | None = None
     """Instead of last: the time span up to now, resampled at `samples` equal steps."""
     samples: int | None = Field(default=None, ge=2, le=10_000)
-    """With over: the number of values; the last one is at the current time. Values between two samples are interpolated
-    linearly; after the newest sample, its value is held. The signal is unknown while no sample is as old as the first
-    step."""
+    """With over: the number of values; the last one is at the current time. Between two samples, values are
+    interpolated linearly; after the newest sample, its value is repeated. The signal is unknown while no sample is as
+    old as the first step."""
 
     @model_validator(mode="after")
     def _complete(self) -> ModelWindow:
@@ -159,9 +159,9 @@ class ModelSource(Model):
     file: FilePath
     """The path of the .onnx file, e.g. on a volume: /models/risk.onnx. Events contain its SHA-256 digest."""
     sha256: str | None = Field(default=None, pattern=r"^[0-9a-f]{64}$", max_length=64)
-    """The expected SHA-256 digest of the file. Any other file is refused."""
+    """The expected SHA-256 digest of the file. A file with another digest is refused."""
     inputs: list[ModelInput] = Field(min_length=1, max_length=16, json_schema_extra=map_list("name"))
-    """The inputs of the model, all of them."""
+    """All inputs of the model."""
     output: TensorName | None = None
     """The output to use as the signal: a number, or a list if it has several values. Default: the only output, or a map
     of all outputs by name."""

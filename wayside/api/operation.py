@@ -15,8 +15,8 @@ class Operation(StrEnum):
 
 MEANING = (
     "Deploy: the application runs while any Deploy task is live. Reconfigure: the parameters replace the merged "
-    "parameters of running instances; nothing is started. Suspend: running instances are stopped, unless a Deploy task "
-    "of higher priority demands them. Reconfigure and Suspend select an instance by the parameters that the template's "
-    "key refers to; without any of these parameters they apply to all instances."
+    "parameters of running instances; nothing is started. Suspend: running instances are stopped, unless a Deploy "
+    "task of higher priority demands them. Reconfigure and Suspend select an instance by the parameters that "
+    "the template's key refers to; without any of these parameters, they apply to all instances."
 )
 """The description of the field `operation`."""

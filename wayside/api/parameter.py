@@ -120,12 +120,12 @@ class Parameter(Model):
     """A regular expression (RE2 syntax) for a string, or for each string of an array. It may match anywhere in the
     string; use ^…$ to match the whole string."""
     enum: list[JsonValue] | None = Field(default=None, min_length=1, max_length=64, json_schema_extra=ATOMIC_LIST)
-    """The allowed values. Not with merge Union, Intersection or Sum, whose results may be other values."""
+    """The allowed values. Not with merge Union, Intersection or Sum, which can produce other values."""
     merge: Merge = Merge.SAME
-    """How the values of several tasks become one. Same: tasks must agree; a task that differs is refused with reason
-    Conflict. Union, Intersection: the items of any array, or of all arrays, sorted. Max, Min, Sum: the maximum, minimum
-    or sum of the numbers. All, Any: true if all, or any, of the booleans are true. HighestPriority: the value of the
-    task with the highest priority."""
+    """How the values of several tasks become one. Same: all tasks must have the same value; a task that differs is
+    refused with reason Conflict. Union: the items that occur in any array, sorted. Intersection: the items that occur
+    in all arrays, sorted. Max, Min, Sum: the maximum, minimum or sum of the numbers. All: true if all booleans are
+    true. Any: true if at least one is true. HighestPriority: the value of the task with the highest priority."""
 
     @model_validator(mode="after")
     def _coherent(self) -> Parameter:

@@ -46,9 +46,10 @@ class Place(Model):
     area: list[Corner] | None = Field(default=None, min_length=3, max_length=1000, json_schema_extra=ATOMIC_LIST)
     """The corners of an area. It is closed automatically, and its edges must not cross."""
     line: list[Corner] | None = Field(default=None, min_length=2, max_length=1000, json_schema_extra=ATOMIC_LIST)
-    """The points of a line, in its direction. With an area: the centreline of the lane, whose surface is the area."""
+    """The points of a line, in its direction. With an area, the place is a lane: the line is its centreline, and the
+    area its surface."""
     width: float | None = Field(default=None, gt=0, le=1000)
-    """The width in metres of a lane. Its centreline is line."""
+    """The width of a lane in metres. The line is its centreline."""
 
 
 class Origin(Model):
@@ -72,7 +73,8 @@ class MapFile(Model):
 
     file: FilePath
     """The path of a GeoJSON file (.geojson, .json) or a lanelet2 map (.osm), as the detector sees it: relative to its
-    working directory, or on a mounted volume. The name of a place is the property or tag `name`, or else the id."""
+    working directory, or on a mounted volume. The name of a place is its property or tag `name`; without one, its
+    id."""
     origin: Origin | None = None
     """The point at which x and y are 0. With it, places are in metres, by projection. Default: places are in degrees
     (WGS 84)."""

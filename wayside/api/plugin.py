@@ -18,7 +18,7 @@ class DataSource(Model):
     name: ObjectName
     """The name by which streams refer to the source."""
     plugin: ObjectName
-    """The plugin: mqtt, bag, or the name of a wayside.sources entry point of an installed package."""
+    """The name of the plugin: mqtt, bag, or an entry point of the group wayside.sources in an installed package."""
     parameters: FreeData = Field(default_factory=dict)
     """The parameters of the plugin; see its documentation."""
 
@@ -27,7 +27,8 @@ class SignalPlugin(Model):
     """A plugin that computes a signal, and its parameters."""
 
     name: ObjectName
-    """The plugin: unmatched-objects, or the name of a wayside.signals entry point of an installed package."""
+    """The name of the plugin: unmatched-objects, or an entry point of the group wayside.signals in an installed
+    package."""
     parameters: FreeData = Field(default_factory=dict)
     """The parameters of the plugin; see its documentation."""
 
@@ -36,11 +37,11 @@ class ActionPlugin(Model):
     """An action of an installed package, and its parameters."""
 
     name: ObjectName
-    """The plugin: the name of a wayside.actions entry point of an installed package."""
+    """The name of the plugin: an entry point of the group wayside.actions in an installed package."""
     parameters: FreeData = Field(default_factory=dict)
     """The parameters of the plugin; see its documentation."""
     values: NamedData = Field(default_factory=dict)
-    """Values that the plugin receives for each episode. They can contain ${…} with the rule's variables, as at the
-    start of the episode."""
+    """Values that the plugin receives for each episode. They can contain ${…} with the rule's variables at the start of
+    the episode."""
     window: Window | None = None
     """The samples that the plugin receives. Default: none."""

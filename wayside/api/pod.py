@@ -277,14 +277,15 @@ class DetectorPod(Model):
     """Fields of the pod's security context, as in a PodSpec, e.g. fsGroup. They override the defaults. The defaults
     meet the restricted Pod Security Standard. Not with mode Sidecar."""
     env: list[DetectorVariable] = Field(default_factory=list, max_length=64, json_schema_extra=map_list("name"))
-    """Environment variables. They are added to those of the manager's option --detector-env, and override them."""
+    """Environment variables, in addition to those of the manager's option --detector-env. On equal names, these here
+    win."""
     volumes: list[DetectorVolume] = Field(default_factory=list, max_length=16, json_schema_extra=map_list("name"))
     """Volumes for volumeMounts."""
     volume_mounts: list[DetectorVolumeMount] = Field(
         default_factory=list, max_length=16, json_schema_extra=map_list("mountPath")
     )
     """The mounts of the volumes, e.g. for the folders of the state, the recordings, the database spool and the database
-    files. A folder outside all mounts gets a volume that is removed with the pod."""
+    files. A folder of the Detector outside all mounts gets a volume that is removed with the pod."""
     secret_names: list[ObjectName] = Field(default_factory=list, max_length=32, json_schema_extra=SET_LIST)
     """The Secrets that rules may use. A Secret that the Detector itself refers to is available to rules only if it is
     listed here as well. Anyone who can write rules can send the contents of these Secrets elsewhere."""

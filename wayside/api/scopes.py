@@ -89,14 +89,14 @@ class PairsScope(Model):
     """CEL over a, b, distance (metres) and closingSpeed (m/s). The rule applies only to pairs for which it is true. An
     open episode ends with reason OutOfScope when it becomes false."""
     a: Role | None = None
-    """Selects the clients that can be a. If a or b is set, pairs are ordered: car1+car2 and car2+car1 are separate
-    subjects if both match."""
+    """Selects the clients that can take role a. If a or b is set, pairs are ordered: car1+car2 and car2+car1 are
+    separate subjects if both match."""
     b: Role | None = None
-    """Selects the clients that can be b. If a or b is set, pairs are ordered: car1+car2 and car2+car1 are separate
-    subjects if both match."""
+    """Selects the clients that can take role b. If a or b is set, pairs are ordered: car1+car2 and car2+car1 are
+    separate subjects if both match."""
     max_pairs: int = Field(default=10_000, ge=1, le=1_000_000)
     """The maximum number of pairs per evaluation. At the limit, the nearest pairs are evaluated; the others are skipped
-    and counted. Pairs with an open episode, or whose condition already holds, are always evaluated."""
+    and counted. A pair with an open episode, or whose `when` is already true, is always evaluated."""
 
 
 class FleetScope(Model):

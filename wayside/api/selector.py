@@ -76,7 +76,7 @@ class LabelSelector(Model):
     """Selects objects by their labels. An object must meet all requirements; an empty selector selects every object."""
 
     match_labels: dict[LabelKey, LabelValue] = Field(default_factory=dict, max_length=16)
-    """The labels that an object must have, all of them."""
+    """The labels that an object must have."""
     match_expressions: list[LabelRequirement] = Field(
         default_factory=list, max_length=16, json_schema_extra=ATOMIC_LIST
     )

@@ -48,9 +48,9 @@ class MessageDefinition(Model):
     name: MessageType
     """The type, e.g. my_package/msg/Track."""
     definition: str = Field(max_length=65_536)
-    """The definition in the format of .msg files. Each type that it refers to needs a definition as well: either its
-    own entry in messages, or a section of this text that begins with a line of = and a line `MSG: <type>`, as `ros2
-    bag` writes it."""
+    """The definition in the format of .msg files. Each type that it refers to also needs a definition: either its own
+    entry in messages, or a section of this text that begins with a line of = characters and a line `MSG: <type>`, as
+    `ros2 bag` writes it."""
 
 
 class Asn1Module(Model):
@@ -69,7 +69,7 @@ class History(Model):
     """How much history to request from publishers. Without limits: all of it."""
 
     samples: int | None = Field(default=None, ge=1, le=100_000)
-    """The maximum number of samples per key; the newest."""
+    """The maximum number of samples per key. The newest samples are requested."""
     age: PositiveDuration | None = None
     """The maximum age of the samples."""
 
@@ -200,14 +200,15 @@ class Stream(Model):
     """Only with source zenoh: request lost samples again. Needs Advanced Publishers with sequence numbers and a cache.
     Samples that cannot be recovered are counted."""
     layout: Layout = Layout.PLAIN
-    """Plain: samples arrive on the key itself, also with zenoh-bridge-ros2dds. RmwZenoh: samples arrive on the keys of
-    rmw_zenoh nodes, which add the domain before the topic, and the type and type hash after it; key is the topic."""
+    """Plain: samples arrive on the key itself, also from zenoh-bridge-ros2dds. RmwZenoh: key is a ROS topic, and
+    samples arrive on the keys of rmw_zenoh nodes, which add the domain before the topic, and the type and type hash
+    after it."""
     domain: int | None = Field(default=None, ge=0, le=232)
     """The ROS domain ID of a stream with layout RmwZenoh. Default: every domain."""
     client: str | None = Field(
         default=None, min_length=1, max_length=512, pattern=r"^([A-Za-z0-9._:-]{1,63}|.*[$][{].*)$"
     )
-    """The client of the samples, if the key does not capture it: a name, or a template over the message such as
+    """The client of the samples, if the key does not capture it: a name, or a template over the message, such as
     its-${msg.header.stationId}. Expressions in the template can use msg, key (the captured chunks) and, with items,
     item."""
     items: Expression | None = None
@@ -223,8 +224,8 @@ class Stream(Model):
     encoding uper: an ETSI ITS message, e.g. etsi/cam. Default: all ETSI ITS messages."""
     stamp: Expression | None = None
     """CEL over msg: the sender's time in seconds since the epoch, e.g. msg.time_ms / 1000; or sample.received, the
-    receive time (t of JSON lines). Default: header.stamp if the type has one, the generation time of an ETSI ITS
-    message, otherwise none."""
+    receive time (in a JSON-lines recording, the field t). Default: header.stamp if the type has one, the generation
+    time of an ETSI ITS message, otherwise none."""
     position: StreamPosition | None = None
     """The position of the client in a sample. Expressions over a sample use it as position, and pairs scopes can refer
     to it."""
@@ -246,8 +247,8 @@ class Stream(Model):
     """If true, the last sample of each key stays valid until replaced, e.g. /tf_static or a map. It is kept beyond the
     buffer's duration, staleAfter defaults to Never, and a replay delivers it first."""
     frame_prefix: str | None = Field(default=None, min_length=1, max_length=128)
-    """Only with type tf2_msgs/msg/TFMessage: a prefix to remove from the names of the frames, so that they are the same
-    for every client. ${client} stands for the client's name, e.g. ${client}/."""
+    """Only with type tf2_msgs/msg/TFMessage: a prefix to remove from the names of the frames, so that every client has
+    the same frame names. ${client} stands for the client's name, e.g. ${client}/."""
 
     @model_validator(mode="after")
     def _coherent(self) -> Stream:

@@ -55,7 +55,7 @@ class Zenoh(Access):
     """If true, publishers on the same machine can pass samples in shared memory. The pods must then share /dev/shm."""
 
     liveliness: Key | None = Field(default=None, json_schema_extra=checked("self.contains('${client:')", _NO_CLIENT))
-    """The key expression of the clients' liveliness tokens, e.g. vehicles/${client:*}. A client with a token is present
+    """The key expression of the clients' liveliness tokens, e.g. vehicles/${client:*}. A client with a token is known
     even if it sends no data. It is lost as soon as its last token disappears."""
 
     @model_validator(mode="after")

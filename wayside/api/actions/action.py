@@ -30,13 +30,13 @@ class ActionSpec(Model):
     record: RecordAction | None = None
     """Records the samples around the episode as rosbag2 with MCAP files."""
     trigger: TriggerAction | None = None
-    """Requests another system to record while the episode lasts."""
+    """Makes another system record while the episode lasts."""
     database: DatabaseAction | None = None
     """Writes the samples around the episode to the Detector's database (MongoDB)."""
     notify: NotifyAction | None = None
     """Sends notifications over HTTP, to an Alertmanager or on a Zenoh key."""
     plugin: ActionPlugin | None = None
-    """Runs an action of an installed package."""
+    """Runs an action plugin of an installed package."""
 
     @property
     def field(self) -> str:

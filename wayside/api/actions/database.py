@@ -29,11 +29,11 @@ class DatabaseAction(Window):
     database: DatabaseName = "wayside"
     """The name of the database on the server."""
     metadata: NamedData = Field(default_factory=dict)
-    """Additional fields of the scenario, such as the driver. Values can contain ${…} with the rule's variables, as at
-    the start of the episode."""
+    """Additional fields of the scenario, such as the driver. Values can contain ${…} with the rule's variables at the
+    start of the episode."""
     renew_after: PositiveDuration | None = None
-    """The scenario is completed after this time, and the episode continues in a new one. Each sample is in exactly one
-    scenario. For rules whose episodes never end. Default: one scenario per episode."""
+    """Completes the scenario after this time and continues in a new one, for rules whose episodes never end. Each
+    sample is in exactly one scenario. Default: one scenario per episode."""
     files: Attachments | None = None
     """Which data is written to files. Default: binary fields above 64Ki if the Detector has database.files, otherwise
     none."""

@@ -16,10 +16,11 @@ class Deploy(Model):
     """The name of the ApplicationTemplate, in the namespace of the rule."""
     operation: Operation = Field(default=Operation.DEPLOY, description=MEANING)
     priority: int = Field(default=0, ge=-1_000_000, le=1_000_000)
-    """The priority of the task; the highest comes first. Ties are ordered by creation time, then by name."""
+    """The priority of the task. Higher priorities come first; among equal priorities, the older task, then the smaller
+    name."""
     parameters: NamedData = Field(default_factory=dict)
-    """The values for the template's parameters. They can contain ${…} with the rule's variables, as at the start of the
+    """The values for the template's parameters. They can contain ${…} with the rule's variables at the start of the
     episode."""
     follow: bool = False
-    """If true, the parameters are computed again at each evaluation while the episode lasts, and the task is patched
-    when they change. A parameter that is unknown or fails keeps its last value."""
+    """If true, each evaluation during the episode computes the parameters again, and patches the task when they change.
+    A parameter that becomes unknown, or whose expression fails, keeps its last value."""

@@ -58,19 +58,19 @@ class NotifyZenoh(Model):
     """A key of the detector's Zenoh session."""
 
     key: str = Field(min_length=1, max_length=255, pattern=r"^[^/*$#?]+(/[^/*$#?]+)*$")
-    """The key on which the event is published, in addition to its own key, e.g. city/alerts."""
+    """The key on which the event is published, e.g. city/alerts, in addition to the usual key of the event."""
 
 
 class Grouping(Model):
     """Groups several events into one message."""
 
     wait: PositiveDuration = PositiveDuration("10s")
-    """How long to collect events after the first one of a group, before the message is sent."""
+    """How long a group collects events after its first one. Then its message is sent."""
     by: list[Identifier] = Field(default_factory=list, max_length=8, json_schema_extra=SET_LIST)
-    """The names of labels. Events with the same values of these labels share a message. Default: all events of the rule
-    share messages."""
+    """The names of labels. Events with the same values of these labels form a group. Default: all events of the rule
+    form one group."""
     maximum: int = Field(default=20, ge=1, le=1000)
-    """The maximum number of events that a message contains in full. All events are counted."""
+    """The maximum number of events that a message contains in full. Further events are only counted."""
 
 
 class Rate(Model):
@@ -109,16 +109,16 @@ class NotifyAction(Model):
     text: Template | None = None
     """The text of the message, or the description of an alert. It can contain ${…}."""
     labels: dict[Identifier, Annotated[str, Field(max_length=1024)]] = Field(default_factory=dict, max_length=32)
-    """Labels by which the receiver can filter or route, such as severity. Values can contain ${…}. An alert has them as
-    its labels."""
+    """Labels by which the receiver can filter or route, such as severity. Values can contain ${…}. They become the
+    labels of an alert."""
     grouping: Grouping | None = None
     """Groups several events into one message. Default: one message per event."""
     rate: Rate | None = None
     """The maximum rate of messages. Default: no limit."""
     waiting: int = Field(default=1000, ge=1, le=100_000)
-    """The maximum number of waiting messages. Further messages become dead letters."""
+    """The maximum number of queued messages. Further messages become dead letters."""
     give_up_after: Duration = Duration("1h")
-    """A message becomes a dead letter after delivery has failed for this time, over several attempts."""
+    """How long to retry the delivery of a message. After that, the message becomes a dead letter."""
 
     @model_validator(mode="after")
     def _groups_by_labels(self) -> NotifyAction:

@@ -36,14 +36,14 @@ class RecordAction(Window):
     templates_in: ClassVar[tuple[str, ...]] = ("metadata",)
 
     compression: Compression = Compression.NONE
-    """The compression of chunks: None, Lz4 (fast) or Zstd (smaller). Readers detect it."""
+    """The compression of the chunks: None, Lz4 (faster) or Zstd (smaller). Readers detect the compression."""
     split: Split = Split()
     """When to continue in a new file. Default: never."""
     renew_after: PositiveDuration | None = None
-    """The recording is completed after this time, and the episode continues in a new one. Each sample is in exactly one
-    recording. For rules whose episodes never end. Default: one recording per episode."""
+    """Completes the recording after this time and continues in a new one, for rules whose episodes never end. Each
+    sample is in exactly one recording. Default: one recording per episode."""
     metadata: FreeData = Field(default_factory=dict)
-    """Additional metadata of the recording. Values can contain ${…} with the rule's variables, as at the start of the
+    """Additional metadata of the recording. Values can contain ${…} with the rule's variables at the start of the
     episode."""
 
     @property

@@ -47,15 +47,15 @@ class TriggerDetector(Model):
     """The holder name of the other detector: the name of the Detector, or <detector>.<pod> for a Sidecar. It can
     contain ${…} with the rule's variables, e.g. recorder.${client}."""
     streams: list[ObjectName] | None = Field(default=None, min_length=1, max_length=128, json_schema_extra=SET_LIST)
-    """The streams of the other detector. Default: all that it records on request."""
+    """The streams of the other detector. Default: all streams that it records on request."""
     clients: WindowClients = WindowClients.ALL
     """All: every client that the other detector knows. Subjects: the clients of the episode."""
     with_clients: list[ClientName] = Field(default_factory=list, max_length=64, json_schema_extra=SET_LIST)
-    """With `clients: Subjects`: additional clients."""
+    """Additional clients. Only with `clients: Subjects`."""
     before: Duration = Duration("0s")
-    """The time from the start of the recording to the onset, as far as the other detector's buffer reaches."""
+    """How long before the onset the recording starts. The buffer of the other detector limits this time."""
     after: Duration = Duration("0s")
-    """The time from the end of the episode to the end of the recording."""
+    """How long after the end of the episode the recording ends."""
 
 
 class ServiceCall(Model):
@@ -66,11 +66,11 @@ class ServiceCall(Model):
     type: ServiceType
     """The type of the service, e.g. rosbag2_interfaces/srv/Resume."""
     definition: str | None = Field(default=None, max_length=16_384)
-    """The definition of the type, in the format of .srv files. Not needed for the services of rosbag2's recorder and of
-    std_srvs (ROS 2 Jazzy)."""
+    """The definition of the type, in the format of .srv files. Not needed for the services of the rosbag2 recorder and
+    of std_srvs (ROS 2 Jazzy)."""
     request: NamedData = Field(default_factory=dict)
-    """The fields of the request. Values can contain ${…} with the rule's variables, as at the start of the episode.
-    Omitted fields are zero or empty."""
+    """The fields of the request. Values can contain ${…} with the rule's variables at the start of the episode. Omitted
+    fields are zero or empty."""
 
 
 class TriggerRos2(Model):
@@ -120,8 +120,8 @@ class HttpCall(Model):
     url: HttpUrl
     """The URL, e.g. https://recorder/recordings/{id}. {id} is replaced with the ID of the recording."""
     body: FreeData | None = None
-    """The JSON body. Values can contain ${…} with the rule's variables, as at the start of the episode. Default: an
-    object with id, do (start or stop), maximumDuration, and event (the CloudEvent of the start)."""
+    """The JSON body. Values can contain ${…} with the rule's variables at the start of the episode. Default: an object
+    with id, do (start or stop), maximumDuration, and event (the CloudEvent of the start)."""
 
     @field_validator("url")
     @classmethod
@@ -153,19 +153,18 @@ class TriggerAction(Model):
     constraints = (exactly_one("detector", "ros2", "http"),)
 
     detector: TriggerDetector | None = None
-    """A recording by another detector."""
+    """Requests a recording from another detector."""
     ros2: TriggerRos2 | None = None
-    """Calls of ROS 2 services, e.g. of rosbag2."""
+    """Calls ROS 2 services, e.g. those of the rosbag2 recorder."""
     http: TriggerHttp | None = None
-    """Requests to an HTTP endpoint."""
+    """Sends requests to an HTTP endpoint."""
     maximum_duration: PositiveDuration = PositiveDuration("10m")
-    """The maximum duration of the recording. The recording ends after this time even without a stop. Another detector
-    enforces the limit itself. For ROS 2 services and HTTP endpoints, this detector sends the stop, and must be running
-    to do so."""
+    """The maximum duration of the recording. Another detector enforces the limit itself. For ROS 2 services and HTTP
+    endpoints, this detector sends the stop when the time is over, and must be running then."""
     give_up_after: PositiveDuration = PositiveDuration("5m")
-    """How long to retry a start or stop that is not confirmed."""
+    """How long to retry a start or stop that the other system does not confirm."""
     timeout: PositiveDuration = PositiveDuration("3s")
-    """The timeout of one reply over Zenoh."""
+    """How long to wait for a reply over Zenoh."""
 
     @property
     def templates(self) -> Mapping[str, JsonValue]:

@@ -20,13 +20,13 @@ class Window(Model):
     """Samples around an episode. Samples of latched streams, such as /tf_static, are always included."""
 
     streams: list[ObjectName] | None = Field(default=None, min_length=1, max_length=128, json_schema_extra=SET_LIST)
-    """The streams. Latched streams are always included. Default: all streams of the Detector."""
+    """The streams to include. Latched streams are always included. Default: all streams of the Detector."""
     clients: WindowClients = WindowClients.SUBJECTS
     """Subjects: the clients of the episode (in a fleet scope: all clients). All: every client."""
     with_clients: list[ClientName] = Field(default_factory=list, max_length=64, json_schema_extra=SET_LIST)
     """Additional clients, such as a roadside unit that observes the scene."""
     before: Duration = Duration("0s")
-    """The time from the start of the window to the onset. This time plus the rule's `for` must not exceed the buffer
+    """How long before the onset the window starts. The sum of this time and the rule's `for` must not exceed the buffer
     duration of the streams."""
     after: Duration = Duration("0s")
-    """The time from the end of the episode to the end of the window."""
+    """How long after the end of the episode the window ends."""
