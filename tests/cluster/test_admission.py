@@ -98,7 +98,7 @@ WRONG: list[tuple[Object, Object, list[str]]] = [
     (
         template("incoherent"),
         {"parameters": {"region": {"type": "string", "required": True, "default": "north"}}},
-        ["spec.parameters.region", "a required parameter has no default"],
+        ["spec.parameters.region", "a required parameter cannot have a default"],
     ),
     (rule("misspelt"), {"when": "distence < 150"}, ["spec.when", "line 1, column 1", "distence", "distance"]),
     (rule("mistyped"), {"until": "distance + 200"}, ["spec.until", "must be a boolean"]),
@@ -114,7 +114,7 @@ WRONG: list[tuple[Object, Object, list[str]]] = [
                 {"name": "a", "deploy": {"templateName": "app", "parameters": {"x": "y" * 40_000, "z": "y" * 30_000}}}
             ]
         },
-        ["spec.actions[0].deploy.parameters", "exceeds the limit of 65536; the largest value is x: shorten it"],
+        ["spec.actions[0].deploy.parameters", "exceeds the limit of 65536: shorten the largest value, x"],
     ),
     (detector(), {"clientTimeout": "30s", "streams": "msg.t +"}, ["spec.streams[0].stamp", "ends too early"]),
 ]

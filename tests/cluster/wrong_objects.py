@@ -25,7 +25,7 @@ WRONG: list[tuple[str, str, Changes, str]] = [
         "EventRule",
         "half a position",
         {f"{PAIRS}.position.y": ABSENT},
-        r"spec\.scope\.pairs\.position: .*give x and y \(and z, if it matters\) in metres, or latitude and longitude",
+        r"spec\.scope\.pairs\.position: .*give x and y \(optionally z\), or latitude and longitude",
     ),
     (
         "EventRule",
@@ -57,14 +57,14 @@ WRONG: list[tuple[str, str, Changes, str]] = [
         "EventRule",
         "evaluation too often",
         {"spec.evaluation.every": "5ms"},
-        r"spec\.evaluation\.every: .*give 10ms or more",
+        r"spec\.evaluation\.every: .*must be 10ms or more",
     ),
     *(
         (
             "EventRule",
             f"evaluation every {zero}",
             {"spec.evaluation.every": zero},
-            r"spec\.evaluation\.every: .*give 10ms or more",
+            r"spec\.evaluation\.every: .*must be 10ms or more",
         )
         for zero in ("0ms", "0s", "0m", "0h")
     ),
@@ -167,7 +167,7 @@ WRONG: list[tuple[str, str, Changes, str]] = [
         "Detector",
         "two clients of one stream",
         {f"{STREAM}.client": "ego"},
-        r"spec\.streams\[0\]\.client: .*key must capture the client.*not both",
+        r"spec\.streams\[0\]\.client: .*either key must capture the client",
     ),
     (
         "Detector",
@@ -292,7 +292,7 @@ WRONG: list[tuple[str, str, Changes, str]] = [
         "ApplicationTemplate",
         "a baseline beside a key",
         {"spec.baseline": {}},
-        r"baseline is only for a template without key",
+        r"baseline is valid only without key",
     ),
     (
         "ApplicationTask",
@@ -301,7 +301,12 @@ WRONG: list[tuple[str, str, Changes, str]] = [
         r'spec\.operation: .*"Deploy", "Reconfigure"',
     ),
     ("ApplicationTemplate", "any of texts", {"spec.parameters.region.merge": "Any"}, r"All and Any need type boolean"),
-    ("ApplicationTemplate", "bounds that exclude all", {f"{PARAMETER}.maximum": 0}, r"minimum is above maximum"),
+    (
+        "ApplicationTemplate",
+        "bounds that exclude all",
+        {f"{PARAMETER}.maximum": 0},
+        r"minimum must not be above maximum",
+    ),
     ("ApplicationTemplate", "a pattern of numbers", {f"{PARAMETER}.pattern": "^a"}, r"pattern needs type string"),
     ("ApplicationTemplate", "items of a number", {f"{PARAMETER}.items": "string"}, r"items needs type array"),
     (
@@ -357,7 +362,7 @@ WRONG: list[tuple[str, str, Changes, str]] = [
 
 TIME = "2026-01-02T03:05:00Z"
 
-_KEY = "Forbidden: is immutable and can be neither added nor removed"
+_KEY = "Forbidden: is immutable, and cannot be added or removed"
 _TASK = "Forbidden: is immutable; only parameters and endTime can change"
 _INSTANCE = "Forbidden: is immutable: delete this instance"
 

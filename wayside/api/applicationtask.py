@@ -163,7 +163,7 @@ class ApplicationTask(Kind):
         ),
         validation(
             "!has(oldSelf.spec.endTime) || (has(self.spec.endTime) && self.spec.endTime == oldSelf.spec.endTime)",
-            "is immutable once set, since an ended demand cannot resume: create another task",
+            "is immutable once set: create another task",
             ".spec.endTime",
             "Forbidden",
         ),

@@ -94,8 +94,8 @@ FileName = Annotated[str, Field(min_length=1, max_length=253, pattern=r"^[-._a-z
 OCI = "oci://"
 
 _FORMS = (
-    "write oci://… with a version, the name of a chart with its repository and version, or the absolute "
-    "path of a folder or archive in the manager's image"
+    "write oci://… with a version, the name of a chart with its repository and version, or the absolute path of a "
+    "folder or archive in the manager's image"
 )
 _VERSION = r"^v?[0-9]+(\.[0-9]+){0,2}(-[0-9A-Za-z.-]+)?(\+[0-9A-Za-z.-]+)?$"
 
@@ -136,11 +136,14 @@ class Helm(Model):
     def _one_place(self) -> Helm:
         if self.chart.startswith("/"):
             if self.version is not None or self.repository is not None:
-                raise ValueError(f"chart {self.chart} is a path, which has neither version nor repository: remove them")
+                raise ValueError(f"chart {self.chart} is a path: remove version and repository")
         elif self.version is None:
             raise ValueError(f"chart {self.chart} needs an exact version: {_FORMS}")
         elif self.chart.startswith(OCI) == (self.repository is not None):
-            raise ValueError(f"the location of chart {self.chart} is unclear: {_FORMS}")
+            problem = (
+                "needs a repository" if self.repository is None else "is an OCI reference, which has no repository"
+            )
+            raise ValueError(f"chart {self.chart} {problem}: {_FORMS}")
         return self
 
 
@@ -151,8 +154,7 @@ class ApplicationTemplateSpec(Model):
         exactly_one("manifests", "helm"),
         constraint(
             "!has(self.baseline) || !has(self.key)",
-            "baseline is only for a template without key, which has one instance: remove baseline or key; with key, "
-            "use a rule with `when: true` to select the instances that always run",
+            "baseline is valid only without key: remove baseline or key; with key, use a rule with `when: true`",
             ".baseline",
             "Forbidden",
             holds=lambda template: template.baseline is None or template.key is None,
@@ -193,9 +195,7 @@ class ApplicationTemplateSpec(Model):
             for field in ("apiVersion", "kind"):
                 value = manifest.get(field)
                 if not isinstance(value, str) or not value:
-                    raise ValueError(
-                        f"manifests[{index}].{field}: is missing: every manifest needs apiVersion and kind"
-                    )
+                    raise ValueError(f"manifests[{index}].{field}: is missing: give it as a string")
                 if "${" in value:
                     raise ValueError(f"manifests[{index}].{field}: {value!r} must be literal, without ${{…}}")
         return manifests
@@ -240,14 +240,14 @@ class ApplicationTemplate(Kind):
     object_validations: ClassVar[list[JsonDict]] = [
         validation(
             "has(self.spec.key) == has(oldSelf.spec.key) && (!has(self.spec.key) || self.spec.key == oldSelf.spec.key)",
-            "is immutable and can be neither added nor removed: create another template",
+            "is immutable, and cannot be added or removed: create another template",
             ".spec.key",
             "Forbidden",
         ),
         validation(
             "!has(self.spec.lifecycle) || !has(self.spec.lifecycle.fallback)"
             " || self.spec.lifecycle.fallback.templateName != self.metadata.name",
-            "is this template itself: name another",
+            "must be another template than this one",
             ".spec.lifecycle.fallback.templateName",
         ),
     ]

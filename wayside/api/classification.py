@@ -209,7 +209,7 @@ class Classification(Model):
     def _once(cls, values: list[CharacteristicValue]) -> list[CharacteristicValue]:
         twice = [value for value in values if values.count(value) > 1]
         if twice:
-            raise ValueError(f"{twice[0].value} is given twice: remove one")
+            raise ValueError(f"{twice[0].value} is given twice: give it once")
         return values
 
     def to_json(self) -> dict[str, Any]:

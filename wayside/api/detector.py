@@ -168,12 +168,12 @@ class DetectorSpec(Model):
             return self
         if self.mode is DetectorMode.SIDECAR and self.pod is not None and (given := self.pod.on_its_own):
             fields = " and ".join(f"pod.{field}" for field in given)
-            raise ValueError(f"{fields} cannot be used with mode Sidecar, which uses an existing pod: remove them")
+            raise ValueError(f"mode Sidecar uses an existing pod: remove {fields}")
         for field, path in self.folders.items():
             if not path.startswith("/") or path.strip("/") == "" or ":" in path or ".." in path.split("/"):
                 raise ValueError(
-                    f"{field}: {path!r} cannot be a volume path: in a pod, use an absolute path without .. and :, "
-                    "such as /var/lib/wayside"
+                    f"{field}: must be an absolute path without .. and :, such as /var/lib/wayside, if the detector "
+                    f"runs in a pod; got {path!r}"
                 )
         return self
 
@@ -196,7 +196,7 @@ class DetectorSpec(Model):
         for name in (allowed.streams or ()) if allowed is not None else ():
             if self.stream(name) is None:
                 there = ", ".join(stream.name for stream in self.streams)
-                raise ValueError(f"recordings.onRequest.streams: there is no stream {name}; the Detector has {there}")
+                raise ValueError(f"recordings.onRequest.streams: the Detector has no stream {name}; it has {there}")
         return self
 
     def stream(self, name: str) -> Stream | None:

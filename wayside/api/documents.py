@@ -33,7 +33,7 @@ MAXIMUM_BYTES = 256 * 1024
 
 _BOUNDED = ("ApplicationTemplate", "Detector", "EventRule")  # tasks and instances have bounds for their parameters
 
-_TOO_DEEP = f"is nested more than {_DEEPEST} levels deep: flatten it; a YAML alias may refer to itself"
+_TOO_DEEP = f"is nested more than {_DEEPEST} levels deep: flatten it, and check for a YAML alias that refers to itself"
 
 _YAML_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
@@ -132,7 +132,7 @@ def parse_object(raw: dict[str, Any]) -> Kind:
             raise ValueError("spec: is nested too deeply: flatten it") from None
         if size > MAXIMUM_BYTES:
             raise ValueError(
-                f"spec: has {size} bytes as JSON; an object of kind {kind.__name__} may have at most {MAXIMUM_BYTES}: "
+                f"spec: must have at most {MAXIMUM_BYTES} bytes as JSON; got {size}: "
                 "move data into files, ConfigMaps or charts"
             )
     try:
@@ -204,7 +204,7 @@ def _document(node: yaml.Node, file: str, problems: list[Problem]) -> Document |
         return None
     try:
         if not isinstance(raw, dict):
-            raise ValueError(f"must be an object; got {raw!r}: each document needs apiVersion, kind, metadata and spec")
+            raise ValueError(f"must be an object with apiVersion, kind, metadata and spec; got {raw!r}")
         kind = _kind_of(raw)
     except ValueError as error:
         problems.append(Problem(file, *_mark(marks, ()), "", str(error)))
@@ -221,8 +221,8 @@ def _kind_of(raw: dict[str, Any]) -> type[Kind]:
     kind = KINDS.get(str(raw.get("kind")))
     if raw.get("apiVersion") != API_VERSION or kind is None:
         raise ValueError(
-            f"apiVersion {raw.get('apiVersion')!r}, kind {raw.get('kind')!r} is not a Wayside kind: "
-            f"write apiVersion: {API_VERSION} and one of the kinds {', '.join(KINDS)}"
+            f"must have apiVersion {API_VERSION} and one of the kinds {', '.join(KINDS)}; "
+            f"got apiVersion {raw.get('apiVersion')!r}, kind {raw.get('kind')!r}"
         )
     return kind
 
@@ -243,7 +243,7 @@ def _value(node: yaml.Node, path: FieldPath, marks: dict[FieldPath, tuple[int, i
         raise _TagError(
             path[:3],
             mark,
-            f"the object has more than {_MOST_FIELDS} fields: remove YAML aliases, which multiply fields",
+            f"the object must have at most {_MOST_FIELDS} fields: remove YAML aliases, which multiply fields",
         )
     if node.tag.startswith("!"):
         written = f"{node.tag} {node.value}".strip() if isinstance(node, yaml.ScalarNode) else node.tag

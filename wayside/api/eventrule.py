@@ -79,12 +79,12 @@ OF_AN_EPISODE = frozenset(
 )  # fmt: skip
 """The aggregates of an open episode: they need no more than a few numbers, however long it lasts."""
 
-_SOURCE = "give exactly one of stream, ruleName, model, plugin and of (aggregate Age with over: Episode needs none)"
+_SOURCE = "give exactly one of stream, ruleName, model, plugin and of (none for aggregate Age with over: Episode)"
 _OF = "a signal with of cannot have value, where, or the aggregates Age and Active: remove them"
 _LAG = "lag needs a signal with of, and is not valid with over: Episode"
 _EPISODE = (
-    f"over: Episode needs one of the aggregates {', '.join(sorted(OF_AN_EPISODE))}; Age must not have of, and all "
-    "others need it"
+    f"over: Episode needs one of the aggregates {', '.join(sorted(OF_AN_EPISODE))}, and of (except with Age, which "
+    "cannot have of)"
 )
 _QUANTILE = "aggregate Quantile needs quantile, e.g. quantile: 0.95; with any other aggregate, remove quantile"
 _CLIENT = "client is valid only with stream or ruleName: remove it"
@@ -97,7 +97,7 @@ class Signal(Model):
     constraints = (
         constraint(
             "self.aggregate in ['Last', 'First', 'Previous', 'Age', 'Active'] || has(self.over)",
-            "all aggregates but Last, First, Previous, Age and Active need a window: give over, e.g. over: 5s",
+            "every aggregate except Last, First, Previous, Age and Active needs a window: give over, e.g. over: 5s",
             ".over",
             "Required",
         ),
@@ -222,7 +222,7 @@ class Signal(Model):
         if self.of is None and self.aggregate not in WITHOUT_VALUE and self.value is None:
             raise ValueError(f"aggregate {self.aggregate} needs a value, e.g. value: msg.speed")
         if self.aggregate in WITHOUT_VALUE and self.value is not None:
-            raise ValueError(f"aggregate {self.aggregate} uses no value: remove value (use where to select samples)")
+            raise ValueError(f"aggregate {self.aggregate} uses no value: remove value (to select samples, use where)")
         return self
 
 
@@ -242,13 +242,15 @@ class Evaluation(Model):
     )
 
     every: Duration | None = Field(
-        default=None, json_schema_extra=checked("duration(self) >= duration('10ms')", "give 10ms or more")
+        default=None, json_schema_extra=checked("duration(self) >= duration('10ms')", "must be 10ms or more")
     )
     """The period at whose whole multiples the rule is evaluated, 10ms or more. Default: 1s."""
     on_sample: ObjectName | None = None
     """The stream at whose samples the rule is evaluated, for the subjects of the sample's client. The rule is also
     evaluated whenever a `for`, a cooldown or an unknownTimeout expires."""
-    on_demand: bool | None = Field(default=None, json_schema_extra=checked("self", "write true, or leave it out"))
+    on_demand: bool | None = Field(
+        default=None, json_schema_extra=checked("self", "must be true: remove it, or set it to true")
+    )
     """If true, the rule is evaluated only on request."""
     priority: int = Field(default=0, ge=-1_000, le=1_000)
     """Under overload, the detector evaluates rules of lower priority less often, the lowest first."""
@@ -265,7 +267,7 @@ class Evaluation(Model):
         if self.every is not None and self.every.ns < 10_000_000:
             raise ValueError(f"every: must be 10ms or more; got {self.every}")
         if self.on_demand is False:
-            raise ValueError("onDemand: write true, or leave it out")
+            raise ValueError("onDemand: must be true; got false: remove it")
         return self
 
 

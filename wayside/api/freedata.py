@@ -59,8 +59,8 @@ def of_bounded_size(data: dict[str, Any]) -> dict[str, Any]:
     if total > MAXIMUM_BYTES:
         name = max(data, key=lambda each: size({each: data[each]}))
         raise ValueError(
-            f"the total size of {total} bytes as JSON exceeds the limit of {MAXIMUM_BYTES}; the largest value is "
-            f"{name}: shorten it, or refer to a file"
+            f"the total size of {total} bytes as JSON exceeds the limit of {MAXIMUM_BYTES}: "
+            f"shorten the largest value, {name}, or refer to a file"
         )
     return data
 
@@ -87,7 +87,7 @@ def _depth(value: object) -> int:
 
 def _check_depth(name: str, value: object, levels: int) -> None:
     if isinstance(value, float) and not math.isfinite(value):
-        raise ValueError(f"{name} is {value}: give a finite number")
+        raise ValueError(f"{name} must be a finite number; got {value}")
     if isinstance(value, list | dict):
         if levels == 0 and value:
             raise ValueError(f"{name} is nested more than {MAXIMUM_DEPTH} levels deep: flatten it")

@@ -33,9 +33,9 @@ class ModelWindow(Model):
     @model_validator(mode="after")
     def _complete(self) -> ModelWindow:
         if (self.last is None) == (self.over is None):
-            raise ValueError("give exactly one of last and over (with samples)")
+            raise ValueError("give exactly one of last and over")
         if (self.over is None) != (self.samples is None):
-            raise ValueError("over and samples go together: give both, e.g. over: 5s and samples: 50")
+            raise ValueError("over needs samples, and samples needs over: give both, e.g. over: 5s and samples: 50")
         return self
 
     @property
@@ -83,7 +83,7 @@ class ModelImage(Model):
     def _one_for_each_channel(self) -> ModelImage:
         for name, values in (("mean", self.mean), ("std", self.std)):
             if values and len(values) != self.depth:
-                raise ValueError(f"{name}: {len(values)} values for {self.depth} channels: give one for each")
+                raise ValueError(f"{name}: must have one value per channel, {self.depth} in total; got {len(values)}")
         return self
 
     @property
@@ -110,9 +110,11 @@ class ModelPoints(Model):
     @model_validator(mode="after")
     def _one_for_each_field(self) -> ModelPoints:
         if len(set(self.fields)) < len(self.fields):
-            raise ValueError("fields: give each once")
+            raise ValueError("fields: a field is given twice: give it once")
         if self.scale and len(self.scale) != len(self.fields):
-            raise ValueError(f"scale: {len(self.scale)} values for {len(self.fields)} fields: give one for each")
+            raise ValueError(
+                f"scale: must have one value per field, {len(self.fields)} in total; got {len(self.scale)}"
+            )
         return self
 
 

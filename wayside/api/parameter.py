@@ -89,7 +89,7 @@ class Parameter(Model):
         ),
         constraint(
             "!has(self.minimum) || !has(self.maximum) || self.minimum <= self.maximum",
-            "minimum is above maximum: no value is valid",
+            "minimum must not be above maximum",
             ".minimum",
         ),
         constraint("!has(self.items) || self.type == 'array'", "items needs type array", ".items"),
@@ -136,22 +136,22 @@ class Parameter(Model):
     def _incoherences(self) -> Iterator[str]:
         fitting = _FITTING.get(self.merge, tuple(ParameterType))
         if self.type not in fitting:
-            yield f"merge {self.merge} needs type {' or '.join(fitting)}, not {self.type}"
+            yield f"merge {self.merge} needs type {' or '.join(fitting)}; got {self.type}"
         if self.type not in _NUMERIC and (self.minimum is not None or self.maximum is not None):
-            yield f"minimum and maximum need type number or integer, not {self.type}"
+            yield f"minimum and maximum need type number or integer; got {self.type}"
         if self.minimum is not None and self.maximum is not None and self.minimum > self.maximum:
-            yield f"minimum {self.minimum:g} is above maximum {self.maximum:g}: no value is valid"
+            yield f"minimum must not be above maximum {self.maximum:g}; got {self.minimum:g}"
         if self.items is not None and self.type is not ParameterType.ARRAY:
-            yield f"items needs type array, not {self.type}"
+            yield f"items needs type array; got {self.type}"
         if self.pattern is not None and self.type is not ParameterType.STRING and self.items is not ItemType.STRING:
-            yield f"pattern needs type string, or type array with items string, not {self.type}"
+            yield f"pattern needs type string, or type array with items string; got {self.type}"
         if self.enum is not None and self.merge in _MAKING:
-            yield f"merge {self.merge} can produce values that enum does not list: remove one of merge and enum"
+            yield f"merge {self.merge} can produce values that enum does not list: remove merge or enum"
         for index, value in enumerate(self.enum or ()):
             if not _has_type(value, self.type):
-                yield f"enum: item {index}, {value!r}, is not of type {self.type}"
+                yield f"enum[{index}]: {value!r} is not of type {self.type}"
         if self.required and self.default is not None:
-            yield "a required parameter has no default: remove one of required and default"
+            yield "a required parameter cannot have a default: remove required or default"
         if self.default is not None:
             problem = self.problem(self.default)
             if problem:

@@ -113,15 +113,17 @@ class DetectorResources(Model):
             for name in amounts:
                 if name not in _RESOURCES and "/" not in name:
                     raise ValueError(
-                        f"{field}: {name!r} is not a resource: use {', '.join(_RESOURCES)}, or an extended resource, "
-                        "such as example.com/gpu"
+                        f"{field}: must be {', '.join(_RESOURCES)} or an extended resource, such as example.com/gpu; "
+                        f"got {name!r}"
                     )
         for name, amount in self.requests.items():
             limit = self.limits.get(name)
             if limit is not None and amount.value > limit.value:
-                raise ValueError(f"requests.{name}: {amount} is more than limits.{name}, {limit}: raise the limit")
+                raise ValueError(f"requests.{name}: must be at most limits.{name}, {limit}; got {amount}")
             if "/" in name and (limit is None or amount.value != limit.value):
-                raise ValueError(f"requests.{name}: {amount} must equal limits.{name}: set both to the same amount")
+                raise ValueError(
+                    f"requests.{name}: must equal limits.{name}; got {amount}: set both to the same amount"
+                )
         return self
 
 
@@ -221,7 +223,7 @@ class DetectorToleration(Model):
         constraint(
             "(has(self.key) || (has(self.operator) && self.operator == 'Exists')) && "
             "!(has(self.value) && has(self.operator) && self.operator == 'Exists')",
-            "without key, operator must be Exists; with operator Exists, remove value",
+            "without key, operator must be Exists; with operator Exists, value must be absent",
             ".operator",
             holds=lambda toleration: (
                 toleration.value is None if toleration.operator == "Exists" else toleration.key is not None
@@ -295,7 +297,9 @@ class DetectorPod(Model):
         volumes = {each.name for each in self.volumes}
         for mount in self.volume_mounts:
             if mount.name not in volumes:
-                raise ValueError(f"volumeMounts: {mount.mount_path}: volumes has no {mount.name}: add it")
+                raise ValueError(
+                    f"volumeMounts: {mount.mount_path}: there is no volume {mount.name}: add it to volumes"
+                )
         return self
 
     @property

@@ -26,7 +26,7 @@ class Position(Model):
         constraint(
             "has(self.x) == has(self.y) && has(self.latitude) == has(self.longitude)"
             " && !(has(self.x) && has(self.latitude)) && (!has(self.z) || has(self.x))",
-            "give x and y (and z, if it matters) in metres, or latitude and longitude in degrees",
+            "give x and y (optionally z), or latitude and longitude",
             holds=lambda position: (
                 {axis for axis in ("x", "y", "z", "latitude", "longitude") if getattr(position, axis) is not None}
                 in (set(), {"x", "y"}, {"x", "y", "z"}, {"latitude", "longitude"})

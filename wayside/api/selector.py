@@ -35,7 +35,7 @@ class LabelRequirement(Model):
     constraints = (
         constraint(
             "(self.operator in ['In', 'NotIn']) == (has(self.values) && self.values.size() > 0)",
-            "operators In and NotIn need values; Exists and DoesNotExist have none",
+            "operators In and NotIn need values; with Exists and DoesNotExist, remove values",
             ".values",
             holds=lambda required: (required.operator in ("In", "NotIn")) == bool(required.values),
         ),

@@ -93,7 +93,7 @@ class StreamPosition(Model):
             "has(self.x) == has(self.y) && has(self.latitude) == has(self.longitude)"
             " && has(self.x) != has(self.latitude)"
             " && (has(self.x) || !(has(self.z) || has(self.yaw))) && (has(self.latitude) || !has(self.heading))",
-            "give x and y (and z, yaw) in metres and radians, or latitude and longitude (and heading) in degrees",
+            "give x and y (optionally z and yaw), or latitude and longitude (optionally heading)",
             holds=lambda position: any(
                 needed <= position.axes.keys() - {"speed"} <= {*needed, *further}
                 for needed, further in (({"x", "y"}, ("z", "yaw")), ({"latitude", "longitude"}, ("heading",)))
@@ -148,12 +148,12 @@ class Stream(Model):
         ),
         constraint(
             "self.key.contains('${client:') != has(self.client)",
-            "key must capture the client, as ${client:*}, or client must name it; not both",
+            "either key must capture the client with ${client:*}, or client must name it",
             ".client",
         ),
         constraint(
             "!has(self.framePrefix) || (has(self.type) && self.type == 'tf2_msgs/msg/TFMessage')",
-            "framePrefix is valid only for streams of type tf2_msgs/msg/TFMessage",
+            "framePrefix is valid only for streams of type tf2_msgs/msg/TFMessage: remove it",
             ".framePrefix",
             "Forbidden",
         ),
@@ -164,7 +164,7 @@ class Stream(Model):
         ),
         constraint(
             "self.layout != 'RmwZenoh' || self.source == 'zenoh'",
-            "layout RmwZenoh needs source zenoh: remove one of them",
+            "layout RmwZenoh needs source zenoh: remove layout or source",
             ".layout",
         ),
         constraint(
@@ -253,26 +253,30 @@ class Stream(Model):
     @model_validator(mode="after")
     def _coherent(self) -> Stream:
         if self.encoding is Encoding.CDR and self.type is None:
-            raise ValueError("a cdr stream needs its message type: give type, e.g. geometry_msgs/msg/PoseStamped")
+            raise ValueError("type is required with encoding cdr: add it, e.g. geometry_msgs/msg/PoseStamped")
         if self.encoding not in (Encoding.CDR, Encoding.UPER) and self.type is not None:
-            raise ValueError(f"a {self.encoding} stream has no type: remove it")
+            raise ValueError(f"type is not allowed with encoding {self.encoding}: remove it")
         if self.layout is Layout.RMW_ZENOH and self.encoding not in (Encoding.CDR, Encoding.RAW):
             raise ValueError(
                 f"layout RmwZenoh needs ROS 2 messages: encoding must be cdr or raw; got {self.encoding}: "
-                "correct encoding, or remove layout"
+                "change encoding, or remove layout"
             )
         if self.layout is Layout.RMW_ZENOH and self.source != ZENOH:
-            raise ValueError(f"layout RmwZenoh needs source zenoh, not {self.source}: remove one of them")
+            raise ValueError(f"layout RmwZenoh needs source zenoh; got {self.source}: remove layout or source")
         if self.domain is not None and self.layout is not Layout.RMW_ZENOH:
             raise ValueError("domain is valid only with layout RmwZenoh: remove it")
         if self.type is not None and (self.encoding is Encoding.UPER) != self.type.startswith("etsi/"):
             example = "etsi/cam" if self.encoding is Encoding.UPER else "geometry_msgs/msg/PoseStamped"
-            raise ValueError(f"{self.type} is not a message type of {self.encoding} streams: use one such as {example}")
+            raise ValueError(
+                f"type must be a message type of {self.encoding} streams, such as {example}; got {self.type}"
+            )
         captures = "${client:" in self.key
         if captures and self.client is not None:
-            raise ValueError("key captures the client and client names one: remove one of them")
+            raise ValueError("key captures the client, and client names one: remove the capture or client")
         if not captures and self.client is None:
-            raise ValueError("key does not capture the client: write ${client:*} in place of its name, or set client")
+            raise ValueError(
+                "key does not capture the client: replace the client's name in key with ${client:*}, or set client"
+            )
         if self.items is not None:
             self._check_items()
         if self.frame_prefix is not None and not self.carries_transforms:
@@ -281,7 +285,7 @@ class Stream(Model):
             try:
                 PositiveDuration.parse(self.stale_after)
             except ValueError as error:
-                raise ValueError(f"staleAfter: {error}: give a duration, or Never") from None
+                raise ValueError(f"staleAfter: {error}, or write Never") from None
         return self
 
     def _check_items(self) -> None:

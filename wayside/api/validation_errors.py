@@ -19,10 +19,10 @@ _PATTERNS = {
     r"^[A-Za-z0-9._:-]+$": "letters, digits and . _ : -",
     r"^[A-Za-z_][A-Za-z0-9_]*$": "letters, digits and _, not beginning with a digit",
     r"^[A-Za-z][A-Za-z0-9_]*/msg/[A-Za-z][A-Za-z0-9_]*$": "package/msg/Type, e.g. geometry_msgs/msg/PoseStamped",
-    r"^https?://[^\s/?#@\\]+([/?][^\s#]*)?$": "like https://host:port/path, without # and without a user and password "
-    "before the host (give credentialsSecretName)",
+    r"^https?://[^\s/?#@\\]+([/?][^\s#]*)?$": "a URL such as https://host:port/path, without # and without credentials "
+    "(for these, use credentialsSecretName)",
     r"^[^/*$#?]+(/[^/*$#?]+)*$": "a Zenoh key without wildcards, e.g. city/alerts",
-    r"^WAYSIDE_[A-Z0-9_]+$": "a name that begins with WAYSIDE_, in capitals: rules cannot use other variables",
+    r"^WAYSIDE_[A-Z0-9_]+$": "a name in capitals that begins with WAYSIDE_, since rules cannot use other variables",
     r"^([-a-z0-9.]{1,253}/)?[A-Za-z0-9]([-_.A-Za-z0-9]*[A-Za-z0-9])?$": "a label's key, e.g. site or example.com/site",
     r"^([A-Za-z0-9]([-_.A-Za-z0-9]*[A-Za-z0-9])?)?$": "a label's value: up to 63 letters, digits, - _ . with a letter "
     "or digit at both ends",
@@ -81,9 +81,9 @@ def _message(item: ErrorDetails) -> str:
             return "is empty: give it a value, or remove it"
         case "string_type" if isinstance(given, bool | int | float):
             written = str(given).lower() if isinstance(given, bool) else str(given)
-            return f"must be a string; got {written}: put it in quotes, e.g. '{written}'"
+            return f"must be a string; got {written}: put it in quotes, as in '{written}'"
         case "string_type":
-            return f"must be a string; got {_short(given)}: quote it as a whole"
+            return f"must be a string; got {_short(given)}: put the whole value in quotes"
         case "bool_type" | "bool_parsing":
             return f"must be true or false; got {_short(given)}"
         case "model_type" | "model_attributes_type" | "dict_type":

@@ -352,16 +352,19 @@ def test_pods_that_are_over_are_no_trouble() -> None:
         ({"mode": None}, "serviceAccountNames has no effect without mode Sidecar"),
         (
             {"pod": {"nodeSelector": {"a": "b"}, "securityContext": {"fsGroup": 1}}},
-            "pod.nodeSelector and pod.securityContext cannot be used with mode Sidecar",
+            "mode Sidecar uses an existing pod: remove pod.nodeSelector and pod.securityContext",
         ),
         ({"serviceAccountNames": ["a", "a"]}, "serviceAccountNames: a is given twice"),
-        ({"state": {"path": "state"}}, "state.path: 'state' cannot be a volume path"),
+        ({"state": {"path": "state"}}, "state.path: must be an absolute path"),
         (
             {"pod": {"resources": {"requests": {"memory": "2Gi"}}}},
-            "requests.memory: 2Gi is more than limits.memory, 1Gi",
+            "requests.memory: must be at most limits.memory, 1Gi; got 2Gi",
         ),
-        ({"pod": {"resources": {"requests": {"x": "1"}}}}, "requests: 'x' is not a resource"),
-        ({"pod": {"resources": {"requests": {"a.b/gpu": "1"}}}}, "requests.a.b/gpu: 1 must equal limits"),
+        (
+            {"pod": {"resources": {"requests": {"x": "1"}}}},
+            "requests: must be cpu, memory, ephemeral-storage or an extended resource",
+        ),
+        ({"pod": {"resources": {"requests": {"a.b/gpu": "1"}}}}, "requests.a.b/gpu: must equal limits.a.b/gpu; got 1"),
     ],
 )
 def test_what_makes_no_sense_is_refused_by_its_field(spec: Json, logged: str) -> None:

@@ -61,5 +61,5 @@ def test_the_guides_example_is_a_classification() -> None:
 
 
 def test_a_value_that_is_given_twice_is_refused() -> None:
-    with pytest.raises(ValidationError, match="Rare is given twice: remove one"):
+    with pytest.raises(ValidationError, match="Rare is given twice: give it once"):
         Classification.model_validate({"incidence": ["Rare", "Common", "Rare"]})

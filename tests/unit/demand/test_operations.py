@@ -224,7 +224,7 @@ def test_a_baseline_that_does_not_fit_is_reported_to_the_template_and_one_beside
     with pytest.raises(RenderError, match=r"spec\.baseline\.parameters\.rateHz: 99 is above the maximum of 50"):
         Renderer(template(**with_baseline(rateHz=99)), Policy())
     assert of(spec=with_baseline(rateHz=99)).instances == {}
-    with pytest.raises(ValidationError, match="baseline is only for a template without key"):
+    with pytest.raises(ValidationError, match="baseline is valid only without key"):
         template(**{**FUSION, "baseline": {}})
 
 

@@ -143,9 +143,9 @@ def test_a_wrong_expression_in_the_values_is_found_when_the_template_is_compiled
     ("helm", "problem"),
     [
         ({"chart": "oci://registry.example/app"}, "needs an exact version"),
-        ({"chart": "app", "version": "1.0.0"}, "is unclear"),
-        ({"chart": "oci://r/app", "version": "1.0.0", "repository": "https://x"}, "is unclear"),
-        ({"chart": "/charts/app", "version": "1.0.0"}, "neither version nor repository"),
+        ({"chart": "app", "version": "1.0.0"}, "chart app needs a repository"),
+        ({"chart": "oci://r/app", "version": "1.0.0", "repository": "https://x"}, "an OCI reference"),
+        ({"chart": "/charts/app", "version": "1.0.0"}, "is a path: remove version and repository"),
         ({"chart": "app", "version": "^1", "repository": "https://x"}, "version"),
         ({"chart": "--post-renderer", "version": "1.0.0", "repository": "https://x"}, "chart"),
     ],

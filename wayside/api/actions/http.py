@@ -72,7 +72,7 @@ class HttpAccess(Model):
     def _unique_headers(self) -> HttpAccess:
         names = [header.name.lower() for header in self.headers]
         if len(set(names)) < len(names):
-            raise ValueError("headers: give each name only once (names are case-insensitive)")
+            raise ValueError("headers: a name is used twice (names are case-insensitive): names must be unique")
         return self
 
     @property

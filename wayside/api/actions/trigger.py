@@ -35,7 +35,7 @@ ServiceType = Annotated[
 
 _ANY_CALL = constraint(
     "has(self.start) || has(self.stop)",
-    "give start, stop or both: otherwise nothing is called",
+    "give start, stop or both",
     holds=lambda trigger: trigger.start is not None or trigger.stop is not None,
 )
 
@@ -127,7 +127,9 @@ class HttpCall(Model):
     @classmethod
     def _fixed(cls, url: str) -> str:
         if "${" in url:
-            raise ValueError("must not contain ${…}, which could change the target: use {id}, and put values into body")
+            raise ValueError(
+                "must not contain ${…}, which could change the target: use {id}, or move the values to body"
+            )
         return url
 
 
