@@ -12,7 +12,17 @@ from application_manager.core.objects.ownership import controller_of
 from application_manager.core.objects.poddefaults import PodDefaults
 from application_manager.core.objects.policy import Name
 from application_manager.core.objects.sidecars import SIDECAR_LABEL
+from wayside.api import Detector
 from wayside.kubernetes.resources import Object
+
+
+@dataclass(frozen=True, slots=True)
+class Processed:
+    """The condition Running of one generation of a Detector."""
+
+    uid: str
+    generation: int
+    running: ConditionState
 
 
 @dataclass
@@ -24,13 +34,13 @@ class DetectorIndex:
 
     Attributes:
         defaults: what holds for all pods; None: no detector is run.
-        running: the condition Running.
+        processed: the condition Running, and the version of the Detector that it is about.
         requesting: the pods that request it as a sidecar.
     """
 
     defaults: PodDefaults | None = None
     objects: dict[str, dict[str, Object]] = field(default_factory=dict)
-    running: dict[Name, ConditionState] = field(default_factory=dict)
+    processed: dict[Name, Processed] = field(default_factory=dict)
     requesting: dict[Name, list[Object]] = field(default_factory=dict)
     _troubles: dict[Name, list[Trouble]] = field(default_factory=dict)
 
@@ -52,6 +62,14 @@ class DetectorIndex:
         for pod in requesting:
             self.requesting.setdefault(_detector_of(pod, SIDECAR_LABEL), []).append(pod)
         self._troubles = {name: summary(troubles) for name, troubles in found.items()}
+
+    def running(self, detector: Detector) -> ConditionState | None:
+        """The condition Running of this generation of the Detector; None where it was not processed yet."""
+        known = self.processed.get((detector.namespace, detector.name))
+        metadata = detector.metadata
+        if known is None or (known.uid, known.generation) != (metadata.uid, metadata.generation):
+            return None
+        return known.running
 
     def owned(self, uid: str) -> dict[str, Object]:
         """The objects that the Detector of this uid controls, by kind; what is added stays until the next look."""

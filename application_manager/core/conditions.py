@@ -8,7 +8,7 @@ there only while waiting alone helps nothing.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from wayside.api.base import Condition
@@ -19,17 +19,18 @@ MAXIMUM_MESSAGE = 4096  # characters, as the CRDs allow
 
 @dataclass(frozen=True, slots=True)
 class ConditionState:
-    """What a condition should be now."""
+    """What a condition should be now; `unknown`: whether it holds is not known yet."""
 
     type: str
     holds: bool
     reason: str
     message: str = ""
+    unknown: bool = False
 
     @property
     def status(self) -> str:
         """The condition's status."""
-        return "True" if self.holds else "False"
+        return "Unknown" if self.unknown else str(self.holds)
 
 
 def updated(
@@ -116,14 +117,14 @@ def concluded(
 ) -> list[Condition]:
     """The conditions updated with at least one state, and Ready and Stalled, which follow from them.
 
-    The object is ready if all states hold. `now` in seconds since 1970; `stalled`: the reasons that somebody has to
-    correct the object for.
+    The object is ready if all states hold; otherwise Ready follows the first that does not.
+    `now` in seconds since 1970; `stalled`: the reasons that somebody has to correct the object for.
     """
     failing = next((each for each in states if not each.holds), None)
     if failing is None:
         follow = [ConditionState(READY, True, READY, states[-1].message)]
     else:
-        follow = [ConditionState(READY, False, failing.reason, failing.message)]
+        follow = [replace(failing, type=READY)]
         if failing.reason in stalled:
             follow.append(ConditionState(STALLED, True, failing.reason, failing.message))
     return updated(known, [*states, *follow], generation, now, only_while=(STALLED,))

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
 from application_manager.cache.cluster_cache import DETECTOR, ClusterCache
-from application_manager.cache.detector_index import DetectorIndex
+from application_manager.cache.detector_index import DetectorIndex, Processed
 from application_manager.core.conditions import ConditionState
 from application_manager.core.findings.injections import injection
 from application_manager.core.findings.rulefindings import detector_findings
@@ -70,23 +70,20 @@ class DetectorWork:
         entry = self.cache.store.get(DETECTOR, name)
         self._report(name)
         if entry is None:
-            self.index.running.pop(name, None)
+            self.index.processed.pop(name, None)
             return
         if not isinstance(entry.model, Detector) or entry.raw["metadata"].get("deletionTimestamp"):
             return  # what is there stays, until the Detector can be read again or is gone
         detector = entry.model
         if detector.spec.mode is None:
-            state = None
             await self._remove(name, entry.uid, self.index.owned(entry.uid))
-        else:
-            state = await self._make(name, detector)
-        if self.index.running.get(name) == state:
+            self.index.processed.pop(name, None)
             return
-        if state is None:
-            del self.index.running[name]
-        else:
-            self.index.running[name] = state
-        self.judge(name)
+        running = await self._make(name, detector)
+        processed = Processed(entry.uid, detector.metadata.generation, running)
+        if self.index.processed.get(name) != processed:
+            self.index.processed[name] = processed
+            self.judge(name)
 
     async def _make(self, name: Name, detector: Detector) -> ConditionState:
         if self.index.defaults is None:

@@ -70,7 +70,10 @@ class RuleWork:
         else:
             old, reason, what = DetectorStatus.model_validate(written), DETECTOR_INVALID, "detector"
             if isinstance(entry.model, Detector):
-                rules, running = self.cache.models(EVENT_RULE, EventRule, namespace), self.detectors.running.get(name)
+                rules, running = (
+                    self.cache.models(EVENT_RULE, EventRule, namespace),
+                    self.detectors.running(entry.model),
+                )
                 job = partial(detector_status, entry.model, rules, now, running)
         problem = entry.problem
         if job is not None:

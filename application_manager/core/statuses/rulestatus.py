@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from application_manager.core.conditions import ConditionState, concluded
+from application_manager.core.conditions import ConditionState, concluded, find
 from application_manager.core.findings.findings import Findings
 from application_manager.core.findings.rulefindings import detector_findings, rule_findings, selecting, selects
 from application_manager.core.health.pods import Trouble, summary, trouble
@@ -44,6 +44,11 @@ NOT_ACCEPTED = ConditionState(
     RUNNING, False, "NotAccepted", "no objects are created for a Detector that is not accepted"
 )
 """The condition of a Detector that cannot run and was never made."""
+
+_NOT_PROCESSED = ConditionState(
+    RUNNING, False, "Pending", "the manager has not processed this generation yet", unknown=True
+)
+"""The condition of a Detector whose objects were not looked at since it changed."""
 
 _NAMES_LISTED = 5  # in a column of a table
 
@@ -84,20 +89,27 @@ def detector_status(
 ) -> DetectorStatus:
     """The detector's status, given the rules of its namespace; `now` in seconds since 1970.
 
-    `running`: whether it runs, where the manager runs it and knows.
+    `running`: whether this generation of it runs, with a mode; None where the manager has not looked since its start.
     """
     old = detector.status or DetectorStatus()
-    states = [
-        _accepted(detector_findings(detector), DETECTOR_INVALID),
-        *([] if running is None else [running]),
-    ]
-    kept = [each for each in old.conditions if detector.spec.mode is not None or each.type != RUNNING]
     generation = detector.metadata.generation
+    states = [_accepted(detector_findings(detector), DETECTOR_INVALID)]
+    if detector.spec.mode is not None:
+        states.append(running or _known_running(old, generation))
+    kept = [each for each in old.conditions if detector.spec.mode is not None or each.type != RUNNING]
     return DetectorStatus(
         observed_generation=generation,
         rules=sum(1 for each in rules if selects(detector, each)),
         conditions=concluded(kept, states, generation, now, stalled=(DETECTOR_INVALID,)),
     )
+
+
+def _known_running(status: DetectorStatus, generation: int) -> ConditionState:
+    """Whether this generation of the detector runs, as its status has it."""
+    known = find(status.conditions, RUNNING)
+    if known is None or known.observed_generation != generation or known.status == "Unknown":
+        return _NOT_PROCESSED
+    return ConditionState(RUNNING, known.status == "True", known.reason, known.message)
 
 
 def unreadable_status(status: Status, reason: str, problem: str, generation: int, now: float) -> Status:
@@ -137,6 +149,8 @@ def carried(detector: Detector, pods: Sequence[Mapping[str, Any]]) -> ConditionS
         )
     missing = len(pods) - len(sidecars)
     but = f"; {missing} were created without it: their Events report why" if missing else ""
+    if sidecars and not running:
+        return ConditionState(RUNNING, False, "NotReady", f"it runs in 0 {of}{but}")
     return ConditionState(RUNNING, True, "InPods", f"it runs in {running} {of}{but}")
 
 

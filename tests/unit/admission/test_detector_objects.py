@@ -11,6 +11,7 @@ import yaml
 from pydantic import ValidationError
 from typer.testing import CliRunner
 
+from application_manager.cache.detector_index import DetectorIndex, Processed
 from application_manager.cli import app
 from application_manager.commands.options import PullPolicy
 from application_manager.core.conditions import find
@@ -23,6 +24,7 @@ from tests.cluster.manifests import DETECTOR
 from tests.guides import guide, yaml_blocks
 from tests.unit.manager_objects import NOW
 from wayside.api import Detector
+from wayside.api.detector import DetectorStatus
 
 IMAGE = "wayside:1"
 ON_A_CLAIM = {
@@ -295,6 +297,35 @@ def test_the_condition_goes_with_the_mode() -> None:
     assert find(detector_status(without, [], NOW).conditions, "Running") is None
     unknown_yet = detector().model_copy(update={"status": logged})
     assert find(detector_status(unknown_yet, [], NOW).conditions, "Running") == condition
+
+
+def readiness(status: DetectorStatus) -> dict[str, tuple[str, str]]:
+    return {each.type: (each.status, each.reason) for each in status.conditions if each.type != "Accepted"}
+
+
+def test_a_detector_is_not_ready_before_this_generation_of_it_was_processed() -> None:
+    pending = {"Running": ("Unknown", "Pending"), "Ready": ("Unknown", "Pending")}
+    assert readiness(detector_status(detector(), [], NOW)) == pending
+    runs = running(deployment(1), [])
+    ready = detector_status(detector(), [], NOW, runs)
+    assert readiness(ready) == {"Running": ("True", "Running"), "Ready": ("True", "Ready")}
+    restarted = detector().model_copy(update={"status": ready})
+    assert readiness(detector_status(restarted, [], NOW)) == readiness(ready)
+
+    metadata = restarted.metadata.model_copy(update={"generation": 2})
+    changed = restarted.model_copy(update={"metadata": metadata})
+    assert readiness(detector_status(changed, [], NOW)) == pending
+    index = DetectorIndex(processed={("site", changed.name): Processed("u-1", 1, runs)})
+    assert index.running(restarted) == runs
+    assert index.running(changed) is None
+    namesake = changed.metadata.model_copy(update={"uid": "u-2", "generation": 1})
+    assert index.running(changed.model_copy(update={"metadata": namesake})) is None
+
+
+def test_a_restarted_manager_keeps_that_a_detector_does_not_run() -> None:
+    pulled = running(deployment(0), [Trouble(TroubleReason.IMAGE_PULL_FAILED, "cannot pull image x: not found")])
+    failing = detector().model_copy(update={"status": detector_status(detector(), [], NOW, pulled)})
+    assert readiness(detector_status(failing, [], NOW))["Ready"] == ("False", "ImagePullFailed")
 
 
 def test_the_guide_shows_a_detector_that_keeps_its_files_and_what_resources_are_the_default() -> None:

@@ -333,6 +333,12 @@ def test_the_condition_reports_in_how_many_pods_it_runs_and_what_keeps_it_from_r
     broken = runs | {"status": runs["status"] | {"containerStatuses": [{"name": "main", "state": waiting}]}}
     assert carried(of, [broken]).holds
     assert [each["spec"]["initContainers"][0]["name"] for each in sidecar_pods([broken, pod()])] == [CONTAINER]
+    logged = carried(of, [state(injected(pod(), of), state={"waiting": {"reason": "PodInitializing"}})])
+    assert (logged.holds, logged.reason, logged.message) == (
+        False,
+        "NotReady",
+        "it runs in 0 of 1 pods with its label",
+    )
     assert carried(detector(serviceAccountNames=[]), []).reason == "NoAccounts"
 
 
