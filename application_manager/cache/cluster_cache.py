@@ -83,11 +83,13 @@ class WorkRecord:
 
     Attributes:
         uid: the instance's; a record of a namesake is worth nothing.
+        generation: of the instance, that was worked on.
         digest: of the rendering that was last applied in full.
         since: when the instance was first worked on by this process, in seconds since 1970.
     """
 
     uid: str
+    generation: int
     decision: Decision
     applied: ApplyResult
     digest: str | None

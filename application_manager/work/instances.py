@@ -293,7 +293,10 @@ class InstanceWork:
             applied = replace(applied, state=ConditionState("Applied", False, TOO_LARGE, too_large))
         before = start.record_of(instance)
         since = before.since if before is not None else time.time()
-        self.cache.records[start.name] = WorkRecord(instance.metadata.uid, start.decision, applied, digest, since)
+        metadata = instance.metadata
+        self.cache.records[start.name] = WorkRecord(
+            metadata.uid, metadata.generation, start.decision, applied, digest, since
+        )
         self.done(start.name)
 
     def _decide(self, name: Name) -> Decision | None:

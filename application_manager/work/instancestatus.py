@@ -68,7 +68,15 @@ class InstanceStatusWork:
         suspended = suspended_condition(instance, record.decision, live.values())
         ready = _overdue(self._ready(instance, applied.state, live, troubles), record.decision)
         new = instance_status(
-            instance, record.decision, applied.state, ready, applied.objects, record.digest, now, suspended
+            instance,
+            record.decision,
+            applied.state,
+            ready,
+            applied.objects,
+            record.digest,
+            now,
+            record.generation,
+            suspended,
         )
         if until > now and instance.status != new:
             self.again(name, until)
@@ -117,8 +125,9 @@ class InstanceStatusWork:
         new = LastDecision(decision, service or InstanceProgress(name[1], applied=False, ready=False))
         self.cache.served[name] = new
         all_changed = old is None or (old.service, old.decision.fallback) != (new.service, decision.fallback)
+        known = old.decision.generations if old is not None else {}
         for task, verdict in verdicts.items():
-            if all_changed or before.get(task) != verdict:
+            if all_changed or (before.get(task), known.get(task)) != (verdict, decision.generations[task]):
                 self.task_changed((name[0], task))
 
     def _troubles(

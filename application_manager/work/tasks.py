@@ -62,15 +62,15 @@ class TaskWork:
             await self._write_shed(name)
             return
         task = self.cache.task(name)
-        known = self._verdict(name)
+        known = self._verdict(name, task) if task is not None else None
         if task is None or known is None or task.metadata.deletion_timestamp is not None:
             return
-        verdict, service = known
+        verdict, service, generation = known
         if verdict.reason == RefusalReason.TEMPLATE_NOT_FOUND and await self._has_template(
             name[0], task.spec.template_name
         ):
             return  # the watch of templates was behind that of tasks; the template's event enqueues the task again
-        await self._write(name, task, verdict, service)
+        await self._write(name, task, verdict, service, generation)
 
     async def _write_shed(self, name: Name) -> None:
         """Write that a task is not taken in; it is read for that alone."""
@@ -80,14 +80,14 @@ class TaskWork:
         except ValueError:
             return
         if isinstance(task, ApplicationTask):
-            await self._write(name, task, finished(task) or _SHED, None)
+            await self._write(name, task, finished(task) or _SHED, None, task.metadata.generation)
 
     async def _write(
-        self, name: Name, task: ApplicationTask, verdict: Verdict, service: InstanceProgress | None
+        self, name: Name, task: ApplicationTask, verdict: Verdict, service: InstanceProgress | None, generation: int
     ) -> None:
         now = time.time()
         old = task.status or ApplicationTaskStatus()
-        new = task_status(task, verdict, service, now)
+        new = task_status(task, verdict, service, now, generation)
         try:
             if not await self.statuses.write(TASKS, task, task.status, new, now, _OWN_CONDITIONS):
                 return
@@ -121,11 +121,11 @@ class TaskWork:
             self.observe(found)
         return found is not None
 
-    def _verdict(self, name: Name) -> tuple[Verdict, InstanceProgress | None] | None:
-        """What became of the task; None where its instance was not looked at yet."""
+    def _verdict(self, name: Name, task: ApplicationTask) -> tuple[Verdict, InstanceProgress | None, int] | None:
+        """What became of the task, and of which generation of it; None where its instance was not looked at yet."""
         verdict = self.cache.claims.verdict(name)
         if verdict is not None:
-            return verdict, None
+            return verdict, None, task.metadata.generation
         claimed = self.cache.claims.claim(name)
         if claimed is None:
             return None
@@ -135,7 +135,7 @@ class TaskWork:
         if found is None:
             return None
         services = [served[each].service for each in found.serving]
-        return found.verdict, together(services) if services else None
+        return found.verdict, together(services) if services else None, found.generation
 
     def _decided(self, namespace: str, claimed: Claim) -> Iterator[Name]:
         """The instances whose decisions the verdict of a claim takes."""

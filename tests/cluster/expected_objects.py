@@ -170,7 +170,7 @@ def _tasks(tasks: list[ApplicationTask], outcome: NamespaceOutcome) -> Iterator[
         if task.status is None:
             yield f"task {task.name}: has no status"
             continue
-        should = task_status(task, verdict, None, time.time())
+        should = task_status(task, verdict, None, time.time(), task.metadata.generation)
         if task.status.instance_name != should.instance_name:
             yield f"task {task.name}: instance {task.status.instance_name}, not {should.instance_name}"
         if verdict.kind is not VerdictKind.COUNTS and task.status.phase != should.phase:

@@ -176,6 +176,7 @@ def _decide_one(name: str, template_name: str, claims: Iterable[Claim], indexes:
         parameters=None if paused or settled.too_large else settled.parameters,
         tasks=settled.tasks,
         verdicts=verdicts | settled.verdicts,
+        generations=_generations(ordered),
         release_time=release_time,
         next_change=min((change for change in changes if change > now), default=None),
         paused=paused,
@@ -215,7 +216,12 @@ def _decide_for_all(name: str, indexes: Indexes, now: float) -> Decision | None:
     live, verdicts, changes = live_claims(ordered, usable, indexes.leases(ordered), now)
     verdicts |= {each.task.name: waiting_for_any(each) for each in live}
     change = min((each for each in changes if each > now), default=None)
-    return Decision(name, template_of_all(name) or "", verdicts=verdicts, next_change=change)
+    template_name = template_of_all(name) or ""
+    return Decision(name, template_name, verdicts=verdicts, generations=_generations(ordered), next_change=change)
+
+
+def _generations(claims: Iterable[Claim]) -> dict[str, int]:
+    return {each.task.name: each.task.metadata.generation for each in claims}
 
 
 def precedence(task: ApplicationTask) -> tuple[int, str, str]:
@@ -231,4 +237,11 @@ def _left_alone(instance: ApplicationInstance, claims: list[Claim]) -> Decision:
     refused = Verdict(VerdictKind.REFUSED, RefusalReason.INSTANCE_NOT_MANAGED, message)
     verdicts = {each.task.name: refused for each in claims}
     spec = instance.spec
-    return Decision(instance.name, spec.template_name, spec.key, verdicts=verdicts, paused=is_paused(instance))
+    return Decision(
+        instance.name,
+        spec.template_name,
+        spec.key,
+        verdicts=verdicts,
+        generations=_generations(claims),
+        paused=is_paused(instance),
+    )

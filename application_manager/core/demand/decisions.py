@@ -19,6 +19,7 @@ class Decision:
         parameters: the merged values; None where they stay as they are.
         tasks: the tasks that contribute, in their order.
         verdicts: of all tasks that claim the instance, by task name.
+        generations: of these tasks, that the decision is about.
         release_time: when it goes, in seconds since 1970; None: it stays.
         next_change: when this decision changes by itself, in seconds since 1970; None: not at all.
         paused: whether a person wants the instance and its objects left as they are.
@@ -43,6 +44,7 @@ class Decision:
     parameters: dict[str, object] | None = None
     tasks: tuple[str, ...] = ()
     verdicts: dict[str, Verdict] = field(default_factory=dict)
+    generations: dict[str, int] = field(default_factory=dict)
     release_time: float | None = None
     next_change: float | None = None
     paused: bool = False

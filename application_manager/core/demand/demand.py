@@ -161,10 +161,14 @@ class _Snapshot:
 
 @dataclass(frozen=True, slots=True)
 class TaskVerdict:
-    """The verdict of a task that claims something, and the names of the instances that serve it."""
+    """The verdict of a task that claims something, and the names of the instances that serve it.
+
+    `generation`: of the task, that the verdict is about.
+    """
 
     verdict: Verdict
     serving: tuple[str, ...]
+    generation: int
 
 
 def verdict_of(claimed: Claim, decided: Mapping[str, Decision], meant: Iterable[str]) -> TaskVerdict | None:
@@ -180,12 +184,14 @@ def verdict_of(claimed: Claim, decided: Mapping[str, Decision], meant: Iterable[
         found = {name: decided[name].verdicts for name in meant if name in decided and name != claimed.instance}
         parts = {name: verdicts[task] for name, verdicts in found.items() if task in verdicts}
         serving = tuple(name for name, each in parts.items() if each.kind is VerdictKind.COUNTS)
-        return TaskVerdict(gathered(claimed, parts, own.verdicts[task]), serving)
+        generation = min(decided[name].generations[task] for name in (claimed.instance, *parts))
+        return TaskVerdict(gathered(claimed, parts, own.verdicts[task]), serving, generation)
     instead = own.fallback.instance_of(task) if own.fallback is not None else None
     other = decided.get(instead) if instead is not None else None
     verdict = turned(own.verdicts[task], task, own.fallback, other.verdicts if other is not None else {})
     serves = instead if instead is not None and verdict.reason == FALLEN_BACK else claimed.instance
-    return TaskVerdict(verdict, (serves,))
+    known = own.generations[task]
+    return TaskVerdict(verdict, (serves,), known if other is None else min(known, other.generations.get(task, known)))
 
 
 def claim_or_verdict(template: TemplateState, task: ApplicationTask) -> Claim | Verdict:

@@ -70,11 +70,12 @@ def together(services: Sequence[InstanceProgress]) -> InstanceProgress:
 
 
 def task_status(
-    task: ApplicationTask, verdict: Verdict, service: InstanceProgress | None, now: float
+    task: ApplicationTask, verdict: Verdict, service: InstanceProgress | None, now: float, generation: int
 ) -> ApplicationTaskStatus:
     """The task's status as it is now; `service` is that of the verdict's instance.
 
-    A finished task has no condition Applied or Ready: nothing is done for it any more.
+    `generation`: of the task, that the verdict is about: the task may have changed since. A finished task has no
+    condition Applied or Ready: nothing is done for it any more.
     """
     old = task.status or ApplicationTaskStatus()
     since = format_seconds(now)
@@ -107,13 +108,13 @@ def task_status(
             states.append(ConditionState(STALLED, True, verdict.reason, verdict.message))
     # A task that counts keeps what is known of its service while nothing newer is.
     only_while = (STALLED,) if verdict.kind is VerdictKind.COUNTS else ("Applied", "Ready", STALLED)
-    conditions = updated(old.conditions, states, task.metadata.generation, now, only_while=only_while)
+    conditions = updated(old.conditions, states, generation, now, only_while=only_while)
     instance = old.instance_name or verdict.instance if finished else verdict.instance
     return ApplicationTaskStatus(
         phase=_task_phase(verdict, service, suspends),
         instance_name=instance,
         message=_task_message(verdict, service, suspends),
-        observed_generation=task.metadata.generation,
+        observed_generation=generation,
         applied_time=applied_time,
         ready_time=ready_time,
         conditions=conditions,
@@ -176,12 +177,13 @@ def instance_status(
     objects: Iterable[ObjectReference],
     spec_hash: str | None,
     now: float,
+    generation: int,
     suspended: ConditionState | None = None,
 ) -> ApplicationInstanceStatus:
     """The instance's status.
 
     `applied`, `ready` and `suspended` are its conditions, the last of which is None where it was never suspended;
-    `spec_hash` is that of what was last applied.
+    `spec_hash` is that of what was last applied; `generation`: of the instance, that was applied.
     """
     old = instance.status or ApplicationInstanceStatus()
     lingering = decision.release_time is not None
@@ -193,7 +195,6 @@ def instance_status(
         phase = InstancePhase.SUSPENDED
     else:
         phase = InstancePhase.READY if ready.holds else InstancePhase.APPLIED
-    generation = instance.metadata.generation
     capped = ("SumBeyondBounds", "; ".join(decision.capped)) if decision.capped else None
     states = (
         applied,

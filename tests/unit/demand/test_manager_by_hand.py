@@ -68,7 +68,7 @@ def test_the_status_reports_who_keeps_it_and_once_more_when_that_is_over() -> No
     assert (state.type, state.holds) == ("Held", True)
     assert "anna, measuring" in state.message
     well = ConditionState("Applied", True, "Applied"), ConditionState("Ready", True, "Ready")
-    status = instance_status(held, decided(held), *well, (), None, NOW)
+    status = instance_status(held, decided(held), *well, (), None, NOW, 0)
     assert {each.type: each.status for each in status.conditions} == {
         "Applied": "True",
         "Ready": "True",

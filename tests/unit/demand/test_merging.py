@@ -107,7 +107,7 @@ def test_the_instance_reports_that_a_sum_is_capped_and_when_it_is_no_more() -> N
         tasks = [task(f"t{index}", {"rate": rate}) for index, rate in enumerate(rates)]
         (decision,) = demand(templates, tasks, [here], {}, NOW).instances.values()
         applied = ConditionState("Applied", True, "Applied")
-        status = instance_status(here, decision, applied, applied, [], None, NOW)
+        status = instance_status(here, decision, applied, applied, [], None, NOW, 0)
         here = here.model_copy(update={"status": status})
         logged = {each.type: (each.status, each.message) for each in status.conditions}.get("Capped")
         return (decision.parameters or {}).get("rate"), logged

@@ -8,8 +8,10 @@ import pytest
 
 from application_manager.cache.claim_index import ClaimIndex
 from application_manager.cache.store import Entry
+from application_manager.core.claims.claims import Claim, claim
 from application_manager.core.claims.operations import Verdict, VerdictKind
 from application_manager.core.conditions import ConditionState, changed, updated
+from application_manager.core.demand.demand import demand, verdict_of
 from application_manager.core.statuses.status import InstanceProgress, difference, finished_since, task_status
 from tests.unit.manager_objects import NOW, task, template
 from wayside.api.applicationtask import TaskPhase
@@ -39,7 +41,7 @@ def test_only_a_change_of_status_or_reason_is_worth_an_event() -> None:
 
 def test_a_tasks_phases_follow_its_instance() -> None:
     phases = [
-        task_status(task("a"), COUNTS, service, NOW).phase
+        task_status(task("a"), COUNTS, service, NOW, 0).phase
         for service in (
             None,
             InstanceProgress("app", False, False),
@@ -51,25 +53,43 @@ def test_a_tasks_phases_follow_its_instance() -> None:
 
 
 def test_a_task_is_not_ready_while_its_instance_is_not_made_and_keeps_what_was_known_of_it_afterwards() -> None:
-    pending = task_status(task("a"), COUNTS, None, NOW)
+    pending = task_status(task("a"), COUNTS, None, NOW, 0)
     assert logged(pending) == {"Accepted": "True", "Ready": "False"}
-    ready = task_status(task("a"), COUNTS, InstanceProgress("app", True, True), NOW)
-    later = task_status(task("a").model_copy(update={"status": ready}), COUNTS, None, NOW + 1)
+    ready = task_status(task("a"), COUNTS, InstanceProgress("app", True, True), NOW, 0)
+    later = task_status(task("a").model_copy(update={"status": ready}), COUNTS, None, NOW + 1, 0)
     assert logged(later) == {"Accepted": "True", "Applied": "True", "Ready": "True"}
 
 
 def test_a_task_is_no_more_applied_or_ready_than_its_instance_and_keeps_since_when_it_once_was() -> None:
-    ready = task_status(task("a"), COUNTS, InstanceProgress("app", True, True), NOW)
+    ready = task_status(task("a"), COUNTS, InstanceProgress("app", True, True), NOW, 0)
     served = task("a").model_copy(update={"status": ready})
-    later = task_status(served, COUNTS, InstanceProgress("app", False, False, "broken"), NOW + 1)
+    later = task_status(served, COUNTS, InstanceProgress("app", False, False, "broken"), NOW + 1, 0)
     assert logged(later) == {"Accepted": "True", "Applied": "False", "Ready": "False"}
     assert later.phase is TaskPhase.PENDING
     assert later.applied_time == later.ready_time == format_seconds(NOW)
     over = task_status(
-        task("a").model_copy(update={"status": later}), Verdict(VerdictKind.FINISHED, "Ended", "ended"), None, NOW + 2
+        task("a").model_copy(update={"status": later}),
+        Verdict(VerdictKind.FINISHED, "Ended", "ended"),
+        None,
+        NOW + 2,
+        0,
     )
     assert logged(over) == {"Accepted": "True", "Finished": "True"}
     assert over.ready_time == format_seconds(NOW)
+
+
+def test_a_status_is_of_the_generation_that_was_decided_not_of_a_later_one() -> None:
+    first, later = (
+        task("a").model_copy(update={"metadata": task("a").metadata.model_copy(update={"generation": each})})
+        for each in (1, 2)
+    )
+    claimed = claim(template(), first)
+    assert isinstance(claimed, Claim)
+    decision = demand([template()], [first], [], {}, NOW).instances["app"]
+    found = verdict_of(claimed, {"app": decision}, [])
+    assert found is not None
+    status = task_status(later, found.verdict, InstanceProgress("app", True, True), NOW, found.generation)
+    assert {status.observed_generation, *(each.observed_generation for each in status.conditions)} == {1}
 
 
 @pytest.mark.parametrize(
@@ -77,32 +97,34 @@ def test_a_task_is_no_more_applied_or_ready_than_its_instance_and_keeps_since_wh
 )
 def test_a_task_that_does_not_count_is_not_ready_for_the_same_reason(kind: VerdictKind, stalled: bool) -> None:
     served = task("a").model_copy(
-        update={"status": task_status(task("a"), COUNTS, InstanceProgress("app", True, True), NOW)}
+        update={"status": task_status(task("a"), COUNTS, InstanceProgress("app", True, True), NOW, 0)}
     )
-    status = task_status(served, Verdict(kind, "Because", "why"), None, NOW + 1)
+    status = task_status(served, Verdict(kind, "Because", "why"), None, NOW + 1, 0)
     found = {each.type: (each.status, each.reason) for each in status.conditions}
     assert found["Ready"] == ("False", "Because")
     assert "Applied" not in found
     assert ("Stalled" in found) is stalled
-    again = task_status(task("a").model_copy(update={"status": status}), Verdict(kind, "Because", "why"), None, NOW + 9)
+    again = task_status(
+        task("a").model_copy(update={"status": status}), Verdict(kind, "Because", "why"), None, NOW + 9, 0
+    )
     assert again == status
 
 
 def test_a_tasks_conditions_name_the_trouble_of_its_instance_before_and_after_it_was_ready() -> None:
     pulling = InstanceProgress("app", True, False, "cannot pull image app:1: not found", "ImagePullFailed")
-    waiting = task_status(task("a"), COUNTS, pulling, NOW)
+    waiting = task_status(task("a"), COUNTS, pulling, NOW, 0)
     ready = next(each for each in waiting.conditions if each.type == "Ready")
     assert (ready.status, ready.reason, ready.message) == ("False", "ImagePullFailed", pulling.problem)
     served = task("a").model_copy(
-        update={"status": task_status(task("a"), COUNTS, InstanceProgress("app", True, True), NOW)}
+        update={"status": task_status(task("a"), COUNTS, InstanceProgress("app", True, True), NOW, 0)}
     )
-    later = next(each for each in task_status(served, COUNTS, pulling, NOW).conditions if each.type == "Ready")
+    later = next(each for each in task_status(served, COUNTS, pulling, NOW, 0).conditions if each.type == "Ready")
     assert (later.status, later.reason, later.message) == ("False", "ImagePullFailed", pulling.problem)
 
 
 def test_a_finished_task_keeps_its_instance_and_reports_since_when() -> None:
-    served = task("a").model_copy(update={"status": task_status(task("a"), COUNTS, None, NOW)})
-    done = task_status(served, Verdict(VerdictKind.FINISHED, "Ended", "ended"), None, NOW + 7)
+    served = task("a").model_copy(update={"status": task_status(task("a"), COUNTS, None, NOW, 0)})
+    done = task_status(served, Verdict(VerdictKind.FINISHED, "Ended", "ended"), None, NOW + 7, 0)
     assert (done.phase, done.instance_name) == (TaskPhase.FINISHED, "app")
     assert finished_since(served.model_copy(update={"status": done})) == NOW + 7
     assert finished_since(served) is None
@@ -117,13 +139,13 @@ def test_a_task_that_ends_before_its_status_is_written_still_reports_what_served
     index.note(name, Entry({}, ended), template())
     verdict = index.verdict(name)
     assert verdict is not None
-    done = task_status(ended, verdict, None, NOW)
+    done = task_status(ended, verdict, None, NOW, 0)
     assert (done.phase, done.instance_name) == (TaskPhase.FINISHED, claimed.instance)
 
 
 def test_a_holder_that_returns_takes_back_that_its_task_is_finished() -> None:
-    lost = task_status(task("a"), Verdict(VerdictKind.FINISHED, "DetectorLost", "lost"), None, NOW)
-    back = task_status(task("a").model_copy(update={"status": lost}), COUNTS, None, NOW + 1)
+    lost = task_status(task("a"), Verdict(VerdictKind.FINISHED, "DetectorLost", "lost"), None, NOW, 0)
+    back = task_status(task("a").model_copy(update={"status": lost}), COUNTS, None, NOW + 1, 0)
     assert logged(back)["Finished"] == "False"
     assert finished_since(task("a").model_copy(update={"status": back})) is None
 

@@ -112,9 +112,9 @@ def test_phases_of_tasks_describe_the_suspension() -> None:
         InstanceProgress("app", True, False, suspended=True, stopped=True),
     )
     night = task("night", operation="Suspend")
-    assert task_status(task("a"), COUNTS, off, NOW).phase == "Suspended"
-    assert [task_status(night, COUNTS, each, NOW).phase for each in (on, off)] == ["Active", "Ready"]
-    waiting = task_status(night, Verdict(VerdictKind.WAITING, "NothingRuns", "starts nothing"), None, NOW)
+    assert task_status(task("a"), COUNTS, off, NOW, 0).phase == "Suspended"
+    assert [task_status(night, COUNTS, each, NOW, 0).phase for each in (on, off)] == ["Active", "Ready"]
+    waiting = task_status(night, Verdict(VerdictKind.WAITING, "NothingRuns", "starts nothing"), None, NOW, 0)
     assert (waiting.phase, waiting.conditions[0].status, waiting.conditions[0].reason) == (
         "Waiting",
         "True",
