@@ -10,6 +10,8 @@ For each program and the package that they share, into which much of both has mo
 - loose modules: directly in the top folder, beside the folders;
 - floors: levels of the layers contract in pyproject.toml;
 - names: public classes and functions that are defined in two or more modules, over all packages;
+- vocabulary: the different last words of the names of public classes (`EventSink` is a sink);
+- concepts: the rows of the table of concepts in docs/architecture.md;
 - retries: loops that try again after an error, written by hand. Such a loop has an `except` that does not leave it, and
   a pause of some seconds that only an error causes (it is in the `except`, or success has left the loop before it) or
   that the `except` sets. A loop that waits for its next item, or that looks periodically whether or not the last
@@ -21,6 +23,7 @@ from __future__ import annotations
 import argparse
 import ast
 import io
+import re
 import subprocess
 import tarfile
 import tempfile
@@ -76,6 +79,12 @@ class Module:
             if isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) and node.name[0] != "_":
                 yield node.name
 
+    def nouns(self) -> Iterator[str]:
+        """The last words of the names of the public classes that it defines."""
+        for node in self.tree.body:
+            if isinstance(node, ast.ClassDef) and node.name[0] != "_":
+                yield re.findall("[A-Z][a-z0-9]*|[A-Z]+", node.name)[-1]
+
     def retries(self) -> int:
         """How many loops try again after an error."""
         return sum(_is_retry(loop) for loop in ast.walk(self.tree) if isinstance(loop, _LOOPS))
@@ -88,7 +97,7 @@ def main() -> None:
     options = parser.parse_args()
     root = Path(__file__).parents[1]
     with tempfile.TemporaryDirectory() as folder:
-        command = ["git", "-C", str(root), "archive", options.revision, *PACKAGES, "pyproject.toml"]
+        command = ["git", "-C", str(root), "archive", options.revision, *PACKAGES, "docs", "pyproject.toml"]
         archive = subprocess.run(command, check=True, capture_output=True).stdout
         with tarfile.open(fileobj=io.BytesIO(archive)) as files:
             files.extractall(folder, filter="data")
@@ -123,6 +132,9 @@ def counted(root: Path) -> dict[str, int]:
     )
     names = Counter(name for each in every for name in each.public())
     found["public names defined twice or more"] = sum(count > 1 for count in names.values())
+    found["words that name public classes"] = len({noun for each in every for noun in each.nouns()})
+    page = root / "docs" / "architecture.md"
+    found["concepts listed in docs/architecture.md"] = _rows(page.read_text(encoding="utf-8")) if page.exists() else 0
     found["retries written by hand"] = sum(each.retries() for each in every)
     return found
 
@@ -146,6 +158,12 @@ def brought(root: Path, revision: str) -> Counter[str]:
             added[f"{path.partition('/')[0]}: {figure}"] += number
             added[f"all: {figure}"] += number
     return added
+
+
+def _rows(page: str) -> int:
+    """The number of rows of the table under the heading Concepts."""
+    table = page.partition("\n## Concepts\n")[2].partition("\n## ")[0]
+    return max(sum(line.startswith("|") for line in table.splitlines()) - 2, 0)
 
 
 def _is_counted(path: str) -> bool:
