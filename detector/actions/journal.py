@@ -50,7 +50,7 @@ class Journal:
         try:
             self._store = action_store(self.path.parent, self.path.name, lose)
         except StoreError as error:
-            _log.error("action %s of EventRule %s keeps no journal: %s", context.action, context.rule.name, error)
+            _log.error("action %s of EventRule %s has no journal: %s", context.action, context.rule.name, error)
             context.lose(unkept, 1, str(error))
 
     @property

@@ -38,7 +38,12 @@ def prepare_action(action: api.ActionSpec, streams: Sequence[str] | None = None)
         given = action.parameters
         if not isinstance(given, offered.Parameters):
             wanted = f"{offered.Parameters.__module__}.{offered.Parameters.__name__}"
-            raise PluginError(((action.field,), f"the installed action {action.kind} takes the parameters {wanted}"))
+            raise PluginError(
+                (
+                    (action.field,),
+                    f"the installed action {action.kind} requires parameters of {wanted}; got {type(given).__name__}",
+                )
+            )
         return offered, given
     name = action.plugin.name
     if name in api.ActionSpec.model_fields:

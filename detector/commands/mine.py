@@ -90,7 +90,7 @@ def mine_recordings(
     finally:
         workers.close()
     if not run.complete:
-        typer.echo(f"{_did(run)}; other shares are not finished yet: {output}", err=True)
+        typer.echo(f"{_did(run)}; other shares are not finished yet, so {output} contains no dataset yet", err=True)
         return
     summary = summary_of(output)
     if run.changed or not (output / REPORT).exists():
@@ -103,7 +103,7 @@ def _finish(run: MiningRun, summary: Summary, output: Path, *, shared: bool) -> 
     """Print the errors and the last line. A share fails only if another attempt may help."""
     for cut in run.cut:
         whole = ", ".join(f"{rule} ({why})" for rule, why in sorted(cut.whole.items()))
-        typer.echo(f"{cut.name}: cut into {cut.pieces} pieces" + (f", whole for {whole}" if whole else ""), err=True)
+        typer.echo(f"{cut.name}: cut into {cut.pieces} pieces" + (f"; not cut for {whole}" if whole else ""), err=True)
     for error in summary.errors[:_ERRORS]:
         what = "" if error["kind"] == "unreadable" else f"{error['kind']}: "
         typer.echo(f"{error['recording']}: {what}{error['message']}", err=True)

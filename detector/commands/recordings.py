@@ -46,7 +46,7 @@ def start(
         maximumDuration=maximum_duration,
     )
     if detector is None and name is None:
-        refuse("no detector given to record: give --name NAME or --detector FILE")
+        refuse("the detector is missing: give --name NAME or --detector FILE")
     _send(request, detector, name, connect, timeout, as_json)
 
 
@@ -62,7 +62,7 @@ def stop(
 ) -> None:
     """End a recording."""
     if detector is None and name is None:
-        refuse("no detector given to stop: give --name NAME or --detector FILE")
+        refuse("the detector is missing: give --name NAME or --detector FILE")
     _send(_request(do="stop", id=identity, after=after), detector, name, connect, timeout, as_json)
 
 

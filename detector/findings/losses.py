@@ -159,13 +159,13 @@ class Losses:
                 what = (
                     f"the stamps of stream {name} are {-counters.delays[name] / 1e9:.1f} s ahead of the receive times"
                 )
-                late = "with clock Data this makes the samples of other streams late; set the clock of the sender"
+                late = "with clock Data this makes the samples of other streams late; synchronize the sender's clock"
                 yield f"ahead {name}", Finding(DIVERGING_STAMPS.name, f"{what}: {late}, {remedy}")
             elif behind > _APART:
                 what = (
                     f"the stamps of stream {name} are {behind / 1e9:.1f} s further behind the receive times than those"
                 )
-                late = "with clock Data this makes its samples late; set the clock of the sender"
+                late = "with clock Data this makes its samples late; synchronize the sender's clock"
                 yield f"behind {name}", Finding(DIVERGING_STAMPS.name, f"{what} of stream {right[0]}: {late}, {remedy}")
 
     def all(self) -> Iterator[Loss]:

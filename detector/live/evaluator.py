@@ -298,9 +298,9 @@ class Evaluator:
         """Raise the level of thinning after a slow cycle, and lower it once cycles are fast again."""
         if self._overload.observe(self._now(), spent, self._engine.schedule.highest):
             level, highest = self._overload.level, self._engine.schedule.highest
-            text = "the evaluation is overloaded" if spent > LONG else "the evaluation keeps up with the load"
+            text = "the evaluation is overloaded" if spent > LONG else "the evaluation is fast enough again"
             _log.warning(
-                "%s: now skipping evaluations of low-priority rules at level %d of %d",
+                "%s: evaluations of low-priority rules are skipped at level %d of %d",
                 text,
                 level,
                 highest,

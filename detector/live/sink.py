@@ -141,7 +141,7 @@ class EventLog:
         self._thread.join()
         self._file.close()
         if self.dropped:
-            _log.error("%d events are missing in %s", self.dropped, self._path)
+            _log.error("in total, %d events were not written to %s", self.dropped, self._path)
 
     def _run(self) -> None:
         while (line := self._lines.get()) is not None:

@@ -82,7 +82,7 @@ def _sections(folder: Path, summary: Summary) -> Iterator[str]:
     if summary.nearest:
         yield _section(
             "Nearest without an episode",
-            "Only rules with a margin. Up to 0: the condition did not hold. Above 0: the condition did not hold long "
+            "Only rules with a margin. At 0 or below, the condition was not true; above 0, it was not true for long "
             "enough.",
             ["rule", "recording", "subject", "time", "#margin"],
             [

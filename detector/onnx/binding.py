@@ -78,7 +78,7 @@ class Runner:
         names = [self._output] if self._output is not None else list(outputs)
         columns = {name: outputs[name].astype(np.float64) for name in names}
         if any(len(column) != len(rows) for column in columns.values()):
-            raise ModelError(f"the model did not return {len(rows)} rows for {len(rows)} clients")
+            raise ModelError(f"the model must return {len(rows)} rows for {len(rows)} clients")
         if len(names) == 1:
             return [_plain(columns[names[0]][row]) for row in range(len(rows))]
         return [{name: _plain(columns[name][row]) for name in names} for row in range(len(rows))]

@@ -99,7 +99,7 @@ def _load(offers: PluginClasses[T], name: str) -> type[T]:
     base = f"{offers.base.__module__}.{offers.base.__qualname__}"
     complete = inspect.isclass(offered) and issubclass(offered, offers.base) and not inspect.isabstract(offered)
     if not complete:
-        raise LookupError(f"{what} is {entry.value}, which is not a complete {base} ({offers.guide})")
+        raise LookupError(f"{what} must be a complete subclass of {base}; got {entry.value} ({offers.guide})")
     model = getattr(offered, "Parameters", None)
     if not (inspect.isclass(model) and issubclass(model, offers.model)):
         raise LookupError(f"{what}: give {entry.value} a class Parameters({offers.model.__name__}) ({offers.guide})")

@@ -264,7 +264,7 @@ def _begin(
 ) -> Replay:
     document = record.document
     if record.kind != "start":
-        raise RecordingError(f"the intake file begins with {record.kind!r}, not with a start: record again")
+        raise RecordingError(f"the intake file must begin with a start record; got {record.kind!r}: record again")
     version = int(document.get("version", 1))
     return Replay(
         detector or Detector.model_validate(detector_as_of(document["detector"], version)),

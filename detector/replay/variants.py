@@ -75,7 +75,7 @@ def variants_of(rules: Sequence[EventRule], sets: Sequence[str], sweeps: Sequenc
         rule, path, text = _parts("--sweep", option, known)
         chosen += [(rule, [*fixed.get(rule, ()), Change(rule, path, value)]) for value in _values(option, text)]
     if len(chosen) > _MOST:
-        raise VariantError(f"--sweep: {len(chosen)} variants are more than {_MOST}: use larger steps")
+        raise VariantError(f"--sweep may give at most {_MOST} variants; got {len(chosen)}: use larger steps")
     taken = set(known)
     return [*others, *(_variant(known[rule], changes, taken) for rule, changes in chosen)]
 

@@ -146,7 +146,7 @@ class PairLog:
         for name in sorted({str(path[0]) for path in read} & these.derived.keys()):
             if np.isnan(self._numbers(name, these.derived[name])[row]):
                 return f"{name}: no value"
-        return "a value that it reads does not exist"
+        return "it reads a value that does not exist"
 
 
 class PathLog:

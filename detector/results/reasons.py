@@ -10,7 +10,7 @@ from detector.engine.columns.block import Block, Track
 from wayside.expressions import Expression
 from wayside.rules import CompiledRule, PairSubject
 
-_OTHERWISE = "a value that it reads does not exist"
+_OTHERWISE = "it reads a value that does not exist"
 
 
 def why_unknown(block: Block, point: int, track: Track, expression: Expression | None) -> str:

@@ -75,7 +75,7 @@ STREAM: tuple[tuple[str, type, str, Callable[[StreamStatus], float | None]], ...
     (
         "stream_buffered_bytes",
         _GAUGE,
-        "Bytes of these samples in the buffer, overhead included",
+        "Size of the samples in the buffer in bytes, overhead included",
         lambda s: s.buffered_bytes,
     ),
 )

@@ -38,7 +38,9 @@ def total_view(total: Total) -> RenderableType:
 
 def _sums(total: Total) -> Iterator[RenderableType]:
     least = "" if total.clients_complete else "at least "
-    shared = f" ({least}{total.shared_client_count} of them known to several)" if total.shared_client_count else ""
+    shared = (
+        f" ({least}{total.shared_client_count} of them known to several detectors)" if total.shared_client_count else ""
+    )
     yield (
         f"{len(total.detectors)} detectors, {total.client_count} clients{shared}, {total.demand_count} demands, "
         f"buffer {_size(total.buffered_bytes)} of {_size(total.maximum_bytes)}, {total.gaps} gaps"
@@ -79,7 +81,7 @@ def _sums(total: Total) -> Iterator[RenderableType]:
     yield from _tasks(total.tasks)
     yield from _lost(total.drops)
     if total.shared_clients:
-        yield f"known to several: {_listed(total.shared_clients, total.shared_client_count)}"
+        yield f"known to several detectors: {_listed(total.shared_clients, total.shared_client_count)}"
     if total.missing_count:
         yield f"missing: {total.missing_count} expected clients"
 

@@ -275,7 +275,7 @@ def _state(run: RuleRun, schedule: Schedule) -> tuple[RuleState, str]:
     if not run.rule.enabled:
         return RuleState.DISABLED, "enabled is false"
     if run.rule.name in schedule.paused:
-        return RuleState.PAUSED, "open episodes are kept until it is resumed"
+        return RuleState.PAUSED, "open episodes are kept until the rule is resumed"
     if not run.rule.on_demand and (thinned := schedule.thinning(run.rule)) > 1:
-        return RuleState.DEGRADED, f"the machine is too slow: the rule is evaluated once in {thinned} times"
+        return RuleState.DEGRADED, f"the machine is too slow: only one in {thinned} evaluations of the rule runs"
     return RuleState.ACCEPTED, "dryRun: publishing events, running no action" if run.rule.dry_run else ""

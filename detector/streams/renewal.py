@@ -178,7 +178,9 @@ class Renewal:
                 self._look()
         except Exception as error:  # noqa: BLE001  otherwise certificates would expire unnoticed
             if not self._stop.is_set():
-                log.critical("cannot watch the certificates any more; renewed ones are not loaded: %s", error)
+                log.critical(
+                    "the thread that watches the certificates ended; renewed certificates are not loaded: %s", error
+                )
                 self._on_failure(error)
 
     def _look(self) -> None:

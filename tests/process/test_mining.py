@@ -184,7 +184,7 @@ def test_a_long_recording_is_cut_for_the_rules_for_which_that_is_exact(fleet: Pa
     (fleet / "long").mkdir()
     write_mcap(fleet / "long" / "drive.mcap", 7, 600.0, cars=2)
     logged = mine(fleet, "cut", "--processes", "2", drives="long")
-    assert "long/drive.mcap: cut into 3 pieces, whole for close (pairs)" in logged
+    assert "long/drive.mcap: cut into 3 pieces; not cut for close (pairs)" in logged
     assert "pieces" not in mine(fleet, "uncut", "--processes", "1", drives="long")
     assert files(fleet / "cut") == files(fleet / "uncut")
     ((episodes,),) = requested(fleet, "SELECT count(*) FROM 'cut/episodes/*/*.parquet'")

@@ -228,7 +228,7 @@ def test_a_running_detector_follows_changes_of_its_sources_and_reports_their_sta
             "spec.sources[0].plugin: cannot load plugin unmet: ModuleNotFoundError: No module named",
         ),
         ({"plugin": "absent"}, "spec.sources[0].plugin: cannot load plugin absent: AttributeError"),
-        ({"plugin": "noparameters"}, "which is not a complete detector.sources.base.Source"),
+        ({"plugin": "noparameters"}, "must be a complete subclass of detector.sources.base.Source"),
         (
             {"plugin": "unfinished"},
             "spec.sources[0].plugin: plugin unfinished: give tests.process.test_sources:Unfinished a",

@@ -194,7 +194,7 @@ def test_a_start_and_a_stop_may_come_twice_and_in_any_order(unhurt: Peer) -> Non
     late = RecordingRequest(do="stop", id="y")
     assert requested(unhurt.endpoint, late).state is Progress.UNKNOWN
     begun = requested(unhurt.endpoint, RecordingRequest(do="start", id="y"))
-    assert (begun.state, begun.message) == (Progress.UNKNOWN, "it was stopped before it was started")
+    assert (begun.state, begun.message) == (Progress.UNKNOWN, "the recording was stopped before it was started")
 
 
 def test_a_recording_whose_stop_never_comes_ends_by_itself(unhurt: Peer) -> None:
@@ -210,7 +210,7 @@ def test_what_is_not_allowed_is_refused(rsu: Peer, town: Peer) -> None:
     refused = requested(rsu.endpoint, RecordingRequest(do="start", id="x", streams=["poes"]))
     assert (refused.state, refused.message) == (
         Progress.REFUSED,
-        "stream poes may not be recorded here; permitted are pose, speed",
+        "stream poes may not be recorded here; the permitted streams are pose, speed",
     )
     refused = requested(rsu.endpoint, RecordingRequest(do="start", id="x"), "town")
     assert refused.message.startswith("this detector accepts no recording requests")
@@ -218,7 +218,7 @@ def test_what_is_not_allowed_is_refused(rsu: Peer, town: Peer) -> None:
         assert requested(rsu.endpoint, RecordingRequest(do="start", id=f"x{number}")).state is Progress.RECORDING
     full = requested(rsu.endpoint, RecordingRequest(do="start", id="x8"))
     assert full.message == "8 recordings are in progress, the maximum (recordings.onRequest.maximumRecordings)"
-    with pytest.raises(ValueError, match="start: give the id of the recording"):
+    with pytest.raises(ValueError, match="start requires the id of the recording"):
         requested(rsu.endpoint, RecordingRequest(do="start"))
 
 
@@ -277,7 +277,7 @@ def test_nobody_who_records_costs_only_the_recording(endpoint: str, tmp_path: Pa
     town.send("car1", {"v": 1})
     town.status_when(lambda status: status.rules[0].ended == 1)
     status = town.status_when(lambda status: status.actions[0].failed == 1)
-    assert status.actions[0].last_failure.startswith("gave up starting it:")
+    assert status.actions[0].last_failure.startswith("gave up starting the recording:")
     lost = town.status_when(lambda status: any(drops.cause.startswith("action_recordings") for drops in status.drops))
     assert [drops.count for drops in lost.drops if drops.cause.startswith("action_recordings")] == [1]
     assert town.stop() == 0

@@ -192,7 +192,7 @@ def test_a_recording_ends_after_its_maximum_duration_also_while_the_episode_last
         assert [request.method for request in there.requests] == ["PUT", "DELETE"]
     assert (outcome.state, outcome.message) == (
         OutcomeState.DONE,
-        "its maximumDuration ended it before the episode ended",
+        "the recording reached its maximumDuration before the episode ended",
     )
 
 

@@ -131,7 +131,7 @@ def test_what_a_service_refuses_is_reported(process: Process) -> None:
     node.offer("recorder/on", "std_srvs/srv/Trigger", "", "bool success\nstring message\n", lambda request: refusal)
     process.send("car1", {"v": 20})
     status = process.status_when(lambda status: bool(status.actions and status.actions[0].failed))
-    assert status.actions[0].last_failure == "gave up starting it: /recorder/on refused: the disk is full"
+    assert status.actions[0].last_failure == "gave up starting the recording: /recorder/on refused: the disk is full"
     assert len(node.calls) >= 2
 
 

@@ -51,7 +51,7 @@ def bson_values(document: Mapping[str, Any]) -> dict[str, Any]:
 
 def _plain(value: Any, depth: int) -> Any:
     if depth > _DEPTH:
-        raise UnfitError(f"it is nested more than {_DEPTH} levels deep")
+        raise UnfitError(f"the message is nested more than {_DEPTH} levels deep")
     match value:
         case np.generic():
             return _plain(value.item(), depth)  # first: numpy's doubles are Python's as well

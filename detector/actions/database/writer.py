@@ -167,7 +167,7 @@ class DatabaseWriter:
 
         def attempt() -> bool:
             if broke >= patience:
-                return self._divide(write, "the server closes the connection when it receives it")
+                return self._divide(write, "the server closes the connection when it receives this request")
             if backoff.failures and self._late():
                 return False
             try:
@@ -218,7 +218,7 @@ class DatabaseWriter:
         scenario = bson.decode(write.documents[index]).get("scenario", "")
         if not self._send(scenarios.reject(write.database, scenario, why)):
             return False
-        lose(1, f"the database rejected it: {why}")
+        lose(1, f"the database rejected the document: {why}")
         return True
 
     def _lost_earlier(self, count: int, why: str) -> None:
@@ -227,7 +227,7 @@ class DatabaseWriter:
     def _confirm(self, write: Write, matched: int, why: str) -> None:
         confirm = self._confirms.pop(write.completes, None)
         if confirm is not None:
-            confirm(bool(matched) and not why, why or "the database rejected some of it")
+            confirm(bool(matched) and not why, why or "the database rejected a part of the scenario")
 
     def _pause(self, seconds: float) -> None:
         """Wait before the next attempt, but not beyond the end; new requests go to the disk."""
@@ -249,14 +249,14 @@ class DatabaseWriter:
         for write in self._queue.close():
             if write.documents:
                 lose = write.losing or self._lost_earlier
-                lose(len(write.documents), "the detector stopped before it was written")
+                lose(len(write.documents), "the detector stopped before it wrote the document")
         confirms, self._confirms = self._confirms, {}
         for confirm in confirms.values():
             confirm(False, self._end_text())
 
     def _end_text(self) -> str:
         where = "unwritten requests stay in the spool" if self._queue.spools else "there is no spool"
-        return f"the detector stopped before the database stored it ({self._away or 'it was busy'}); {where}"
+        return f"the detector stopped before the database stored the scenario ({self._away or 'it was busy'}); {where}"
 
     def _note_away(self, why: str) -> None:
         if not self._away:
@@ -309,7 +309,7 @@ def _made(database: DatabaseConnection, lose: Callable[[str, int, str], None]) -
     except AccessError as error:
         raise ActionError(str(error)) from None
     except ValueError as error:
-        raise ActionError(f"{_FIELD}: the connection string is wrong: {error}: write mongodb://…") from None
+        raise ActionError(f"{_FIELD} must be a connection string mongodb://…: {error}") from None
     try:
         return DatabaseWriter(server, database.spool, lose)
     except StoreError as error:

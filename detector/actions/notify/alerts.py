@@ -234,8 +234,8 @@ class AlertQueue:
             self._report(alert, OutcomeState.DONE, "")
         else:
             why = (
-                "it was accepted only after the end of the episode, because of failures: an Alertmanager does not "
-                "notify about such alerts"
+                "the Alertmanager accepted the alert only after the end of the episode, because of failures: it does "
+                "not notify about such alerts"
             )
             self._setting.lose("alerts that were accepted too late to notify", 1, why)
             self._report(alert, OutcomeState.FAILED, why)

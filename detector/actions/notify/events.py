@@ -110,7 +110,7 @@ class DeliveryLedger:
         self._report(entry.episode, Outcome(state, text, bytes=entry.bytes, missing=lost, details=details))
 
 
-UNDELIVERED = "the detector stopped, or the action was removed from the rule, before it was delivered"
+UNDELIVERED = "the detector stopped, or the action was removed from the rule, before the event was delivered"
 FULL = "the queue is full (waiting)"
 
 

@@ -132,7 +132,7 @@ class Record(Action[api.RecordAction]):
             return
         del self._open[episode.id]
         if series.problem:
-            log.error("rule %s, episode %s: the recording is cut: %s", episode.rule, episode.id, series.problem)
+            log.error("rule %s, episode %s: the recording ended early: %s", episode.rule, episode.id, series.problem)
         self.context.report(episode, series.outcome(OutcomeState.FAILED if series.problem else OutcomeState.DONE))
 
     def _lose(self, samples: int) -> None:

@@ -66,7 +66,7 @@ def decompress(name: str, data: bytes, size: int) -> bytes:
                 return zstandard.decompress(data, max_output_size=size)
     except (RuntimeError, zstandard.ZstdError) as error:
         raise ValueError(str(error)) from error
-    raise ValueError(f"unknown compression of recordings: {name!r}")
+    raise ValueError(f"unknown compression {name!r}")
 
 
 MAGIC = b"\x89MCAP0\r\n"

@@ -103,7 +103,7 @@ class Trigger(Action[api.TriggerAction]):
             return
         if self.context.closing.is_set() and self._outlives():
             del self._recordings[identity], self._episodes[identity]  # but not in the journal
-            message = "it continues: the episode is resumed after the restart, or its maximumDuration ends it"
+            message = "the recording continues until the restarted detector stops it, or until its maximumDuration"
             self.context.report(episode, self._outcome(OutcomeState.DONE, recording, message))
         else:
             now = time.monotonic()

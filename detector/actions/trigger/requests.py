@@ -89,7 +89,7 @@ def read_request(payload: bytes) -> RecordingRequest:
     if not payload:
         return RecordingRequest()
     if len(payload) > MAXIMUM_BYTES:
-        raise ValueError(f"a request of {len(payload)} bytes is too long: at most {MAXIMUM_BYTES}")
+        raise ValueError(f"a request may have at most {MAXIMUM_BYTES} bytes; got {len(payload)}")
     try:
         request = RecordingRequest.model_validate_json(payload)
     except ValidationError as error:
@@ -97,7 +97,7 @@ def read_request(payload: bytes) -> RecordingRequest:
         where = ".".join(map(str, first["loc"])) or "the request"
         raise ValueError(f"{where}: {first['msg']}") from None
     if request.do != "status" and request.id is None:
-        raise ValueError(f"{request.do}: give the id of the recording")
+        raise ValueError(f"id is missing: {request.do} requires the id of the recording")
     return request
 
 

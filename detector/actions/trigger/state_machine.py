@@ -91,7 +91,11 @@ class RemoteRecording:
     def look(self, now: float) -> NextRequest | None:
         """The request to send now; None: none is due."""
         if self.step is NextRequest.HOLD and now >= self._limit:
-            self.note = "its maximumDuration ended it before the episode ended" if self.ended is None else self.note
+            self.note = (
+                "the recording reached its maximumDuration before the episode ended"
+                if self.ended is None
+                else self.note
+            )
             self._to(NextRequest.STOP, now)
         return self.step if now >= self.due and not self.finished else None
 
@@ -109,7 +113,7 @@ class RemoteRecording:
         if now - self._since < self._limits.give_up or self.step is NextRequest.HOLD:
             return
         if self.step is NextRequest.START:
-            self.problem = f"gave up starting it: {why}"
+            self.problem = f"gave up starting the recording: {why}"
             if self.unanswered:
                 self._to(NextRequest.STOP, now)  # otherwise it might record for nothing
             else:
@@ -119,7 +123,7 @@ class RemoteRecording:
             self.problem = self.problem or f"gave up waiting for the confirmation of the stop: {why}"
             self.step = NextRequest.FINISHED
         else:
-            self.note = self.note or f"its result is unknown: {why}"
+            self.note = self.note or f"the result of the recording is unknown: {why}"
             self.step = NextRequest.FINISHED
 
     def answered(self, now: float, report: Report) -> None:
@@ -134,7 +138,7 @@ class RemoteRecording:
             self._started(now, report)
         elif report.progress is Progress.UNKNOWN:
             if self.confirmed and not self.problem:
-                self.problem = "the other system no longer knows the recording: it restarted, and the recording is cut"
+                self.problem = "the other system restarted and no longer knows the recording, which is incomplete"
             self.step = NextRequest.FINISHED
         elif report.progress.over:
             self._over(report)
@@ -164,9 +168,9 @@ class RemoteRecording:
     def _over(self, report: Report) -> None:
         """The recording has ended there."""
         if report.progress is not Progress.DONE:
-            self.problem = self.problem or report.message or "it failed on the other system"
+            self.problem = self.problem or report.message or "the recording failed on the other system"
         elif self.step in (NextRequest.START, NextRequest.HOLD):
-            self.note = report.message or "it ended on the other system before the episode ended"
+            self.note = report.message or "the recording ended on the other system before the episode ended"
         else:
             self.note = self.note or report.message
         self.step = NextRequest.FINISHED

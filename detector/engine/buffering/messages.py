@@ -179,5 +179,5 @@ class Messages:
 def _nanoseconds(seconds: object) -> int:
     """A stamp in seconds, to the microsecond: a double has no greater precision for a time since the epoch."""
     if not isinstance(seconds, int | float) or not 0 <= seconds < 1e11:
-        raise ValueError(f"stamp {seconds!r} is not a time in seconds since the epoch")
+        raise ValueError(f"stamp must be a time in seconds since the epoch; got {seconds!r}")
     return round(seconds * 1e6) * 1000

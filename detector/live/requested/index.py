@@ -85,7 +85,7 @@ class RecordingIndex:
         identity = request.id or ""
         entry = self._entries.get(identity)
         if entry is None:
-            message = "it was stopped before it was started"
+            message = "the recording was stopped before it was started"
             self._entries[identity] = RequestedRecording(identity, Progress.UNKNOWN, stopped=True, message=message)
             self._forget()
             return RecordingReport(identity, Progress.UNKNOWN, "this detector does not know the recording"), None
@@ -128,7 +128,7 @@ class RecordingIndex:
         may = streams if allowed.streams is None else allowed.streams
         for name in request.streams or ():
             if name not in may:
-                return f"stream {name} may not be recorded here; permitted are {', '.join(sorted(may))}"
+                return f"stream {name} may not be recorded here; the permitted streams are {', '.join(sorted(may))}"
         return ""
 
     def _forget(self) -> None:

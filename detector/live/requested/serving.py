@@ -187,4 +187,4 @@ class RequestedRecordings:
             future.result(_PATIENCE)
         except TimeoutError:
             # It is carried out later: a repeated request with the same id returns its state.
-            _log.warning("the evaluation did not process a recording request within %g s", _PATIENCE)
+            _log.warning("the evaluation thread did not process a recording request within %g s", _PATIENCE)

@@ -131,7 +131,7 @@ def _wrong_fields(fields: Iterable[tuple[str, FieldDesc]], known: Collection[str
             yield field, f"has {detail[1]} elements, which no message can have"
         below = message_type_of(desc)
         if below is not None and below not in known:
-            yield field, f"is of {_missing(below)}"
+            yield field, f"has the type {_missing(below)}"
 
 
 class _EndlessError(ValueError):
@@ -165,7 +165,7 @@ def message_type_of(desc: FieldDesc) -> str | None:
 
 def _missing(name: str) -> str:
     reason = _UNSUPPORTED.get(name.rsplit("/", 1)[-1])
-    return f"{name}: {reason}" if reason else f"{name}, which is unknown: give its definition as well"
+    return f"{name}: {reason}" if reason else f"{name}, which is unknown: also give its definition"
 
 
 def _place(definition: Definition, type_name: str, field: str) -> str:

@@ -58,7 +58,7 @@ def test_what_is_not_confirmed_is_requested_later_and_later_and_given_up() -> No
         if step is NextRequest.STOP:
             break
     assert times == [0, 0.5, 1.5, 3.5, 7.5, 15.5, 30.5, 45.5, 60.5]
-    assert course.problem == "gave up starting it: silence"
+    assert course.problem == "gave up starting the recording: silence"
     assert not course.lost_stop
 
 
@@ -80,7 +80,7 @@ def test_what_is_refused_is_requested_again_and_then_needs_no_stop() -> None:
         assert course.look(now) is NextRequest.START
         course.answered(now, Report(Progress.REFUSED, "too many"))
     assert course.finished
-    assert course.problem == "gave up starting it: too many"
+    assert course.problem == "gave up starting the recording: too many"
 
 
 def test_a_system_that_was_restarted_continues_with_the_next_start() -> None:
@@ -95,7 +95,7 @@ def test_a_system_that_was_restarted_continues_with_the_next_start() -> None:
     course.end(301, 301)
     course.answered(301, UNKNOWN)  # restarted once more, just now
     assert course.finished
-    assert "restarted, and the recording is cut" in course.problem
+    assert "restarted and no longer knows the recording" in course.problem
 
 
 def test_a_system_that_does_not_count_the_time_is_stopped_after_it() -> None:
@@ -105,7 +105,7 @@ def test_a_system_that_does_not_count_the_time_is_stopped_after_it() -> None:
     assert course.look(29.9) is None
     assert course.look(30) is NextRequest.STOP
     course.answered(30, DONE)
-    assert course.note == "its maximumDuration ended it before the episode ended"
+    assert course.note == "the recording reached its maximumDuration before the episode ended"
 
 
 def test_a_system_that_counts_the_time_itself_reports_it() -> None:

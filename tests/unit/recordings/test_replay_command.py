@@ -178,7 +178,7 @@ def test_with_clock_data_a_header_that_is_seconds_behind_is_named_with_its_strea
     path = write_lines(command.folder / "drive.jsonl", *recording)
     warning = (
         "warning: the stamps of stream speed are 5.1 s further behind the receive times than those of stream pose: "
-        "with clock Data this makes its samples late; set the clock of the sender, give streams[speed].stamp"
+        "with clock Data this makes its samples late; synchronize the sender's clock, give streams[speed].stamp"
     )
     assert warning in command.replay(path).logged
     ran = command.run("check", "--strict", "detector.yaml", "rules.yaml", "--recording", str(path))

@@ -82,7 +82,7 @@ def test_parameters_of_single_clients_hold_for_variants_that_do_not_set_them(tmp
         ([], ["too-fast.parameters.limits=1:2:1"], "rule too-fast has no parameter limits; it has area, limit"),
         ([], ["too-fast.parameters.limit=3:1:1"], "last not below first"),
         ([], ["too-fast.parameters.limit=1:2:0"], "with step above 0"),
-        ([], ["too-fast.parameters.limit=0:1000:1"], "1001 variants are more than 100"),
+        ([], ["too-fast.parameters.limit=0:1000:1"], "--sweep may give at most 100 variants; got 1001"),
         (["harsh.signals.slowest.over=1s"], [], "there is no slowest; the names are speed, fastest"),
         (["harsh.signals.speed.over=x"], [], "harsh with signals.speed.over=x: spec.signals.0.over"),
     ],

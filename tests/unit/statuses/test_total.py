@@ -132,8 +132,8 @@ def test_the_command_adds_up_the_detectors_of_a_file_each_in_its_own_network(
     assert (code, msgspec.json.decode(text, type=Total)) == (0, expected)
     code, text, _ = requested("--detector", str(answers.file), "--rule", "fast", "--timeout", "60")
     assert code == 0
-    assert "2 detectors, 4 clients (1 of them known to several)" in text
-    assert "known to several: car2" in text
+    assert "2 detectors, 4 clients (1 of them known to several detectors)" in text
+    assert "known to several detectors: car2" in text
     assert "fast" in text
     assert "slow" not in text
 
