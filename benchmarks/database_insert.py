@@ -74,7 +74,7 @@ def the_samples(count: int) -> list[EpisodeSample]:
     return made
 
 
-class Nobody:
+class NoMessenger:
     """There is no Zenoh here."""
 
     def publish(self, *_: Any) -> None:
@@ -102,7 +102,7 @@ def with_the_action(detector: Detector, samples: list[EpisodeSample], name: str)
     def lose(what: str, count: int, why: str) -> None:
         raise AssertionError(f"{count} {what} lost: {why}")
 
-    context = ActionContext(rule, "keep", "h", lambda: around, Nobody(), report, lose, threading.Event())
+    context = ActionContext(rule, "keep", "h", lambda: around, NoMessenger(), report, lose, threading.Event())
     action = Database(DatabaseAction(database=name), context)
     action.wake()
     episode = Episode(

@@ -33,7 +33,7 @@ class Message(msgspec.Struct):
     speed: float
 
 
-class Spent(NamedTuple):
+class CpuTimes(NamedTuple):
     """Nanoseconds of CPU time of each tick, and of decoding its payloads; and the samples of all these ticks."""
 
     engine: list[int]
@@ -71,7 +71,7 @@ def main() -> None:
         )
 
 
-def measure(rules: Sequence[EventRule], clients: int, ticks: int, fill: float) -> Spent:
+def measure(rules: Sequence[EventRule], clients: int, ticks: int, fill: float) -> CpuTimes:
     """Fill the windows, then measure `ticks` ticks; `fill` is seconds."""
     before = round(fill * 1e9 / speeds.TICK)
     arrivals = list(speeds.arrivals(clients, HZ, (before + ticks + 1) * speeds.TICK / 1e9))
@@ -80,7 +80,7 @@ def measure(rules: Sequence[EventRule], clients: int, ticks: int, fill: float) -
     for tick, part in parts[:before]:
         live.advance(part, tick)
     tune_garbage_collection()
-    spent = Spent([], [], sum(len(part) for _, part in parts[before:]))
+    spent = CpuTimes([], [], sum(len(part) for _, part in parts[before:]))
     for tick, part in parts[before:]:
         begin = time.process_time_ns()
         live.advance(part, tick)

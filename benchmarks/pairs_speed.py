@@ -30,7 +30,7 @@ from detector.engine.samples.sample import Arrival
 PEER_UP_TO = 10_000
 
 
-class Spent(NamedTuple):
+class CpuTimes(NamedTuple):
     """Seconds of CPU time of each tick but the first, and of all; the episodes that started and ended in all."""
 
     ticks: list[float]
@@ -66,7 +66,7 @@ def main() -> int:
     return 0 if same else 1
 
 
-def measure(parts: Sequence[tuple[int, Sequence[Arrival]]]) -> Spent:
+def measure(parts: Sequence[tuple[int, Sequence[Arrival]]]) -> CpuTimes:
     """Drive the engine tick by tick."""
     live = Live(crowd.detector(), [crowd.rule()], crowd.START)
     tune_garbage_collection()
@@ -77,10 +77,10 @@ def measure(parts: Sequence[tuple[int, Sequence[Arrival]]]) -> Spent:
         events += live.advance(part, tick)
         ticks.append(time.process_time() - begin)
     starts = sum(event.started for event in events)
-    return Spent(ticks[1:], sum(ticks), starts, len(events) - starts)
+    return CpuTimes(ticks[1:], sum(ticks), starts, len(events) - starts)
 
 
-def compare(parts: Sequence[tuple[int, Sequence[Arrival]]], clients: int, spent: Spent) -> bool:
+def compare(parts: Sequence[tuple[int, Sequence[Arrival]]], clients: int, spent: CpuTimes) -> bool:
     """Print what the peer takes; whether it finds as many starts and ends as Wayside."""
     arrivals = [each for _, part in parts for each in part]
     with tempfile.TemporaryDirectory() as folder:

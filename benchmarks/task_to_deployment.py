@@ -88,7 +88,7 @@ def task(namespace: str, region: str) -> dict[str, Any]:
     }
 
 
-class Raw:
+class RawCalls:
     """The three calls, as a program would make them that knows everything beforehand."""
 
     def __init__(self, client: Client, namespace: str) -> None:
@@ -116,7 +116,7 @@ class Raw:
         }
 
 
-class Seen:
+class DeploymentWatch:
     """When each Deployment of a namespace came up, by a watch."""
 
     def __init__(self) -> None:
@@ -177,7 +177,7 @@ async def measure(sequential: int, burst: int, manager: subprocess.Popen[bytes],
     """Measure and print; the sequential ratio of p50."""
     ours, theirs = namespaces
     client = manager_client(await load_configuration())
-    raw, seen = Raw(client, theirs), Seen()
+    raw, seen = RawCalls(client, theirs), DeploymentWatch()
     await client.create(TEMPLATES, {**TEMPLATE, "metadata": {"name": "app", "namespace": ours}})
     async with seen.watching(client, ours):
         for index in range(5):  # warm up both
@@ -223,7 +223,7 @@ async def measure(sequential: int, burst: int, manager: subprocess.Popen[bytes],
     return ratio
 
 
-async def managed_burst(client: Client, seen: Seen, namespace: str, regions: list[str]) -> float:
+async def managed_burst(client: Client, seen: DeploymentWatch, namespace: str, regions: list[str]) -> float:
     """Seconds from the creation of the first task until all Deployments were seen."""
     count, began = len(seen.at), time.perf_counter()
     creating = asyncio.create_task(at_once([client.create(TASKS, task(namespace, region)) for region in regions]))

@@ -21,7 +21,7 @@ from wayside.times import format_time
 WAIT = 60.0
 
 
-class Silent:
+class NoMessenger:
     """No Zenoh session."""
 
     def publish(self, key: str, payload: bytes, encoding: str) -> None:
@@ -88,7 +88,7 @@ def a_harness(notify: Mapping[str, Any], *, state: Path | None = None, messenger
         action="notify",
         holder="h",
         configuration=lambda: DetectorConfiguration(detector, {}, standard()),
-        messenger=messenger or Silent(),
+        messenger=messenger or NoMessenger(),
         report=report,
         lose=lose,
         closing=harness.closing,

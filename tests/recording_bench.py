@@ -42,7 +42,7 @@ class Bench:
             action="bag",
             holder="h",
             configuration=self._surroundings,
-            messenger=_Silent(),
+            messenger=_NoMessenger(),
             report=lambda episode, outcome: self.reports.append((episode.id, outcome)),
             lose=lambda what, count, why: self.lost.append((what, count, why)),
             closing=threading.Event(),
@@ -79,7 +79,7 @@ class Bench:
         return Path(str(outcome.details["folder"]))
 
 
-class _Silent:
+class _NoMessenger:
     def publish(self, key: str, payload: bytes, encoding: str) -> None:
         raise AssertionError("recordings publish nothing")
 

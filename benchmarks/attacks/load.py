@@ -31,7 +31,7 @@ from pathlib import Path
 from application_manager.cluster.client import manager_client
 from application_manager.core.claims.claims import instance_name
 from benchmarks.attacks.cluster import LOUD, QUIET, SYSTEM, UNSERVED, Cluster, small_cluster
-from benchmarks.task_to_deployment import PATIENCE, TASKS, TEMPLATE, Seen, cpu_seconds, task
+from benchmarks.task_to_deployment import PATIENCE, TASKS, TEMPLATE, DeploymentWatch, cpu_seconds, task
 from wayside.kubernetes.client import Client
 from wayside.kubernetes.connection import load_configuration
 from wayside.kubernetes.resources import Resource
@@ -52,7 +52,7 @@ STAGES = ("creation", "Deployment", "status", "raw calls")
 class Measured:
     """Seconds from the creation of tasks to their Deployments, and to their statuses."""
 
-    def __init__(self, client: Client, seen: Seen) -> None:
+    def __init__(self, client: Client, seen: DeploymentWatch) -> None:
         self._client = client
         self._seen = seen
 
@@ -150,7 +150,7 @@ def largest(pid: int) -> float:
 async def measure(options: argparse.Namespace, cluster: Cluster, manager: int) -> list[str]:
     """Measure and print; what was missed."""
     os.environ["KUBECONFIG"] = str(cluster.tenants[QUIET])
-    client, seen = manager_client(await load_configuration()), Seen()
+    client, seen = manager_client(await load_configuration()), DeploymentWatch()
     measured = Measured(client, seen)
     programs = {**cluster.programs, "manager": manager}
     attacker: subprocess.Popen[bytes] | None = None

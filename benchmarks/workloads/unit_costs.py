@@ -31,7 +31,7 @@ from benchmarks.task_to_deployment import (
     TASKS,
     TEMPLATE,
     TEMPLATES,
-    Seen,
+    DeploymentWatch,
     at_once,
     cpu_seconds,
     fresh_namespaces,
@@ -239,7 +239,7 @@ def manager(tasks: int) -> dict[str, float]:
 
 
 async def _serve(plane: ControlPlane, process: subprocess.Popen[bytes], namespace: str, count: int) -> dict[str, float]:
-    client, seen, api = manager_client(await load_configuration()), Seen(), plane.api(namespace)
+    client, seen, api = manager_client(await load_configuration()), DeploymentWatch(), plane.api(namespace)
     spec = json.loads(json.dumps(TEMPLATE["spec"]))
     spec["manifests"][0]["spec"]["replicas"] = 1
     await client.create(TEMPLATES, {**TEMPLATE, "metadata": {"name": "app", "namespace": namespace}, "spec": spec})

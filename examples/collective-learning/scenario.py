@@ -32,7 +32,7 @@ POSE = "geometry_msgs/msg/PoseStamped"
 
 
 @dataclass(frozen=True, slots=True)
-class Thing:
+class StreetObject:
     """Something that stands or moves straight on: metres at second 0, and m/s."""
 
     name: str
@@ -61,19 +61,19 @@ class Error:
 
 
 VEHICLES = {
-    Thing("car-1", -80.0, -2.0, 8.0, 0.0): 0.0,
-    Thing("car-2", 2.0, -90.0, 0.0, 6.0): math.pi / 2,
-    Thing("car-3", 18.0, -16.0): 2.3,  # parked
-    Thing("car-4", -400.0, -2.0): 0.0,  # far away, and sees nothing of all this
+    StreetObject("car-1", -80.0, -2.0, 8.0, 0.0): 0.0,
+    StreetObject("car-2", 2.0, -90.0, 0.0, 6.0): math.pi / 2,
+    StreetObject("car-3", 18.0, -16.0): 2.3,  # parked
+    StreetObject("car-4", -400.0, -2.0): 0.0,  # far away, and sees nothing of all this
 }
 """Each with its heading in radians."""
 THINGS = (
-    Thing("pedestrian", 8.0, 7.0),
-    Thing("cyclist", -20.0, 12.0, 2.0, 0.0),
-    Thing("truck", -14.0, -14.0),
-    Thing("tractor", 95.0, 30.0),  # not at the scene
+    StreetObject("pedestrian", 8.0, 7.0),
+    StreetObject("cyclist", -20.0, 12.0, 2.0, 0.0),
+    StreetObject("truck", -14.0, -14.0),
+    StreetObject("tractor", 95.0, 30.0),  # not at the scene
 )
-GHOST = Thing("ghost", -6.0, 24.0)
+GHOST = StreetObject("ghost", -6.0, 24.0)
 TRUTH = (
     Error("car-1", "pedestrian", 7.0, 11.0),
     Error("car-2", "truck", 11.5, 12.1),  # too short to matter
@@ -132,20 +132,20 @@ def messages(seed: int) -> Iterator[Message]:
                 yield replace(sent, after_ns=after + LATENCY_NS // 2)
 
 
-def _from(vehicle: Thing, heading: float, thing: Thing, t: float) -> tuple[float, float]:
+def _from(vehicle: StreetObject, heading: float, thing: StreetObject, t: float) -> tuple[float, float]:
     """Where the thing is as seen from the vehicle: metres ahead and to the left."""
     (x, y), (vx, vy) = thing.at(t), vehicle.at(t)
     cosine, sine = math.cos(heading), math.sin(heading)
     return cosine * (x - vx) + sine * (y - vy), -sine * (x - vx) + cosine * (y - vy)
 
 
-def _near(vehicle: Thing, t: float) -> list[Thing]:
+def _near(vehicle: StreetObject, t: float) -> list[StreetObject]:
     """What the vehicle can see: things, and other vehicles."""
     others = [each for each in VEHICLES if each is not vehicle]
     return [each for each in (*THINGS, *others) if math.dist(each.at(t), vehicle.at(t)) < REACH_M]
 
 
-def _listed(vehicle: Thing, t: float) -> list[Thing]:
+def _listed(vehicle: StreetObject, t: float) -> list[StreetObject]:
     """What stands in its list of objects."""
     wrong = {each.thing for each in TRUTH if each.vehicle == vehicle.name and each.start_s <= t < each.end_s}
     return [each for each in _near(vehicle, t) if each.name not in wrong] + [GHOST] * (GHOST.name in wrong)

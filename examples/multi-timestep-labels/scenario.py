@@ -40,7 +40,7 @@ POSE = "geometry_msgs/msg/PoseStamped"
 
 
 @dataclass(frozen=True, slots=True)
-class Thing:
+class StreetObject:
     """Something in the street: what it is, where at second 0, in metres along and across, and its speed along."""
 
     number: int
@@ -72,13 +72,13 @@ class Error:
 
 
 THINGS = (
-    Thing(1, "van", 70.0, 3.0),
-    Thing(2, "cyclist", 60.0, -3.0, 5.0),
-    Thing(3, "pedestrian", 150.0, 4.5),
-    Thing(4, "oncoming car", 300.0, -3.5, -12.0),
-    Thing(5, "bus", 260.0, 3.5),
-    Thing(6, "child", 300.0, 5.0),
-    Thing(7, "car ahead", 25.0, 0.0, EGO_SPEED),
+    StreetObject(1, "van", 70.0, 3.0),
+    StreetObject(2, "cyclist", 60.0, -3.0, 5.0),
+    StreetObject(3, "pedestrian", 150.0, 4.5),
+    StreetObject(4, "oncoming car", 300.0, -3.5, -12.0),
+    StreetObject(5, "bus", 260.0, 3.5),
+    StreetObject(6, "child", 300.0, 5.0),
+    StreetObject(7, "car ahead", 25.0, 0.0, EGO_SPEED),
 )
 TRUTH = (
     Error("van", 0.0, 2.6, "car"),  # known before the perception is sure of it
@@ -124,7 +124,7 @@ def messages(seed: int) -> Iterator[Message]:
         yield Message(after + LATENCY_NS, "vehicles/ego/perception/tracks", as_json(content))
 
 
-def _track(rng: np.random.Generator, thing: Thing, t: float) -> dict[str, object] | None:
+def _track(rng: np.random.Generator, thing: StreetObject, t: float) -> dict[str, object] | None:
     """What stands about the thing in the list; None where nothing does."""
     ahead = thing.ahead(t)
     wrong = next((each for each in TRUTH if each.thing == thing.name and each.start_s <= t < each.end_s), None)

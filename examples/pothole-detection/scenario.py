@@ -22,7 +22,7 @@ IMU = "sensor_msgs/msg/Imu"
 
 
 @dataclass(frozen=True, slots=True)
-class Thing:
+class Obstacle:
     """What a car drives over, from one second to another."""
 
     car: str
@@ -32,18 +32,18 @@ class Thing:
 
 
 TRUTH = (
-    Thing("car-1", "pothole", 8.0, 8.14),
-    Thing("car-1", "bump", 16.0, 16.6),
-    Thing("car-1", "pothole", 23.3, 23.44),
-    Thing("car-1", "cobbles", 30.0, 42.0),
-    Thing("car-1", "pothole", 36.5, 36.64),  # among cobblestones
-    Thing("car-2", "bump", 10.0, 10.6),
-    Thing("car-2", "cobbles", 15.0, 25.0),
-    Thing("car-2", "bump", 19.0, 19.6),
-    Thing("car-2", "bump", 33.0, 33.6),
-    Thing("car-2", "bump", 34.0, 34.6),
-    Thing("car-3", "bump", 20.0, 20.6),
-    Thing("car-3", "pothole", 21.5, 21.64),  # right behind a bump
+    Obstacle("car-1", "pothole", 8.0, 8.14),
+    Obstacle("car-1", "bump", 16.0, 16.6),
+    Obstacle("car-1", "pothole", 23.3, 23.44),
+    Obstacle("car-1", "cobbles", 30.0, 42.0),
+    Obstacle("car-1", "pothole", 36.5, 36.64),  # among cobblestones
+    Obstacle("car-2", "bump", 10.0, 10.6),
+    Obstacle("car-2", "cobbles", 15.0, 25.0),
+    Obstacle("car-2", "bump", 19.0, 19.6),
+    Obstacle("car-2", "bump", 33.0, 33.6),
+    Obstacle("car-2", "bump", 34.0, 34.6),
+    Obstacle("car-3", "bump", 20.0, 20.6),
+    Obstacle("car-3", "pothole", 21.5, 21.64),  # right behind a bump
 )
 CARS = ("car-1", "car-2", "car-3")
 

@@ -13,7 +13,7 @@ from rich.table import Table
 from detector.assembly import DetectorError
 from detector.replay.message import RecordingError
 from detector.testing import RefusedError
-from examples.running.cases import Ran, folder_of, run, scenario_of, use_cases
+from examples.running.cases import CaseResult, folder_of, run, scenario_of, use_cases
 from examples.running.recording import write_recording
 from wayside.api.documents import DocumentError
 from wayside.manifests import to_yaml
@@ -49,7 +49,7 @@ def main() -> int:
 
 def _run(names: list[str], kept: Path | None, scratch: Path) -> int:
     console = Console(highlight=False, width=None if sys.stdout.isatty() else _WIDTH)
-    ran: list[Ran] = []
+    ran: list[CaseResult] = []
     with console.status("") as status:
         for name in names:
             status.update(f"{name} ({len(ran) + 1} of {len(names)})")
@@ -67,7 +67,7 @@ def _run(names: list[str], kept: Path | None, scratch: Path) -> int:
     return 0 if all(each.verdict.as_it_must_be for each in ran) else 1
 
 
-def _write(ran: Ran, output: Path) -> None:
+def _write(ran: CaseResult, output: Path) -> None:
     lines = "".join(f"{event.to_json()}\n" for event in ran.played.events)
     (output / "events.jsonl").write_text(lines, encoding="utf-8")
     if ran.played.tasks:
@@ -75,7 +75,7 @@ def _write(ran: Ran, output: Path) -> None:
         (output / "tasks.yaml").write_text(text, encoding="utf-8")
 
 
-def _table(ran: list[Ran]) -> Table:
+def _table(ran: list[CaseResult]) -> Table:
     table = Table(box=None, pad_edge=False)
     table.add_column("use case", no_wrap=True)
     for title in ("messages", "events expected", "found", "actions expected", "done", "time"):

@@ -19,7 +19,7 @@ SCENARIO = "scenario.py"
 
 
 @dataclass(frozen=True, slots=True)
-class Ran:
+class CaseResult:
     """What became of a use case."""
 
     name: str
@@ -62,7 +62,7 @@ def scenario_of(name: str) -> Scenario:
     return made
 
 
-def run(name: str, output: Path) -> Ran:
+def run(name: str, output: Path) -> CaseResult:
     """Run a use case; what comes out goes below the output folder.
 
     Raises:
@@ -78,4 +78,4 @@ def run(name: str, output: Path) -> Ran:
     count = write_recording(scenario.messages(), recording)
     played = play(folder_of(name), recording, output)
     verdict = judge(scenario, played, folder_of(name))
-    return Ran(name, scenario, played, verdict, count, time.monotonic() - began)
+    return CaseResult(name, scenario, played, verdict, count, time.monotonic() - began)

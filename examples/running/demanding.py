@@ -20,7 +20,7 @@ from wayside.api.documents import load_documents
 
 
 @dataclass(frozen=True, slots=True)
-class Running:
+class RunningTask:
     """What an instance consists of."""
 
     kinds: tuple[str, ...]
@@ -30,7 +30,7 @@ class Running:
     suspended: bool = False
 
 
-def running_at(folder: Path, history: Iterable[tuple[float, ApplicationTask]], at_s: float) -> dict[str, Running]:
+def running_at(folder: Path, history: Iterable[tuple[float, ApplicationTask]], at_s: float) -> dict[str, RunningTask]:
     """What would run at second `at_s`, by `<template>/<key>`; what only lingers is not there.
 
     Args:
@@ -58,7 +58,7 @@ def running_at(folder: Path, history: Iterable[tuple[float, ApplicationTask]], a
     return found
 
 
-def consists_of(manifests: Sequence[Mapping[str, Any]], *, suspended: bool = False) -> Running:
+def consists_of(manifests: Sequence[Mapping[str, Any]], *, suspended: bool = False) -> RunningTask:
     """What an instance with these objects is."""
     configuration: dict[str, Any] = {}
     for manifest in manifests:
@@ -66,10 +66,10 @@ def consists_of(manifests: Sequence[Mapping[str, Any]], *, suspended: bool = Fal
             for text in manifest.get("data", {}).values():
                 content = yaml.safe_load(text)
                 configuration |= content if isinstance(content, dict) else {}
-    return Running(tuple(sorted(manifest["kind"] for manifest in manifests)), configuration, suspended)
+    return RunningTask(tuple(sorted(manifest["kind"] for manifest in manifests)), configuration, suspended)
 
 
-def unlike(moment: Moment, found: Mapping[str, Running]) -> Iterator[str]:
+def unlike(moment: Moment, found: Mapping[str, RunningTask]) -> Iterator[str]:
     """How what runs differs from what must run at the moment, a line each."""
     for name in sorted({*moment.runs, *found}):
         if name not in found:

@@ -32,7 +32,7 @@ BEFORE_S, AFTER_S = 3.0, 2.0
 
 
 @dataclass(frozen=True, slots=True)
-class Thing:
+class StreetObject:
     """Something in the street: where it is at second 0, in metres along and across, and how fast it goes along."""
 
     name: str
@@ -57,14 +57,14 @@ class Error:
 
 
 THINGS = (
-    Thing("van", 60.0, 3.0),
-    Thing("pedestrian", 75.0, 4.5),
-    Thing("cyclist", 20.0, -3.0, 5.0),
-    Thing("car ahead", 30.0, 0.0, EGO_SPEED),
-    Thing("oncoming car", 400.0, -3.5, -9.0),
-    Thing("second pedestrian", 240.0, 5.0),
+    StreetObject("van", 60.0, 3.0),
+    StreetObject("pedestrian", 75.0, 4.5),
+    StreetObject("cyclist", 20.0, -3.0, 5.0),
+    StreetObject("car ahead", 30.0, 0.0, EGO_SPEED),
+    StreetObject("oncoming car", 400.0, -3.5, -9.0),
+    StreetObject("second pedestrian", 240.0, 5.0),
 )
-GHOST = Thing("ghost", 190.0, 2.0)
+GHOST = StreetObject("ghost", 190.0, 2.0)
 """A reflection: there is nothing."""
 TRUTH = (
     Error("pedestrian", SHADOW, 5.0, 9.5),  # overlooked beside the van by the existing one
@@ -106,7 +106,7 @@ def messages(seed: int) -> Iterator[Message]:
             yield Message(after + latency, f"vehicles/ego/{perception}/objects", as_json(content))
 
 
-def _has(perception: str, thing: Thing, t: float) -> bool:
+def _has(perception: str, thing: StreetObject, t: float) -> bool:
     """Whether the perception has the thing in its list."""
     error = next((each for each in TRUTH if each.thing == thing.name and each.start_s <= t < each.end_s), None)
     return thing is not GHOST if error is None else error.only == perception

@@ -102,7 +102,7 @@ class Vehicles:
             self._failure = failure
 
 
-class Town:
+class PairsNamespace:
     """A namespace in which the demands of pairs are served, however the programs run.
 
     Attributes:
@@ -170,7 +170,7 @@ class Town:
         return found
 
 
-class Chain(Town):
+class Chain(PairsNamespace):
     """Both programs, as processes, on a namespace with a Detector, a rule and a template."""
 
     def __init__(self, api: Api, namespace: str, processes: Processes, folder: Path) -> None:

@@ -25,7 +25,7 @@ _HOP = frozenset({"connection", "content-length", "content-encoding", "host", "k
 
 
 @dataclass
-class Seen:
+class ProxiedRequest:
     """One request: when it came, by a monotonic clock, and what was answered (0: nothing yet).
 
     `refused`: by the proxy, since an API server itself may have reasons to answer the same.
@@ -52,18 +52,18 @@ class Proxy:
     url: str = ""
     cut: bool = False
     refuse: Callable[[str, str], tuple[int, int] | None] = lambda _method, _path: None
-    seen: list[Seen] = field(default_factory=list)
+    seen: list[ProxiedRequest] = field(default_factory=list)
     most: int = 0
     under_way: int = 0
     slow: float = 0.0  # s by which every answer is late
     hushed: frozenset[int] = frozenset()  # indexes in `seen` of watches whose connection stands and brings nothing
 
-    def writes(self) -> list[Seen]:
+    def writes(self) -> list[ProxiedRequest]:
         """The requests that change anything but a Lease; a question about rights changes nothing."""
         others = ("/leases", "/selfsubjectaccessreviews")
         return [each for each in self.seen if each.method != "GET" and not any(other in each.path for other in others)]
 
-    def lease_writes(self) -> list[Seen]:
+    def lease_writes(self) -> list[ProxiedRequest]:
         """The requests that changed a Lease, and whose answers came."""
         return [each for each in self.seen if each.method != "GET" and "/leases" in each.path and each.status]
 
@@ -97,7 +97,7 @@ async def _serve(proxy: Proxy, target: str, ready: threading.Event, over: asynci
     async with aiohttp.ClientSession(connector=connector, auto_decompress=False) as session:
 
         async def handle(request: web.Request) -> web.StreamResponse:
-            seen = Seen(request.method, request.path_qs, time.monotonic())
+            seen = ProxiedRequest(request.method, request.path_qs, time.monotonic())
             index = len(proxy.seen)
             proxy.seen.append(seen)
             watches = "watch=true" in request.path_qs
@@ -124,7 +124,7 @@ async def _serve(proxy: Proxy, target: str, ready: threading.Event, over: asynci
 
 
 async def _answer(
-    proxy: Proxy, session: aiohttp.ClientSession, target: str, request: web.Request, seen: Seen, index: int
+    proxy: Proxy, session: aiohttp.ClientSession, target: str, request: web.Request, seen: ProxiedRequest, index: int
 ) -> web.StreamResponse:
     await _while_cut(proxy)
     refusal = proxy.refuse(request.method, request.path_qs)

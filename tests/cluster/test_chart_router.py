@@ -43,7 +43,7 @@ Connect = Callable[..., zenoh.Session]
 
 
 @dataclass(frozen=True)
-class Guarded:
+class GuardedRouter:
     """The router's own session, and what connects to it."""
 
     router: zenoh.Session
@@ -51,12 +51,12 @@ class Guarded:
 
 
 @pytest.fixture
-def connect(guarded: Guarded) -> Connect:
+def connect(guarded: GuardedRouter) -> Connect:
     return guarded.connect
 
 
 @pytest.fixture
-def guarded(helm: Helm, tmp_path: Path) -> Iterator[Guarded]:
+def guarded(helm: Helm, tmp_path: Path) -> Iterator[GuardedRouter]:
     """Connects with a certificate of this name; optionally from another authority, or with none."""
     authority, other = Authority(tmp_path), Authority(tmp_path, "foreign")
     certificate, key = authority.sign("router")
@@ -95,7 +95,7 @@ def guarded(helm: Helm, tmp_path: Path) -> Iterator[Guarded]:
         return sessions[-1]
 
     with closing(opened(made)) as inside:
-        yield Guarded(inside, connected)
+        yield GuardedRouter(inside, connected)
         for each in sessions:
             each.close()  # type: ignore[no-untyped-call]
 
@@ -160,7 +160,7 @@ KEYS = (
 
 
 @pytest.mark.parametrize("who", MAY)
-def test_each_client_reaches_only_its_own_keys(guarded: Guarded, who: str) -> None:
+def test_each_client_reaches_only_its_own_keys(guarded: GuardedRouter, who: str) -> None:
     """Watched from within the router, to which no access control applies."""
     inside, session = guarded.router, guarded.connect(who)
     reached: dict[str, set[str]] = {each: set() for each in ("publishes", "token", "receives", "queries", "answers")}

@@ -24,7 +24,7 @@ NAME = "wayside-intersection-a"
 LONG = 600  # s: a Lease that lasts longer than any wait here
 
 
-class Holding:
+class LeaseCandidate:
     """A process that wants the Lease, as far as the Lease is concerned."""
 
     def __init__(self, loop: Background, namespace: str, identity: ProcessIdentity, **options: Any):
@@ -95,7 +95,7 @@ def test_it_lasts_15_seconds_and_belongs_to_the_pod(
     created = api.create({"apiVersion": "v1", "kind": "Pod", "metadata": {"name": "detector-1"}, "spec": pod})
     monkeypatch.setenv("POD_NAME", "detector-1")
     monkeypatch.setenv("POD_UID", created["metadata"]["uid"])
-    Holding(loop, namespace, ProcessIdentity.of_this_process()).wait_held()
+    LeaseCandidate(loop, namespace, ProcessIdentity.of_this_process()).wait_held()
     lease = api.get("Lease", NAME)
     assert lease["spec"]["leaseDurationSeconds"] == 15
     assert lease["spec"]["holderIdentity"] == "detector-1"
@@ -104,7 +104,7 @@ def test_it_lasts_15_seconds_and_belongs_to_the_pod(
 
 
 def test_it_is_renewed_after_each_third_of_its_duration(api: Api, namespace: str, loop: Background) -> None:
-    Holding(loop, namespace, ProcessIdentity("pod-1"), duration=15.0).wait_held()
+    LeaseCandidate(loop, namespace, ProcessIdentity("pod-1"), duration=15.0).wait_held()
     specs = renewals(api, 3)
     gaps = [(moment(after) - moment(before)).total_seconds() for before, after in pairwise(specs)]
     assert all(4.9 < gap < 15.0 for gap in gaps), gaps
@@ -113,7 +113,7 @@ def test_it_is_renewed_after_each_third_of_its_duration(api: Api, namespace: str
 
 
 def test_one_that_was_deleted_by_hand_comes_back(api: Api, namespace: str, loop: Background) -> None:
-    Holding(loop, namespace, ProcessIdentity("pod-1"), duration=3.0).wait_held()
+    LeaseCandidate(loop, namespace, ProcessIdentity("pod-1"), duration=3.0).wait_held()
     api.delete("Lease", NAME)
     api.wait_for("Lease", NAME, lambda _: True, what="the Lease is there again")
 
@@ -121,10 +121,10 @@ def test_one_that_was_deleted_by_hand_comes_back(api: Api, namespace: str, loop:
 def test_a_second_process_waits_until_the_first_has_been_silent_for_the_duration(
     api: Api, namespace: str, loop: Background, caplog: pytest.LogCaptureFixture
 ) -> None:
-    first = Holding(loop, namespace, ProcessIdentity("pod-1"), duration=3.0)
+    first = LeaseCandidate(loop, namespace, ProcessIdentity("pod-1"), duration=3.0)
     first.wait_held()
     clock = [0.0]  # the second one's, in s: how fast this machine is changes nothing
-    second = Holding(loop, namespace, ProcessIdentity("pod-2"), duration=3.0, monotonic=lambda: clock[0])
+    second = LeaseCandidate(loop, namespace, ProcessIdentity("pod-2"), duration=3.0, monotonic=lambda: clock[0])
     seen = renewals(api, 1)[-1]
     for _ in range(4):  # for longer than the duration
         seen = another(api, seen)
@@ -143,7 +143,7 @@ def test_a_second_process_waits_until_the_first_has_been_silent_for_the_duration
 
 
 def test_what_was_released_is_taken_at_once_and_still_lasts(api: Api, namespace: str, loop: Background) -> None:
-    first = Holding(loop, namespace, ProcessIdentity("pod-1"), duration=LONG)
+    first = LeaseCandidate(loop, namespace, ProcessIdentity("pod-1"), duration=LONG)
     first.wait_held()
     first.stop()
     released = api.get("Lease", NAME)["spec"]
@@ -151,16 +151,16 @@ def test_what_was_released_is_taken_at_once_and_still_lasts(api: Api, namespace:
     assert released["leaseDurationSeconds"] == LONG, "the manager keeps counting the demands for the usual time"
     assert api.get("Lease", NAME)["metadata"]["labels"] == {HOLDER_LEASE_LABEL: "true"}
     api.patch("Lease", NAME, {"metadata": {"labels": {HOLDER_LEASE_LABEL: None, "team": "mobility"}}})
-    Holding(loop, namespace, ProcessIdentity("pod-2")).wait_held()
+    LeaseCandidate(loop, namespace, ProcessIdentity("pod-2")).wait_held()
     labels = api.get("Lease", NAME)["metadata"]["labels"]
     assert labels == {HOLDER_LEASE_LABEL: "true", "team": "mobility"}, "as one of an older release gets it"
 
 
 def test_the_next_container_of_the_same_pod_takes_over_at_once(namespace: str, loop: Background) -> None:
-    first = Holding(loop, namespace, ProcessIdentity("pod-1"), duration=LONG)
+    first = LeaseCandidate(loop, namespace, ProcessIdentity("pod-1"), duration=LONG)
     first.wait_held()
     first.die()
-    Holding(loop, namespace, ProcessIdentity("pod-1")).wait_held()
+    LeaseCandidate(loop, namespace, ProcessIdentity("pod-1")).wait_held()
 
 
 def test_a_process_that_died_on_this_machine_is_succeeded_at_once_and_a_live_one_is_not(
@@ -169,10 +169,10 @@ def test_a_process_that_died_on_this_machine_is_succeeded_at_once_and_a_live_one
     own = ProcessIdentity.of_this_process()
     machine = own.text.removesuffix(str(os.getpid()))
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as other:
-        first = Holding(loop, namespace, ProcessIdentity(f"{machine}{other.pid}"), duration=LONG)
+        first = LeaseCandidate(loop, namespace, ProcessIdentity(f"{machine}{other.pid}"), duration=LONG)
         first.wait_held()
         first.die()
-        second = Holding(loop, namespace, own)
+        second = LeaseCandidate(loop, namespace, own)
         wait_until(lambda: second.lease.attempts, lambda n: n >= 2, what="it has tried twice")
         assert not second.held
         other.kill()
@@ -182,7 +182,7 @@ def test_a_process_that_died_on_this_machine_is_succeeded_at_once_and_a_live_one
 def test_one_that_was_taken_over_holds_no_more(
     api: Api, namespace: str, loop: Background, caplog: pytest.LogCaptureFixture
 ) -> None:
-    first = Holding(loop, namespace, ProcessIdentity("pod-1"), duration=3.0)
+    first = LeaseCandidate(loop, namespace, ProcessIdentity("pod-1"), duration=3.0)
     first.wait_held()
     api.patch("Lease", NAME, {"spec": {"holderIdentity": "pod-2", "leaseDurationSeconds": LONG}})
     first.wait_held(False)
@@ -193,7 +193,7 @@ def test_one_that_was_taken_over_holds_no_more(
 def test_an_outage_does_not_take_it_away(
     control_plane: ControlPlane, api: Api, namespace: str, loop: Background
 ) -> None:
-    holding = Holding(loop, namespace, ProcessIdentity("pod-1"), duration=3.0)
+    holding = LeaseCandidate(loop, namespace, ProcessIdentity("pod-1"), duration=3.0)
     holding.wait_held()
     with control_plane.outage():
         wait_until(lambda: holding.lease.failures, lambda n: n >= 2, what="two renewals failed")

@@ -31,7 +31,7 @@ def rule(name: str, labels: dict[str, str] | None = None, **spec: Any) -> Object
     return {"apiVersion": API_VERSION, "kind": "EventRule", "metadata": metadata, "spec": full}
 
 
-class Following:
+class RulesFollower:
     """Collects each set as it comes."""
 
     def __init__(self, loop: Background, namespace: str):
@@ -59,9 +59,9 @@ def names_of(rule_set: RuleSet) -> list[str]:
 
 
 @pytest.fixture
-def following(control_plane: ControlPlane, namespace: str) -> Iterator[Following]:
+def following(control_plane: ControlPlane, namespace: str) -> Iterator[RulesFollower]:
     with background(control_plane.kubeconfig) as loop:
-        yield Following(loop, namespace)
+        yield RulesFollower(loop, namespace)
 
 
 def test_the_selected_rules_come_by_name_and_others_do_not(
@@ -70,12 +70,12 @@ def test_the_selected_rules_come_by_name_and_others_do_not(
     for each in (rule("c"), rule("b", {"site": "b"}), rule("a"), detector()):
         api.create(each)
     with background(control_plane.kubeconfig) as loop:
-        following = Following(loop, namespace)
+        following = RulesFollower(loop, namespace)
         following.wait_rules("a", "c")
         assert len(following.sets) == 1, "nothing comes before all is known"
 
 
-def test_each_change_is_followed(api: Api, following: Following) -> None:
+def test_each_change_is_followed(api: Api, following: RulesFollower) -> None:
     api.create(detector())
     following.wait_rules()
     api.create(rule("a"))
@@ -93,7 +93,7 @@ def test_each_change_is_followed(api: Api, following: Following) -> None:
     following.wait(lambda last: last.detector.spec.client_timeout == "7s", "the Detector is the changed one")
 
 
-def test_a_status_or_an_annotation_is_no_change(api: Api, following: Following) -> None:
+def test_a_status_or_an_annotation_is_no_change(api: Api, following: RulesFollower) -> None:
     api.create(detector())
     api.create(rule("a"))
     following.wait_rules("a")
@@ -106,7 +106,7 @@ def test_a_status_or_an_annotation_is_no_change(api: Api, following: Following) 
 
 
 def test_the_last_known_set_holds_while_the_detector_is_gone(
-    api: Api, following: Following, caplog: pytest.LogCaptureFixture
+    api: Api, following: RulesFollower, caplog: pytest.LogCaptureFixture
 ) -> None:
     wait_until(lambda: caplog.text, lambda text: "no Detector 'intersection-a'" in text, what="the log reports it")
     api.create(detector())
@@ -127,7 +127,7 @@ def test_the_last_known_set_holds_while_the_detector_is_gone(
 
 
 def test_a_rule_that_cannot_be_read_is_reported_and_left_out(
-    api: Api, following: Following, caplog: pytest.LogCaptureFixture
+    api: Api, following: RulesFollower, caplog: pytest.LogCaptureFixture
 ) -> None:
     # A CRD's schema cannot constrain a map's keys, so the API server accepts this.
     deploy = {"name": "x", "deploy": {"templateName": "t", "parameters": {"not-an-identifier": 1}}}
@@ -145,7 +145,7 @@ def test_a_rule_that_cannot_be_read_is_reported_and_left_out(
 
 @pytest.mark.own_control_plane
 def test_what_changed_during_an_outage_is_seen_after_it(
-    control_plane: ControlPlane, api: Api, following: Following
+    control_plane: ControlPlane, api: Api, following: RulesFollower
 ) -> None:
     api.create(detector())
     api.create(rule("a"))

@@ -56,7 +56,7 @@ def by_name(*demands: Demand) -> dict[str, Demand]:
     return {each.name: each for each in demands}
 
 
-class Running:
+class BackgroundReconciler:
     """A reconciler that runs in the background."""
 
     def __init__(self, loop: Background, namespace: str, holder: str, resync: float):
@@ -88,15 +88,17 @@ class Running:
 
 
 @contextmanager
-def reconciling(kubeconfig: Path, namespace: str, holder: str = HOLDER, resync: float = RARELY) -> Iterator[Running]:
+def reconciling(
+    kubeconfig: Path, namespace: str, holder: str = HOLDER, resync: float = RARELY
+) -> Iterator[BackgroundReconciler]:
     with background(kubeconfig) as loop:
-        running = Running(loop, namespace, holder, resync)
+        running = BackgroundReconciler(loop, namespace, holder, resync)
         yield running
         running.stop()
 
 
 @pytest.fixture
-def running(control_plane: ControlPlane, namespace: str) -> Iterator[Running]:
+def running(control_plane: ControlPlane, namespace: str) -> Iterator[BackgroundReconciler]:
     with reconciling(control_plane.kubeconfig, namespace) as started:
         yield started
 
@@ -116,7 +118,7 @@ def is_ended(task: Object) -> bool:
     return "endTime" in task["spec"]
 
 
-def test_a_demand_becomes_a_task_that_ends_with_it(api: Api, namespace: str, running: Running) -> None:
+def test_a_demand_becomes_a_task_that_ends_with_it(api: Api, namespace: str, running: BackgroundReconciler) -> None:
     wanted = demand(namespace)
     running.update(by_name(wanted))
     [task] = tasks_are(api, {wanted.name})
@@ -131,7 +133,7 @@ def test_a_demand_becomes_a_task_that_ends_with_it(api: Api, namespace: str, run
     running.counted(DeployCounts(created=1, ended=1))
 
 
-def test_the_values_at_the_start_are_kept(api: Api, namespace: str, running: Running) -> None:
+def test_the_values_at_the_start_are_kept(api: Api, namespace: str, running: BackgroundReconciler) -> None:
     wanted = demand(namespace)
     values = {"distance": 149.5, "a": {"client": "car1", "streams": ["pose"]}}
     wanted = dataclasses.replace(wanted, episode=msgspec.structs.replace(wanted.episode, values=values))
@@ -140,7 +142,9 @@ def test_the_values_at_the_start_are_kept(api: Api, namespace: str, running: Run
     assert running.restored() == [wanted]
 
 
-def test_changed_parameters_are_patched_and_removed_ones_go(api: Api, namespace: str, running: Running) -> None:
+def test_changed_parameters_are_patched_and_removed_ones_go(
+    api: Api, namespace: str, running: BackgroundReconciler
+) -> None:
     wanted = demand(namespace)
     running.update(by_name(wanted))
     [before] = tasks_are(api, {wanted.name})
@@ -156,7 +160,9 @@ def test_changed_parameters_are_patched_and_removed_ones_go(api: Api, namespace:
     running.counted(DeployCounts(created=1, patched=1))
 
 
-def test_what_cannot_be_changed_is_recreated_under_the_same_name(api: Api, namespace: str, running: Running) -> None:
+def test_what_cannot_be_changed_is_recreated_under_the_same_name(
+    api: Api, namespace: str, running: BackgroundReconciler
+) -> None:
     wanted = demand(namespace)
     running.update(by_name(wanted))
     [before] = tasks_are(api, {wanted.name})
@@ -170,7 +176,7 @@ def test_what_cannot_be_changed_is_recreated_under_the_same_name(api: Api, names
     assert after["metadata"]["uid"] != before["metadata"]["uid"]
 
 
-def test_a_live_task_deleted_by_hand_comes_back(api: Api, namespace: str, running: Running) -> None:
+def test_a_live_task_deleted_by_hand_comes_back(api: Api, namespace: str, running: BackgroundReconciler) -> None:
     wanted = demand(namespace)
     running.update(by_name(wanted))
     [before] = tasks_are(api, {wanted.name})
@@ -184,7 +190,7 @@ def test_a_live_task_deleted_by_hand_comes_back(api: Api, namespace: str, runnin
     wait_until(lambda: running.counts, lambda counts: counts.recreated == 1, what="counted as created again")
 
 
-def test_a_task_ended_by_hand_stays_ended(api: Api, namespace: str, running: Running) -> None:
+def test_a_task_ended_by_hand_stays_ended(api: Api, namespace: str, running: BackgroundReconciler) -> None:
     wanted, other = demand(namespace), demand(namespace, "car3+car4")
     running.update(by_name(wanted))
     tasks_are(api, {wanted.name})
@@ -199,7 +205,7 @@ def test_a_task_ended_by_hand_stays_ended(api: Api, namespace: str, running: Run
 
 @pytest.mark.own_control_plane
 def test_an_outage_delays_starts_and_ends_and_loses_none(
-    control_plane: ControlPlane, api: Api, namespace: str, running: Running
+    control_plane: ControlPlane, api: Api, namespace: str, running: BackgroundReconciler
 ) -> None:
     stays, ends, starts, passes = (demand(namespace, subject) for subject in ("a+b", "c+d", "e+f", "g+h"))
     running.update(by_name(stays, ends))
@@ -223,14 +229,14 @@ def test_an_end_that_a_stopped_detector_could_not_report_is_reported_by_the_next
 ) -> None:
     wanted = demand(namespace)
     with background(control_plane.kubeconfig) as loop:
-        first = Running(loop, namespace, HOLDER, RARELY)
+        first = BackgroundReconciler(loop, namespace, HOLDER, RARELY)
         first.update(by_name(wanted))
         tasks_are(api, {wanted.name})
         with control_plane.outage():
             first.update({}, {wanted.name: START + SECOND})
             first.stop(deadline=0.2)
         [task] = tasks_are(api, {wanted.name})
-        second = Running(loop, namespace, HOLDER, RARELY)
+        second = BackgroundReconciler(loop, namespace, HOLDER, RARELY)
         assert second.restored() == [wanted]
         assert not is_ended(api.get("ApplicationTask", wanted.name)), "nothing is ended before the engine has spoken"
         second.update({}, {wanted.name: START + 5 * SECOND})
@@ -260,7 +266,9 @@ def test_a_detector_that_stops_leaves_its_live_tasks_alive_and_adopts_them(
         assert api.get("ApplicationTask", task["metadata"]["name"]) == task
 
 
-def test_others_tasks_are_neither_ended_nor_treated_as_own(api: Api, namespace: str, running: Running) -> None:
+def test_others_tasks_are_neither_ended_nor_treated_as_own(
+    api: Api, namespace: str, running: BackgroundReconciler
+) -> None:
     wanted = demand(namespace)
     foreign = demand(namespace, "x+y", holder="intersection-b")
     usurped = task_manifest(to_task(wanted))
@@ -284,7 +292,9 @@ def test_others_tasks_are_neither_ended_nor_treated_as_own(api: Api, namespace: 
     assert [api.get("ApplicationTask", each["metadata"]["name"]) for each in before] == before
 
 
-def test_a_task_that_exists_is_distinguished_from_other_refusals(namespace: str, running: Running, api: Api) -> None:
+def test_a_task_that_exists_is_distinguished_from_other_refusals(
+    namespace: str, running: BackgroundReconciler, api: Api
+) -> None:
     wanted = demand(namespace)
     running.update(by_name(wanted))
     tasks_are(api, {wanted.name})
@@ -306,7 +316,7 @@ def test_what_is_forbidden_is_done_once_it_is_allowed(control_plane: ControlPlan
         tasks_are(api, {wanted.name})
 
 
-def test_a_burst_of_demands_is_served_each_once(api: Api, namespace: str, running: Running) -> None:
+def test_a_burst_of_demands_is_served_each_once(api: Api, namespace: str, running: BackgroundReconciler) -> None:
     wanted = by_name(*(demand(namespace, f"car{number}+rsu") for number in range(300)))
     running.update(wanted)
     tasks_are(api, set(wanted))

@@ -24,7 +24,7 @@ def loop(control_plane: ControlPlane) -> Iterator[Background]:
         yield started
 
 
-class Following:
+class ReflectorReader:
     """Keeps what a reflector yields, and the resulting state."""
 
     def __init__(self, loop: Background, namespace: str, resync: float = 600.0):
@@ -60,7 +60,7 @@ def config_map(named: str, x: str, marked: str = "yes") -> Object:
 def test_creations_changes_and_deletions_come_without_another_list(api: Api, namespace: str, loop: Background) -> None:
     api.create(config_map("a", "1"))
     api.create(config_map("other", "1", marked="no"))
-    following = Following(loop, namespace)
+    following = ReflectorReader(loop, namespace)
     following.wait(a="1")
     api.create(config_map("b", "1"))
     api.patch("ConfigMap", "a", {"data": {"x": "2"}})
@@ -73,7 +73,7 @@ def test_creations_changes_and_deletions_come_without_another_list(api: Api, nam
 
 def test_all_is_listed_again_after_the_resync_period(api: Api, namespace: str, loop: Background) -> None:
     api.create(config_map("a", "1"))
-    following = Following(loop, namespace, resync=1.0)
+    following = ReflectorReader(loop, namespace, resync=1.0)
     wait_until(lambda: following.reflector.lists, lambda n: n >= 3, what="three lists")
     assert following.reflector.outages == 0
     assert following.data == {"a": "1"}
@@ -85,7 +85,7 @@ def test_what_happens_around_an_outage_is_not_missed(
 ) -> None:
     api.create(config_map("a", "1"))
     api.create(config_map("b", "1"))
-    following = Following(loop, namespace)
+    following = ReflectorReader(loop, namespace)
     following.wait(a="1", b="1")
     control_plane.stop_api_server()
     try:

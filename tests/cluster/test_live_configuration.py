@@ -84,7 +84,7 @@ def wait_until_announced(api: Api, *sources: str) -> Object:
     return pod
 
 
-class Reported:
+class SourcesSubscriber:
     """What comes on a key, as sources; None for a deletion."""
 
     def __init__(self, session: zenoh.Session, key: str) -> None:
@@ -159,7 +159,7 @@ def test_zenoh_has_each_change_and_answers_who_comes_late(
     api: Api, namespace: str, network: zenoh.Session, manager: Process
 ) -> None:
     key = f"wayside/instances/{namespace}/fusion/configuration"
-    reported = Reported(network, key)
+    reported = SourcesSubscriber(network, key)
     api.create(template())
     api.create(vehicle("car1"))
     reported.wait_for(["car1"])
@@ -202,7 +202,7 @@ def test_zenoh_may_come_late_and_go(api: Api, namespace: str, endpoint: str, man
             wait_until(
                 lambda: requested(session, key), lambda found, cars=cars: found == [cars], what="there is an answer"
             )
-            reported = Reported(session, key)
+            reported = SourcesSubscriber(session, key)
             api.create(vehicle(f"car{number}"))
             reported.wait_for([*cars, f"car{number}"])
     assert manager.terminate(patience=15) == 0

@@ -33,7 +33,7 @@ from tests.cluster.expected_objects import (
     template,
     wait_settled,
 )
-from tests.cluster.faulty_proxy import Seen, faulty_proxy
+from tests.cluster.faulty_proxy import ProxiedRequest, faulty_proxy
 from tests.cluster.manifests import DETECTOR, EVENT_RULE
 from tests.cluster.namespaces import new_namespace
 from tests.cluster.processes import Processes
@@ -119,7 +119,7 @@ def each_verb_is_missed(api: Api, whole: list[Object], lacks: Callable[[], list[
         wait_until(lacks, expected.__eq__, what=f"{expected} lack, and nothing else")
 
 
-def used(seen: list[Seen], namespace: str) -> Iterator[Verb]:
+def used(seen: list[ProxiedRequest], namespace: str) -> Iterator[Verb]:
     """The rights that a manager's requests needed, in RBAC's terms."""
     for each in seen:
         parts = urlsplit(each.path)

@@ -8,7 +8,7 @@ from application_manager.core.claims.claims import instance_name
 from tests.cluster.api import Api
 from tests.cluster.controlplane import ControlPlane
 from tests.cluster.expected_objects import condition, start_manager, task, template, wait_settled
-from tests.cluster.faulty_proxy import Proxy, Seen, faulty_proxy
+from tests.cluster.faulty_proxy import ProxiedRequest, Proxy, faulty_proxy
 from tests.cluster.processes import Processes
 from tests.cluster.waiting import wait_until
 
@@ -21,12 +21,12 @@ BESIDE = 4
 LISTS_AND_LEASES = ("watch=true", "limit=", "/leases", "/selfsubjectaccessreviews")
 
 
-def about_tasks(proxy: Proxy, since: int) -> list[Seen]:
+def about_tasks(proxy: Proxy, since: int) -> list[ProxiedRequest]:
     """The requests that are neither lists, which come with time and not with tasks, nor about Leases."""
     return [each for each in proxy.seen[since:] if not any(part in each.path for part in LISTS_AND_LEASES)]
 
 
-def applies(seen: list[Seen]) -> list[Seen]:
+def applies(seen: list[ProxiedRequest]) -> list[ProxiedRequest]:
     return [each for each in seen if each.method == "PATCH" and "force=true" in each.path]
 
 
@@ -40,7 +40,7 @@ def test_a_task_with_an_instance_of_its_own_takes_two_applies_and_four_other_req
         api.create(task("warm"))
         wait_settled(api)
         wait_until(lambda: api.get("ApplicationTemplate", "app"), lambda raw: raw["status"]["instances"] == 1, what="1")
-        counted: list[list[Seen]] = []
+        counted: list[list[ProxiedRequest]] = []
         for number in range(10 * MANY):
             wait_settled(api)
             since, began = len(proxy.seen), time.monotonic()

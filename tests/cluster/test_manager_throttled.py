@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from tests.cluster.api import Api
 from tests.cluster.controlplane import ControlPlane
 from tests.cluster.expected_objects import start_manager, task, template, wait_settled
-from tests.cluster.faulty_proxy import Seen, faulty_proxy
+from tests.cluster.faulty_proxy import ProxiedRequest, faulty_proxy
 from tests.cluster.processes import Processes
 from tests.cluster.waiting import wait_until
 from wayside.kubernetes.pacing import AT_ONCE, MOST_WRITES
@@ -86,6 +86,6 @@ def test_an_api_server_that_refuses_everything_for_a_while_is_waited_for(
         assert manager.alive
 
 
-def watches(seen: Seen) -> bool:
+def watches(seen: ProxiedRequest) -> bool:
     """Whether the request is kopf's: a watch, or the list before it, which it restarts at any time."""
     return "watch=true" in seen.path or "/namespaces/" not in seen.path

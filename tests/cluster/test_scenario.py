@@ -40,7 +40,7 @@ SAMPLING = 0.2  # s: a pose is up to 0.1 s old, and so is what the observer saw
 
 
 @dataclass
-class Seen:
+class Snapshot:
     """What existed at one moment."""
 
     since_ns: int  # the epoch
@@ -54,7 +54,7 @@ class Observer:
     """Looks at the Deployments and ConfigMaps of a namespace ten times a second."""
 
     api: Api
-    seen: list[Seen] = field(default_factory=list)
+    seen: list[Snapshot] = field(default_factory=list)
 
     def watching(self) -> AbstractContextManager[None]:
         return repeated("observer", self.look, LOOKING)
@@ -70,7 +70,7 @@ class Observer:
             if found is not None:
                 content = yaml.safe_load(found["data"]["sources.yaml"])
                 sources[content["place"]] = tuple(content["sources"])
-        self.seen.append(Seen(before, time.monotonic() - began, frozenset(pairs), sources))
+        self.seen.append(Snapshot(before, time.monotonic() - began, frozenset(pairs), sources))
 
 
 def _vehicles(deployment: dict[str, Any]) -> tuple[str, ...]:
@@ -119,7 +119,7 @@ def test_the_deployments_over_time_are_those_that_the_positions_call_for(
 
     judge = episodes(simulate(SEED, DURATION), DURATION)
     assert len(judge) >= 4
-    seen = Moments(observer.seen, start_ns=int(logged[1]), late_s=int(logged[2]) / 1000)
+    seen = Timeline(observer.seen, start_ns=int(logged[1]), late_s=int(logged[2]) / 1000)
     assert_recorders(seen, recorders(judge, LINGER))
     assert_fusions(seen, fusions(judge, LINGER))
     tasks = api.wait_list(
@@ -140,7 +140,7 @@ def test_the_deployments_over_time_are_those_that_the_positions_call_for(
 
 
 @dataclass
-class Moments:
+class Timeline:
     """What was seen, in seconds into the drive, and how late it may have been at most.
 
     A machine that is slow is so for vehicles and observer too: by how much poses were sent late, by how much longer
@@ -148,7 +148,7 @@ class Moments:
     as well.
     """
 
-    seen: list[Seen]
+    seen: list[Snapshot]
     start_ns: int
     late_s: float
 
@@ -163,11 +163,11 @@ class Moments:
         pauses = ((after.since_ns - each.since_ns) / 1e9 - each.took_s for each, after in pairwise(self.seen))
         return max(0.0, max(pauses) - LOOKING)
 
-    def __iter__(self) -> Iterator[tuple[float, Seen]]:
+    def __iter__(self) -> Iterator[tuple[float, Snapshot]]:
         return (((each.since_ns - self.start_ns) / 1e9, each) for each in self.seen)
 
 
-def assert_recorders(seen: Moments, spans: dict[tuple[str, str], list[Any]]) -> None:
+def assert_recorders(seen: Timeline, spans: dict[tuple[str, str], list[Any]]) -> None:
     """A recorder exists during its pair's span, within the tolerance, and at no other time."""
     assert len(seen.seen) > DURATION, "the observer must have looked often enough to prove anything"
     assert {pair for _, moment in seen for pair in moment.pairs} == spans.keys()
@@ -182,7 +182,7 @@ def assert_recorders(seen: Moments, spans: dict[tuple[str, str], list[Any]]) -> 
             assert may or not exists, f"at {at:.2f} s (+ {allowed:.2f} s) there is a recorder for {pair}: {its}"
 
 
-def assert_fusions(seen: Moments, expected: dict[str, list[Any]]) -> None:
+def assert_fusions(seen: Timeline, expected: dict[str, list[Any]]) -> None:
     """The sources at a place are at each moment those of some state that is due about then."""
     met = dict.fromkeys(expected, 0)
     allowed = seen.allowed

@@ -18,7 +18,7 @@ import zenoh
 
 from application_manager.core.claims.claims import instance_name
 from examples.running.cases import folder_of, scenario_of, use_cases
-from examples.running.demanding import Running, consists_of, unlike
+from examples.running.demanding import RunningTask, consists_of, unlike
 from examples.running.scenario import SECOND, Message, Moment
 from tests.cluster.api import Api
 from tests.cluster.expected_objects import condition, start_manager, wait_settled
@@ -135,7 +135,7 @@ def wait_runs(api: Api, moment: Moment) -> None:
     )
 
 
-def running(api: Api) -> dict[str, Running]:
+def running(api: Api) -> dict[str, RunningTask]:
     """What is there in the namespace, by template and key."""
     found = {}
     for instance in api.list("ApplicationInstance"):

@@ -9,7 +9,7 @@ import pytest
 from tests.cluster.api import Api
 from tests.cluster.chain import BETWEEN, BUSES, CARS, FAR, NEAR, TRAMS, VANS, untouched
 from tests.e2e.node import Node
-from tests.e2e.town import Heard, NodeTown, restarts_of
+from tests.e2e.pairs_on_node import PairsOnNode, PublishedEvents, restarts_of
 from wayside.times import parse_time
 
 OUTAGE = 60.0
@@ -17,12 +17,12 @@ OUTAGE = 60.0
 
 
 @pytest.fixture
-def town(node: Node, api: Api, image: str) -> NodeTown:
+def town(node: Node, api: Api, image: str) -> PairsOnNode:
     """Not yet started."""
-    return NodeTown(node, api, image)
+    return PairsOnNode(node, api, image)
 
 
-def test_episodes_continue_while_kubelet_and_containerd_restart(town: NodeTown) -> None:
+def test_episodes_continue_while_kubelet_and_containerd_restart(town: PairsOnNode) -> None:
     town.start()
     with town.vehicles() as vehicles:
         for pair in (CARS, VANS):
@@ -52,7 +52,7 @@ def test_episodes_continue_while_kubelet_and_containerd_restart(town: NodeTown) 
         town.settled()
 
 
-def test_after_a_restart_of_the_node_everything_runs_that_is_demanded_then(town: NodeTown) -> None:
+def test_after_a_restart_of_the_node_everything_runs_that_is_demanded_then(town: PairsOnNode) -> None:
     town.start()
     with town.vehicles() as vehicles:
         for pair in (CARS, VANS):
@@ -79,10 +79,10 @@ def test_after_a_restart_of_the_node_everything_runs_that_is_demanded_then(town:
 
 
 def test_without_the_api_server_applications_continue_and_what_was_seen_is_reported_afterwards(
-    town: NodeTown, api: Api
+    town: PairsOnNode, api: Api
 ) -> None:
     town.start(after="1s")
-    with town.vehicles() as vehicles, Heard(town.endpoint) as heard:
+    with town.vehicles() as vehicles, PublishedEvents(town.endpoint) as heard:
         for pair in (CARS, VANS):
             vehicles.place(pair, NEAR)
         deployed, pod = town.wait_deployed(CARS), town.wait_running(CARS)

@@ -15,7 +15,7 @@ from tests.cluster.api import Api
 from tests.cluster.chain import BETWEEN, CARS, NEAR, PERIOD, VANS, untouched
 from tests.cluster.waiting import wait_until
 from tests.e2e.node import Node
-from tests.e2e.town import PATIENCE, NodeTown, restarts_of
+from tests.e2e.pairs_on_node import PATIENCE, PairsOnNode, restarts_of
 from tests.e2e.wayside_in_cluster import ZENOH_PORT
 from tests.e2e.workloads import deployment, running_pods, service, wait_available
 from tests.process.test_rmw_zenoh import Node as RosNode
@@ -47,7 +47,7 @@ LOST = 20
 """Minimum number of samples of each stream that are published without a router."""
 
 
-class Numbered:
+class NumberingVehicle:
     """A vehicle with numbered samples, ten a second of each stream.
 
     Attributes:
@@ -101,8 +101,8 @@ class Numbered:
 
 
 @contextmanager
-def numbered(endpoint: str) -> Iterator[Numbered]:
-    vehicle = Numbered(endpoint)
+def numbered(endpoint: str) -> Iterator[NumberingVehicle]:
+    vehicle = NumberingVehicle(endpoint)
     try:
         yield vehicle
     finally:
@@ -140,7 +140,7 @@ def router(api: Api, image: str) -> str:
 def test_detector_and_vehicles_find_a_restarted_router_and_losses_are_counted(
     node: Node, api: Api, image: str, router: str
 ) -> None:
-    town = NodeTown(node, api, image)
+    town = PairsOnNode(node, api, image)
     town.start(
         zenoh={"mode": "client", "connect": [f"tcp/{router}:{ZENOH_PORT}"]},
         streams=[POSE_STREAM, ROS_STREAM, {**ADVANCED_STREAM, "history": {"samples": 1}}],

@@ -40,7 +40,7 @@ class Counting(Plugin[CountingParameters]):
         return {"count": self.count, "clients": list(clients), "v": reported}
 
 
-class Strange(Plugin[CountingParameters]):
+class InvalidValue(Plugin[CountingParameters]):
     """Its value is no plain data."""
 
     Parameters = CountingParameters

@@ -14,7 +14,7 @@ from tests.certificates import Authority
 from tests.http_servers import Endpoint
 from tests.http_servers import endpoint as http_endpoint
 from tests.mongodb import MongoServer, running
-from tests.mongodb.way import Way
+from tests.mongodb.proxy import ServerProxy
 from tests.networks import Arrivals
 from tests.ports import free_endpoint
 from tests.process.database_harness import Harness, MakeHarness
@@ -41,15 +41,15 @@ def database(mongodb: MongoServer, name: str) -> Iterator[Any]:
 
 
 @pytest.fixture
-def way(mongodb: MongoServer) -> Iterator[Way]:
-    made = Way(mongodb)
+def proxy(mongodb: MongoServer) -> Iterator[ServerProxy]:
+    made = ServerProxy(mongodb)
     yield made
     made.cut()
 
 
 @pytest.fixture
-def harness(way: Way, name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[MakeHarness]:
-    monkeypatch.setenv("TEST_MONGODB_URI", way.uri)
+def harness(proxy: ServerProxy, name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[MakeHarness]:
+    monkeypatch.setenv("TEST_MONGODB_URI", proxy.uri)
     made: list[Harness] = []
 
     def make(

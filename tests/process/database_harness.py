@@ -29,7 +29,7 @@ SPEEDS = "json/speed"
 """The collection of the samples of stream speed."""
 
 
-class Nobody:
+class NoMessenger:
     """No Zenoh: the action needs none."""
 
     def publish(self, *_: Any) -> None:
@@ -56,7 +56,7 @@ class Harness:
             action="keep",
             holder="d",
             configuration=lambda: self.configuration,
-            messenger=Nobody(),
+            messenger=NoMessenger(),
             report=self._report,
             lose=self._lose,
             closing=self.closing,

@@ -20,7 +20,7 @@ from paho.mqtt.enums import CallbackAPIVersion
 PASSWORD = "open sesame"
 
 
-class Guard(BaseAuthPlugin):
+class PasswordPlugin(BaseAuthPlugin):
     """Lets in who knows the password, and the tests' publisher."""
 
     async def authenticate(self, *, session: Session) -> bool:
@@ -30,7 +30,7 @@ class Guard(BaseAuthPlugin):
 @contextmanager
 def broker(port: int, *, guarded: bool = False, **listener: Any) -> Iterator[subprocess.Popen[str]]:
     """The broker's process, ready to take connections; killed at the end."""
-    guard = {"tests.process.mqtt_broker.Guard": {}}
+    guard = {"tests.process.mqtt_broker.PasswordPlugin": {}}
     anyone = {"amqtt.plugins.authentication.AnonymousAuthPlugin": {"allow_anonymous": True}}
     config = {
         "listeners": {"default": {"type": "tcp", "bind": f"127.0.0.1:{port}", **listener}},

@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from tests.driving import a_deploy, a_rule, a_stream
-from tests.mongodb.way import Way
+from tests.mongodb.proxy import ServerProxy
 from tests.process.database_harness import wait_until
 from tests.process.running import PATIENCE, Process
 from tests.recording_bench import mcap_files, metadata_of
@@ -20,8 +20,8 @@ GIVEN = {"overarchingPurpose": ["Safety"], "incidence": ["Rare"], "typeOfAction"
 
 
 @pytest.fixture
-def process(tmp_path: Path, way: Way, monkeypatch: pytest.MonkeyPatch) -> Iterator[Process]:
-    monkeypatch.setenv("TEST_MONGODB_URI", way.uri)
+def process(tmp_path: Path, proxy: ServerProxy, monkeypatch: pytest.MonkeyPatch) -> Iterator[Process]:
+    monkeypatch.setenv("TEST_MONGODB_URI", proxy.uri)
     process = Process(tmp_path)
     yield process
     assert process.stop() == 0

@@ -13,7 +13,7 @@ import pytest
 
 from tests.driving import a_rule, a_stream
 from tests.mongodb import MongoServer
-from tests.mongodb.way import Way
+from tests.mongodb.proxy import ServerProxy
 from tests.process.database_harness import wait_until
 from tests.process.running import PATIENCE, Process
 from tests.recording_bench import mcap_files, read_with_mcap
@@ -25,7 +25,7 @@ CLIENTS = ("car1", "car2")
 PADDING = "x" * 12_000
 
 
-class Detecting(Process):
+class RecordingDetector(Process):
     """A detector that writes each bout to a database and to a recording."""
 
     def __init__(self, folder: Path, database: Any, spool: str) -> None:
@@ -85,20 +85,20 @@ class Detecting(Process):
 
 @pytest.fixture
 def pair(
-    tmp_path: Path, way: Way, mongodb: MongoServer, database: Any, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[tuple[Detecting, Detecting]]:
+    tmp_path: Path, proxy: ServerProxy, mongodb: MongoServer, database: Any, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[tuple[RecordingDetector, RecordingDetector]]:
     """One with room for everything on its disk, one with little."""
-    monkeypatch.setenv("TEST_MONGODB_URI", way.uri)
+    monkeypatch.setenv("TEST_MONGODB_URI", proxy.uri)
     client = database.client
-    ample = Detecting(tmp_path / "ample", client[f"{database.name}a"], "2Gi")
-    tight = Detecting(tmp_path / "tight", client[f"{database.name}t"], "4Mi")
+    ample = RecordingDetector(tmp_path / "ample", client[f"{database.name}a"], "2Gi")
+    tight = RecordingDetector(tmp_path / "tight", client[f"{database.name}t"], "4Mi")
     yield ample, tight
     for each in (ample, tight):
         assert each.stop() == 0
         client.drop_database(each.database.name)
 
 
-def drive(detectors: tuple[Detecting, Detecting], seconds: float) -> int:
+def drive(detectors: tuple[RecordingDetector, RecordingDetector], seconds: float) -> int:
     """Each client's speed passes the threshold twice a second, for most of the time; then all stand.
 
     Gives how many samples each detector got.
@@ -117,25 +117,25 @@ def drive(detectors: tuple[Detecting, Detecting], seconds: float) -> int:
 
 
 def test_a_minute_without_the_database_costs_neither_events_nor_recordings_and_every_loss_is_counted(
-    pair: tuple[Detecting, Detecting], way: Way
+    pair: tuple[RecordingDetector, RecordingDetector], proxy: ServerProxy
 ) -> None:
     samples = drive(pair, 3)
     before = []
     for each in pair:
         before.append(len(each.at_rest(samples)))
         wait_until(lambda each=each: any(one["complete"] for one in each.scenarios()), PATIENCE)
-    way.cut()
+    proxy.cut()
     samples += drive(pair, AWAY)
     for each, earlier in zip(pair, before, strict=True):
         begun = each.at_rest(samples)
         assert len(begun) - earlier > AWAY  # two clients, and a bout lasts half a second
         wait_until(lambda each=each, begun=begun: each.recorded().keys() == set(begun), 3 * PATIENCE, pause=1.0)
         assert not {one["episode"] for one in each.scenarios()} & set(begun[earlier:])
-    way.restore()
+    proxy.restore()
     for each in pair:
         begun = each.episodes("started")
 
-        def settled(each: Detecting = each, begun: list[str] = begun) -> bool:
+        def settled(each: RecordingDetector = each, begun: list[str] = begun) -> bool:
             there = each.scenarios()
             return {one["episode"] for one in there} == set(begun) and all(one["state"] != "Open" for one in there)
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from detector.actions import OutcomeState
-from tests.mongodb.way import Way
+from tests.mongodb.proxy import ServerProxy
 from tests.process.database_harness import (
     SPEEDS,
     MakeHarness,
@@ -22,20 +22,20 @@ from tests.process.database_harness import (
 
 
 def test_while_the_server_is_away_documents_wait_on_disk_and_follow_in_order_each_once(
-    harness: MakeHarness, database: Any, way: Way, tmp_path: Path
+    harness: MakeHarness, database: Any, proxy: ServerProxy, tmp_path: Path
 ) -> None:
     keep = harness(spool=2**26)
     first, second = keep.begin("e1"), keep.begin("e2")
     keep.take(first, speeds(1500))
     wait_until(lambda: len(numbers(database)) >= 1000)
-    way.cut()
+    proxy.cut()
     keep.take(first, speeds(3000, first=1500))
     keep.finish(first)
     keep.take(second, speeds(100))
     keep.finish(second)
     wait_until(lambda: spooled(tmp_path / "spool") > 100_000)
     assert scenario(database)["complete"] is False
-    way.restore()
+    proxy.restore()
     assert [keep.outcome(name).state for name in ("e1", "e2")] == [OutcomeState.DONE] * 2
     assert numbers(database) == list(range(4500))
     assert numbers(database, "e2.keep") == list(range(100))
@@ -45,11 +45,11 @@ def test_while_the_server_is_away_documents_wait_on_disk_and_follow_in_order_eac
 
 
 def test_a_full_spool_drops_what_is_new_counts_it_and_keeps_earlier_scenarios_whole(
-    harness: MakeHarness, database: Any, way: Way, monkeypatch: pytest.MonkeyPatch
+    harness: MakeHarness, database: Any, proxy: ServerProxy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("detector.actions.database.queue.MEMORY", 100_000)
     keep = harness(spool=400_000)
-    way.cut()
+    proxy.cut()
     early, late = keep.begin("e1"), keep.begin("e2")
     keep.take(early, speeds(500))
     keep.finish(early)
@@ -57,7 +57,7 @@ def test_a_full_spool_drops_what_is_new_counts_it_and_keeps_earlier_scenarios_wh
         keep.take(late, speeds(1000, first=1000 * number))
     keep.finish(late)
     assert keep.losses.total() > 0
-    way.restore()
+    proxy.restore()
     assert keep.outcome("e1").state is OutcomeState.DONE
     outcome = keep.outcome("e2")
     assert outcome.state is OutcomeState.FAILED
@@ -71,9 +71,9 @@ def test_a_full_spool_drops_what_is_new_counts_it_and_keeps_earlier_scenarios_wh
 
 
 def test_what_waited_when_the_detector_ended_is_written_by_the_next_run(
-    harness: MakeHarness, database: Any, way: Way
+    harness: MakeHarness, database: Any, proxy: ServerProxy
 ) -> None:
-    way.cut()
+    proxy.cut()
     before = harness(spool=2**26)
     episode, open_one = before.begin("e1"), before.begin("e2")
     before.take(episode, speeds(1200))
@@ -81,7 +81,7 @@ def test_what_waited_when_the_detector_ended_is_written_by_the_next_run(
     before.finish(episode)
     before.close()
     assert "stay in the spool" in before.outcome("e1").message
-    way.restore()
+    proxy.restore()
     after = harness(spool=2**26)
     wait_until(lambda: scenario_or_none(database, "e2.keep").get("state") == "Interrupted")
     assert numbers(database) == list(range(1200))
@@ -91,12 +91,12 @@ def test_what_waited_when_the_detector_ended_is_written_by_the_next_run(
 
 
 def test_a_document_that_the_server_refuses_costs_its_scenarios_completeness_and_no_other(
-    harness: MakeHarness, database: Any, way: Way
+    harness: MakeHarness, database: Any, proxy: ServerProxy
 ) -> None:
     keep = harness()
     good, bad = keep.begin("e1"), keep.begin("e2")
     samples = speeds(40)
-    way.poison = b"a poisoned text"
+    proxy.poison = b"a poisoned text"
     poisoned = samples[20]._replace(payload=b'{"v": 20, "text": "a poisoned text"}')
     keep.take(good, samples)
     keep.take(bad, [*samples[:20], poisoned, *samples[21:]])
@@ -113,16 +113,16 @@ def test_a_document_that_the_server_refuses_costs_its_scenarios_completeness_and
 
 
 def test_a_server_that_hangs_holds_up_nothing_but_the_queue(
-    harness: MakeHarness, database: Any, way: Way, monkeypatch: pytest.MonkeyPatch
+    harness: MakeHarness, database: Any, proxy: ServerProxy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("detector.actions.database.server._SECONDS", 4.0)
     keep = harness(spool=2**26)
     episode = keep.begin()
-    way.hang()
+    proxy.hang()
     keep.take(episode, speeds(2000))
     keep.finish(episode)
     wait_until(lambda: (keep.action._writer is not None) and keep.action._writer.away != "")
-    way.restore()
+    proxy.restore()
     assert keep.outcome().state is OutcomeState.DONE
     assert numbers(database) == list(range(2000))
 
@@ -143,10 +143,10 @@ def test_with_write_concern_one_a_scenario_that_lost_documents_afterwards_is_not
 
 
 def test_a_damaged_request_in_the_spool_costs_its_scenario_and_no_other(
-    harness: MakeHarness, database: Any, way: Way
+    harness: MakeHarness, database: Any, proxy: ServerProxy
 ) -> None:
     keep = harness(spool=2**26)
-    way.cut()
+    proxy.cut()
     first, second = keep.begin("e1"), keep.begin("e2")
     keep.take(first, speeds(2000))
     assert keep.action._writer is not None
@@ -166,7 +166,7 @@ def test_a_damaged_request_in_the_spool_costs_its_scenario_and_no_other(
     with queue._disk:
         assert queue._spool is not None
         queue._spool._db.execute("UPDATE records SET record = zeroblob(length(record)) WHERE id = ?", doomed)
-    way.restore()
+    proxy.restore()
     assert keep.outcome("e2").state is OutcomeState.DONE
     assert keep.outcome("e1").state is OutcomeState.FAILED
     assert scenario(database)["complete"] is False
@@ -174,10 +174,10 @@ def test_a_damaged_request_in_the_spool_costs_its_scenario_and_no_other(
 
 
 def test_a_spool_whose_disk_fails_holds_up_nothing_and_continues_at_the_next_start(
-    harness: MakeHarness, database: Any, way: Way, tmp_path: Path
+    harness: MakeHarness, database: Any, proxy: ServerProxy, tmp_path: Path
 ) -> None:
     keep = harness(spool=2**26)
-    way.cut()
+    proxy.cut()
     first = keep.begin("e1")
     keep.take(first, speeds(2000))
     wait_until(lambda: spooled(tmp_path / "spool") > 100_000)
@@ -190,7 +190,7 @@ def test_a_spool_whose_disk_fails_holds_up_nothing_and_continues_at_the_next_sta
     keep.take(second, speeds(1000))
     keep.finish(second)
     keep.finish(first)
-    way.restore()
+    proxy.restore()
     assert keep.outcome("e2").state is OutcomeState.DONE
     assert keep.outcome("e1").state is OutcomeState.FAILED
     assert keep.losses.total() > 0
@@ -201,10 +201,10 @@ def test_a_spool_whose_disk_fails_holds_up_nothing_and_continues_at_the_next_sta
     assert not after.losses
 
 
-def test_open_episodes_report_that_the_database_is_away(harness: MakeHarness, way: Way) -> None:
+def test_open_episodes_report_that_the_database_is_away(harness: MakeHarness, proxy: ServerProxy) -> None:
     keep = harness(spool=2**26)
     episode = keep.begin()
-    way.cut()
+    proxy.cut()
 
     def reported(away: bool) -> bool:
         keep.take(episode, speeds(1000))
@@ -212,5 +212,5 @@ def test_open_episodes_report_that_the_database_is_away(harness: MakeHarness, wa
         return last is not None and last.message.startswith("the database is unavailable") is away
 
     wait_until(lambda: reported(True))
-    way.restore()
+    proxy.restore()
     wait_until(lambda: reported(False))

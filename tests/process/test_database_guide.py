@@ -15,7 +15,7 @@ from detector.actions.host import ActionHost
 from detector.assembly import stream_readers
 from detector.assembly.checking import findings
 from tests.driving import a_detector, a_rule, a_stream, an_engine, arrival, at, compiled
-from tests.mongodb.way import Way
+from tests.mongodb.proxy import ServerProxy
 from tests.process.database_harness import wait_until
 from wayside.api import Detector, EventRule
 from wayside.api.documents import DocumentError, load_documents
@@ -105,8 +105,8 @@ def as_json(rule: dict[str, Any], database: str) -> EventRule:
 class Drive:
     """The engine and the actions as in `detector run`, with samples at given times."""
 
-    def __init__(self, rule: EventRule, way: Way, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setenv("MONGODB_GUIDE_URI", way.uri)
+    def __init__(self, rule: EventRule, proxy: ServerProxy, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setenv("MONGODB_GUIDE_URI", proxy.uri)
         streams = (a_stream("odometry"), a_stream("points", encoding="raw"))
         self.detector: Detector = a_detector(*streams, database={"uriVariable": "MONGODB_GUIDE_URI"})
         self.engine = an_engine(self.detector)
@@ -137,9 +137,9 @@ def numbers(database: Any) -> list[float]:
 
 
 def test_record_all_has_every_sample_once_from_one_evaluation_to_the_next(
-    name: str, database: Any, way: Way, monkeypatch: pytest.MonkeyPatch
+    name: str, database: Any, proxy: ServerProxy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    drive = Drive(as_json(RECORD_ALL, name), way, monkeypatch)
+    drive = Drive(as_json(RECORD_ALL, name), proxy, monkeypatch)
     for second in range(5):
         drive.take([odometry(second + k / 100, 100 * second + k, 5) for k in range(100)], second + 1)
     drive.take([arrival(5.5, "car1", b"x" * 1000, "points")], 6)
@@ -154,9 +154,9 @@ def test_record_all_has_every_sample_once_from_one_evaluation_to_the_next(
 
 
 def test_threshold_has_the_window_around_the_time_at_which_it_was_passed(
-    name: str, database: Any, way: Way, monkeypatch: pytest.MonkeyPatch
+    name: str, database: Any, proxy: ServerProxy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    drive = Drive(as_json(THRESHOLD, name), way, monkeypatch)
+    drive = Drive(as_json(THRESHOLD, name), proxy, monkeypatch)
     speeds = [20.0] * 1000 + [20 - 0.1 * k for k in range(1, 101)] + [10.0] * 500
     drive.take([odometry(k / 100, k, v) for k, v in enumerate(speeds)], 16)
     wait_until(lambda: [each["complete"] for each in database["Scenarios"].find()] == [True])

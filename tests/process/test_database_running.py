@@ -14,7 +14,7 @@ import pytest
 from detector.status.model import RuleStatus
 from detector.streams.codecs.cdr import CdrDecoder
 from tests.driving import a_rule, a_stream
-from tests.mongodb.way import Way
+from tests.mongodb.proxy import ServerProxy
 from tests.process.database_harness import spooled, wait_until
 from tests.process.running import PATIENCE, Process
 from tests.recording_bench import mcap_files, read_with_mcap
@@ -27,8 +27,8 @@ EVERY = {"every": "100ms"}
 
 
 @pytest.fixture
-def process(tmp_path: Path, way: Way, monkeypatch: pytest.MonkeyPatch) -> Iterator[Process]:
-    monkeypatch.setenv("TEST_MONGODB_URI", way.uri)
+def process(tmp_path: Path, proxy: ServerProxy, monkeypatch: pytest.MonkeyPatch) -> Iterator[Process]:
+    monkeypatch.setenv("TEST_MONGODB_URI", proxy.uri)
     process = Process(tmp_path)
     yield process
     assert process.stop() == 0
@@ -160,7 +160,7 @@ def check(database: Any) -> int:
 
 @pytest.mark.parametrize("away", [False, True])
 def test_after_kill_9_nothing_that_looks_complete_is_incomplete(
-    process: Process, name: str, database: Any, way: Way, *, away: bool
+    process: Process, name: str, database: Any, proxy: ServerProxy, *, away: bool
 ) -> None:
     keep = {"name": "keep", "database": {"database": name, "before": "20ms", "after": "20ms"}}
     rule = a_rule("bout", signals=[FAST], when="v > 10", evaluation={"onSample": "speed"}, actions=[keep])
@@ -170,7 +170,7 @@ def test_after_kill_9_nothing_that_looks_complete_is_incomplete(
     drive.send_until(lambda rule: rule.started > 2, *BOUTS)
     if away:
         wait_until(lambda: check(database) > 0, PATIENCE)
-        way.cut()
+        proxy.cut()
         drive.send_until(lambda rule: rule.started > 12, *BOUTS)
         wait_until(lambda: spooled(process.folder / "spool") > 0, PATIENCE)
     else:
@@ -179,7 +179,7 @@ def test_after_kill_9_nothing_that_looks_complete_is_incomplete(
     process.process.kill()
     process.process.wait()
     process.vehicle.close()  # type: ignore[no-untyped-call]
-    way.restore()
+    proxy.restore()
     before = check(database)
     process.start()
     drive = Drive(process, first=100_000)

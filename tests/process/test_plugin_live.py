@@ -37,7 +37,7 @@ RULE = plugin_rule(when="p.count - 6 * double(int(p.count / 6)) >= 3", evaluatio
 OTHER = plugin_rule("other", when="p.count - 4 * double(int(p.count / 4)) >= 2", evaluation=OFTEN)
 
 
-class Kept:
+class CollectingSink:
     """Where events go."""
 
     def __init__(self) -> None:
@@ -71,7 +71,7 @@ def wait_until(condition: Callable[[], bool], feed: Callable[[], None]) -> None:
 def test_killed_and_started_again_the_replay_gives_the_same_events(tmp_path: Path) -> None:
     detector = a_detector()
     failures: list[BaseException] = []
-    kept, intake = Kept(), Intake(time.time_ns)
+    kept, intake = CollectingSink(), Intake(time.time_ns)
     writer = IntakeWriter(tmp_path / "intake.mcap", detector.spec.streams)
     with closing(ProcessHost(patience=60)) as host:
         engine = make_engine(detector, stream_readers(detector), holder="h", start=time.time_ns(), plugins=host)

@@ -19,7 +19,7 @@ from detector.replay.intake_file import read_intake
 from detector.streams.codecs.cdr import CdrDecoder
 from tests import programs
 from tests.driving import a_rule, a_stream
-from tests.mongodb.way import Way
+from tests.mongodb.proxy import ServerProxy
 from tests.process.database_harness import wait_until
 from tests.process.running import PATIENCE, Process
 from tests.recording_bench import Recorded, mcap_files, read_with_mcap, read_with_rosbags, seconds
@@ -165,9 +165,9 @@ def as_stored(message: Recorded) -> Recorded:
 
 @pytest.mark.parametrize("clock", ["Wall", "Data"])
 def test_overlapping_episodes_have_exactly_their_samples_in_recordings_and_in_the_database(
-    process: Process, clock: str, way: Way, name: str, database: Any, monkeypatch: pytest.MonkeyPatch
+    process: Process, clock: str, proxy: ServerProxy, name: str, database: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("TEST_MONGODB_URI", way.uri)
+    monkeypatch.setenv("TEST_MONGODB_URI", proxy.uri)
     spec = {"clock": "Data", "lateness": "3s", "maxAhead": "10s"} if clock == "Data" else {}
     spec["database"] = {
         "uriVariable": "TEST_MONGODB_URI",

@@ -79,7 +79,7 @@ class Hanging(Once):
         feed.put("vehicles/car1/pose", b"late")
 
 
-class Unfinished(Source[Any]):
+class WithoutModel(Source[Any]):
     """Has no model of its parameters."""
 
     def run(self, feed: Feed) -> None: ...
@@ -90,7 +90,7 @@ def plugins(monkeypatch: pytest.MonkeyPatch) -> None:
     """The classes above as installed plugins."""
     here = [
         EntryPoint(each.lower(), f"{__name__}:{each}", OFFERS.group)
-        for each in ("Once", "Failing", "Leaving", "Lasting", "Hanging", "Unfinished", "NoParameters", "Absent")
+        for each in ("Once", "Failing", "Leaving", "Lasting", "Hanging", "WithoutModel", "NoParameters", "Absent")
     ]
     here.append(EntryPoint("unmet", "no_such_module:Plugin", OFFERS.group))
     monkeypatch.setattr(entrypoints, "entry_points", lambda group: here)
@@ -230,8 +230,8 @@ def test_a_running_detector_follows_changes_of_its_sources_and_reports_their_sta
         ({"plugin": "absent"}, "spec.sources[0].plugin: cannot load plugin absent: AttributeError"),
         ({"plugin": "noparameters"}, "must be a complete subclass of detector.sources.base.Source"),
         (
-            {"plugin": "unfinished"},
-            "spec.sources[0].plugin: plugin unfinished: give tests.process.test_sources:Unfinished a",
+            {"plugin": "withoutmodel"},
+            "spec.sources[0].plugin: plugin withoutmodel: give tests.process.test_sources:WithoutModel a",
         ),
         (
             {"plugin": "once", "parameters": {"text": 1}},

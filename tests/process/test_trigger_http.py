@@ -29,7 +29,7 @@ from wayside.api.actions import trigger as api
 PATIENCE = 60.0
 
 
-class NoNetwork:
+class NoMessenger:
     """Where no Zenoh session is needed."""
 
     def publish(self, key: str, payload: bytes, encoding: str) -> None:
@@ -41,7 +41,7 @@ class NoNetwork:
         raise ActionError(f"{selector}: nobody answered")
 
 
-class Driven:
+class DrivenAction:
     """The action as its host drives it, on this thread."""
 
     def __init__(self, trigger: dict[str, Any], state: Path | None = None) -> None:
@@ -60,7 +60,7 @@ class Driven:
             action="other",
             holder="h",
             configuration=lambda: configuration,
-            messenger=NoNetwork(),
+            messenger=NoMessenger(),
             report=lambda _, outcome: self.outcomes.append(outcome),
             lose=lambda what, count, why: self.lost.append(f"{count} {what}: {why}"),
             closing=self.closing,
@@ -105,7 +105,7 @@ def end(episode: Episode) -> Episode:
 
 def test_an_endpoint_is_notified_of_the_start_and_of_the_end() -> None:
     with endpoint() as there:
-        driven = Driven(http(there.url, maximumDuration="5m"))
+        driven = DrivenAction(http(there.url, maximumDuration="5m"))
         episode = an_episode(driven.parameters)
         driven.action.started(episode)
         driven.until(driven.recording)
@@ -129,7 +129,7 @@ def test_an_endpoint_is_notified_of_the_start_and_of_the_end() -> None:
 def test_a_body_of_ones_own_is_sent_as_it_is_rendered() -> None:
     with endpoint() as there:
         call = {"url": f"{there.url}/snap", "body": {"vehicle": "${client}", "speed": "${v}"}}
-        driven = Driven({"http": {"stop": call}})
+        driven = DrivenAction({"http": {"stop": call}})
         rendered = {"http": {"stop": {"body": {"vehicle": "car1", "speed": 3.0}}}}
         episode = an_episode(driven.parameters, rendered=rendered)
         driven.action.started(episode)
@@ -142,7 +142,7 @@ def test_a_body_of_ones_own_is_sent_as_it_is_rendered() -> None:
 @pytest.mark.parametrize("fault", [answers(500), answers(503, Retry_After="1"), hangs()], ids=["500", "busy", "hangs"])
 def test_what_fails_is_sent_again_under_the_same_key(fault: Any) -> None:
     with endpoint(fault) as there:
-        driven = Driven(http(there.url, "1s"))
+        driven = DrivenAction(http(there.url, "1s"))
         episode = an_episode(driven.parameters)
         driven.action.started(episode)
         driven.until(lambda: any("start is not confirmed yet" in outcome.message for outcome in driven.outcomes))
@@ -160,7 +160,7 @@ def test_what_fails_is_sent_again_under_the_same_key(fault: Any) -> None:
 
 def test_a_start_that_is_refused_for_good_is_not_sent_again() -> None:
     with endpoint(answers(403, b"not you")) as there:
-        driven = Driven(http(there.url))
+        driven = DrivenAction(http(there.url))
         driven.action.started(an_episode(driven.parameters))
         outcome = driven.finished()
         assert outcome.state is OutcomeState.FAILED
@@ -170,7 +170,7 @@ def test_a_start_that_is_refused_for_good_is_not_sent_again() -> None:
 
 def test_a_stop_that_is_never_confirmed_is_counted() -> None:
     with endpoint() as there:
-        driven = Driven(http(there.url, giveUpAfter="1s"))
+        driven = DrivenAction(http(there.url, giveUpAfter="1s"))
         episode = an_episode(driven.parameters)
         driven.action.started(episode)
         driven.until(driven.recording)
@@ -186,7 +186,7 @@ def test_a_stop_that_is_never_confirmed_is_counted() -> None:
 
 def test_a_recording_ends_after_its_maximum_duration_also_while_the_episode_lasts() -> None:
     with endpoint() as there:
-        driven = Driven(http(there.url, maximumDuration="1s"))
+        driven = DrivenAction(http(there.url, maximumDuration="1s"))
         driven.action.started(an_episode(driven.parameters))
         outcome = driven.finished()
         assert [request.method for request in there.requests] == ["PUT", "DELETE"]
@@ -198,7 +198,7 @@ def test_a_recording_ends_after_its_maximum_duration_also_while_the_episode_last
 
 def test_at_the_end_of_the_detector_an_episode_that_will_not_be_known_again_is_stopped() -> None:
     with endpoint() as there:
-        driven = Driven(http(there.url))
+        driven = DrivenAction(http(there.url))
         episode = an_episode(driven.parameters)
         driven.action.started(episode)
         driven.until(driven.recording)
@@ -214,7 +214,7 @@ def test_what_the_next_run_restores_continues_and_is_stopped_by_that_one(tmp_pat
     with endpoint() as there:
         trigger = http(there.url)
         trigger["http"]["stop"] = {"url": f"{there.url}/stop", "body": {"who": "${client}"}}
-        driven = Driven(trigger, tmp_path)
+        driven = DrivenAction(trigger, tmp_path)
         rendered = {"http": {"stop": {"body": {"who": "car1"}}}}
         episode = an_episode(driven.parameters, rendered=rendered)
         driven.action.started(episode)
@@ -224,7 +224,7 @@ def test_what_the_next_run_restores_continues_and_is_stopped_by_that_one(tmp_pat
         driven.action.close()
         assert [request.method for request in there.requests] == ["PUT"]
 
-        following = Driven(trigger, tmp_path)
+        following = DrivenAction(trigger, tmp_path)
         unrendered = {"http": "it needs values from before the detector's restart"}
         resumed = an_episode(following.parameters, rendered={}, unrendered=unrendered, resumed=True)
         following.action.started(resumed)
@@ -245,11 +245,11 @@ def test_a_changed_rule_leaves_the_recordings_of_its_running_episodes_alone(
     """The action with its old rule ends them, though the one with the new rule has the same parameters."""
     monkeypatch.setattr("detector.actions.trigger.action._CLAIM", 0.0)
     with endpoint() as there:
-        before = Driven(http(there.url), tmp_path)
+        before = DrivenAction(http(there.url), tmp_path)
         episode = an_episode(before.parameters)
         before.action.started(episode)
         before.until(before.recording)
-        after = Driven(http(there.url), tmp_path)
+        after = DrivenAction(http(there.url), tmp_path)
         assert after.action.wake() is None
         assert [request.method for request in there.requests] == ["PUT"]
         before.action.ended(end(episode))
@@ -262,7 +262,7 @@ def test_a_changed_rule_leaves_the_recordings_of_its_running_episodes_alone(
 def test_a_state_folder_that_cannot_be_written_is_counted_and_costs_nothing_else(tmp_path: Path) -> None:
     (tmp_path / "triggers").write_text("a file where a folder should be")
     with endpoint() as there:
-        driven = Driven(http(there.url), tmp_path)
+        driven = DrivenAction(http(there.url), tmp_path)
         driven.action.started(an_episode(driven.parameters))
         driven.until(driven.recording)
     (lost,) = driven.lost
@@ -272,7 +272,7 @@ def test_a_state_folder_that_cannot_be_written_is_counted_and_costs_nothing_else
 def test_one_dead_endpoint_costs_one_attempt_at_a_time() -> None:
     """Fifty episodes wait for it together, and not each for its own timeout."""
     with endpoint(hangs()) as there:
-        driven = Driven(http(there.url, "1s"))
+        driven = DrivenAction(http(there.url, "1s"))
         for number in range(50):
             driven.action.started(an_episode(driven.parameters, id=f"e{number}"))
         begin = time.monotonic()

@@ -7,7 +7,7 @@ from typing import Any
 
 from tests.reference.aggregates import NOTHING, aggregated
 from tests.reference.margins import margin
-from tests.reference.scopes import Look
+from tests.reference.scopes import SubjectView
 from tests.reference.signals import evaluated, nanoseconds
 
 Values = dict[str, Any]
@@ -22,7 +22,7 @@ class Evaluations:
     """Since windows were reset."""
     all: list[tuple[int, Values]] = field(default_factory=list)
 
-    def look(self, signals: list[dict[str, Any]], look: Look, now: int, kept: int) -> Look:
+    def look(self, signals: list[dict[str, Any]], look: SubjectView, now: int, kept: int) -> SubjectView:
         """What there is to be seen with these signals, of which each reads those before it."""
         here: Values = {}
         self.before.append((now, here))
@@ -41,7 +41,7 @@ class Evaluations:
             value = aggregated(signal.get("aggregate", "Last"), window, signal.get("quantile"))
             if value is not NOTHING:
                 variables[name] = values[name] = value
-        return Look(look.subject, variables, look.names, look.in_scope, look.near, values)
+        return SubjectView(look.subject, variables, look.names, look.in_scope, look.near, values)
 
     def statistics(self, signals: list[dict[str, Any]], start: int, now: int) -> Values:
         """What is known of the episode that started then."""

@@ -7,9 +7,9 @@ from typing import Any
 
 from tests.reference.aggregates import NOTHING
 from tests.reference.derived import Evaluations
-from tests.reference.episodes import Break, Episode, Seen, Truth, episodes, in_progress, wakes
+from tests.reference.episodes import Break, Episode, Observation, Truth, episodes, in_progress, wakes
 from tests.reference.samples import SECOND, Received, Sample
-from tests.reference.scopes import Look, Subject, both, looks, text
+from tests.reference.scopes import Subject, SubjectView, both, looks, text
 from tests.reference.signals import Sources, Start, nanoseconds, of_rule, truth
 
 
@@ -31,7 +31,7 @@ class Rule:
 
     name: str
     spec: dict[str, Any]
-    history: dict[Subject, list[Seen | Break]] = field(default_factory=dict)
+    history: dict[Subject, list[Observation | Break]] = field(default_factory=dict)
     looked: dict[str, list[int]] = field(default_factory=dict)
     """The ticks at which a client was looked at since it is known."""
     evaluations: dict[Subject, Evaluations] = field(default_factory=dict)
@@ -222,7 +222,7 @@ class Reference:
 
     def _evaluate(self, rule: Rule, selection: Selection | None, *, lose: bool) -> None:
         timeout = self.received.timeout
-        found: dict[Subject, tuple[Seen | Break, dict[str, Any]]] = {}
+        found: dict[Subject, tuple[Observation | Break, dict[str, Any]]] = {}
         if lose:
             for subject in rule.history:
                 if any(client not in self.received.known for client in subject[0]):
@@ -290,10 +290,10 @@ class Reference:
             if rule.spec.get("enabled", True)
         }
 
-    def _seen(self, rule: Rule, look: Look) -> Seen:
+    def _seen(self, rule: Rule, look: SubjectView) -> Observation:
         when = truth(rule.spec["when"], look.variables, look.names)
         until = truth(rule.spec["until"], look.variables, look.names) if "until" in rule.spec else _not(when)
-        return Seen(self.now, both(look.in_scope, look.near, when, _not(until)), look.in_scope, until)
+        return Observation(self.now, both(look.in_scope, look.near, when, _not(until)), look.in_scope, until)
 
 
 def _in_order(rules: dict[str, dict[str, Any]]) -> list[str]:

@@ -10,7 +10,7 @@ Truth = bool | None
 
 
 @dataclass(frozen=True)
-class Seen:
+class Observation:
     """The verdicts of the rule for the subject at a tick."""
 
     time: int
@@ -38,7 +38,7 @@ class Episode:
     reason: str = ""
 
 
-def episodes(history: list[Seen | Break], hold: int, cooldown: int, unknown_timeout: int) -> list[Episode]:
+def episodes(history: list[Observation | Break], hold: int, cooldown: int, unknown_timeout: int) -> list[Episode]:
     """All episodes, the last of which may be open."""
     found: list[Episode] = []
     first = 0
@@ -68,7 +68,7 @@ def episodes(history: list[Seen | Break], hold: int, cooldown: int, unknown_time
             return found
 
 
-def wakes(history: list[Seen | Break], hold: int, cooldown: int, unknown_timeout: int) -> set[int]:
+def wakes(history: list[Observation | Break], hold: int, cooldown: int, unknown_timeout: int) -> set[int]:
     """When one of the subject's times is over."""
     found = episodes(history, hold, cooldown, unknown_timeout)
     rests_until = 0
@@ -76,7 +76,7 @@ def wakes(history: list[Seen | Break], hold: int, cooldown: int, unknown_timeout
         last = found[-1]
         if last.end is None:
             since = [each for each in history if each.time > last.start]
-            unknown = since and isinstance(since[-1], Seen) and since[-1].until is None
+            unknown = since and isinstance(since[-1], Observation) and since[-1].until is None
             return {_unknown_since(since, "until") + unknown_timeout} if unknown else set()
         rests_until = last.end + cooldown
         history = [each for each in history if each.time > (last.end or 0)]
@@ -84,11 +84,11 @@ def wakes(history: list[Seen | Break], hold: int, cooldown: int, unknown_timeout
     if onset is None:
         return {rests_until}
     last_seen = history[-1]
-    unknown = isinstance(last_seen, Seen) and last_seen.condition is None
+    unknown = isinstance(last_seen, Observation) and last_seen.condition is None
     return {onset + hold, *([_unknown_since(history, "condition") + hold + 1] if unknown else [])}
 
 
-def in_progress(history: list[Seen | Break], hold: int, cooldown: int, unknown_timeout: int) -> bool:
+def in_progress(history: list[Observation | Break], hold: int, cooldown: int, unknown_timeout: int) -> bool:
     """Whether an episode is open or about to start."""
     found = episodes(history, hold, cooldown, unknown_timeout)
     if not found:
@@ -100,16 +100,16 @@ def in_progress(history: list[Seen | Break], hold: int, cooldown: int, unknown_t
     return bool(since) and _pending(since, hold, end + cooldown) is not None
 
 
-def _onset(history: list[Seen | Break], hold: int, rests_until: int) -> int | None:
+def _onset(history: list[Observation | Break], hold: int, rests_until: int) -> int | None:
     """When the condition began to hold, if it has done so for long enough at the end of the history."""
     last = history[-1]
-    if not isinstance(last, Seen) or last.condition is not True:
+    if not isinstance(last, Observation) or last.condition is not True:
         return None
     since = _pending(history, hold, rests_until)
     return since if since is not None and last.time - since >= hold else None
 
 
-def _pending(history: list[Seen | Break], hold: int, rests_until: int) -> int | None:
+def _pending(history: list[Observation | Break], hold: int, rests_until: int) -> int | None:
     """When the condition began to hold, if it does or has been unknown for no longer than `hold`."""
     since: int | None = None
     for index, each in enumerate(history):
@@ -123,7 +123,7 @@ def _pending(history: list[Seen | Break], hold: int, rests_until: int) -> int | 
     return since
 
 
-def _unknown_since(history: list[Seen | Break], what: Literal["condition", "until"]) -> int:
+def _unknown_since(history: list[Observation | Break], what: Literal["condition", "until"]) -> int:
     """The first of the ticks at the end of the history at which it was unknown without a break."""
     since = history[-1].time
     for each in reversed(history):
@@ -133,7 +133,7 @@ def _unknown_since(history: list[Seen | Break], what: Literal["condition", "unti
     return since
 
 
-def _end(history: list[Seen | Break], unknown_timeout: int) -> str | None:
+def _end(history: list[Observation | Break], unknown_timeout: int) -> str | None:
     """Why an episode that started before the history ends with it."""
     last = history[-1]
     if isinstance(last, Break):

@@ -17,7 +17,7 @@ Vector = tuple[Fraction, Fraction]
 
 
 @dataclass(frozen=True)
-class Where:
+class PlaceContext:
     """What is known of the road users and places that expressions are about."""
 
     places: dict[str, dict[str, Any]]
@@ -25,7 +25,9 @@ class Where:
     """Of the samples of one stream: the names of the fields of msg, by axis."""
 
 
-def with_fields(source: str, variables: dict[str, Any], where: Where) -> tuple[str, dict[str, Any], tuple[str, ...]]:
+def with_fields(
+    source: str, variables: dict[str, Any], where: PlaceContext
+) -> tuple[str, dict[str, Any], tuple[str, ...]]:
     """The expression with a plain variable for each field of a place or of another road user; unknown ones are absent.
 
     Also the variables, and the names of those that were added.
@@ -65,7 +67,7 @@ def located(spec: dict[str, Any], positions: dict[str, dict[str, str]]) -> dict[
     return {**spec, "scope": {"pairs": {**pairs, "position": position}}, "signals": signals}
 
 
-def _place(name: str, variables: dict[str, Any], where: Where) -> dict[str, float]:
+def _place(name: str, variables: dict[str, Any], where: PlaceContext) -> dict[str, float]:
     """The position that an expression names, without what is not known."""
     if name in ("position", "positionBefore"):
         message = variables.get("msg" if name == "position" else "before") or {}

@@ -19,7 +19,7 @@ Subject = tuple[tuple[str, ...], str | None]
 
 
 @dataclass(frozen=True)
-class Look:
+class SubjectView:
     """A subject, and what is to be seen of it."""
 
     subject: Subject
@@ -41,7 +41,9 @@ def _uses(spec: dict[str, Any], word: str) -> bool:
     return any(word in str(spec.get(field, "")) for field in ("when", "until", "scope", "signals"))
 
 
-def looks(spec: dict[str, Any], received: Received, now: int, view: Callable[[str], dict[str, Any]]) -> Iterator[Look]:
+def looks(
+    spec: dict[str, Any], received: Received, now: int, view: Callable[[str], dict[str, Any]]
+) -> Iterator[SubjectView]:
     """All subjects that a rule can be about now."""
     views = {client: view(client) for client in sorted(received.known)}
     signals = [signal["name"] for signal in spec.get("signals", []) if "stream" in signal or "ruleName" in signal]
@@ -65,11 +67,13 @@ def _clients(
     signals: list[str],
     extra: dict[str, Any],
     element: str | None,
-) -> Iterator[Look]:
+) -> Iterator[SubjectView]:
     for client, view in views.items():
         variables = {**view, **extra}
         in_scope = truth(scope.get("where"), variables, (*MEMBER, *extra))
-        yield Look(((client,), element), variables, (*MEMBER, *signals, *extra), in_scope, True, only(view, signals))
+        yield SubjectView(
+            ((client,), element), variables, (*MEMBER, *signals, *extra), in_scope, True, only(view, signals)
+        )
 
 
 def _fleet(
@@ -78,14 +82,14 @@ def _fleet(
     signals: list[str],
     extra: dict[str, Any],
     element: str | None,
-) -> Look:
+) -> SubjectView:
     names = (*MEMBER, *signals, *extra)
     members = [view for view in views.values() if truth(scope["members"], {**view, **extra}, names) is True]
     values = {
         "count": float(len(members)),
         "members": [only(view, ["client", *signals]) for view in members],
     }
-    return Look(((), element), {"members": members, **extra}, ("members", *extra), True, True, values)
+    return SubjectView(((), element), {"members": members, **extra}, ("members", *extra), True, True, values)
 
 
 def _pairs(
@@ -96,7 +100,7 @@ def _pairs(
     element: str | None,
     received: Received,
     now: int,
-) -> Iterator[Look]:
+) -> Iterator[SubjectView]:
     ordered = "a" in scope or "b" in scope
     places = {client: _place(scope["position"], client, received, now, now) for client in views}
     placed = {
@@ -124,7 +128,7 @@ def _pairs(
         in_scope = both(*roles, truth(scope.get("where"), variables, names))
         values = {role: only(variables[role], ["client", "position", *signals]) for role in ("a", "b")}
         values |= only(variables, ["distance", "closingSpeed"])
-        yield Look(((a, b), element), variables, names, in_scope, near, values)
+        yield SubjectView(((a, b), element), variables, names, in_scope, near, values)
 
 
 def _distance(one: tuple[float, ...] | None, other: tuple[float, ...] | None) -> float | None:

@@ -8,7 +8,7 @@ from functools import cache
 from typing import Any
 
 from tests.reference.aggregates import NOTHING, aggregated
-from tests.reference.places import Where, with_fields
+from tests.reference.places import PlaceContext, with_fields
 from tests.reference.samples import SECOND, Received
 from wayside.expressions import UNKNOWN, CelType, Environment, Expression
 
@@ -29,7 +29,7 @@ def truth(source: str | None, variables: dict[str, Any], names: Iterable[str]) -
     return value if isinstance(value, bool) else None
 
 
-_WHERE = Where({}, {})
+_WHERE = PlaceContext({}, {})
 
 
 def set_places(places: Iterable[dict[str, Any]], position: dict[str, str]) -> None:

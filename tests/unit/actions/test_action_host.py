@@ -130,7 +130,7 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         thread.join(60)  # what was let go just now is still to note its words, and not among those of the next test
 
 
-class Site:
+class HostHarness:
     """An engine and a host, and what was published."""
 
     def __init__(self, *rules: EventRule, **options: Any) -> None:
@@ -182,13 +182,13 @@ def fast(**actions: str) -> EventRule:
     )
 
 
-def one_episode(site: Site, client: str = "car1", begin: float = 0.0) -> None:
+def one_episode(site: HostHarness, client: str = "car1", begin: float = 0.0) -> None:
     site.take((begin + 0.05, client, 1.0), until=begin + 0.5)
     site.take((begin + 0.55, client, 0.0), until=begin + 1.0)
 
 
 def test_an_action_receives_an_episode_in_order_and_closed_at_last() -> None:
-    site = Site(fast(a="recorded"))
+    site = HostHarness(fast(a="recorded"))
     one_episode(site)
     site.host.close()
     assert Recorded.reported == [
@@ -203,7 +203,7 @@ def test_an_action_receives_an_episode_in_order_and_closed_at_last() -> None:
 
 
 def test_what_one_raises_fails_that_episode_and_no_other() -> None:
-    site = Site(fast(a="raises", b="recorded"))
+    site = HostHarness(fast(a="raises", b="recorded"))
     one_episode(site)
     one_episode(site, "car2", begin=2.0)
     site.host.close()
@@ -219,7 +219,7 @@ def test_what_one_raises_fails_that_episode_and_no_other() -> None:
 
 
 def test_one_that_cannot_be_made_fails_its_episodes_with_the_reason() -> None:
-    site = Site(fast(a="impossible", b="recorded"))
+    site = HostHarness(fast(a="impossible", b="recorded"))
     one_episode(site)
     site.host.close()
     assert site.counts("a").last_failure == "cannot create the action: OSError: no paper"
@@ -227,7 +227,7 @@ def test_one_that_cannot_be_made_fails_its_episodes_with_the_reason() -> None:
 
 
 def test_one_that_hangs_holds_up_nobody_and_what_finds_its_queue_full_is_counted() -> None:
-    site = Site(fast(a="hangs", b="recorded"), maximum_bytes=1000)
+    site = HostHarness(fast(a="hangs", b="recorded"), maximum_bytes=1000)
     site.take((0.05, "car1", 1.0), until=0.5)
     for step in range(40):
         site.take((0.6 + step / 10, "car1", 1.0), until=0.65 + step / 10)
@@ -243,7 +243,7 @@ def test_one_that_hangs_holds_up_nobody_and_what_finds_its_queue_full_is_counted
 
 
 def test_one_that_hangs_at_the_end_is_left_behind() -> None:
-    site = Site(fast(a="hangs"))
+    site = HostHarness(fast(a="hangs"))
     one_episode(site)
     site.host.close(grace=0.05)
     assert [each.what for each in site.host.outcomes.lost()] == [
@@ -252,7 +252,7 @@ def test_one_that_hangs_at_the_end_is_left_behind() -> None:
 
 
 def test_one_that_is_replaced_completes_what_it_has_and_the_new_one_continues() -> None:
-    site = Site(fast(a="recorded"))
+    site = HostHarness(fast(a="recorded"))
     site.take((0.05, "car1", 1.0), until=0.5)
     site.when(lambda: "a 1 samples car1" in Recorded.reported)
     site.follow(fast(b="recorded"))
@@ -263,14 +263,14 @@ def test_one_that_is_replaced_completes_what_it_has_and_the_new_one_continues() 
 
 def test_one_is_woken_when_it_wishes_and_what_it_raises_then_is_counted() -> None:
     Wakes.calls = 0
-    site = Site(fast(a="wakes"))
+    site = HostHarness(fast(a="wakes"))
     site.when(lambda: Wakes.calls > 5)
     assert [(each.what, each.count) for each in site.host.outcomes.lost()] == [("times Wakes.wake failed", 1)]
     site.host.close()
 
 
 def test_one_that_reports_nothing_has_failed_at_the_end() -> None:
-    site = Site(fast(a="silent"))
+    site = HostHarness(fast(a="silent"))
     one_episode(site)
     site.host.close()
     counts = site.counts("a")
@@ -278,7 +278,7 @@ def test_one_that_reports_nothing_has_failed_at_the_end() -> None:
 
 
 def test_each_outcome_is_reported_once() -> None:
-    site = Site(fast(a="recorded", b="raises"))
+    site = HostHarness(fast(a="recorded", b="raises"))
     one_episode(site)
     site.host.close()
     episode = site.published[0][0].split("/")[4]

@@ -31,7 +31,7 @@ class Lamp(Action[LampParameters]):
     Parameters: ClassVar[type[BaseModel]] = LampParameters
 
 
-class Bare(Action[Any]):
+class WithoutModel(Action[Any]):
     """Has no model of its parameters."""
 
 
@@ -40,7 +40,12 @@ def packages(monkeypatch: pytest.MonkeyPatch) -> None:
     """The classes above as installed actions."""
     here = [
         EntryPoint(name, f"{__name__}:{value}", OFFERS.group)
-        for name, value in (("lamp", "Lamp"), ("bare", "Bare"), ("parameters", "LampParameters"), ("lost", "Absent"))
+        for name, value in (
+            ("lamp", "Lamp"),
+            ("bare", "WithoutModel"),
+            ("parameters", "LampParameters"),
+            ("lost", "Absent"),
+        )
     ]
     monkeypatch.setattr(entrypoints, "entry_points", lambda group: here)
     entrypoints._load.cache_clear()
@@ -62,7 +67,11 @@ def test_an_action_gets_its_parameters_as_its_model() -> None:
         ("xyz", {}, "plugin.name: no action xyz is installed; there are bare, lamp, lost, parameters"),
         ("lost", {}, "plugin.name: cannot load action lost: AttributeError"),
         ("parameters", {}, "must be a complete subclass of detector.actions.base.Action; got "),
-        ("bare", {}, "plugin.name: action bare: give tests.unit.actions.test_actions_registry:Bare a class Parameters"),
+        (
+            "bare",
+            {},
+            "plugin.name: action bare: give tests.unit.actions.test_actions_registry:WithoutModel a class Parameters",
+        ),
         (
             "deploy",
             {},

@@ -22,7 +22,7 @@ from detector.status.metrics import Metrics
 from detector.status.model import CertificateStatus
 from tests.driving import Drive, a_detector, arrival
 from tests.promtool import find_promtool
-from tests.unit.statuses.test_status import FAST, Kept
+from tests.unit.statuses.test_status import FAST, ObservedEngine
 
 ALERTS = FILES / "monitoring" / "alerts.yaml"
 DASHBOARD = FILES / "monitoring" / "dashboard.json"
@@ -45,7 +45,7 @@ def exported() -> set[str]:
     """The names of all samples of both programs."""
     measures = Measures()
     measures.registry.register(Overview(ClusterCache(Policy()), lambda: [("task", 0, 0)]))
-    taken = Kept(Drive(a_detector(), FAST)).take(arrival(0.5, "car", {"v": 20}), until=1)
+    taken = ObservedEngine(Drive(a_detector(), FAST)).take(arrival(0.5, "car", {"v": 20}), until=1)
     status = msgspec.structs.replace(taken, certificate=CertificateStatus(expires=1.0))
     texts = measures.text().decode(), Metrics(lambda: status).text().decode()
     found = set()

@@ -70,7 +70,7 @@ def reported(classification: dict[str, list[str]], *others: Any, **spec: Any) ->
     return [str(each) for each in contradictions(rule, compile_rule(rule, DETECTOR), DETECTOR, named)]
 
 
-class Way(NamedTuple):
+class ContradictionCase(NamedTuple):
     """A rule that is warned of: the field, a piece of the text, and what makes it right."""
 
     given: dict[str, list[str]]
@@ -79,8 +79,10 @@ class Way(NamedTuple):
     right: dict[str, list[str]]
 
 
-def way(dimension: str, value: str, shows: str, right: str, **spec: Any) -> Way:
-    return Way({dimension: value.split()}, spec, f"spec.classification.{dimension}{shows}", {dimension: right.split()})
+def way(dimension: str, value: str, shows: str, right: str, **spec: Any) -> ContradictionCase:
+    return ContradictionCase(
+        {dimension: value.split()}, spec, f"spec.classification.{dimension}{shows}", {dimension: right.split()}
+    )
 
 
 NOW = [SPEED]
@@ -94,7 +96,7 @@ WAYS = [
         "about two clients: write Two, or Multiple", "Two", scope=PAIRS, when="distance < 5"),
     way("numberOfParticipants", "One", "[0]: One (a single participant) contradicts the rule: spec.scope.fleet",
         "Multiple", scope=FLEET, when="size(members) > 3.0"),
-    Way({"numberOfParticipants": ["One"], "eventDetectionEntity": ["External"]}, {},
+    ContradictionCase({"numberOfParticipants": ["One"], "eventDetectionEntity": ["External"]}, {},
         "spec.classification.eventDetectionEntity[0]: External (the detecting entity is the source of neither",
         {"numberOfParticipants": ["Two"], "eventDetectionEntity": ["External"]}),
     way("actingEntity", "External", "[0]: External (the acting entity is another one) "
@@ -159,7 +161,7 @@ WAYS = [
 
 
 @pytest.mark.parametrize("given_way", WAYS, ids=lambda each: each.shows.removeprefix("spec.classification.")[:60])
-def test_a_contradiction_is_reported_and_what_fits_is_not(given_way: Way) -> None:
+def test_a_contradiction_is_reported_and_what_fits_is_not(given_way: ContradictionCase) -> None:
     warnings = reported(given_way.given, **given_way.spec)
     assert any(warning.startswith(given_way.shows) for warning in warnings), warnings
     assert reported(given_way.right, **given_way.spec) == []

@@ -77,7 +77,7 @@ def test_a_refused_change_of_a_rule_in_an_intake_file_ends_no_episode_as_it_ende
     assert [refusal.kept for refusal in outcome.refusals] == [True]
 
 
-class Nowhere:
+class NullSink:
     """Takes events and demands, and does nothing with them."""
 
     def events(self, events: object) -> None: ...
@@ -90,7 +90,7 @@ class Nowhere:
 def test_with_clock_data_the_evaluation_rests_between_its_looks_however_old_the_stamps_are() -> None:
     detector = a_detector(clock="Data")
     evaluator = Evaluator(
-        an_engine(detector), Intake(lambda: START), Nowhere(), now=lambda: at(1e6), on_failure=lambda error: None
+        an_engine(detector), Intake(lambda: START), NullSink(), now=lambda: at(1e6), on_failure=lambda error: None
     )
     assert evaluator.pause() > 0.01
 

@@ -209,7 +209,7 @@ def tasks_of(drawn: Iterable[tuple[str, str, int, int]], prefix: str = "t") -> l
     ]
 
 
-class Site:
+class SimulatedNamespace:
     """A namespace that a manager manages, one step after the other; all that it remembers is what is live."""
 
     def __init__(self, bounds: tuple[int | None, int | None, int | None], uptime: int = 0) -> None:
@@ -269,7 +269,7 @@ class Site:
 @few
 @given(demands, demands, limits, st.randoms())
 def test_no_order_and_no_duplication_changes_anything(before: Any, drawn: Any, bounds: Any, source: Any) -> None:
-    site, live = Site(bounds), tasks_of(drawn)
+    site, live = SimulatedNamespace(bounds), tasks_of(drawn)
     site.settle(tasks_of(before, "b"), linger=False)
     expected = site.outcome(live)
     shuffled = [*live, *source.sample(live, len(live) // 2)]
@@ -284,7 +284,7 @@ def test_no_order_and_no_duplication_changes_anything(before: Any, drawn: Any, b
 def test_no_limit_is_ever_exceeded_whatever_comes_and_whatever_is_slow(
     history: Any, bounds: Any, uptime: int, source: Any
 ) -> None:
-    site = Site(bounds, uptime)
+    site = SimulatedNamespace(bounds, uptime)
     for index, drawn in enumerate(history):
         live = tasks_of(drawn, f"h{index}-")
         for _ in range(4):
@@ -296,7 +296,7 @@ def test_no_limit_is_ever_exceeded_whatever_comes_and_whatever_is_slow(
 @few
 @given(demands, demands, limits)
 def test_a_higher_priority_never_waits_while_a_lower_one_runs(before: Any, drawn: Any, bounds: Any) -> None:
-    site, live = Site(bounds), tasks_of(drawn)
+    site, live = SimulatedNamespace(bounds), tasks_of(drawn)
     site.settle(tasks_of(before, "b"))
     site.settle(live)
     site.check_limits()
@@ -319,7 +319,7 @@ def test_a_higher_priority_never_waits_while_a_lower_one_runs(before: Any, drawn
 @few
 @given(demands, demands, limits)
 def test_it_comes_to_rest_and_a_demand_that_goes_restores_what_was(drawn: Any, more: Any, bounds: Any) -> None:
-    site, live = Site(bounds), tasks_of(drawn)
+    site, live = SimulatedNamespace(bounds), tasks_of(drawn)
     site.settle(live)
     before = set(site.instances)
     known = {(each.spec.template_name, each.spec.parameters["region"]) for each in live}
@@ -335,7 +335,7 @@ def test_it_comes_to_rest_and_a_demand_that_goes_restores_what_was(drawn: Any, m
 @given(demands, limits, st.integers(0, 40))
 def test_from_nothing_the_first_in_order_run(drawn: Any, bounds: Any, seconds: int) -> None:
     """The order by hand: one after the other, as far as there is room; and time alone changes nothing."""
-    site, live = Site(bounds), tasks_of(drawn)
+    site, live = SimulatedNamespace(bounds), tasks_of(drawn)
     expected: dict[str, str] = {}
     ordered = sorted(live, key=lambda each: (-each.spec.priority, each.metadata.creation_timestamp, each.name))
     for each in ordered:

@@ -136,7 +136,7 @@ def test_the_newest_of_all_stays_when_the_cap_leaves_room_for_one() -> None:
 
 
 @dataclass
-class Doing:
+class BufferStep:
     """A step of the life of a buffer."""
 
     what: str
@@ -148,24 +148,24 @@ class Doing:
 
 doings = st.one_of(
     st.builds(
-        Doing,
+        BufferStep,
         st.just("insert"),
         st.sampled_from("ab"),
         st.sampled_from("st"),
         st.integers(0, 100),
         st.binary(max_size=100),
     ),
-    st.builds(Doing, st.just("expire"), time=st.integers(0, 120)),
-    st.builds(Doing, st.just("forget"), st.sampled_from("ab")),
-    st.builds(Doing, st.just("keep"), stream=st.sampled_from("st")),
-    st.builds(Doing, st.just("clear")),
+    st.builds(BufferStep, st.just("expire"), time=st.integers(0, 120)),
+    st.builds(BufferStep, st.just("forget"), st.sampled_from("ab")),
+    st.builds(BufferStep, st.just("keep"), stream=st.sampled_from("st")),
+    st.builds(BufferStep, st.just("clear")),
 )
 
 
 @settings(max_examples=200)
 @given(st.lists(doings, max_size=60), st.integers(400, 5_000), st.one_of(st.none(), st.integers(200, 1_500)))
 def test_the_bytes_are_those_of_what_is_held_and_within_the_cap(
-    steps: list[Doing], cap: int, lane_cap: int | None
+    steps: list[BufferStep], cap: int, lane_cap: int | None
 ) -> None:
     buffer = Buffer(cap)
     came: set[int] = set()

@@ -38,7 +38,7 @@ LISTS = frozenset({"list"})
 LIST = {"key": "stations/${station:*}/list", "items": "msg.list", "client": "${item.id}"}
 
 
-class Plain:
+class PythonJsonDecoder:
     """Reads payloads as Python does, since JSON proper has no NaN."""
 
     def decode(self, payload: bytes) -> Any:
@@ -78,7 +78,7 @@ def by_the_engine(scene: Scene, cut: int) -> list[Event]:
     buffer = _given({"duration": "6s", "bytes": scene.all_bytes})
     detector = a_detector(*streams, clientTimeout="4s", buffer=buffer, places=[*PLACES], **clock)
     entries = stream_readers(detector)
-    decoders = dict.fromkeys(STREAMS, Plain())
+    decoders = dict.fromkeys(STREAMS, PythonJsonDecoder())
     engine = Engine(detector, holder="h", decoders=decoders, read_key=entries.read_key, start=START)
     engine.set_rules(compiled(detector, *(a_rule(name, **spec) for name, spec in scene.rules.items())))
     events: list[Event] = []

@@ -11,8 +11,8 @@ import pytest
 
 from detector.commands import cli
 from examples.running.__main__ import main
-from examples.running.cases import Ran, folder_of, run, scenario_of, use_cases
-from examples.running.demanding import Running, unlike
+from examples.running.cases import CaseResult, folder_of, run, scenario_of, use_cases
+from examples.running.demanding import RunningTask, unlike
 from examples.running.judging import judge
 from examples.running.playing import Played, play
 from examples.running.recording import write_recording
@@ -22,18 +22,18 @@ from wayside.process import commandline
 
 
 @pytest.fixture(scope="module", params=use_cases())
-def ran(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Ran:
+def ran(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> CaseResult:
     """A use case that was run."""
     return run(request.param, tmp_path_factory.mktemp(request.param))
 
 
-def test_a_use_case_gives_the_results_of_its_truth(ran: Ran) -> None:
+def test_a_use_case_gives_the_results_of_its_truth(ran: CaseResult) -> None:
     assert ran.verdict.problems == []
     assert ran.verdict.expected == ran.verdict.found > 0
     assert ran.verdict.actions_expected == ran.verdict.actions_done > 0
 
 
-def test_a_use_case_without_results_is_reported(ran: Ran, tmp_path: Path) -> None:
+def test_a_use_case_without_results_is_reported(ran: CaseResult, tmp_path: Path) -> None:
     problems = judge(ran.scenario, Played(tmp_path), folder_of(ran.name)).problems
     assert {each.split(" of ")[0] for each in problems if " starts never; expected: " in each} == {
         each.rule for each in ran.scenario.episodes
@@ -43,7 +43,7 @@ def test_a_use_case_without_results_is_reported(ran: Ran, tmp_path: Path) -> Non
     }
 
 
-def test_a_use_case_is_reported_with_its_picture_and_files(ran: Ran) -> None:
+def test_a_use_case_is_reported_with_its_picture_and_files(ran: CaseResult) -> None:
     folder, picture = folder_of(ran.name), ran.scenario.picture_file
     readme = (folder / "README.md").read_text(encoding="utf-8")
     assert f"]({picture})" in readme
@@ -90,15 +90,18 @@ def test_what_differs_is_reported(tmp_path: Path) -> None:
 
 def test_what_runs_otherwise_is_reported() -> None:
     moment = Moment(3, {"driving/a": {"maxSpeed": 4}, "driving/b": {}})
-    right = {"driving/a": Running(("Deployment",), {"maxSpeed": 4, "vehicle": "a"}), "driving/b": Running(("Pod",))}
+    right = {
+        "driving/a": RunningTask(("Deployment",), {"maxSpeed": 4, "vehicle": "a"}),
+        "driving/b": RunningTask(("Pod",)),
+    }
     assert list(unlike(moment, right)) == []
-    wrong = {"driving/a": Running(("Deployment",), {"maxSpeed": 13.9}), "driving/c": Running(())}
+    wrong = {"driving/a": RunningTask(("Deployment",), {"maxSpeed": 13.9}), "driving/c": RunningTask(())}
     assert [problem.split(":")[0].split(" is ")[0] for problem in unlike(moment, wrong)] == [
         "at 3 s driving/a",
         "at 3 s driving/b does not run",
         "at 3 s driving/c runs; it must not",
     ]
-    asleep = {**right, "driving/b": Running(("Pod",), suspended=True)}
+    asleep = {**right, "driving/b": RunningTask(("Pod",), suspended=True)}
     assert list(unlike(moment, asleep)) == ["at 3 s driving/b is suspended"]
     assert list(unlike(dataclasses.replace(moment, suspended=["driving/b"]), asleep)) == []
 

@@ -10,14 +10,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.unit.expressions.authoring import (
+from tests.unit.expressions.random_expressions import (
     ANYTHING,
     ENVIRONMENT,
     FOREIGN,
     KINDS,
     OTHER,
     PLAIN,
-    Author,
+    ExpressionGenerator,
     Row,
     Table,
     by_path,
@@ -44,7 +44,7 @@ from wayside.expressions.columns.functions import SCALAR, VECTORISED, calculate
 @given(st.integers(0, 2**32), KINDS, rows_of(ANYTHING))
 @settings(max_examples=100, deadline=None)
 def test_rows_have_the_values_that_cel_gives(seed: int, kind: CelType, rows: list[Row]) -> None:
-    table, author = Table(rows), Author(seed)
+    table, author = Table(rows), ExpressionGenerator(seed)
     for source in (author.number(3), author.truth(3), *(author.anything(2) for _ in range(4))):
         expression = compiled(source, kind)
         found = None if expression is None else table.by_columns(expression)
@@ -57,7 +57,7 @@ def test_rows_have_the_values_that_cel_gives(seed: int, kind: CelType, rows: lis
 @given(st.integers(0, 2**32), rows_of(PLAIN))
 @settings(max_examples=100, deadline=None)
 def test_numbers_and_absent_values_never_need_cel(seed: int, rows: list[Row]) -> None:
-    table, author = Table(rows), Author(seed)
+    table, author = Table(rows), ExpressionGenerator(seed)
     for source in (author.number(3), author.truth(3), author.truth(2)):
         expression = compiled(source)
         if expression is None:

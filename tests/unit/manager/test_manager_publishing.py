@@ -24,7 +24,7 @@ NAME = ("site", "fusion")
 KEY = "wayside/instances/site/fusion/configuration"
 
 
-class Wire:
+class TcpProxy:
     """A TCP connection to somewhere else, that can be cut and mended."""
 
     def __init__(self, target: int) -> None:
@@ -85,7 +85,7 @@ def running(publisher: Publisher) -> Iterator[Callable[[Callable[[], None]], Non
         assert ended.wait(PATIENCE)
 
 
-class Heard:
+class Subscriber:
     def __init__(self, session: zenoh.Session) -> None:
         self.contents: list[str | None] = []
         self._subscriber = session.declare_subscriber("wayside/instances/**", self._take)
@@ -104,9 +104,9 @@ def answers(session: zenoh.Session, key: str) -> list[bytes]:
 
 def test_what_changes_while_the_connection_is_lost_is_published_once_it_is_back() -> None:
     endpoint = free_endpoint()
-    wire = Wire(int(endpoint.rpartition(":")[2]))
+    wire = TcpProxy(int(endpoint.rpartition(":")[2]))
     with router(listen__endpoints=[endpoint]) as network:
-        heard = Heard(network)
+        heard = Subscriber(network)
         publisher = Publisher(settings([f"tcp/127.0.0.1:{wire.port}"]))
         with running(publisher) as call:
             call(lambda: publisher.publish(NAME, {"a": "1"}))
@@ -125,7 +125,7 @@ def test_what_changes_while_the_connection_is_lost_is_published_once_it_is_back(
 def test_changes_are_published_in_order_and_each_query_answered() -> None:
     endpoint = free_endpoint()
     with router(listen__endpoints=[endpoint]) as network:
-        heard = Heard(network)
+        heard = Subscriber(network)
         publisher = Publisher(settings([endpoint]))
         with running(publisher) as call:
             for content in ("1", "1", "2"):

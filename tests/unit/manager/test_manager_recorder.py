@@ -15,7 +15,7 @@ from wayside.kubernetes.client import Client
 from wayside.kubernetes.errors import ApiError
 
 
-class Refusing:
+class RejectingServer:
     """An API server that takes no Event."""
 
     def __init__(self) -> None:
@@ -33,7 +33,7 @@ def report(events: Recorder, first: int, count: int) -> None:
         events.event(about, EventReason.ACCEPTED, "counts", NOW)
 
 
-class Taking:
+class AcceptingServer:
     """An API server that takes all Events, and notes their namespaces."""
 
     def __init__(self) -> None:
@@ -44,7 +44,7 @@ class Taking:
 
 
 def test_namespaces_take_turns() -> None:
-    server = Taking()
+    server = AcceptingServer()
     events = Recorder(cast("Client", server))
 
     async def flood() -> None:
@@ -65,7 +65,7 @@ def lines(caplog: pytest.LogCaptureFixture) -> list[str]:
 
 
 def test_thousands_that_do_not_fit_are_two_lines_with_their_count(caplog: pytest.LogCaptureFixture) -> None:
-    server = Refusing()
+    server = RejectingServer()
     events = Recorder(cast("Client", server))
 
     async def flood() -> None:
@@ -85,7 +85,7 @@ def test_what_is_dropped_later_is_reported_when_its_time_has_come_though_no_furt
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(recorder, "_REPORT_EVERY", 0.2)
-    events = Recorder(cast("Client", Refusing()))
+    events = Recorder(cast("Client", RejectingServer()))
 
     async def trickle() -> None:
         running = asyncio.create_task(events.run())

@@ -16,7 +16,7 @@ from tests.driving import a_detector, a_rule, a_stream, at
 from tests.unit.recordings.test_recordings import write_lines
 
 
-class Ran(NamedTuple):
+class CommandResult(NamedTuple):
     code: int
     logged: str
     events: list[dict[str, Any]]
@@ -42,16 +42,16 @@ class CommandLine:
         path.parent.mkdir(parents=True, exist_ok=True)
         return write_lines(path, *({"t": at(time), "key": key, "value": value} for time, value in samples))
 
-    def run(self, *arguments: str) -> Ran:
+    def run(self, *arguments: str) -> CommandResult:
         self._monkeypatch.setattr(sys, "argv", ["detector", *arguments])
         self._monkeypatch.chdir(self.folder)
         with pytest.raises(SystemExit) as left:
             main()
         events = self.folder / "out" / "events.jsonl"
         found = [json.loads(line) for line in events.read_text().splitlines()] if events.exists() else []
-        return Ran(int(left.value.code or 0), self._capsys.readouterr().err, found)
+        return CommandResult(int(left.value.code or 0), self._capsys.readouterr().err, found)
 
-    def replay(self, *recordings: str | Path, options: Sequence[str] = ()) -> Ran:
+    def replay(self, *recordings: str | Path, options: Sequence[str] = ()) -> CommandResult:
         given = ["--detector", "detector.yaml", "--rules", "rules.yaml", "--output", "out"]
         return self.run("replay", *map(str, recordings), *given, *options)
 

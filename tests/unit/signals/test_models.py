@@ -34,7 +34,7 @@ def x(**given: Any) -> dict[str, Any]:
     return {"name": "x", **given}
 
 
-class Driven(Drive):
+class ModelDrive(Drive):
     """As `Drive`, with the models of its rules."""
 
     def __init__(self, detector: Detector, *rules: EventRule) -> None:
@@ -58,7 +58,7 @@ def always(*signals: Any, **spec: Any) -> EventRule:
 def test_a_models_output_is_a_signal_and_its_sha256_is_in_the_event(tmp_path: Path) -> None:
     file = onnx_models.weighted(tmp_path / "m.onnx", [0.5, -1.0], bias=2.0)
     rule = a_rule("r", signals=[SPEED, GAP, risk(file, x(signals=["speed", "gap"]))], when="risk > 5")
-    drive = Driven(a_detector(), rule)
+    drive = ModelDrive(a_detector(), rule)
     assert drive.take(arrival(0.4, "car", {"v": 10}), arrival(0.5, "car", {"x": 4}, "pose"), until=1) == []
     drive.take(arrival(1.5, "car", {"v": 20}), until=2)
     assert drive.values() == {"speed": 20.0, "gap": 4.0, "risk": 8.0}
@@ -79,7 +79,7 @@ def test_all_clients_of_a_tick_are_one_batch_and_those_with_an_unknown_input_are
         return original(self, rows)
 
     file = onnx_models.weighted(tmp_path / "m.onnx", [1.0])
-    drive = Driven(a_detector(), always(SPEED, risk(file, x(signals=["speed"]))))
+    drive = ModelDrive(a_detector(), always(SPEED, risk(file, x(signals=["speed"]))))
     monkeypatch.setattr(ModelFile, "run_rows", counted)
     sent = [arrival(0.1 + n / 100, f"car{n}", {"v": n} if n else {}) for n in range(5)]
     drive.take(*sent, until=1)
@@ -92,7 +92,7 @@ def test_all_clients_of_a_tick_are_one_batch_and_those_with_an_unknown_input_are
 
 def test_a_model_for_one_client_at_a_time_runs_as_often_as_there_are_clients(tmp_path: Path) -> None:
     file = onnx_models.weighted(tmp_path / "m.onnx", [1.0], clients=1)
-    drive = Driven(a_detector(), always(SPEED, risk(file, x(signals=["speed"]))))
+    drive = ModelDrive(a_detector(), always(SPEED, risk(file, x(signals=["speed"]))))
     drive.take(arrival(0.1, "a", {"v": 1}), arrival(0.2, "b", {"v": 2}), until=1)
     assert [event.values["risk"] for event in drive.events] == [1.0, 2.0]
 
@@ -100,7 +100,7 @@ def test_a_model_for_one_client_at_a_time_runs_as_often_as_there_are_clients(tmp
 def test_the_last_samples_are_a_window_oldest_first_and_unknown_while_there_are_fewer(tmp_path: Path) -> None:
     file = onnx_models.weighted(tmp_path / "m.onnx", [100.0, 10.0, 1.0])
     signal = risk(file, x(window={"signals": ["speed"], "last": 3}))
-    drive = Driven(a_detector(), a_rule("r", signals=[SPEED, signal], when="risk > 0"))
+    drive = ModelDrive(a_detector(), a_rule("r", signals=[SPEED, signal], when="risk > 0"))
     assert drive.take(arrival(0.1, "car", {"v": 1}), arrival(0.2, "car", {"v": 2}), until=1) == []
     drive.take(arrival(1.1, "car", {"v": 3}), until=2)
     assert drive.values()["risk"] == 123.0
@@ -109,7 +109,7 @@ def test_the_last_samples_are_a_window_oldest_first_and_unknown_while_there_are_
 def test_a_time_is_drawn_again_at_equal_steps(tmp_path: Path) -> None:
     file = onnx_models.same(tmp_path / "m.onnx", [3, 2])
     window = {"signals": ["speed", "gap"], "over": "2s", "samples": 3}
-    drive = Driven(
+    drive = ModelDrive(
         a_detector(), a_rule("r", signals=[SPEED, GAP, risk(file, x(window=window))], when="risk[0][0] >= 0")
     )
     sent = [arrival(0.5, "car", {"v": 0}), arrival(0.5, "car", {"x": 5}, "pose"), arrival(2.5, "car", {"v": 20})]
@@ -124,7 +124,7 @@ def test_several_outputs_are_a_map_and_output_names_one(tmp_path: Path) -> None:
         risk(file, x(signals=["speed", "gap"])),
         risk(file, x(signals=["speed", "gap"]), name="h", output="high"),
     )
-    drive = Driven(a_detector(), a_rule("r", signals=[SPEED, GAP, both, one], when="risk.low[1] > 0 && h[0] > 0"))
+    drive = ModelDrive(a_detector(), a_rule("r", signals=[SPEED, GAP, both, one], when="risk.low[1] > 0 && h[0] > 0"))
     drive.take(arrival(0.4, "car", {"v": 10}), arrival(0.5, "car", {"x": 4}, "pose"), until=1)
     assert drive.values()["risk"] == {"low": [9.0, 3.0], "high": [11.0, 5.0]}
     assert drive.values()["h"] == [11.0, 5.0]
@@ -134,7 +134,7 @@ def test_in_a_pair_each_has_its_own(tmp_path: Path) -> None:
     file = onnx_models.weighted(tmp_path / "m.onnx", [1.0])
     scope = {"pairs": {"position": {"stream": "pose", "x": "msg.x", "y": "msg.y"}, "within": 100}}
     rule = a_rule("r", scope=scope, signals=[SPEED, risk(file, x(signals=["speed"]))], when="a.risk + b.risk > 5")
-    drive = Driven(a_detector(), rule)
+    drive = ModelDrive(a_detector(), rule)
     for n, car in enumerate("abc"):
         where = {"x": 1000.0 if car == "c" else 0.0, "y": 0}
         drive.take(arrival(0.1 + n / 10, car, {"v": n + 3}), arrival(0.15 + n / 10, car, where, "pose"), until=0.5)
@@ -177,7 +177,7 @@ LIDAR = a_stream("lidar", encoding="cdr", type="sensor_msgs/msg/PointCloud2")
 
 def sensed(tmp_path: Path, shape: list[int], given: dict[str, Any], payload: bytes, stream: str) -> Drive:
     signal = risk(onnx_models.same(tmp_path / "m.onnx", shape), x(**given), name="out")
-    drive = Driven(a_detector(CAMERA, LIDAR), always(signal))
+    drive = ModelDrive(a_detector(CAMERA, LIDAR), always(signal))
     drive.take(arrival(0.5, "car", payload, stream), until=1)
     return drive
 
@@ -256,7 +256,7 @@ def test_a_model_that_fails_at_run_time_is_unknown_and_counted(tmp_path: Path) -
     file = onnx_models.saved(
         tmp_path / "m.onnx", {"x": ["n", 1]}, {"y": ["n", 1]}, nodes, {"table": np.float32([1, 2])}
     )
-    drive = Driven(a_detector(), a_rule("r", signals=[SPEED, risk(file, x(signals=["speed"]))], when="risk > 1"))
+    drive = ModelDrive(a_detector(), a_rule("r", signals=[SPEED, risk(file, x(signals=["speed"]))], when="risk > 1"))
     assert drive.take(arrival(0.5, "car", {"v": 9}), until=1) == []
     counters = drive.engine.counters.rule("r")
     assert counters.errors == 1
@@ -321,7 +321,7 @@ def test_a_rule_with_another_model_is_another_rule(tmp_path: Path) -> None:
     detector = a_detector()
     rule = always(SPEED, risk(file, x(signals=["speed"])))
     index, fields = RuleIndex(), stream_readers(detector).fields
-    drive = Driven(detector, rule)
+    drive = ModelDrive(detector, rule)
     drive.take(arrival(0.5, "car", {"v": 1}), until=1)
     assert drive.note(drive.engine.set_rules(index.compile([rule], detector, fields)[0])) == []
     onnx_models.weighted(file, [2.0])
@@ -334,7 +334,7 @@ def test_the_same_samples_give_the_same_bytes(tmp_path: Path) -> None:
     signal = risk(file, x(window={"signals": ["speed"], "last": 8}))
 
     def lines() -> list[str]:
-        drive = Driven(a_detector(), a_rule("r", signals=[SPEED, signal], when="risk > 0"))
+        drive = ModelDrive(a_detector(), a_rule("r", signals=[SPEED, signal], when="risk > 0"))
         values = np.random.default_rng(3).normal(size=400)
         sent: list[Arrival] = [arrival(0.01 + n / 20, f"car{n % 5}", {"v": value}) for n, value in enumerate(values)]
         drive.take(*sent, until=20)
@@ -354,7 +354,7 @@ def test_the_documentations_example_is_a_rule_that_runs(tmp_path: Path) -> None:
         helper.make_node("Add", ["s", "h"], ["risk"]),
     ]
     spec["signals"][2]["model"]["file"] = str(onnx_models.saved(tmp_path / "m.onnx", shapes, {"risk": ["n", 1]}, nodes))
-    driven = Driven(a_detector(a_stream("odometry"), a_stream("radar")), a_rule("r", **spec))
+    driven = ModelDrive(a_detector(a_stream("odometry"), a_stream("radar")), a_rule("r", **spec))
     twist = {"twist": {"twist": {"linear": {"x": 10}}}}
     sent = [arrival(0.01 * n, "car", twist, "odometry") for n in range(1, 30)]
     assert driven.take(*sent, arrival(0.5, "car", {"range": 4}, "radar"), until=1) == ["r car started 1"]

@@ -136,7 +136,7 @@ def test_what_passed_the_api_server_and_is_invalid_is_reported_in_its_status(kin
     }
     assert cache.store.put(raw) is not None
 
-    class Accepting(Client):
+    class AcceptingClient(Client):
         """An API server that takes every status."""
 
         async def patch_status(
@@ -146,7 +146,7 @@ def test_what_passed_the_api_server_and_is_invalid_is_reported_in_its_status(kin
             return {**raw, "metadata": {**raw["metadata"], "resourceVersion": str(len(written) + 1)}, "status": status}
 
     async def reconcile_twice() -> None:
-        client = Accepting(Configuration(), "test", field_manager="test")
+        client = AcceptingClient(Configuration(), "test", field_manager="test")
         work = RuleWork(cache, StatusWriter(client, Recorder(client), observe), InProcess())
         await work.reconcile(((API_VERSION, kind), ("site", "odd")))
         await work.reconcile(((API_VERSION, kind), ("site", "odd")))

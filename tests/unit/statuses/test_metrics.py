@@ -18,7 +18,7 @@ from detector.status.server import PagesAddress, StatusServer
 from detector.streams.loss_counter import Cause
 from tests.driving import Drive, a_detector, a_rule, a_stream, arrival, at
 from tests.guides import guide
-from tests.unit.statuses.test_status import FAST, Kept
+from tests.unit.statuses.test_status import FAST, ObservedEngine
 
 
 def samples(status: Status) -> dict[tuple[str, ...], float]:
@@ -34,7 +34,7 @@ def samples(status: Status) -> dict[tuple[str, ...], float]:
 
 def test_a_scrape_has_the_values_of_the_status() -> None:
     streams = a_stream("pose"), a_stream("speed", stamp="msg.t")
-    kept = Kept(Drive(a_detector(*streams), FAST, a_rule("off", when="true", enabled=False)))
+    kept = ObservedEngine(Drive(a_detector(*streams), FAST, a_rule("off", when="true", enabled=False)))
     sent = {"v": 20, "t": at(0.5) / 1e9 - 0.03}
     status = kept.take(arrival(0.5, "car", sent), arrival(0.7, "bus", b"{"), until=1)
     found = samples(status)
@@ -53,7 +53,7 @@ def test_a_scrape_has_the_values_of_the_status() -> None:
 
 
 def test_metrics_have_no_client_label() -> None:
-    kept = Kept(Drive(a_detector(), FAST))
+    kept = ObservedEngine(Drive(a_detector(), FAST))
     few = len(samples(kept.take(arrival(0.5, "car", {"v": 20}), until=1)))
     many = kept.take(*(arrival(1.1 + n / 1000, f"car{n}", {"v": 20}) for n in range(100)), until=2)
     assert len(samples(many)) == few

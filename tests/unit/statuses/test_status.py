@@ -31,7 +31,7 @@ SPEED = {"name": "v", "stream": "speed", "value": "msg.v"}
 FAST = a_rule("fast", signals=[SPEED], when="v > 10")
 
 
-class Kept:
+class ObservedEngine:
     """An engine, its status, and the wall clock."""
 
     def __init__(self, drive: Drive) -> None:
@@ -49,7 +49,7 @@ class Kept:
 
 def test_streams_are_reported_with_rate_age_buffer_and_latency() -> None:
     stamped = a_stream("speed", stamp="msg.t")
-    kept = Kept(Drive(a_detector(a_stream("pose"), stamped), FAST))
+    kept = ObservedEngine(Drive(a_detector(a_stream("pose"), stamped), FAST))
     for second in range(10):
         sent = arrival(second + 0.5, "car", {"v": 1, "t": at(second + 0.5) / 1e9 - 0.03})
         status = kept.take(sent, until=second + 1)
@@ -66,7 +66,7 @@ def test_streams_are_reported_with_rate_age_buffer_and_latency() -> None:
 
 
 def test_rules_are_reported_with_what_was_unknown_failed_and_is_open() -> None:
-    kept = Kept(Drive(a_detector(), FAST))
+    kept = ObservedEngine(Drive(a_detector(), FAST))
     status = kept.take(arrival(0.5, "car", {"v": 20}), arrival(0.6, "bus", {}), until=1)
     (rule,) = status.rules
     assert (rule.state, rule.evaluations, rule.ticks, rule.started, rule.open) == (RuleState.ACCEPTED, 2, 1, 1, 1)
@@ -77,7 +77,7 @@ def test_rules_are_reported_with_what_was_unknown_failed_and_is_open() -> None:
 
 
 def test_the_latency_of_a_rule_counts_a_sample_once_however_long_nothing_follows() -> None:
-    kept = Kept(Drive(a_detector(), FAST))
+    kept = ObservedEngine(Drive(a_detector(), FAST))
     kept.take(arrival(0.5, "car", {"v": 20}), until=1)
     for second in range(2, 20):
         status = kept.take(until=second)
@@ -89,7 +89,7 @@ def test_the_latency_of_a_rule_counts_a_sample_once_however_long_nothing_follows
 
 
 def test_silent_clients_leave_room_for_the_latencies_of_others() -> None:
-    kept = Kept(Drive(a_detector(), FAST))
+    kept = ObservedEngine(Drive(a_detector(), FAST))
     kept.take(*(arrival(0.5, f"a{n}", {"v": 20}) for n in range(20)), until=1)
     status = kept.take(arrival(1.5, "z", {"v": 20}), until=2)
     assert status.rules[0].latency is not None
@@ -97,7 +97,7 @@ def test_silent_clients_leave_room_for_the_latencies_of_others() -> None:
 
 
 def test_the_latency_of_a_rule_ends_with_its_evaluation_and_not_with_a_later_look() -> None:
-    kept = Kept(Drive(a_detector(), FAST))
+    kept = ObservedEngine(Drive(a_detector(), FAST))
     for tick in range(1, 11):  # after each tick, a second look in which nothing is evaluated
         kept.take(arrival(tick - 0.5, "car", {"v": 20}), until=tick + 0.01 / tick)
         status = kept.take(until=tick + 0.4)
@@ -107,14 +107,14 @@ def test_the_latency_of_a_rule_ends_with_its_evaluation_and_not_with_a_later_loo
 
 
 def test_with_clock_data_latencies_are_from_the_stamp_to_the_receipt() -> None:
-    kept = Kept(Drive(a_detector(a_stream("speed", stamp="msg.t"), clock="Data"), FAST))
+    kept = ObservedEngine(Drive(a_detector(a_stream("speed", stamp="msg.t"), clock="Data"), FAST))
     kept.take(arrival(100.0, "car", {"v": 1, "t": 1_767_225_600.0}), until=100)
     status = kept.take(arrival(101.25, "car", {"v": 1, "t": 1_767_225_601.0}), until=102)
     assert status.streams[0].latency.sum == pytest.approx(100 + 100.25)
 
 
 def test_a_rule_that_is_refused_or_disabled_reports_it() -> None:
-    kept = Kept(Drive(a_detector(), a_rule("off", when="true", enabled=False)))
+    kept = ObservedEngine(Drive(a_detector(), a_rule("off", when="true", enabled=False)))
     kept.keeper.refused(
         [RefusedRule(a_rule("bad", when="1"), (RuleProblem(("spec", "when"), "no boolean"),), kept=False)]
     )
@@ -127,14 +127,14 @@ def test_a_rule_that_is_refused_or_disabled_reports_it() -> None:
 
 
 def test_drops_are_reported_by_cause() -> None:
-    kept = Kept(Drive(a_detector(), a_rule("r", signals=[SPEED], when="v > 1")))
+    kept = ObservedEngine(Drive(a_detector(), a_rule("r", signals=[SPEED], when="v > 1")))
     status = kept.take(arrival(0.5, "car", b"{"), arrival(0.6, "c%", {}), until=1)
     drops = {(drop.cause, drop.stream): drop.count for drop in status.drops if drop.count}
     assert drops == {("undecodable", "speed"): 1, ("unnamed", "speed"): 1}
 
 
 def test_a_status_is_taken_at_most_once_a_second_and_survives_its_journey() -> None:
-    kept = Kept(Drive(a_detector(), FAST))
+    kept = ObservedEngine(Drive(a_detector(), FAST))
     first = kept.take(arrival(0.5, "car", {"v": 20}), until=1)
     assert kept.take(until=1.9) is first
     second = kept.take(until=2)
@@ -143,7 +143,7 @@ def test_a_status_is_taken_at_most_once_a_second_and_survives_its_journey() -> N
     assert status_view(second) is not None
 
 
-class _Nowhere:
+class _NullSink:
     def events(self, events: object) -> None: ...
 
     def consequences(self, consequences: object) -> None: ...
@@ -155,7 +155,7 @@ def test_what_is_requested_from_the_evaluation_is_done_on_its_thread_and_errors_
     failures: list[BaseException] = []
     drive = Drive(a_detector())
     evaluator = Evaluator(
-        drive.engine, Intake(lambda: at(0)), _Nowhere(), now=lambda: at(0), on_failure=failures.append
+        drive.engine, Intake(lambda: at(0)), _NullSink(), now=lambda: at(0), on_failure=failures.append
     )
     early = evaluator.call(lambda: drive.engine.now)
     evaluator._thread.start()
@@ -297,7 +297,7 @@ def test_the_status_names_what_is_demanded_and_who_is_missing() -> None:
     detector = a_detector(
         clients=[{"name": "rsu-1", "expected": True}, {"name": "rsu-2", "expected": True}], clientTimeout="4s"
     )
-    kept = Kept(Drive(detector, FAST))
+    kept = ObservedEngine(Drive(detector, FAST))
     kept.keeper.demands = ("fast-b", "fast-a")
     status = kept.take(arrival(0.5, "rsu-1", {"v": 20}), until=1)
     assert (status.demands, status.demand_count, status.missing) == (["fast-a", "fast-b"], 2, [])

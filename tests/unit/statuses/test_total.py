@@ -18,13 +18,13 @@ from detector.streams.query_handler import NoAnswerError, QueryHandler
 from detector.streams.zenoh import Network
 from tests.driving import Drive, a_detector, a_rule, arrival
 from tests.ports import free_endpoint
-from tests.unit.statuses.test_status import FAST, Kept
+from tests.unit.statuses.test_status import FAST, ObservedEngine
 from wayside.api.documents import DocumentError
 from wayside.api.zenoh import Zenoh
 
 
 def status(holder: str, *arrivals: Arrival, until: float = 2) -> Status:
-    kept = Kept(Drive(a_detector(), FAST, a_rule("slow", signals=[], when="false")))
+    kept = ObservedEngine(Drive(a_detector(), FAST, a_rule("slow", signals=[], when="false")))
     return msgspec.structs.replace(kept.take(*arrivals, until=until), holder=holder)
 
 

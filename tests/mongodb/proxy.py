@@ -1,4 +1,4 @@
-"""A way to a server over TCP that a test can cut, hang or poison: what is at its ends is real."""
+"""A TCP proxy before a real server, which a test can cut, hang or make fail on certain data."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from tests.mongodb import MongoServer
 from tests.ports import free_port
 
 
-class Way:
-    """Forwards connections from a port of its own."""
+class ServerProxy:
+    """Forwards connections from its own port to the server."""
 
     def __init__(self, server: MongoServer) -> None:
         self._server = server
         self._to = (server.host, server.port)
         self._listener: socket.socket | None = None
-        self.port = free_port()  # of those that no client's end takes while the way is cut
+        self.port = free_port()  # none that the system gives to outgoing connections while the proxy is cut
         self._open: set[socket.socket] = set()
         self._lock = threading.Lock()
         self._flowing = threading.Event()
@@ -28,7 +28,7 @@ class Way:
 
     @property
     def uri(self) -> str:
-        """The server's, by this way: with its credentials and options."""
+        """The URI of the server through the proxy, with its credentials and options."""
         login, at, rest = self._server.uri.partition("://")[2].rpartition("@")
         options = rest.partition("?")[2]
         return f"mongodb://{login}{at}127.0.0.1:{self.port}/?{options}{'&' if options else ''}directConnection=true"
@@ -46,7 +46,7 @@ class Way:
         threading.Thread(target=self._accept, args=(listener,), daemon=True).start()
 
     def cut(self) -> None:
-        """End all connections, and refuse others."""
+        """Close all connections and refuse new ones."""
         with self._lock:
             listener, self._listener = self._listener, None
             ends = list(self._open)
@@ -58,7 +58,7 @@ class Way:
             _end(each)
 
     def hang(self) -> None:
-        """Take what comes, and pass nothing on."""
+        """Accept connections and forward nothing."""
         self._flowing.clear()
 
     def _accept(self, listener: socket.socket) -> None:
@@ -79,9 +79,9 @@ class Way:
                     _end(far)
                     continue
                 for source, target in ((near, far), (far, near)):
-                    threading.Thread(target=self._pass_on, args=(source, target), daemon=True).start()
+                    threading.Thread(target=self._forward, args=(source, target), daemon=True).start()
 
-    def _pass_on(self, source: socket.socket, target: socket.socket) -> None:
+    def _forward(self, source: socket.socket, target: socket.socket) -> None:
         tail = b""
         with suppress(OSError):
             while data := source.recv(65536):

@@ -100,7 +100,7 @@ def rows_of(values: st.SearchStrategy[object]) -> st.SearchStrategy[list[Row]]:
     return st.lists(st.builds(lambda one, other: one | other, row, declared), min_size=1, max_size=6)
 
 
-class Author:
+class ExpressionGenerator:
     """Writes expressions at random."""
 
     def __init__(self, seed: int) -> None:
@@ -179,7 +179,7 @@ LITERALS = ("0.0", "-0.0", "1", "2.5", "-1", "1e308", "(1.0/0.0)")
 UNARY = ("abs", "sqrt", "sin", "cos", "degrees", "radians")
 BINARY = ("smaller", "larger", "hypot", "atan2", "headingDifference", "timeToCollision")
 LIST = "['x', 0.0, true, '']"
-AUTHORS = st.integers(0, 2**32).map(Author)
+AUTHORS = st.integers(0, 2**32).map(ExpressionGenerator)
 KINDS = st.sampled_from([CelType.DYN, CelType.DYN, CelType.BOOL, CelType.DOUBLE, CelType.STRING])
 
 

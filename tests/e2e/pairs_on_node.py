@@ -11,7 +11,7 @@ import zenoh
 
 from detector.streams.zenoh import open_session
 from tests.cluster.api import Api, ApiError, Object, Objects, Unreachable
-from tests.cluster.chain import HOLDER, Pair, Town, Vehicles, detector, kind_of, rule, template
+from tests.cluster.chain import HOLDER, Pair, PairsNamespace, Vehicles, detector, kind_of, rule, template
 from tests.cluster.waiting import wait_until
 from tests.e2e.node import Node
 from tests.e2e.wayside_in_cluster import METRICS_PORT, ZENOH_PORT, apply_manager, expose_detector
@@ -24,7 +24,7 @@ DETECTOR = f"wayside.dev/runs={HOLDER}"
 IDLE = ["python3", "-c", "import time; time.sleep(10**6)"]
 
 
-class NodeTown(Town):
+class PairsOnNode(PairsNamespace):
     """Both programs as pods, with a Detector, a rule and a template.
 
     Attributes:
@@ -120,7 +120,7 @@ class NodeTown(Town):
             return f"no logs: {error}"
 
 
-class Heard:
+class PublishedEvents:
     """The events that a detector publishes, from outside the cluster; a context manager."""
 
     def __init__(self, endpoint: str) -> None:
@@ -139,7 +139,7 @@ class Heard:
         what = f"the events of {pair} are {kinds}"
         wait_until(lambda: self.kinds(pair), lambda found: found == list(kinds), timeout=PATIENCE, what=what)
 
-    def __enter__(self) -> Heard:
+    def __enter__(self) -> PublishedEvents:
         # It connects in the background, and what is published before, nobody hears.
         wait_until(self._session.info.peers_zid, bool, timeout=PATIENCE, what="the detector is connected")
         return self
