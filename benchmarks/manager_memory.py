@@ -78,7 +78,16 @@ async def _all_reported(client: Client, namespace: str) -> None:
 
 def measure(namespace: str, count: int, size: int) -> tuple[float, float, float]:
     """The memory of a manager of the namespace."""
-    command = [sys.executable, "-m", "application_manager.cli", "run", "--namespace", namespace, "--resync", "3s"]
+    command = [
+        sys.executable,
+        "-m",
+        "application_manager.commands.cli",
+        "run",
+        "--namespace",
+        namespace,
+        "--resync",
+        "3s",
+    ]
     with tempfile.TemporaryFile() as log:
         manager = subprocess.Popen(command, stdout=log, stderr=log)
         try:

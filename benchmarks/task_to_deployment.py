@@ -256,7 +256,7 @@ def main() -> None:
         if plane is not None:
             os.environ["KUBECONFIG"] = str(plane.kubeconfig)
         namespaces = asyncio.run(fresh_namespaces())
-        command = [sys.executable, "-m", "application_manager.cli", "run", "--namespace", namespaces[0]]
+        command = [sys.executable, "-m", "application_manager.commands.cli", "run", "--namespace", namespaces[0]]
         manager = subprocess.Popen(command, stdout=log, stderr=log)
         try:
             ratio = asyncio.run(measure(options.sequential, options.burst, manager, namespaces))

@@ -36,11 +36,12 @@ from application_manager.core.findings.injections import (
     read_pod,
 )
 from application_manager.core.findings.reviews import OverloadedError, Request, Weight, answer, read
+from application_manager.core.findings.rulefindings import RuleContext
 from application_manager.core.findings.templatefindings import template_findings
 from application_manager.core.objects.detectors import deployment_to_try
 from application_manager.core.objects.poddefaults import PodDefaults
 from application_manager.measures import Measures
-from application_manager.workers.jobs import RuleContext, judge_detector
+from application_manager.workers.jobs import judge_detector
 from application_manager.workers.pool import ExceededError, Runs
 from application_manager.workers.process import Job
 from wayside.api import ApplicationTemplate, Detector, EventRule

@@ -26,13 +26,13 @@ from application_manager.core.demand.lingering import written_deadline
 from application_manager.core.demand.places import Limits, Placement
 from application_manager.core.demand.placing import limits
 from application_manager.core.findings.findings import Findings
+from application_manager.core.findings.rulefindings import RuleContext
 from application_manager.core.holders.leases import HealthyTime, LeaseIndex, LeaseView
 from application_manager.core.holders.policies import TaskPolicy
 from application_manager.core.objects.ownership import ApplyResult
 from application_manager.core.objects.policy import KindKey, Name, Policy
 from application_manager.core.objects.trimming import without_objects
 from application_manager.core.statuses.status import InstanceProgress
-from application_manager.workers.jobs import RuleContext
 from wayside.api import (
     API_VERSION,
     ApplicationInstance,

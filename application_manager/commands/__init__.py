@@ -1,1 +1,1 @@
-"""Commands that read or print, and end by themselves."""
+"""The command line, and the commands that read or print, and end by themselves."""

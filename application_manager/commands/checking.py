@@ -8,7 +8,7 @@ from pathlib import Path
 
 from application_manager.core.findings.checks import INVALID_RULE, INVALID_TEMPLATE
 from application_manager.core.findings.findings import Findings, field_of
-from application_manager.core.findings.rulefindings import deploy_remarks, detector_findings, rule_findings
+from application_manager.core.findings.rulefindings import RuleContext, detector_findings
 from application_manager.core.findings.templatefindings import template_findings
 from application_manager.core.objects.policy import Policy
 from wayside.api import ApplicationTemplate, Detector, EventRule
@@ -66,9 +66,9 @@ def _findings(about: Kind, documents: Sequence[Document], policy: Policy) -> Fin
             detectors = [each for each in here if isinstance(each, Detector)]
             rules = [each for each in here if isinstance(each, EventRule)]
             templates = [each for each in here if isinstance(each, ApplicationTemplate)]
+            found = RuleContext(detectors, rules=rules, templates=templates).findings(about)
             # Rules are often kept apart from all templates: without any there is nothing to check.
-            remarks = deploy_remarks(about, templates) if templates else []
-            return replace(rule_findings(about, detectors, (), rules), remarks=tuple(remarks))
+            return found if templates else replace(found, remarks=())
     return None
 
 

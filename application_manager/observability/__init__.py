@@ -1,1 +1,1 @@
-"""Health, metrics and traces of the manager."""
+"""Health and metrics of the manager."""

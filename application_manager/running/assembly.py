@@ -19,7 +19,6 @@ from application_manager.core.demand.decisions import Decision
 from application_manager.core.objects.policy import KindKey, Name
 from application_manager.measures import Measures
 from application_manager.observability.overview import Overview
-from application_manager.observability.tracing import LostSpans, TaskTraces
 from application_manager.running.headroom import Headroom
 from application_manager.running.options import Options
 from application_manager.watching.router import Router
@@ -34,6 +33,7 @@ from application_manager.work.rendering import Renderings
 from application_manager.work.scaling import WorkloadScaler
 from application_manager.work.statuses import StatusWriter
 from application_manager.work.tasks import TaskWork
+from application_manager.work.tracing import LostSpans, TaskTraces
 from application_manager.work.validating import RuleKey, RuleWork, TemplateWork
 from application_manager.workers.answers import AnswerCache
 from application_manager.workers.claiming import ClaimEvaluator

@@ -16,8 +16,8 @@ from application_manager.core.objects import trimming
 from application_manager.core.objects.policy import Name
 from application_manager.core.statuses.status import InstanceProgress, finished_since, task_status, together
 from application_manager.measures import Measures
-from application_manager.observability.tracing import TaskTraces
 from application_manager.work.statuses import StatusWriter
+from application_manager.work.tracing import TaskTraces
 from wayside.api import ApplicationTask
 from wayside.api.applicationtask import ApplicationTaskStatus
 from wayside.api.documents import parse_object

@@ -20,6 +20,7 @@ from application_manager.core.statuses.rulestatus import (
     RULE_INVALID,
     Status,
     detector_status,
+    rule_status,
     unreadable_status,
 )
 from application_manager.core.statuses.status import template_status
@@ -66,7 +67,7 @@ class RuleWork:
         if kind == EVENT_RULE:
             old, reason, what = EventRuleStatus.model_validate(written), RULE_INVALID, "rule"
             if isinstance(entry.model, EventRule):
-                job = partial(rule_context(self.cache, entry.model).status, entry.model, now)
+                job = partial(rule_status, entry.model, rule_context(self.cache, entry.model), now)
         else:
             old, reason, what = DetectorStatus.model_validate(written), DETECTOR_INVALID, "detector"
             if isinstance(entry.model, Detector):

@@ -12,19 +12,17 @@ import json
 import pickle
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
 from application_manager.core.findings.findings import Findings
-from application_manager.core.findings.rulefindings import deploy_remarks, detector_findings, newly_wrong, rule_findings
+from application_manager.core.findings.rulefindings import detector_findings, newly_wrong
 from application_manager.core.objects.charts import ChartOutcome, ChartRequest
 from application_manager.core.objects.ownership import ApplyProblem
 from application_manager.core.objects.policy import Policy
 from application_manager.core.objects.rendering import ChartPending, Renderer, RenderError, Rendering
-from application_manager.core.statuses.rulestatus import rule_status
 from wayside.api import ApplicationInstance, ApplicationTemplate, Detector, EventRule
-from wayside.api.eventrule import EventRuleStatus
 
 _COMPILED = 64  # templates that a process keeps compiled
 _READ = re.compile(r"\$\{\s*(?:parameters|instance)(?:\.[A-Za-z_]\w*)+\s*\}")
@@ -57,27 +55,6 @@ def _compiled(template: bytes, policy: Policy) -> Renderer | ApplyProblem:
         return Renderer(pickle.loads(template), policy)  # noqa: S301  from the manager
     except RenderError as error:
         return ApplyProblem(error.reason, str(error))
-
-
-@dataclass(frozen=True, slots=True)
-class RuleContext:
-    """What a rule is checked with: the valid objects of its namespace, and the names of the others."""
-
-    detectors: Sequence[Detector] = ()
-    invalid_detectors: Sequence[str] = ()
-    rules: Sequence[EventRule] = ()
-    templates: Sequence[ApplicationTemplate] = ()
-    invalid_templates: Sequence[str] = ()
-
-    def findings(self, rule: EventRule) -> Findings:
-        """What is wrong with the rule, and what its tasks would be refused for."""
-        found = rule_findings(rule, self.detectors, self.invalid_detectors, self.rules)
-        return replace(found, remarks=tuple(deploy_remarks(rule, self.templates, self.invalid_templates)))
-
-    def status(self, rule: EventRule, now: float) -> EventRuleStatus:
-        """The rule's status as of `now`, in seconds since 1970."""
-        remarks = deploy_remarks(rule, self.templates, self.invalid_templates)
-        return rule_status(rule, self.detectors, now, self.invalid_detectors, self.rules, remarks)
 
 
 def judge_detector(detector: Detector, old: Detector | None = None, rules: Sequence[EventRule] = ()) -> Findings:

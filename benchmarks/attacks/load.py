@@ -215,7 +215,7 @@ def main() -> None:
         for namespace in (QUIET, options.attacker):
             cluster.api.create({**TEMPLATE, "metadata": {"name": "app", "namespace": namespace}})
         manager = subprocess.Popen(
-            [sys.executable, "-m", "application_manager.cli", "run", f"--lease={SYSTEM}/application-manager"],
+            [sys.executable, "-m", "application_manager.commands.cli", "run", f"--lease={SYSTEM}/application-manager"],
             env=os.environ | {"KUBECONFIG": str(cluster.manager)},
             stdout=log,
             stderr=log,

@@ -229,7 +229,7 @@ def manager(tasks: int) -> dict[str, float]:
     with ControlPlane(crds=CRDS) as plane, tempfile.TemporaryFile() as log:
         os.environ["KUBECONFIG"] = str(plane.kubeconfig)
         namespace, _ = asyncio.run(fresh_namespaces())
-        command = [sys.executable, "-m", "application_manager.cli", "run", "--namespace", namespace]
+        command = [sys.executable, "-m", "application_manager.commands.cli", "run", "--namespace", namespace]
         process = subprocess.Popen([*command, "--ttl-after-finished", "1s", "--resync", "10s"], stdout=log, stderr=log)
         try:
             return asyncio.run(_serve(plane, process, namespace, tasks))

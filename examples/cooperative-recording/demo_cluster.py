@@ -50,7 +50,7 @@ def main() -> int:
         stack.enter_context(_example(Api(kubeconfig)))
         environment = os.environ | {"KUBECONFIG": str(kubeconfig)}
         run = ["run", "--namespace", NAMESPACE]
-        stack.enter_context(_program("application_manager.cli", run, output / "manager.log", environment))
+        stack.enter_context(_program("application_manager.commands.cli", run, output / "manager.log", environment))
         reported = ["--name", "town", "--output", str(output)]
         stack.enter_context(_program("detector.commands.cli", [*run, *reported], output / "detector.log", environment))
         console.print(f"To look on from another terminal: export KUBECONFIG={kubeconfig}")

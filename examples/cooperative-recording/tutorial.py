@@ -62,7 +62,9 @@ class Stage:
         """The command and what it prints. In it, `<fuse shuttle_1+taxi_1>` stands for the name of that task."""
         real = re.sub(r"<(\w+) (\S+)>", lambda found: self.task(found[1], found[2])["metadata"]["name"], command)
         program, *arguments = shlex.split(real)
-        argv = [str(self.kubectl)] if program == "kubectl" else [sys.executable, "-m", "application_manager.cli"]
+        argv = (
+            [str(self.kubectl)] if program == "kubectl" else [sys.executable, "-m", "application_manager.commands.cli"]
+        )
         done = subprocess.run(
             [*argv, *arguments],
             env=os.environ | {"KUBECONFIG": str(self.kubeconfig)},

@@ -33,7 +33,7 @@ def apply_manager(api: Api, image: str) -> None:
     rbac = [
         sys.executable,
         "-m",
-        "application_manager.cli",
+        "application_manager.commands.cli",
         "rbac",
         f"--namespace={api.namespace}",
         account,

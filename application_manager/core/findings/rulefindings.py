@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 
 from application_manager.core.claims import parameters
 from application_manager.core.findings.checks import (
@@ -79,6 +80,22 @@ def rule_findings(
         else:
             doubts.append(Finding(RULE_NOT_READY.name, f"{whose}{problem}", rule.name))
     return Findings(tuple(problems), tuple(doubts))
+
+
+@dataclass(frozen=True, slots=True)
+class RuleContext:
+    """What a rule is checked with: the valid objects of its namespace, and the names of the others."""
+
+    detectors: Sequence[Detector] = ()
+    invalid_detectors: Sequence[str] = ()
+    rules: Sequence[EventRule] = ()
+    templates: Sequence[ApplicationTemplate] = ()
+    invalid_templates: Sequence[str] = ()
+
+    def findings(self, rule: EventRule) -> Findings:
+        """What is wrong with the rule, and what its tasks would be refused for."""
+        found = rule_findings(rule, self.detectors, self.invalid_detectors, self.rules)
+        return replace(found, remarks=tuple(deploy_remarks(rule, self.templates, self.invalid_templates)))
 
 
 def detector_findings(detector: Detector) -> Findings:

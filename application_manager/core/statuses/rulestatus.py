@@ -8,19 +8,17 @@ is accepted as far as can be known, which the message adds.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 from application_manager.core.conditions import ConditionState, concluded, find
 from application_manager.core.findings.findings import Findings
-from application_manager.core.findings.rulefindings import detector_findings, rule_findings, selecting, selects
+from application_manager.core.findings.rulefindings import RuleContext, detector_findings, selecting, selects
 from application_manager.core.health.pods import Trouble, summary, trouble
 from application_manager.core.health.readiness import not_ready
 from application_manager.core.objects.sidecars import sidecar_pods
 from wayside.api import Detector, EventRule
 from wayside.api.detector import DetectorStatus
 from wayside.api.eventrule import EventRuleStatus
-from wayside.findings import Finding
 
 Status = EventRuleStatus | DetectorStatus
 
@@ -55,17 +53,10 @@ _NAMES_LISTED = 5  # in a column of a table
 _AS_FAR_AS = "message types are checked only by the detector, which logs errors in them"
 
 
-def rule_status(
-    rule: EventRule,
-    detectors: Sequence[Detector],
-    now: float,
-    invalid: Sequence[str] = (),
-    others: Sequence[EventRule] = (),
-    remarks: Sequence[Finding] = (),
-) -> EventRuleStatus:
-    """The rule's status; the arguments are those of `rule_findings`, `now` is in seconds since 1970."""
-    names = [each.name for each in selecting(rule, detectors)]
-    findings = replace(rule_findings(rule, detectors, invalid, others), remarks=tuple(remarks))
+def rule_status(rule: EventRule, context: RuleContext, now: float) -> EventRuleStatus:
+    """The rule's status as of `now`, in seconds since 1970."""
+    names = [each.name for each in selecting(rule, context.detectors)]
+    findings = context.findings(rule)
     old = rule.status or EventRuleStatus()
     generation = rule.metadata.generation
     return EventRuleStatus(

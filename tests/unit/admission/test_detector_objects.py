@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from typer.testing import CliRunner
 
 from application_manager.cache.detector_index import DetectorIndex, Processed
-from application_manager.cli import app
+from application_manager.commands.cli import app
 from application_manager.commands.options import PullPolicy
 from application_manager.core.conditions import find
 from application_manager.core.health.pods import Trouble, TroubleReason

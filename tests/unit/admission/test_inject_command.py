@@ -9,7 +9,7 @@ import pytest
 import yaml
 from typer.testing import CliRunner, Result
 
-from application_manager.cli import EXPECTED, app
+from application_manager.commands.cli import EXPECTED, app
 from application_manager.core.objects.sidecars import CONTAINER
 from wayside.process import commandline
 

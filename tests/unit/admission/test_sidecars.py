@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 from typer.testing import CliRunner
 
-from application_manager.cli import app
+from application_manager.commands.cli import app
 from application_manager.core.findings.injections import answer_pod, injection, read_pod
 from application_manager.core.findings.reviews import ReviewError
 from application_manager.core.objects.detectors import detector_objects, sidecar_roles

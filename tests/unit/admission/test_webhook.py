@@ -14,7 +14,7 @@ import yaml
 
 from application_manager.admission.issuer import make_certificates
 from application_manager.admission.webhook import AT_ONCE, LARGEST, ReviewHandler, WebhookOptions, webhook
-from application_manager.cli import EXPECTED, app
+from application_manager.commands.cli import EXPECTED, app
 from application_manager.core.findings.reviews import OverloadedError, ReviewError
 from application_manager.core.findings.webhooks import PATH
 from application_manager.measures import Measures

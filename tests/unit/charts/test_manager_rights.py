@@ -9,8 +9,8 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from application_manager.cli import app
 from application_manager.cluster.permissions import report_missing
+from application_manager.commands.cli import app
 from application_manager.core.objects.policy import PLURALS, KindKey
 from application_manager.core.objects.rights import merged_rules, rights, roles
 from tests.guides import guide

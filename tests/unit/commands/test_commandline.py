@@ -5,12 +5,14 @@ from __future__ import annotations
 import pytest
 import typer
 
-import application_manager.cli
+import application_manager.commands.cli
 import detector.commands.cli
 from wayside.process import commandline
 
 APPS = [
-    pytest.param(application_manager.cli.app, ["render", "--tasks", "x"], "--templates", id="application-manager"),
+    pytest.param(
+        application_manager.commands.cli.app, ["render", "--tasks", "x"], "--templates", id="application-manager"
+    ),
     pytest.param(detector.commands.cli.app, ["replay", "x"], "--output", id="detector"),
 ]
 

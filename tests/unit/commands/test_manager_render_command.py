@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import yaml
 
-from application_manager.cli import EXPECTED, app
+from application_manager.commands.cli import EXPECTED, app
 from tests.unit.manager_objects import DEPLOYMENT
 from wayside.process import commandline
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import pytest
 from typer.testing import CliRunner
 
-from application_manager import cli as manager
+from application_manager.commands import cli as manager
 from detector.commands import cli as detector
 from tests.guides import ROOT
 

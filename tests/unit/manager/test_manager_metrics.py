@@ -16,10 +16,10 @@ from application_manager.core.objects.policy import Policy
 from application_manager.measures import PREFIX, Measures
 from application_manager.observability.overview import Overview
 from application_manager.observability.pages import STALLED_AFTER, pages, stalled
-from application_manager.observability.tracing import LostSpans
 from application_manager.running.headroom import Headroom
 from application_manager.watching.watch_health import WatchHealth
 from application_manager.work.recorder import BURST, REFILL, EventReason, TokenBuckets
+from application_manager.work.tracing import LostSpans
 from tests.guides import guide
 from tests.unit.manager_objects import instance, task, template
 from wayside.kubernetes.connection import ConfigurationError

@@ -11,10 +11,10 @@ import pytest
 from application_manager.cache.cluster_cache import ClusterCache
 from application_manager.cache.store import Entry
 from application_manager.measures import Measures
-from application_manager.observability.tracing import TaskTraces
 from application_manager.work.recorder import Recorder
 from application_manager.work.statuses import StatusWriter
 from application_manager.work.tasks import TaskWork
+from application_manager.work.tracing import TaskTraces
 from tests.otlp import Received, Receiver
 from tests.unit.manager.memory_server import CONFIG_MAPS, MemoryServer, a_cache, raw, work_on
 from tests.unit.manager_objects import task, template

@@ -9,6 +9,7 @@ import pytest
 from kubernetes.aio.client import Configuration
 
 from application_manager.cache.cluster_cache import ClusterCache
+from application_manager.core.findings.rulefindings import RuleContext
 from application_manager.core.objects.policy import Policy
 from application_manager.core.statuses.rulestatus import detector_status, rule_status
 from application_manager.work.recorder import Recorder
@@ -17,7 +18,6 @@ from application_manager.work.validating import RuleWork
 from tests.inprocess import InProcess
 from tests.unit.manager_objects import NOW
 from wayside.api import API_VERSION, Detector, EventRule
-from wayside.findings import Finding
 from wayside.kubernetes.client import Client
 from wayside.kubernetes.resources import Resource
 
@@ -48,16 +48,16 @@ def detector(name: str = "det", stream: str = "pose", site: str = "a", **more: A
 
 
 def test_a_rule_that_a_detector_can_evaluate_is_accepted() -> None:
-    status = rule_status(rule(), [detector(), detector("other", site="b")], NOW)
+    status = rule_status(rule(), RuleContext([detector(), detector("other", site="b")]), NOW)
     assert status.detectors == ["det"]
     assert status.selected_by == "det"
-    many = rule_status(rule(), [detector(f"d{number}") for number in range(7)], NOW)
+    many = rule_status(rule(), RuleContext([detector(f"d{number}") for number in range(7)]), NOW)
     assert many.selected_by == "d0, d1, d2, d3, d4, and 2 more"
     assert (status.conditions[0].status, status.conditions[0].observed_generation) == ("True", 3)
 
 
 def test_what_is_wrong_with_a_rule_is_reported_with_its_place() -> None:
-    status = rule_status(rule(when="sped > 3"), [detector()], NOW)
+    status = rule_status(rule(when="sped > 3"), RuleContext([detector()]), NOW)
     condition = status.conditions[0]
     assert (condition.status, condition.reason) == ("False", "RuleInvalid")
     for part in ("spec.when", "column 1", "sped", "speed"):
@@ -65,16 +65,19 @@ def test_what_is_wrong_with_a_rule_is_reported_with_its_place() -> None:
 
 
 def test_ready_and_stalled_follow_from_what_is_wrong_and_stalled_goes_with_it() -> None:
-    wrong = rule_status(rule(when="sped > 3"), [detector()], NOW)
+    wrong = rule_status(rule(when="sped > 3"), RuleContext([detector()]), NOW)
     assert [(each.type, each.status) for each in wrong.conditions] == [
         ("Accepted", "False"),
         ("Ready", "False"),
         ("Stalled", "True"),
     ]
-    assert rule_status(rule(when="sped > 3").model_copy(update={"status": wrong}), [detector()], NOW + 9) == wrong
-    right = rule_status(rule().model_copy(update={"status": wrong}), [detector()], NOW)
+    assert (
+        rule_status(rule(when="sped > 3").model_copy(update={"status": wrong}), RuleContext([detector()]), NOW + 9)
+        == wrong
+    )
+    right = rule_status(rule().model_copy(update={"status": wrong}), RuleContext([detector()]), NOW)
     assert [(each.type, each.status) for each in right.conditions] == [("Accepted", "True"), ("Ready", "True")]
-    alone = rule_status(rule().model_copy(update={"status": wrong}), [], NOW)
+    alone = rule_status(rule().model_copy(update={"status": wrong}), RuleContext(), NOW)
     assert [(each.type, each.reason) for each in alone.conditions] == [
         ("Accepted", "NotSelected"),
         ("Ready", "NotSelected"),
@@ -82,13 +85,13 @@ def test_ready_and_stalled_follow_from_what_is_wrong_and_stalled_goes_with_it() 
 
 
 def test_a_problem_with_one_detector_names_it() -> None:
-    condition = rule_status(rule(), [detector(), detector("blind", stream="odometry")], NOW).conditions[0]
+    condition = rule_status(rule(), RuleContext([detector(), detector("blind", stream="odometry")]), NOW).conditions[0]
     assert condition.status == "False"
     assert condition.message.startswith("with Detector blind: spec.signals[0].stream")
 
 
 def test_a_rule_that_nobody_selects_is_reported_with_the_labels_that_would_help() -> None:
-    condition = rule_status(rule(), [detector(site="b")], NOW).conditions[0]
+    condition = rule_status(rule(), RuleContext([detector(site="b")]), NOW).conditions[0]
     assert (condition.status, condition.reason) == ("False", "NotSelected")
     assert "det selects site=b" in condition.message
 
@@ -110,12 +113,12 @@ def test_a_key_that_is_none_is_reported_with_its_place() -> None:
 
 
 def test_what_is_accepted_is_so_only_as_far_as_is_known_here() -> None:
-    for status in (rule_status(rule(), [detector()], NOW), detector_status(detector(), [], NOW)):
+    for status in (rule_status(rule(), RuleContext([detector()]), NOW), detector_status(detector(), [], NOW)):
         assert "message types are checked only by the detector" in status.conditions[0].message
 
 
 def test_a_rule_that_nobody_selects_is_reported_with_invalid_detectors() -> None:
-    condition = rule_status(rule(), [], NOW, ["det"]).conditions[0]
+    condition = rule_status(rule(), RuleContext([], ["det"]), NOW).conditions[0]
     assert (condition.status, condition.reason) == ("False", "NotSelected")
     assert "correct Detector det; its status gives the error" in condition.message
 
@@ -160,14 +163,13 @@ def test_what_passed_the_api_server_and_is_invalid_is_reported_in_its_status(kin
 
 
 def test_what_may_go_wrong_with_a_good_rule_is_reported_and_it_stays_accepted() -> None:
-    condition = rule_status(
-        rule(), [detector()], NOW, remarks=[Finding("unknown-template", "there is no template")]
-    ).conditions[0]
+    deploying = rule(actions=[{"name": "go", "deploy": {"templateName": "app"}}])
+    condition = rule_status(deploying, RuleContext([detector()]), NOW).conditions[0]
     assert condition.status == "True"
-    assert condition.message.endswith("; but there is no template")
+    assert "; but spec.actions[0].deploy.templateName: there is no ApplicationTemplate app in" in condition.message
 
 
 def test_the_same_state_gives_the_same_status() -> None:
-    first = rule_status(rule(), [detector()], NOW)
-    again = rule_status(rule().model_copy(update={"status": first}), [detector()], NOW + 60)
+    first = rule_status(rule(), RuleContext([detector()]), NOW)
+    again = rule_status(rule().model_copy(update={"status": first}), RuleContext([detector()]), NOW + 60)
     assert again == first
