@@ -19,7 +19,7 @@ from detector.status.total import total
 from tests.driving import Drive, a_detector
 from tests.unit.actions.test_deploy import HOLDER, A, B, by_name, ends, eventually, reconciling
 from tests.unit.statuses.test_metrics import samples
-from tests.unit.statuses.test_status import Kept
+from tests.unit.statuses.test_status import ObservedEngine
 from wayside.kubernetes.client import Client
 from wayside.kubernetes.errors import Unreachable
 
@@ -33,7 +33,7 @@ def shown(view: RenderableType) -> list[str]:
 
 
 def a_status(tasks: TaskStatus, lease: LeaseStatus | None = None) -> Status:
-    status = Kept(Drive(a_detector())).take(until=1)
+    status = ObservedEngine(Drive(a_detector())).take(until=1)
     return msgspec.structs.replace(status, tasks=tasks, lease=lease)
 
 
