@@ -144,7 +144,9 @@ def _chunk(text: str, offset: int, chunk: str) -> _Element:
     pieces = chunk.split("$*")
     for piece in pieces:
         if (bad := re.search(r"[*$?#{}]", piece)) is not None:
-            remedy = "inside a chunk a wildcard is written $*" if bad[0] == "*" else "Zenoh reserves it"
+            remedy = (
+                "within a chunk, write $* as the wildcard" if bad[0] == "*" else "remove it, since Zenoh reserves it"
+            )
             raise KeyPatternError(text, offset, f"{bad[0]!r} is not allowed in the chunk {chunk!r}: {remedy}")
     guard = "(?!@)" if not pieces[0] else ""
     body = "[^/]*".join(map(re.escape, pieces))

@@ -45,11 +45,11 @@ def parse_time(text: str) -> int:
     """
     match = _PATTERN.fullmatch(text)
     if match is None:
-        raise ValueError(f"{text!r} is not a time: write it like 2026-01-01T00:00:00.123456789Z")
+        raise ValueError(f"must be a time such as 2026-01-01T00:00:00.123456789Z; got {text!r}")
     try:
         whole = datetime.fromisoformat(match["whole"] + match["zone"].replace("Z", "+00:00"))
     except ValueError as error:
-        raise ValueError(f"{text!r} is not a time: {error}") from error
+        raise ValueError(f"must be a time; got {text!r}: {error}") from error
     # Not timestamp(): a float has no room for nanoseconds.
     since = whole - _EPOCH
     fraction = int((match["fraction"] or "").ljust(9, "0"))

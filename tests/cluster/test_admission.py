@@ -116,7 +116,11 @@ WRONG: list[tuple[Object, Object, list[str]]] = [
         },
         ["spec.actions[0].deploy.parameters", "exceeds the limit of 65536: shorten the largest value, x"],
     ),
-    (detector(), {"clientTimeout": "30s", "streams": "msg.t +"}, ["spec.streams[0].stamp", "ends too early"]),
+    (
+        detector(),
+        {"clientTimeout": "30s", "streams": "msg.t +"},
+        ["spec.streams[0].stamp", "the expression is incomplete"],
+    ),
 ]
 
 

@@ -274,9 +274,7 @@ class Stream(Model):
         if captures and self.client is not None:
             raise ValueError("key captures the client, and client names one: remove the capture or client")
         if not captures and self.client is None:
-            raise ValueError(
-                "key does not capture the client: replace the client's name in key with ${client:*}, or set client"
-            )
+            raise ValueError("key does not capture the client: write ${client:*} in place of its name, or set client")
         if self.items is not None:
             self._check_items()
         if self.frame_prefix is not None and not self.carries_transforms:

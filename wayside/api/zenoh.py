@@ -14,7 +14,7 @@ from wayside.api.constraints import checked, constraint
 Endpoint = Annotated[str, Field(min_length=1, max_length=256, pattern=r"^[a-z]+/.+$")]
 """A Zenoh endpoint such as tcp/zenoh:7447."""
 
-_NO_CLIENT = "liveliness does not capture the client: replace the client's name with ${client:*}"
+_NO_CLIENT = "liveliness does not capture the client: write ${client:*} in place of its name"
 
 
 class ZenohMode(StrEnum):

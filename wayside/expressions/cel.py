@@ -155,7 +155,7 @@ class Environment:
         _check_patterns(parsed, source)
         if growth(parsed) > MOST:
             raise ExpressionError(
-                f"its value could contain more than {MOST} copies of other values", source=source, hint=_SMALLER
+                f"the result could contain more than {MOST} copies of other values", source=source, hint=_SMALLER
             )
         _check_static(typed.return_type(), result, source)
         expression = Expression(source, program, read, leaves, result, self.variables, whole.shapes)
@@ -329,7 +329,7 @@ def _check_patterns(node: Node, source: str) -> None:
             message, hint = "the pattern of `matches` must be a literal string", _LITERAL
         elif (size := pattern_size(literal)) > LARGEST_PATTERN:
             cut = literal if len(literal) <= 80 else f"{literal[:79]}…"
-            message = f"the pattern {cut!r} takes {size} steps, more than the {LARGEST_PATTERN} of `matches`"
+            message = f"the pattern of `matches` must take at most {LARGEST_PATTERN} steps; {cut!r} takes {size}"
             hint = "use fewer repetitions, or smaller character classes"
         else:
             continue

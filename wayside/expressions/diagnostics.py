@@ -23,26 +23,27 @@ _UNEXPECTED = re.compile(r"(?:mismatched|extraneous|no viable alternative at) in
 _MISSING = re.compile(r"missing '(.*?)' at ")
 
 _WORDS = {
-    "and": "CEL writes `&&`",
-    "or": "CEL writes `||`",
-    "not": "CEL writes `!`",
-    "AND": "CEL writes `&&`",
-    "OR": "CEL writes `||`",
-    "NOT": "CEL writes `!`",
-    "if": "CEL writes `condition ? this : that`",
-    "else": "CEL writes `condition ? this : that`",
-    "True": "CEL writes `true`",
-    "False": "CEL writes `false`",
-    "yes": "CEL writes `true`",
-    "no": "CEL writes `false`",
-    "None": "CEL writes `null`",
-    "nil": "CEL writes `null`",
+    "and": "in CEL, write `&&`",
+    "or": "in CEL, write `||`",
+    "not": "in CEL, write `!`",
+    "AND": "in CEL, write `&&`",
+    "OR": "in CEL, write `||`",
+    "NOT": "in CEL, write `!`",
+    "if": "in CEL, write `condition ? this : that`",
+    "else": "in CEL, write `condition ? this : that`",
+    "True": "in CEL, write `true`",
+    "False": "in CEL, write `false`",
+    "yes": "in CEL, write `true`",
+    "no": "in CEL, write `false`",
+    "None": "in CEL, write `null`",
+    "nil": "in CEL, write `null`",
 }
-_SIGNS = {"=": "CEL compares with `==`", "&": "CEL writes `&&`", "|": "CEL writes `||`", "'": "", '"': ""}
+_SIGNS = {"=": "to compare, write `==`", "&": "in CEL, write `&&`", "|": "in CEL, write `||`", "'": "", '"': ""}
 _QUOTE = (
-    "a string is not closed, or YAML removed its quotes: quote the whole expression and use the other quotes inside"
+    "a string is not closed, or YAML removed its quotes: put the whole expression in quotes, and use the other kind of "
+    "quotes inside"
 )
-_DEPTH = "the maximum is 32 levels; each operator of a chain such as `a + b + c` adds one: group it with brackets"
+_DEPTH = "the maximum is 32 levels; each operator of a chain such as `a + b + c` adds one: use parentheses to group it"
 EMPTY = "YAML interprets a leading `!`, `#` or quote itself: put the whole expression in quotes, as in '!braking'"
 
 
@@ -77,7 +78,7 @@ def _explain(text: str, source: str, at: int, names: Collection[str]) -> tuple[s
         return f"unexpected `{sign}`", _SIGNS[sign] or _QUOTE if sign in _SIGNS else None
     if match := _UNEXPECTED.search(text):
         if match[1] == "<EOF>":
-            return "the expression ends too early", _stray_sign(source)
+            return "the expression is incomplete", _stray_sign(source)
         word = next((token.text for token in tokens(source) if token.start <= at < token.end), match[1])
         return f"unexpected `{word}`", _WORDS.get(word) or _after(source, at) or _stray_sign(source)
     if "recursion" in text:
@@ -108,7 +109,7 @@ def _overload(function: str, arguments: str) -> tuple[str, str | None]:
     if operator in FUNCTIONS:
         return message, _takes(operator)
     if operator == "%":
-        return message, "`%` takes integers only: double(int(a) % int(b))"
+        return message, "`%` takes only integers: write double(int(a) % int(b))"
     if "double" in arguments and re.search(r"\bu?int\b", arguments):
         return message, "numbers are doubles here: wrap the integer, as in double(int(x))"
     if operator in ("&&", "||", "!"):
@@ -147,7 +148,7 @@ def _stray_sign(source: str) -> str | None:
 
 # Of a failed evaluation
 
-_NO_MEMBERS: Final = "it reads a field of a value without fields"
+_NO_MEMBERS: Final = "cannot read a field of a value without fields"
 NO_MEMBERS: Final = frozenset({_NO_MEMBERS})
 """The message of `clean` for reading a member of a number, a string or a list."""
 
@@ -206,7 +207,7 @@ def _no_overload(operation: str) -> str:
     name = call[1].replace("_", "").lstrip("@") if not call[1].isalpha() else call[1]
     kinds = [_a(kind) for kind in call[2].split(", ")]
     if name in _COMPARISONS:
-        text = f"`{name}` compares {kinds[0]} with {kinds[1]}"
+        text = f"`{name}` cannot compare {kinds[0]} with {kinds[1]}"
     else:
         text = f"`{_NAMES.get(name, name)}` does not take {' and '.join(kinds)}"
     return f"{text}: for bytes, use {_OF_BYTES}" if "uint64" in operation else text

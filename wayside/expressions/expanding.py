@@ -120,7 +120,7 @@ class _Expansion:
         if len(arguments) != 2:
             self._refuse(at, f"wrong number of arguments for `{name}`", f"write {usage}.{next(iter(fields))}")
         if self._text(after) != "." or after + 1 >= last or self._tokens[after + 1].kind is not TokenKind.NAME:
-            self._refuse(at, f"`{name}` is a value with fields", f"take one, as in {usage}.{next(iter(fields))}")
+            self._refuse(at, f"`{name}` needs a field", f"write {usage}.{next(iter(fields))}")
         chosen = self._text(after + 1)
         if chosen not in fields:
             self._refuse(
@@ -172,7 +172,7 @@ class _Expansion:
 
     def _seen(self, at: int, chosen: str, a: str, b: str) -> str:
         if self._places.geographic is None:
-            self._refuse(at, f"{SEEN_FROM} is about two clients", "use it in a rule with scope pairs")
+            self._refuse(at, f"`{SEEN_FROM}` needs two clients", "use it in a rule with scope pairs")
         if not self._places.known:
             return "(0.0 + 0.0)"
         first, second, heading = AXES[self._places.geographic]
@@ -199,7 +199,7 @@ class _Expansion:
             return "(0.0 + 0.0)"
         if not given:
             self._refuse(
-                at, f"stream {self._places.stream} has no position", "give position in the stream of the Detector"
+                at, f"stream {self._places.stream} has no position", "set position in this stream of the Detector"
             )
         if axis and axis not in given:
             because = f"; {why}" if why else ""
@@ -219,8 +219,8 @@ class _Expansion:
             if name in _OF_A_SAMPLE and name != self._places.own:
                 self._refuse(
                     at,
-                    f"{POSITION_BEFORE} of stream {self._places.stream} is not known, since its position reads {name}",
-                    f"write the position over {self._places.own}",
+                    f"{POSITION_BEFORE} of stream {self._places.stream} is unknown, because its position reads {name}",
+                    f"use only {self._places.own} in the position",
                 )
             found.append(_BEFORE if name == self._places.own else token.text)
             last = last if token.kind is TokenKind.SPACE else token.text

@@ -206,7 +206,7 @@ def _node(data: bytes) -> Node:
     for number, decode in _DECODERS.items():
         if number in fields:
             return decode(_fields(_only(fields, number)))
-    raise ValueError("an expression of a kind that this version of CEL should not produce")
+    raise ValueError("the output of CEL contains an expression of an unknown kind")
 
 
 def _constant(fields: _Fields) -> Scalar:

@@ -183,7 +183,7 @@ def at_one(name: str, key: str, *numbers: float) -> float:
     shape = shape_of(key)
     at, columns = positions_at(shape), [np.array([number], np.float64) for number in numbers]
     if not at.allows(*columns)[0]:
-        raise ValueError(f"{', '.join(f'{number:g}' for number in numbers)} is not a position at {shape.name}")
+        raise ValueError(f"({', '.join(f'{number:g}' for number in numbers)}) is out of range for place {shape.name}")
     return float(AT[name](at, *columns)[0])
 
 

@@ -39,17 +39,17 @@ def tracing(service: str, *, export: bool = True) -> Tracing | None:
     protocol = next((each for each in PROTOCOLS if environment.get(each)), None)
     if protocol is not None and environment[protocol] != PROTOCOL:
         log.warning(
-            "sending no traces: %s is %s, but only %s is supported: set it, with the collector's port for HTTP (4318)",
+            "sending no traces: %s must be %s; got %s: set it, and use the collector's HTTP port (4318)",
             protocol,
-            environment[protocol],
             PROTOCOL,
+            environment[protocol],
         )
         return None
     try:
         from wayside.process.spans import Tracing  # noqa: PLC0415  a slow import of an extra
     except ImportError as error:
         log.warning(
-            "sending no traces, although %s is set: %s; pip install 'wayside[otel]', or unset it", endpoint, error
+            "sending no traces, although %s is set: %s; run pip install 'wayside[otel]', or unset it", endpoint, error
         )
         return None
     return Tracing(service, export=export)

@@ -42,7 +42,9 @@ def _margin(compiler: Compiler, environment: Environment) -> Expression | None:
     spec = compiler.rule.spec
     for index, signal in enumerate(spec.signals):
         if signal.name == MARGIN:
-            compiler.problem(("spec", "signals", index, "name"), "the rule's margin has this name: choose another")
+            compiler.problem(
+                ("spec", "signals", index, "name"), "is the name of the rule's margin: choose another name"
+            )
             return None
     try:
         return compiler.condition(("spec", MARGIN), margin_of(spec), environment, CelType.DOUBLE)

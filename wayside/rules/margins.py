@@ -39,7 +39,7 @@ def margin_of(spec: EventRuleSpec) -> str:
     for name in scales:
         if name not in quantities:
             known = ", ".join(sorted(quantities)) or "none"
-            raise MarginError(("spec", "margin", name), f"there is no signal {name} to scale; the rule has {known}")
+            raise MarginError(("spec", "margin", name), f"the rule has no signal {name}; it has {known}")
     text = [token for token in tokens(spec.when) if token.kind not in _SPACE]
     found = _Margin(spec.when, scales, quantities)
     written = found.either(text)
@@ -71,8 +71,8 @@ class _Margin:
             names = " or ".join(sorted(unscaled[0].quantities)) or "a signal that it reads"
             raise MarginError(
                 ("spec", MARGIN),
-                f"`{unscaled[0].text}` needs a scale, since the comparisons are of different quantities: give the "
-                f"difference of {names} that counts as 1",
+                f"`{unscaled[0].text}` needs a scale, since `when` compares different quantities: add {names}, with "
+                "the difference that counts as a margin of 1",
             )
 
     def _both(self, text: Sequence[Token]) -> str:

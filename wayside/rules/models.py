@@ -55,7 +55,10 @@ def _check(compiler: Compiler, at: FieldPath, given: ModelInput) -> None:
     for field, source, wanted in (("image", given.image, _IMAGE), ("points", given.points, _POINTS)):
         stream = None if source is None else compiler.stream((*at, field, "stream"), source.stream)
         if stream is not None and stream.type != wanted:
-            compiler.problem((*at, field, "stream"), f"stream {stream.name} has type {stream.type}: {wanted} is needed")
+            compiler.problem(
+                (*at, field, "stream"),
+                f"the type of stream {stream.name} must be {wanted}; got {stream.type or 'no type'}",
+            )
 
 
 def _usable(compiler: Compiler, at: FieldPath, names: Sequence[str]) -> list[tuple[FieldPath, Signal]]:
@@ -68,11 +71,11 @@ def _usable(compiler: Compiler, at: FieldPath, names: Sequence[str]) -> list[tup
             known = ", ".join(each for each, other in by_name.items() if other.model is None) or "none"
             problem = f"the rule has no signal {name}; it has {known}"
         elif signal.model is not None:
-            problem = f"{name} is computed by a model and cannot be the input of another model"
+            problem = f"{name} is computed by a model and cannot be the input of another model: remove it"
         elif signal.plugin is not None:
-            problem = f"{name} is computed by a plugin and cannot be the input of a model"
+            problem = f"{name} is computed by a plugin and cannot be the input of a model: remove it"
         elif signal.is_derived:
-            problem = f"{name} is not computed from a stream and cannot be the input of a model"
+            problem = f"{name} is not computed from a stream and cannot be the input of a model: remove it"
         else:
             found.append(((*at, position), signal))
             continue
@@ -83,7 +86,9 @@ def _usable(compiler: Compiler, at: FieldPath, names: Sequence[str]) -> list[tup
 def _check_window(compiler: Compiler, at: FieldPath, window: ModelWindow) -> None:
     for path, signal in _usable(compiler, (*at, "signals"), window.signals):
         if signal.stream is None or signal.value is None:
-            compiler.problem(path, f"a window needs values of a stream: {signal.name} has no stream, or no value")
+            compiler.problem(
+                path, f"{signal.name} must have a stream and a value, since the window consists of its values"
+            )
             continue
         stream = compiler.detector.spec.stream(signal.stream)
         if stream is not None and window.over is not None and window.over.ns >= compiler.kept_ns(stream):

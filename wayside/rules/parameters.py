@@ -85,7 +85,7 @@ def _misfits(name: str, own: object, other: object, rule: str) -> Iterator[str]:
     """The differences of type between an override and the rule's own value; for lists, the items are compared."""
     wanted, given = _kind(own).name, _kind(other).name
     if wanted != given:
-        yield f"{name} of EventRule {rule} is a {wanted}, but the value is a {given}: {other!r:.60}"
+        yield f"{name} must be a {wanted}, as in EventRule {rule}; got a {given}, {other!r:.60}"
     elif isinstance(own, list) and isinstance(other, list) and own:
         for index, item in enumerate(other):
             yield from _misfits(f"{name}[{index}]", own[min(index, len(own) - 1)], item, rule)

@@ -67,10 +67,10 @@ def _out_of_range(geographic: bool, u: float, v: float) -> str | None:
     if not geographic:
         if math.isfinite(u) and math.isfinite(v) and max(abs(u), abs(v)) <= FARTHEST:
             return None
-        return f"[{u:g}, {v:g}] is not a position in metres: give finite numbers"
+        return f"must be at most {FARTHEST:g} metres from the origin; got [{u:g}, {v:g}]"
     if abs(u) <= 90 and abs(v) <= 360:
         return None
-    return f"[{u:g}, {v:g}] is not [latitude, longitude] in degrees: correct the order, or set frame: Metres"
+    return f"must be [latitude, longitude] in degrees; got [{u:g}, {v:g}]: correct the order, or set frame: Metres"
 
 
 def places_of(detector: Detector) -> Mapping[str, Shape]:

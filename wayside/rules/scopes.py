@@ -61,7 +61,7 @@ def _pairs(compiler: Compiler, pairs: PairsScope, element: str | None) -> PairSu
     if not complete and stream is not None:
         compiler.problem(
             (*at, "position", "stream"),
-            f"stream {stream.name} has no position: give x and y, or latitude and longitude, or give position in the "
+            f"stream {stream.name} has no position: give x and y, or latitude and longitude, or set position in this "
             "stream of the Detector",
         )
     for axis in ("x", "y", "z", "latitude", "longitude"):

@@ -51,7 +51,7 @@ def stream_problems(stream: Stream, index: int, fields: Fields | None = None) ->
     try:
         expression = stamp_environment().compile(stream.stamp, result=CelType.DOUBLE)
     except ExpressionError as error:
-        received = stream.stamp.strip() == "t" and "; write sample.received for the t of JSON lines"
+        received = stream.stamp.strip() == "t" and "; for the field t of JSON lines, write sample.received"
         yield from (RuleProblem(path, f"{each}{received or ''}") for each in (error, *error.others))
         return
     for variable, members in (("sample", {"received": None}), ("msg", fields)):

@@ -125,7 +125,7 @@ WAYS = [
         "contradicts the rule: it is evaluated every 1h (spec.evaluation.every): shorten it, or write LongTerm",
         "LongTerm", evaluation={"every": "1h"}),
     way("incidence", "Rare", "[0]: Rare (seldom, as an exception) contradicts the rule: spec.when: true "
-        "always holds: write Frequent", "Frequent", when="true"),
+        "is always true: write Frequent", "Frequent", when="true"),
     way("detectionAlgorithm", "RuleBased", "[0]: RuleBased (rules or heuristics detect the event) contradicts the "
         "rule: spec.signals[1].model is a learnt model: add LearningBased", "RuleBased LearningBased",
         signals=[SPEED, a_model()], when="risk > 0.5"),

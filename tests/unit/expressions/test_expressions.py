@@ -99,7 +99,7 @@ def test_maps_come_back_sorted_in_every_process() -> None:
         ("a.regoin", "there is no `a.regoin`; did you mean `region`?"),
         ("l[3]", "no index 3 in the list$"),
         ("speed + a.region", "there is no `speed`"),
-        ("a.region > 3", "`>` compares a string with a number$"),
+        ("a.region > 3", "`>` cannot compare a string with a number$"),
         ("-a.region", "`-` does not take a string$"),
         ("a.region + l[0]", r"`\+` does not take a string and a number$"),
         ("a.region.hdr.id > 3", "`a.region` is 'north', which has no field `hdr`: correct the path$"),

@@ -20,7 +20,7 @@ def refusal(source: object) -> ExpressionError:
 @pytest.mark.parametrize(
     ("source", "line", "column", "message"),
     [
-        ("distance <", 1, 11, "the expression ends too early"),
+        ("distance <", 1, 11, "the expression is incomplete"),
         ("size(l) > 2 && 'x' > 3", 1, 20, "`>` does not take (string, double)"),
         ("l[speed + 1] + 2 + size(l) + nothing", 1, 30, "`nothing` is not declared here"),
         ("distance\n  + 3 // 4\n  + nothing", 3, 5, "`nothing` is not declared here"),

@@ -110,7 +110,7 @@ def test_a_wrong_call_does_not_compile(source: str, column: int, message: str, h
         ("nearest(msg.o, 0, 0)", {"msg": {"o": [{"x": "1", "y": 2}]}}, Reason.ERROR, "items[0].x must be a number"),
         ("minimum(msg.o)", {"msg": {"o": [None, float("nan")]}}, Reason.ABSENT, "no item of the list is known"),
         ("sqrt(x)", {"x": -1.0}, Reason.ERROR, "needs a number of 0 or more"),
-        ("yaw(msg.q)", {"msg": {"q": {"x": 0, "y": 0, "z": 0, "w": 0}}}, Reason.ERROR, "not a rotation"),
+        ("yaw(msg.q)", {"msg": {"q": {"x": 0, "y": 0, "z": 0, "w": 0}}}, Reason.ERROR, "must be finite and above 0"),
         ("numberAt(msg, 2, 'u16le')", {"msg": b"\0\1\2"}, Reason.ABSENT, "bytes 2 to 3: there are 3"),
         ("numberAt(msg, 2, 'u24')", {"msg": b"\0\1\2"}, Reason.ERROR, "format must be one of u8"),
         ("utf8(msg)", {"msg": b"\xff"}, Reason.ERROR, "not valid UTF-8"),

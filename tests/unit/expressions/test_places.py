@@ -171,16 +171,16 @@ DETECTOR = a_detector(
         ("pose", 'at(position, "crosing").inside', "line 1, column 14: there is no place crosing (did"),
         ("pose", 'at(position, "stop").inside', "stop is a line without width, which has no inside"),
         ("pose", 'at(position, "crossing").along', "crossing is an area, which has no along (it has inside, distance)"),
-        ("pose", 'at(position, "crossing")', "`at` is a value with fields (take one, as in"),
+        ("pose", 'at(position, "crossing")', "`at` needs a field (write "),
         ("pose", 'at(position, "stop").left', "column 22: at has no field left"),
         ("pose", 'at(position, "stop").heading', "the position of stream pose has no yaw; place stop is in metres"),
         ("gnss", 'at(position, "stop").across', "has no x; place stop is in metres (it has latitude, longitude)"),
         ("pose", 'at(position, "town").inside', "has no latitude; place town is in degrees"),
-        ("speed", 'at(position, "stop").across', "stream speed has no position (give position in the stream of the"),
+        ("speed", 'at(position, "stop").across', "stream speed has no position (set position in this stream of the"),
         ("gnss", "positionBefore.altitude", "the position of stream gnss has no altitude (it has latitude, longitude)"),
-        ("late", "positionBefore.x", "positionBefore of stream late is not known, since its position reads sample"),
+        ("late", "positionBefore.x", "positionBefore of stream late is unknown, because its position reads sample"),
         ("pose", "1 + at(position, msg.name).inside", "column 18: the name of a place must be a string in quotes"),
-        ("pose", "seenFrom(msg, msg).ahead", "seenFrom is about two clients (use it in a rule with scope pairs)"),
+        ("pose", "seenFrom(msg, msg).ahead", "`seenFrom` needs two clients (use it in a rule with scope pairs)"),
         ("pose", 'at(position, "crossing").inside + 1', "does not take (bool, double)"),
     ],
 )  # fmt: skip
@@ -234,9 +234,12 @@ def test_problems_of_a_rule_alone_are_none_of_places() -> None:
         ({"line": [[1, 2], [1, 2]]}, "places[0].line: all points of the line are the same: give two or more different"),
         (
             {"frame": "Wgs84", "line": [[10, 52], [100, 52]]},
-            "places[0].line[1]: [100, 52] is not [latitude, longitude]",
+            "places[0].line[1]: must be [latitude, longitude] in degrees; got [100, 52]",
         ),
-        ({"line": [[0, 0], [1e13, 0]]}, "places[0].line[1]: [1e+13, 0] is not a position in metres"),
+        (
+            {"line": [[0, 0], [1e13, 0]]},
+            "places[0].line[1]: must be at most 1e+12 metres from the origin; got [1e+13, 0]",
+        ),
     ],
 )
 def test_what_is_wrong_with_a_place_is_located(place: dict[str, Any], message: str) -> None:

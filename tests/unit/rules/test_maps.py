@@ -153,7 +153,7 @@ def test_rules_name_places_of_maps_and_the_manager_accepts_any(tmp_path: Path) -
         (
             "a.json",
             json.dumps({"features": [feature("n", "LineString", [[500000, 5760000], [500100, 5760000]])]}),
-            "{}, place n: [5.76e+06, 500000] is not [latitude, longitude] in degrees",
+            "{}, place n: must be [latitude, longitude] in degrees; got [5.76e+06, 500000]",
         ),
         ("a.json", json.dumps({"features": [feature("own", "LineString", RING)]}), "another place has this name"),
     ],

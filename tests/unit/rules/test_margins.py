@@ -87,14 +87,18 @@ def test_the_margin_is_a_value_of_events_and_a_signal_for_others() -> None:
 @pytest.mark.parametrize(
     ("spec", "field", "parts"),
     [
-        ({"when": "a > 1 && b > 1", "margin": {"a": 1}}, "spec.margin", ["`b > 1` needs a scale", "difference of b"]),
+        (
+            {"when": "a > 1 && b > 1", "margin": {"a": 1}},
+            "spec.margin",
+            ["`b > 1` needs a scale", "add b, with the difference"],
+        ),
         ({"when": "a - b > 1", "margin": {"a": 1, "b": 2}}, "spec.margin", ["different scales", "a signal with of"]),
         ({"when": "a > 1 && b == 'x'", "margin": {}}, "spec.when", ["comparisons of numbers", "`b == 'x'` is not one"]),
         ({"when": "a > 1 && has(labels.x)", "margin": {}}, "spec.when", ["`has(labels.x)` is not one"]),
         (
             {"when": "a > 1", "margin": {"speed": 1}},
             "spec.margin.speed",
-            ["no signal speed to scale; the rule has a, b"],
+            ["the rule has no signal speed; it has a, b"],
         ),
         ({"when": "margin > 1", "margin": {}}, "spec.margin", ["depends on itself"]),
     ],

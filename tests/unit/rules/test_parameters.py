@@ -163,16 +163,21 @@ def test_a_parameter_that_is_not_there_or_does_not_fit_is_reported_where_it_is_u
     [
         ({"near": 1}, {"neer": 1}, "neer", ["EventRule too-fast has no parameter neer", "did you mean near?"]),
         ({}, {"n": 1}, "n", ["has no parameter n", "it has none"]),
-        ({"m": 1}, {"m": "1"}, "m", ["m of EventRule too-fast is a number, but the value is a string: '1'"]),
-        ({"m": True}, {"m": 1}, "m", ["is a boolean, but the value is a number"]),
-        ({"m": SQUARE}, {"m": {"x": 1}}, "m", ["is a list, but the value is a map"]),
+        ({"m": 1}, {"m": "1"}, "m", ["m must be a number, as in EventRule too-fast; got a string, '1'"]),
+        ({"m": True}, {"m": 1}, "m", ["must be a boolean, as in EventRule too-fast; got a number"]),
+        ({"m": SQUARE}, {"m": {"x": 1}}, "m", ["must be a list, as in EventRule too-fast; got a map"]),
         (
             {"m": SQUARE},
             {"m": [[0, 0], [1, "1"]]},
             "m",
-            ["m[1][1] of EventRule too-fast is a number, but the value is a string"],
+            ["m[1][1] must be a number, as in EventRule too-fast; got a string"],
         ),
-        ({"m": {"a": {"b": 1}}}, {"m": {"a": {"b": []}}}, "m", ["m.a.b", "is a number, but the value is a list"]),
+        (
+            {"m": {"a": {"b": 1}}},
+            {"m": {"a": {"b": []}}},
+            "m",
+            ["m.a.b", "must be a number, as in EventRule too-fast; got a list"],
+        ),
     ],
 )
 def test_a_clients_value_that_does_not_fit_is_reported_at_its_place_in_the_detector(

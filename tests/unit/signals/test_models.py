@@ -291,7 +291,11 @@ def problems(tmp_path: Path, signal: dict[str, Any], detector: Detector | None =
             "window.over",
             "not shorter than",
         ),
-        ({"inputs": [x(points={"stream": "speed", "count": 1})]}, "points.stream", "stream speed has type None"),
+        (
+            {"inputs": [x(points={"stream": "speed", "count": 1})]},
+            "points.stream",
+            "must be sensor_msgs/msg/PointCloud2",
+        ),
         ({"inputs": [x(image={"stream": "none", "width": 1, "height": 1})]}, "image.stream", "has no stream none"),
         ({"output": "riks"}, "model.output", "the model has no output riks; its outputs are risk [any, 1]"),
     ],

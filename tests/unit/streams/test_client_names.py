@@ -79,7 +79,7 @@ def test_a_client_named_by_its_messages_is_lost_and_comes_back() -> None:
     [
         ("its-${msg.id", "client: .*not closed"),
         ("its-${mgs.id}", "client: .*mgs"),
-        ("${1 +}", "client: line 1, column 6: the expression ends too early"),
+        ("${1 +}", "client: line 1, column 6: the expression is incomplete"),
     ],
 )
 def test_a_template_that_does_not_compile_is_reported_with_its_field(client: str, problem: str) -> None:

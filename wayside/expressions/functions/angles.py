@@ -60,7 +60,7 @@ def _quaternion(arguments: tuple[object, ...]) -> Quaternion:
     x, y, z, w = (number(part, f"{name} of the quaternion") for name, part in zip("xyzw", parts, strict=True))
     length = math.hypot(x, y, z, w)
     if length == 0 or math.isinf(length):
-        raise ValueError("a quaternion of length 0 or infinity is not a rotation")
+        raise ValueError(f"the length of the quaternion must be finite and above 0; got {length:g}")
     return x / length, y / length, z / length, w / length
 
 

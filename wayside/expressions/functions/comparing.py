@@ -48,14 +48,14 @@ FUNCTIONS = (
     function(
         "unmatched",
         ResultType.LIST,
-        "the indices of the items that have none of the others within this distance, metres",
+        "the indices of those items that have none of the others within this distance, metres",
         (unmatched, "items:list others:list within"),
         (unmatched, "items:list others:list within path:string"),
     ),
     function(
         "countUnmatched",
         ResultType.NUMBER,
-        "the number of such items",
+        "the number of those items that have none of the others within this distance, metres",
         (count_unmatched, "items:list others:list within"),
         (count_unmatched, "items:list others:list within path:string"),
     ),

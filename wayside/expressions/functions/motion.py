@@ -23,7 +23,7 @@ def time_to_contact(dx: float, dy: float, vx: float, vy: float, radius: float) -
     if radius < 0:
         raise ValueError(f"radius must be 0 or more; got {radius:g}")
     if not all(map(math.isfinite, (dx, dy, vx, vy, radius))):
-        raise ValueError("an argument of timeToCollision is infinite")
+        raise ValueError("the arguments of timeToCollision must be finite")
     apart = math.hypot(dx, dy)
     if apart <= radius:
         return 0.0

@@ -66,7 +66,7 @@ def _corners(polygon: object, names: tuple[str, str]) -> list[Point]:
     if len(corners) < 3:
         raise ValueError(f"a polygon needs three corners or more; got {len(corners)}")
     if not all(map(math.isfinite, (number for corner in corners for number in corner))):
-        raise ValueError("a corner of the polygon is infinite")
+        raise ValueError("the corners of the polygon must be finite")
     return corners
 
 
@@ -93,19 +93,19 @@ FUNCTIONS = (
     function(
         "inside",
         ResultType.BOOLEAN,
-        "whether the position lies inside the polygon or on its edge; same unit for all",
+        "whether the position is inside the polygon or on its edge; all numbers in the same unit",
         (inside, "x y polygon:list"),
     ),
     function(
         "insideWgs84",
         ResultType.BOOLEAN,
-        "the same, degrees; corners are [latitude, longitude]",
+        "whether the position is inside the polygon or on its edge, in degrees; corners are [latitude, longitude]",
         (inside_wgs84, "latitude longitude polygon:list"),
     ),
     function(
         "countInside",
         ResultType.NUMBER,
-        "how many objects of a list lie inside the polygon or on its edge",
+        "the number of objects of a list that are inside the polygon or on its edge",
         (count_inside, "items:list polygon:list"),
         (count_inside, "items:list polygon:list path:string"),
     ),

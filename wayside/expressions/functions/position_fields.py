@@ -72,7 +72,7 @@ def _metres(latitude: float, longitude: float, other_latitude: float, other_long
 
 def _finite(number: float) -> float:
     if not math.isfinite(number):
-        raise ValueError("a position, yaw or speed is infinite")
+        raise ValueError("the position, yaw and speed must be finite")
     return number
 
 

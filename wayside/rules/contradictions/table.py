@@ -149,7 +149,7 @@ def _always(case: Case) -> Iterator[RuleProblem]:
         return
     if case.compiled.when.evaluate_or_unknown({}) is True:
         for value in case.given(Incidence):
-            yield case.against(value, f"spec.when: {case.rule.spec.when} always holds: write Frequent")
+            yield case.against(value, f"spec.when: {case.rule.spec.when} is always true: write Frequent")
 
 
 def _algorithm(case: Case) -> Iterator[RuleProblem]:
@@ -305,7 +305,9 @@ CONTRADICTIONS = (
         "they delay it by 1 h or more",
         _late,
     ),
-    Contradiction("classification-incidence", Incidence, "Rare or Unexpected, but when always holds", _always),
+    Contradiction(
+        "classification-incidence", Incidence, "Rare or Unexpected, but the condition is always true", _always
+    ),
     Contradiction(
         "classification-algorithm",
         DetectionAlgorithm,
