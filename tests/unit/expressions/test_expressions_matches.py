@@ -89,6 +89,6 @@ def test_patterns_that_people_write_and_broken_ones_are_within_the_bound(pattern
 
 def test_the_patterns_of_parameters_have_the_same_bounds() -> None:
     assert "takes 30003 steps, more than 1000" in (pattern_problem(r"\pL{100}") or "")
-    assert "a pattern can match at most 4096" in (mismatch("a+", "a" * 5000) or "")
+    assert "a parameter with a pattern may have at most 4096" in (mismatch("a+", "a" * 5000) or "")
     assert mismatch('^["\\\\]+$', '"\\') is None
     assert mismatch("^[ä😀]+$", "ä😀") is None
