@@ -133,7 +133,7 @@ def spoilt(good: Object, change: Object) -> Object:
     return {"spec": change}
 
 
-def test_what_is_wrong_is_refused_the_old_version_stays_and_without_the_webhook_a_condition_reports_it(
+def test_an_invalid_object_is_rejected_and_without_the_webhook_a_condition_reports_it(
     api: Api, webhook: Webhook
 ) -> None:
     api.create(detector())
@@ -163,7 +163,7 @@ def test_what_is_wrong_is_refused_the_old_version_stays_and_without_the_webhook_
             api.replace({**api.get(kind, name), "spec": good["spec"]})
 
 
-def test_kubectl_prints_what_is_refused_and_what_is_warned_of_as_the_guide_shows(
+def test_kubectl_prints_rejections_and_warnings_as_the_guide_shows(
     api: Api, control_plane: ControlPlane, webhook: Webhook, namespace: str
 ) -> None:
     optional = {"lane": {"type": "string"}}
@@ -197,7 +197,7 @@ def test_kubectl_prints_what_is_refused_and_what_is_warned_of_as_the_guide_shows
         assert "Warning: EventRule close, spec.signals[0].stream" in logged
 
 
-def test_only_a_new_spec_is_refused(api: Api, webhook: Webhook) -> None:
+def test_only_a_changed_spec_is_rejected(api: Api, webhook: Webhook) -> None:
     wrong = template("wrong", manifests=[config({}, name="fixed")])
     api.create(wrong)  # while nothing calls it
     with webhook.requested():
@@ -212,7 +212,7 @@ def test_only_a_new_spec_is_refused(api: Api, webhook: Webhook) -> None:
         api.wait_gone("ApplicationTemplate", "wrong")
 
 
-def test_a_rule_may_follow_its_detector_at_once(api: Api, webhook: Webhook) -> None:
+def test_a_rule_may_be_created_right_after_its_detector(api: Api, webhook: Webhook) -> None:
     api.create(detector())
     with webhook.requested():
         for number in range(10):
@@ -222,7 +222,7 @@ def test_a_rule_may_follow_its_detector_at_once(api: Api, webhook: Webhook) -> N
             api.create(rule(f"rule-{number}", signals=signals))
 
 
-def test_a_detectors_pod_is_tried_by_a_dry_run(api: Api, processes: Processes, tmp_path: Path) -> None:
+def test_a_detectors_pod_is_checked_by_a_dry_run(api: Api, processes: Processes, tmp_path: Path) -> None:
     webhook = Webhook(processes, api, tmp_path / "certificates", options=("--detector-image", "wayside:1"))
     made = detector()
     made["spec"] |= {"mode": "Standalone"}
@@ -243,7 +243,7 @@ def test_a_detectors_pod_is_tried_by_a_dry_run(api: Api, processes: Processes, t
     assert [each["metadata"]["name"] for each in api.list("Deployment")] == ["detector-intersection-a"]
 
 
-def test_a_manager_that_is_away_or_hangs_prevents_nothing(api: Api, processes: Processes, tmp_path: Path) -> None:
+def test_an_absent_or_hanging_manager_blocks_no_request(api: Api, processes: Processes, tmp_path: Path) -> None:
     webhook = Webhook(processes, api, tmp_path / "certificates", patience=TIMEOUT)
     api.create(template())
     with webhook.requested():
@@ -259,7 +259,7 @@ def test_a_manager_that_is_away_or_hangs_prevents_nothing(api: Api, processes: P
         assert webhook.manager.terminate() == 0
 
 
-def test_a_renewed_certificate_is_shown_and_one_that_cannot_be_used_is_not(api: Api, webhook: Webhook) -> None:
+def test_a_renewed_certificate_is_served_and_an_unusable_one_is_not(api: Api, webhook: Webhook) -> None:
     with webhook.requested():
         key = webhook.folder / "tls.key"
         old = key.read_bytes()
@@ -351,7 +351,7 @@ def holds_lease(api: Api) -> str:
     return str(found["spec"]["holderIdentity"])
 
 
-def test_a_standby_answers_as_well(api: Api, processes: Processes, namespace: str, tmp_path: Path) -> None:
+def test_a_standby_answers_reviews_too(api: Api, processes: Processes, namespace: str, tmp_path: Path) -> None:
     active = start_manager(processes, namespace)
     holder = holds_lease(api)
     webhook = Webhook(processes, api, tmp_path / "certificates")

@@ -164,7 +164,7 @@ OURS = "app.kubernetes.io/managed-by=wayside"
 MADE = ("ConfigMap", "Secret", "ServiceAccount", "Deployment", "Job", "CronJob", "Role", "ApplicationTask")
 
 
-def test_values_of_parameters_stay_values_and_templates_of_others_are_out_of_reach(
+def test_parameter_values_are_never_evaluated_and_other_templates_are_out_of_reach(
     api: Api, attacked: Process, control_plane: ControlPlane
 ) -> None:
     other = control_plane.api(new_namespace(control_plane.api(), "other"))
@@ -322,7 +322,7 @@ def refused(api: Api, manifest: Object) -> str:
     return ""
 
 
-def test_bombs_in_a_rule_delay_nobody(api: Api, attacked: Process) -> None:
+def test_expensive_expressions_in_a_rule_delay_nothing_else(api: Api, attacked: Process) -> None:
     items = str(list(range(10)))
     loops = "1"
     for variable in "abcdefgh":  # a hundred million steps

@@ -54,7 +54,7 @@ def test_kubebuilder_assets_that_is_no_folder_is_reported(monkeypatch: pytest.Mo
         ensure_binaries()
 
 
-def test_a_failed_build_shows_the_compilers_words_and_leaves_nothing(
+def test_a_failed_build_shows_the_compiler_output_and_leaves_no_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, console: Console
 ) -> None:
     go = tmp_path / "bin"

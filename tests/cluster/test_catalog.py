@@ -65,7 +65,9 @@ def test_a_rule_that_cannot_be_read_is_reported_and_the_others_are_listed(
     assert summary == "1 of 1 rules"
 
 
-def test_a_user_who_may_not_list_rules_gets_one_line(control_plane: ControlPlane, namespace: str) -> None:
+def test_a_user_without_the_right_to_list_rules_gets_an_error_of_one_line(
+    control_plane: ControlPlane, namespace: str
+) -> None:
     stranger = control_plane.kubeconfig_with_token("catalog-stranger", "no-such-token")
     answer = catalog(stranger, namespace)
     assert answer.returncode == 2

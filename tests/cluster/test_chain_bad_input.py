@@ -77,7 +77,7 @@ def in_turn(*payloads: Callable[[], bytes]) -> Callable[[], bytes]:
     return lambda: next(following)()  # noqa: PLW0108  the next one each time, not the first for ever
 
 
-def test_a_client_whose_poses_cannot_be_read_or_make_no_sense_harms_nobody_else(chain: Chain) -> None:
+def test_a_client_with_unreadable_or_invalid_poses_affects_no_other_client(chain: Chain) -> None:
     random = Random(7)
     senseless = in_turn(
         lambda: b"",
@@ -98,7 +98,7 @@ def test_a_client_whose_poses_cannot_be_read_or_make_no_sense_harms_nobody_else(
         )
 
 
-def test_json_of_the_wrong_shape_harms_nobody_else(chain: Chain) -> None:
+def test_json_of_the_wrong_shape_affects_no_other_client(chain: Chain) -> None:
     shapes = (
         *('{"x": 1, "y"', "[1, 2]", '"north"', "null", '{"y": 0}', '{"x": "far", "y": 0}', '{"x": {"deep": 1}}'),
         *('{"x": 1e999, "y": 0}', '{"x": NaN, "y": 0}', "[" * 100_000),
@@ -132,7 +132,7 @@ def harms_nobody(chain: Chain, vehicles: Vehicles, bad: Callable[[], bytes], *lo
         chain.wait_events(VANS, "started", "Until")
 
 
-def test_with_clock_data_a_client_whose_clock_is_ahead_harms_nobody_else(chain: Chain) -> None:
+def test_with_clock_data_a_client_whose_clock_is_ahead_affects_no_other_client(chain: Chain) -> None:
     spec = {"streams": [cdr_stream()], "clock": "Data", "lateness": "300ms"}
     chain.apply(rule(position="msg.pose.position"), detector(chain.endpoint, **spec))
     running = chain.start()
@@ -168,7 +168,7 @@ BAD_RULES = {
 }
 
 
-def test_rules_that_do_not_compile_are_refused_and_the_others_run(chain: Chain) -> None:
+def test_rules_that_do_not_compile_are_rejected_and_the_others_run(chain: Chain) -> None:
     chain.apply(rule(), detector(chain.endpoint))
     running = chain.start()
     with Vehicles(chain.endpoint) as vehicles, unharmed(chain, vehicles, running):
@@ -196,7 +196,7 @@ def test_detector_check_reports_where_each_rule_is_wrong(tmp_path: Path) -> None
         assert re.search(rf"^{name}\.yaml:\d+:\d+: {logged}", checked.stderr, re.MULTILINE), checked.stderr
 
 
-def test_a_rule_for_a_template_that_is_not_there_reports_it_on_its_task(chain: Chain) -> None:
+def test_a_rule_that_names_a_missing_template_has_a_task_that_reports_it(chain: Chain) -> None:
     missing = [{"name": "record", "deploy": {"templateName": "recordr", "parameters": {}}}]
     chain.apply(rule(), of_vans(missing), detector(chain.endpoint))
     running = chain.start(rules=2)
@@ -238,7 +238,7 @@ def refusal(chain: Chain, of_rule: str) -> Object:
     ],
     ids=["nothing", "both", "no-detector", "no-recording", "command"],
 )
-def test_bad_usage_is_one_line_and_exit_code_2(tmp_path: Path, arguments: list[str], logged: str) -> None:
+def test_a_usage_error_is_one_line_and_exit_code_2(tmp_path: Path, arguments: list[str], logged: str) -> None:
     done = command(*arguments, folder=tmp_path)
     assert done.returncode == 2
     assert logged in done.stderr
@@ -246,7 +246,7 @@ def test_bad_usage_is_one_line_and_exit_code_2(tmp_path: Path, arguments: list[s
     assert not done.stdout
 
 
-def test_a_detector_that_is_not_in_the_cluster_is_waited_for_and_that_is_reported(chain: Chain) -> None:
+def test_a_detector_missing_in_the_cluster_is_reported_and_waited_for(chain: Chain) -> None:
     running = chain.processes.start("detector", "run", "--name", HOLDER, "--namespace", chain.namespace)
     running.wait_for_output(f"there is no Detector '{HOLDER}' in namespace {chain.namespace}: create it")
     chain.apply(rule(), detector(chain.endpoint))

@@ -24,7 +24,7 @@ from tests.cluster.waiting import wait_until
 RUNS = f"Detector {HOLDER} runs with"
 
 
-def test_a_rule_that_means_something_else_ends_its_episodes_and_restarts(chain: Chain, vehicles: Vehicles) -> None:
+def test_a_rule_with_a_changed_meaning_ends_its_episodes_and_restarts(chain: Chain, vehicles: Vehicles) -> None:
     chain.apply(template(linger="20s"))
     chain.start()
     vehicles.place(CARS, NEAR)
@@ -103,7 +103,7 @@ def test_a_detector_is_changed_while_it_runs(chain: Chain, vehicles: Vehicles) -
     chain.settled()
 
 
-def test_a_detector_that_is_changed_to_a_wrong_one_continues_as_before(chain: Chain, vehicles: Vehicles) -> None:
+def test_a_detector_changed_to_an_invalid_spec_continues_as_before(chain: Chain, vehicles: Vehicles) -> None:
     running = chain.start()
     vehicles.place(CARS, NEAR)
     deployed = chain.wait_deployed(CARS)

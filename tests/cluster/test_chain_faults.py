@@ -151,7 +151,7 @@ def test_a_detector_that_is_stopped_ends_promptly_and_its_tasks_stay(chain: Chai
     chain.wait_events(CARS, "started")
 
 
-def test_the_intake_of_a_killed_detector_can_be_replayed_up_to_the_cut(
+def test_the_intake_file_of_a_killed_detector_replays_up_to_the_truncation(
     chain: Chain, vehicles: Vehicles, tmp_path: Path
 ) -> None:
     intake = tmp_path / "intake.mcap"

@@ -23,7 +23,7 @@ def rendered(tmp_path: Path) -> Rendered:
     return Helm(ensure_tools().helm, tmp_path / "home").rendered(yaml.safe_load(example))
 
 
-def test_the_site_with_everything_has_everything(rendered: Rendered, api: Api) -> None:
+def test_the_example_with_all_values_renders_all_objects(rendered: Rendered, api: Api) -> None:
     assert names(rendered.manifests) >= {
         ("Deployment", "wayside-manager"), ("Deployment", "wayside-router"),
         ("PodDisruptionBudget", "wayside-manager"), ("Detector", "town"), ("EventRule", "fast"),
@@ -53,7 +53,7 @@ def test_every_pod_meets_the_restricted_standard_and_writes_only_where_a_volume_
             assert {"requests", "limits"} <= container["resources"].keys()
 
 
-def test_every_value_has_its_place_in_the_schema() -> None:
+def test_the_schema_has_every_value() -> None:
     values, schema = yaml.safe_load((CHART / "values.yaml").read_text()), json.loads(
         (CHART / "values.schema.json").read_text()
     )  # fmt: skip

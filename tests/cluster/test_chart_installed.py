@@ -102,9 +102,7 @@ def pods(api: Api, component: str) -> list[Object]:
     return api.list("Pod", labels=f"app.kubernetes.io/component={component}")
 
 
-def test_what_is_installed_changes_with_upgrades_and_goes_with_the_release_but_for_the_crds(
-    helm: Helm, there: Api
-) -> None:
+def test_an_upgrade_changes_the_objects_and_an_uninstall_removes_all_but_the_crds(helm: Helm, there: Api) -> None:
     install(helm, there, ALL)
     for component, count in (("manager", 2), ("router", 1)):
         # The restricted standard is enforced, so only pods that meet it come into being.
@@ -134,7 +132,7 @@ def test_what_is_installed_changes_with_upgrades_and_goes_with_the_release_but_f
     install(helm, there, {})  # and the CRDs that stayed are taken over by the next release
 
 
-def test_what_an_install_made_goes_as_well_where_no_upgrade_came_between(helm: Helm, there: Api) -> None:
+def test_an_uninstall_without_an_earlier_upgrade_removes_all_objects_too(helm: Helm, there: Api) -> None:
     install(helm, there, ALL | {"crds": {"keep": True}})
     assert there.find("EventRule", "one") is not None
     helm("uninstall", RELEASE, "--namespace", there.namespace)
@@ -168,7 +166,7 @@ def _without_rules(schema: Any) -> Any:
     return {key: _without_rules(value) for key, value in schema.items() if key not in left}
 
 
-def test_crds_that_are_not_kept_go_too(helm: Helm, there: Api) -> None:
+def test_crds_that_are_not_kept_are_removed_too(helm: Helm, there: Api) -> None:
     install(helm, there, {"crds": {"keep": False}})
     helm("uninstall", RELEASE, "--namespace", there.namespace)
     for name in CRD_NAMES:
@@ -185,7 +183,7 @@ def test_crds_that_are_not_kept_go_too(helm: Helm, there: Api) -> None:
         {"router": {"enabled": True, "tls": {"enabled": False}, "accessControl": {"enabled": False}}},
     ],
 )
-def test_the_api_server_takes_all_that_is_rendered(helm: Helm, there: Api, values: dict[str, Any]) -> None:
+def test_the_api_server_accepts_everything_that_is_rendered(helm: Helm, there: Api, values: dict[str, Any]) -> None:
     rendered = helm.rendered(values, namespace=there.namespace).manifests
     for each in rendered:
         if each["apiVersion"] == "wayside.dev/v1alpha1":
@@ -224,7 +222,7 @@ def wait_for_pods(api: Api, component: str, count: int) -> None:
     )
 
 
-def test_the_manager_lives_on_what_is_installed_and_the_test_pods_script_reports_that_it_answers(
+def test_the_installed_rights_suffice_for_the_manager_and_the_test_pod_reaches_it(
     helm: Helm, there: Api, bare: ControlPlane, tmp_path: Path
 ) -> None:
     mine = {"namespaces": [there.namespace], "allowedKinds": ["v1/ConfigMap"], "metrics": {"tlsSecretName": "metrics"}}
@@ -287,7 +285,7 @@ def test_the_manager_lives_on_what_is_installed_and_the_test_pods_script_reports
         processes.kill_all()
 
 
-def test_the_test_pod_is_taken_too(helm: Helm, there: Api) -> None:
+def test_the_api_server_accepts_the_test_pod_too(helm: Helm, there: Api) -> None:
     (pod,) = helm.rendered({}, namespace=there.namespace).of("Pod")
     created = there.create(pod)
     assert created["metadata"]["annotations"]["helm.sh/hook"] == "test"
@@ -297,7 +295,7 @@ def test_the_test_pod_is_taken_too(helm: Helm, there: Api) -> None:
         there.create(privileged)
 
 
-def test_people_may_with_our_kinds_what_they_may_with_others(helm: Helm, there: Api) -> None:
+def test_the_default_roles_of_people_cover_our_kinds(helm: Helm, there: Api) -> None:
     install(helm, there, {})
     rbac = "rbac.authorization.k8s.io"
     for role in ("view", "edit"):

@@ -127,7 +127,7 @@ def refuses(what: str, act: Callable[[], object]) -> None:
     assert caught.value.code == 403
 
 
-def test_a_standalone_detector_touches_only_its_own_tasks_and_its_own_lease(applied: Api, account: Account) -> None:
+def test_a_standalone_detector_may_write_only_its_own_tasks_and_its_own_lease(applied: Api, account: Account) -> None:
     town = account("town")
     wait_in_force(applied, town)
     applied.create(held("of-harbour", "harbour"))
@@ -150,7 +150,7 @@ def test_a_standalone_detector_touches_only_its_own_tasks_and_its_own_lease(appl
     town.create(lease("somebody-elses"))  # no holder's: the roles' matter
 
 
-def test_a_task_that_is_too_large_in_total_is_refused_with_its_field_and_an_old_one_can_end(
+def test_a_task_that_is_too_large_in_total_is_rejected_with_its_field_and_an_existing_one_can_end(
     large: Object, applied: Api
 ) -> None:
     texts = large["spec"]["parameters"]
@@ -178,7 +178,7 @@ def test_a_task_that_is_too_large_in_total_is_refused_with_its_field_and_an_old_
         applied.patch("ApplicationTask", "before", {"spec": {"parameters": {"p0": "y" * 60_000}}})
 
 
-def test_a_sidecar_holds_only_for_the_pod_that_its_token_is_bound_to(applied: Api, account: Account) -> None:
+def test_a_sidecar_may_act_only_for_the_pod_that_its_token_is_bound_to(applied: Api, account: Account) -> None:
     van = account("van", pod="van-1")
     wait_in_force(applied, van)
     van.create(held("mine", "van.van-1"))
@@ -193,7 +193,9 @@ def test_a_sidecar_holds_only_for_the_pod_that_its_token_is_bound_to(applied: Ap
     refuses("delete the task of-another", partial(van.delete, "ApplicationTask", "of-another"))
 
 
-def test_an_account_that_may_hold_for_all_detectors_may_touch_all(applied: Api, account: Account) -> None:
+def test_an_account_with_rights_for_all_detectors_may_write_all_tasks_and_leases(
+    applied: Api, account: Account
+) -> None:
     probe, robot = account("probe", verbs=("none",)), account("robot", verbs=("hold",))
     wait_in_force(applied, probe)
 
@@ -210,7 +212,7 @@ def test_an_account_that_may_hold_for_all_detectors_may_touch_all(applied: Api, 
     refuses("delete the task of-harbour", lambda: probe.delete("ApplicationTask", "of-harbour"))
 
 
-def test_kubernetes_itself_may_empty_the_namespace(applied: Api, account: Account) -> None:
+def test_the_namespace_controller_may_delete_all_objects(applied: Api, account: Account) -> None:
     wait_in_force(applied, account("town"))
     applied.create(held("of-harbour", "harbour"))
     applied.create(lease("wayside-harbour"))

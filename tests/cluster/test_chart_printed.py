@@ -65,7 +65,7 @@ def bound(manifests: list[Object]) -> list[tuple[Any, ...]]:
         (["north", "south"], [], ["v1/Service", "v1/Secret", "apps/v1/StatefulSet"], True),
     ],
 )
-def test_the_managers_roles_are_those_that_it_prints(
+def test_the_charts_roles_are_those_that_the_manager_prints(
     helm: Helm, namespaces: list[str], grant: list[str], kinds: list[str], detectors: bool
 ) -> None:
     manager = {"namespaces": namespaces, "grant": grant, "allowedKinds": kinds, "detectors": {"run": detectors}}
@@ -83,7 +83,7 @@ def test_the_managers_roles_are_those_that_it_prints(
     assert [f"--allowed-kinds={each}" for each in kinds] == [each for each in args if each.startswith("--allowed-k")]
 
 
-def test_a_kind_that_only_the_cluster_knows_needs_its_plural(helm: Helm) -> None:
+def test_a_kind_unknown_to_the_manager_needs_its_plural(helm: Helm) -> None:
     kind = {"kind": "argoproj.io/v1alpha1/Rollout", "plural": "rollouts"}
     given = {"manager": {"allowedKinds": ["v1/Pod", kind]}, "userRoles": {"create": False}}
     rendered = helm.rendered(given)
@@ -96,7 +96,7 @@ def test_a_kind_that_only_the_cluster_knows_needs_its_plural(helm: Helm) -> None
 
 
 @pytest.mark.parametrize("namespaces", [[], ["south", "north"]])
-def test_the_webhook_is_the_one_that_the_manager_prints(helm: Helm, namespaces: list[str]) -> None:
+def test_the_charts_webhook_is_the_one_that_the_manager_prints(helm: Helm, namespaces: list[str]) -> None:
     rendered = helm.rendered({"manager": {"namespaces": namespaces}})
     wanted = printed(
         "webhooks", "--service", "town/wayside-webhook", "--name", "wayside-town",
@@ -112,7 +112,7 @@ def test_the_webhook_is_the_one_that_the_manager_prints(helm: Helm, namespaces: 
     assert without.of("ValidatingWebhookConfiguration")
 
 
-def test_cert_manager_or_somebody_else_can_make_the_webhooks_certificate(helm: Helm) -> None:
+def test_cert_manager_or_another_issuer_can_provide_the_webhooks_certificate(helm: Helm) -> None:
     issuer = {"name": "authority", "kind": "ClusterIssuer"}
     rendered = helm.rendered({"webhook": {"certificates": {"from": "CertManager", "issuerRef": issuer}}})
     certificate, hook = rendered.one("Certificate"), rendered.one("ValidatingWebhookConfiguration")

@@ -42,7 +42,7 @@ def test_each_rendering_is_the_same(helm: Helm) -> None:
 
 
 @pytest.mark.parametrize("keep", [True, False])
-def test_the_crds_are_whole_and_kept_where_that_is_wanted(helm: Helm, keep: bool) -> None:
+def test_the_crds_are_complete_and_kept_if_requested(helm: Helm, keep: bool) -> None:
     rendered = helm.rendered({"crds": {"keep": keep}}).of("CustomResourceDefinition")
     wanted = {text["metadata"]["name"]: text["spec"] for text in map(yaml.safe_load, crd_files().values())}
     assert {each["metadata"]["name"]: each["spec"] for each in rendered} == wanted
@@ -52,7 +52,7 @@ def test_the_crds_are_whole_and_kept_where_that_is_wanted(helm: Helm, keep: bool
 
 
 @pytest.mark.parametrize(("replicas", "budgets"), [(1, 0), (2, 1)])
-def test_a_disruption_budget_is_there_only_for_several_managers(helm: Helm, replicas: int, budgets: int) -> None:
+def test_a_disruption_budget_is_rendered_only_for_several_managers(helm: Helm, replicas: int, budgets: int) -> None:
     rendered = helm.rendered({"manager": {"replicas": replicas}})
     assert len(rendered.of("PodDisruptionBudget")) == budgets
 
@@ -87,7 +87,7 @@ def test_the_linter_finds_nothing(helm: Helm) -> None:
         ({"manager": {"allowedKinds": ["v1/Secret"]}}, r"v1/Secret needs manager\.namespaces"),
     ],
 )
-def test_a_value_that_is_none_is_refused_by_its_name(helm: Helm, values: Values, message: str) -> None:
+def test_an_invalid_value_is_rejected_by_its_name(helm: Helm, values: Values, message: str) -> None:
     with pytest.raises(HelmError, match=message):
         helm.rendered(values)
 
@@ -117,7 +117,7 @@ def test_the_pods_of_the_mining_job_make_one_dataset(helm: Helm, tmp_path: Path)
         helm.rendered({"mining": {"enabled": True}})
 
 
-def test_more_can_be_mounted_into_the_manager(helm: Helm) -> None:
+def test_additional_volumes_can_be_mounted_into_the_manager(helm: Helm) -> None:
     volume, mount = {"name": "tools", "emptyDir": {}}, {"name": "tools", "mountPath": "/tools"}
     given = {"volumes": [volume], "volumeMounts": [mount], "extraArgs": ["--helm=/tools/helm"]}
     pod = helm.rendered({"manager": given}).one("Deployment", "wayside-manager")["spec"]["template"]["spec"]
@@ -131,7 +131,7 @@ def manager_arguments(rendered: Rendered) -> list[str]:
     return list(container["args"])
 
 
-def test_a_detector_of_the_values_is_run_by_the_manager_unless_that_is_not_wanted(helm: Helm) -> None:
+def test_a_detector_in_the_values_is_run_by_the_manager_unless_disabled(helm: Helm) -> None:
     mine = [DETECTOR, DETECTOR | {"name": "van", "run": False}, {"name": "own", "spec": {"mode": "Standalone"}}]
     rendered = helm.rendered({"detectors": mine}, "--api-versions", "wayside.dev/v1alpha1/Detector")
     assert {each["metadata"]["name"]: each["spec"].get("mode") for each in rendered.of("Detector")} == {
@@ -149,7 +149,7 @@ def test_a_detector_of_the_values_is_run_by_the_manager_unless_that_is_not_wante
     assert not [each for each in manager_arguments(off) if "detector" in each]
 
 
-def test_detectors_are_pulled_like_the_manager_and_found_by_what_the_manager_labels_them_with(helm: Helm) -> None:
+def test_detectors_use_the_managers_pull_secrets_and_are_selected_by_its_labels(helm: Helm) -> None:
     values: Values = {
         "image": {"repository": "registry.test/wayside", "tag": "7", "pullPolicy": "Always"},
         "imagePullSecrets": [{"name": "registry"}],
@@ -184,7 +184,7 @@ def test_detectors_are_pulled_like_the_manager_and_found_by_what_the_manager_lab
         assert [(it["scheme"], it["tlsConfig"]) for it in each["spec"]["podMetricsEndpoints"]] == [("https", tls)]
 
 
-def test_sidecars_are_scraped_by_the_port_that_they_have(helm: Helm) -> None:
+def test_sidecars_are_scraped_at_their_own_port(helm: Helm) -> None:
     monitor = helm.rendered({"monitoring": {"podMonitor": {"enabled": True}}}).one("PodMonitor", "wayside-sidecars")
     assert monitor["spec"]["selector"]["matchExpressions"] == [{"key": SIDECAR_LABEL, "operator": "Exists"}]
     stream = {"name": "pose", "key": "vehicles/${client:*}/pose", "encoding": "json"}
@@ -206,7 +206,7 @@ def test_traces_go_to_the_endpoint_from_both_programs(helm: Helm) -> None:
     assert parse_environment(handed_on) == wanted
 
 
-def test_the_examples_values_are_its_detector_where_vehicles_reach_it(helm: Helm) -> None:
+def test_the_examples_values_make_its_detector_and_expose_it_to_vehicles(helm: Helm) -> None:
     example = yaml.safe_load((EXAMPLE / "detector.yaml").read_text())["spec"]
     values = yaml.safe_load((EXAMPLE / "helm" / "values.yaml").read_text())
     rendered = helm.rendered(values, "--api-versions", "wayside.dev/v1alpha1/Detector")
@@ -239,7 +239,7 @@ def test_common_labels_are_on_every_object_and_every_pod(helm: Helm) -> None:
     assert rendered.one("Deployment")["spec"]["template"]["metadata"]["labels"]["team"] == "mobility"
 
 
-def test_a_cluster_that_gives_users_and_has_one_registry_gets_what_it_takes(helm: Helm) -> None:
+def test_user_ids_and_the_registry_can_be_left_to_the_cluster(helm: Helm) -> None:
     nobody = dict.fromkeys(("runAsUser", "runAsGroup", "fsGroup"))
     given: Values = {
         "imageRegistry": "registry.example:5000/mirror/",

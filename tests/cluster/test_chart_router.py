@@ -104,7 +104,7 @@ def opened(settings: dict[str, Any]) -> zenoh.Session:
     return zenoh.open(zenoh.Config.from_json5(json.dumps(settings)))
 
 
-def test_each_client_does_what_it_may_and_nothing_else(connect: Connect) -> None:
+def test_each_client_can_do_only_what_it_is_permitted_to(connect: Connect) -> None:
     car, town, anna = connect("car1"), connect("town"), connect("anna")
     listening = connect("town")  # what one puts itself it gets without the router
     at_town: list[str] = []
@@ -203,20 +203,20 @@ def test_a_client_without_a_certificate_is_refused(connect: Connect, who: dict[s
         connect(who["name"], foreign=who.get("foreign", False))
 
 
-def test_what_makes_no_sense_is_refused_with_the_remedy(helm: Helm) -> None:
+def test_invalid_values_are_rejected_with_the_remedy(helm: Helm) -> None:
     with pytest.raises(HelmError, match=r"give router\.tls\.secretName .* or router\.tls\.issuerRef"):
         helm.rendered({"router": {"enabled": True}})
     with pytest.raises(HelmError, match=r"router\.accessControl knows clients by their certificates"):
         configuration(helm, tls=TLS | {"mutual": False})
 
 
-def test_a_common_name_that_would_be_a_wildcard_in_a_key_is_refused(helm: Helm) -> None:
+def test_a_common_name_with_a_key_wildcard_is_rejected(helm: Helm) -> None:
     clients = [{"name": "vehicles", "commonNames": ["car*"], "publish": ["vehicles/{commonName}/**"]}]
     with pytest.raises(HelmError, match=r'the common name "car\*" of vehicles cannot stand in a key'):
         configuration(helm, accessControl={"clients": clients})
 
 
-def test_more_of_the_configuration_can_be_given(helm: Helm) -> None:
+def test_additional_router_configuration_can_be_given(helm: Helm) -> None:
     made = configuration(
         helm, configuration={"adminspace": {"enabled": True}, "transport": {"unicast": {"max_links": 2}}}
     )

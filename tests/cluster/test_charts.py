@@ -73,7 +73,9 @@ def wait_for_image(api: Api, name: str, image: str = "app:2") -> Object:
     )
 
 
-def test_a_charts_life_is_that_of_manifests(api: Api, manager: Process, charts: Path, kubelet: None) -> None:
+def test_a_chart_is_applied_updated_and_deleted_like_manifests(
+    api: Api, manager: Process, charts: Path, kubelet: None
+) -> None:
     api.create(template("app", {"chart": str(write_chart(charts, "app"))}))
     api.create(demand("one", "app", "car1"))
     deployment = wait_for_image(api, "app")
@@ -95,7 +97,7 @@ def test_a_charts_life_is_that_of_manifests(api: Api, manager: Process, charts: 
     api.wait_gone("Deployment", "app")
 
 
-def test_charts_come_from_a_repository_and_from_a_registry_and_are_kept(
+def test_charts_are_pulled_from_a_repository_and_from_a_registry_and_cached(
     api: Api,
     tools: Tools,
     processes: Processes,
@@ -136,7 +138,7 @@ def test_charts_come_from_a_repository_and_from_a_registry_and_are_kept(
     ],
     ids=["hook", "crd", "random", "error", "kind"],
 )
-def test_a_chart_that_cannot_be_used_is_refused_in_words_and_corrected_it_runs(
+def test_an_unusable_chart_is_rejected_with_a_reason_and_runs_once_corrected(
     api: Api, manager: Process, charts: Path, files: dict[str, str], logged: str
 ) -> None:
     wrong = write_chart(charts, "wrong", {**APPLICATION, **files})
@@ -149,7 +151,7 @@ def test_a_chart_that_cannot_be_used_is_refused_in_words_and_corrected_it_runs(
     wait_for_image(api, "app")
 
 
-def test_wrong_charts_block_nobody(api: Api, manager: Process, charts: Path) -> None:
+def test_hanging_chart_repositories_delay_no_other_template(api: Api, manager: Process, charts: Path) -> None:
     """Many templates whose repository takes connections and never answers; and one that is fine, which comes last."""
     with silence() as url:
         for number in range(4):
@@ -168,7 +170,7 @@ def test_wrong_charts_block_nobody(api: Api, manager: Process, charts: Path) -> 
         assert manager.terminate(patience=15) == 0
 
 
-def test_a_chart_that_is_not_there_is_reported_and_outside_its_folder_refused(api: Api, manager: Process) -> None:
+def test_a_missing_chart_is_reported_and_a_path_outside_the_folder_is_rejected(api: Api, manager: Process) -> None:
     api.create(template("away", {"chart": "app", "version": "1.0.0", "repository": "http://127.0.0.1:1"}))
     api.create(template("outside", {"chart": "/etc"}))
     for name in ("away", "outside"):

@@ -22,7 +22,7 @@ def test_marking_pods_twice_changes_nothing(api: Api) -> None:
     assert api.list("Pod") == first
 
 
-def test_it_has_the_version_that_was_chosen(api: Api) -> None:
+def test_the_control_plane_has_the_requested_version(api: Api) -> None:
     chosen = "v1.31.0" if os.environ.get(VERSION) == "oldest" else "v1.36.3"
     assert json.loads(api.raw("/version"))["gitVersion"] == chosen
 

@@ -45,7 +45,7 @@ def test_the_api_server_accepts_every_crd(control_plane: ControlPlane) -> None:
 
 
 @pytest.mark.parametrize("kind", VALID)
-def test_a_valid_object_is_stored_as_it_was_written(kind: str, api: Api) -> None:
+def test_a_valid_object_is_stored_unchanged(kind: str, api: Api) -> None:
     written = VALID[kind]
     stored = api.create(written)
     assert _covers(stored["spec"], written["spec"]), stored["spec"]
@@ -67,7 +67,7 @@ SCOPES: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("scope", SCOPES)
-def test_every_scope_and_an_elements_own_fields_are_stored_as_they_were_written(scope: str, api: Api) -> None:
+def test_every_scope_and_the_fields_of_elements_are_stored_unchanged(scope: str, api: Api) -> None:
     each = {"as": "site", "of": [{"name": "north", "x": 1.5, "node": "rsu-1", "area": [[0, 0], [1, 1]], "on": True}]}
     rule = changed(EVENT_RULE, {"spec.scope": SCOPES[scope], "spec.each": each})
     stored = api.create(rule)
@@ -89,7 +89,7 @@ def test_every_example_is_accepted(file: Path, api: Api) -> None:
     ("kind", "changes", "message"),
     [pytest.param(kind, changes, message, id=f"{kind}: {what}") for kind, what, changes, message in WRONG],
 )
-def test_a_wrong_object_is_refused_with_a_message_that_helps(
+def test_an_invalid_object_is_rejected_with_a_helpful_message(
     kind: str, changes: Changes, message: str, control_plane: ControlPlane
 ) -> None:
     with pytest.raises(ApiError, match=rf"(?s){message}") as caught:
@@ -104,26 +104,26 @@ def test_a_wrong_object_is_refused_with_a_message_that_helps(
         for kind, changes, message in UPDATES
     ],
 )
-def test_what_is_immutable_cannot_be_changed(kind: str, changes: Changes, message: str, api: Api) -> None:
+def test_immutable_fields_cannot_be_changed(kind: str, changes: Changes, message: str, api: Api) -> None:
     stored = api.create(VALID[kind])
     with pytest.raises(ApiError, match=message):
         api.replace(changed(stored, changes))
 
 
 class TestApplicationTask:
-    def test_its_parameters_may_change(self, api: Api) -> None:
+    def test_parameters_may_change(self, api: Api) -> None:
         stored = api.create(APPLICATION_TASK)
         replaced = api.replace(changed(stored, {"spec.parameters.rateHz": 30, "spec.parameters.sources": ["car3"]}))
         assert replaced["spec"]["parameters"] == {"region": "north", "sources": ["car3"], "rateHz": 30}
 
-    def test_its_end_is_set_once(self, api: Api) -> None:
+    def test_the_end_is_set_only_once(self, api: Api) -> None:
         stored = api.create(APPLICATION_TASK)
         ended = api.replace(changed(stored, {"spec.endTime": TIME}))
         for value in ("2026-01-02T04:00:00Z", ABSENT):
             with pytest.raises(ApiError, match=r"spec\.endTime: Forbidden: is immutable once set: create another task"):
                 api.replace(changed(ended, {"spec.endTime": value}))
 
-    def test_a_persons_task_needs_only_a_template(self, api: Api) -> None:
+    def test_a_manually_created_task_needs_only_a_template(self, api: Api) -> None:
         stored = api.create(changed(APPLICATION_TASK, {"spec": {"templateName": "scene-fusion"}}))
         assert stored["spec"]["priority"] == 0
 
@@ -137,7 +137,7 @@ class TestApplicationTask:
             ("spec.templateName=scene-fusion,status.instanceName!=scene-fusion-abcdefgh", ["one"]),
         ],
     )
-    def test_its_selectable_fields_work_in_a_selector(self, selector: str, found: list[str], api: Api) -> None:
+    def test_selectable_fields_work_in_a_selector(self, selector: str, found: list[str], api: Api) -> None:
         api.create(changed(APPLICATION_TASK, {"metadata.name": "one"}))
         api.create(changed(APPLICATION_TASK, {"metadata.name": "two", "spec.requester.detectorName": "other"}))
         api.create(changed(APPLICATION_TASK, {"metadata.name": "three", "spec": {"templateName": "other"}}))
@@ -150,7 +150,7 @@ class TestApplicationTask:
 
 class TestStatus:
     @pytest.mark.parametrize("kind", VALID)
-    def test_it_is_written_apart_from_the_spec(self, kind: str, api: Api) -> None:
+    def test_the_status_is_written_separately_from_the_spec(self, kind: str, api: Api) -> None:
         condition = {
             "type": "Accepted",
             "status": "True",
@@ -170,7 +170,7 @@ class TestStatus:
         ignored = api.replace(changed(patched, CHANGED[kind]), subresource="status")
         assert ignored["spec"] == stored["spec"]
 
-    def test_a_condition_with_a_status_of_its_own_is_refused(self, api: Api) -> None:
+    def test_a_condition_with_an_unknown_status_is_rejected(self, api: Api) -> None:
         api.create(DETECTOR)
         condition = {"type": "Accepted", "status": "Yes", "reason": "R", "lastTransitionTime": TIME}
         with pytest.raises(ApiError, match=r'conditions\[0\]\.status: Unsupported value: "Yes"'):
@@ -187,21 +187,21 @@ def test_every_field_has_a_description(kind: str, control_plane: ControlPlane) -
 
 
 class TestServerSideApply:
-    def test_two_managers_share_a_rules_signals_by_name(self, api: Api) -> None:
+    def test_two_field_managers_share_a_rules_signals_by_name(self, api: Api) -> None:
         api.apply(EVENT_RULE, field_manager="one")
         other = {"name": "braking", "stream": "odometry", "value": "msg.acceleration"}
         api.apply(changed(EVENT_RULE, {"spec.signals": [other]}), field_manager="two")
         stored = api.get("EventRule", EVENT_RULE["metadata"]["name"])
         assert [signal["name"] for signal in stored["spec"]["signals"]] == ["speed", "braking"]
 
-    def test_free_data_has_one_owner_whatever_is_inside(self, api: Api) -> None:
+    def test_free_form_data_has_one_field_owner(self, api: Api) -> None:
         for manifest in (EVENT_RULE, APPLICATION_TASK):
             fields = str(api.apply(manifest)["metadata"]["managedFields"])
             assert "'f:parameters': {}" in fields
             assert "'f:vehicles'" not in fields
             assert "'f:nested'" not in fields
 
-    def test_applying_the_same_again_changes_nothing(self, api: Api) -> None:
+    def test_applying_an_unchanged_object_changes_nothing(self, api: Api) -> None:
         for manifest in VALID.values():
             first = api.apply(manifest)
             assert api.apply(manifest)["metadata"]["resourceVersion"] == first["metadata"]["resourceVersion"]
@@ -221,7 +221,7 @@ class TestKubectl:
             ("applicationinstance.status.releaseTime", "The end of the linger time"),
         ],
     )
-    def test_explain_teaches(self, path: str, teaches: str, control_plane: ControlPlane) -> None:
+    def test_explain_prints_the_descriptions(self, path: str, teaches: str, control_plane: ControlPlane) -> None:
         explained = " ".join(control_plane.kubectl("explain", path).split())
         assert teaches in explained
 

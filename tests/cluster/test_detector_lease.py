@@ -88,7 +88,7 @@ def moment(spec: Object) -> datetime:
     return datetime.fromisoformat(spec["renewTime"])
 
 
-def test_it_lasts_15_seconds_and_belongs_to_the_pod(
+def test_the_lease_lasts_15_seconds_and_is_held_by_the_pod(
     api: Api, namespace: str, loop: Background, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pod = {"containers": [{"name": "detector", "image": "registry.example/detector:1"}]}
@@ -103,7 +103,7 @@ def test_it_lasts_15_seconds_and_belongs_to_the_pod(
     assert (owner["kind"], owner["name"], owner["uid"]) == ("Pod", "detector-1", created["metadata"]["uid"])
 
 
-def test_it_is_renewed_after_each_third_of_its_duration(api: Api, namespace: str, loop: Background) -> None:
+def test_the_lease_is_renewed_after_each_third_of_its_duration(api: Api, namespace: str, loop: Background) -> None:
     LeaseCandidate(loop, namespace, ProcessIdentity("pod-1"), duration=15.0).wait_held()
     specs = renewals(api, 3)
     gaps = [(moment(after) - moment(before)).total_seconds() for before, after in pairwise(specs)]
@@ -112,13 +112,13 @@ def test_it_is_renewed_after_each_third_of_its_duration(api: Api, namespace: str
     assert len({spec["acquireTime"] for spec in specs}) == 1
 
 
-def test_one_that_was_deleted_by_hand_comes_back(api: Api, namespace: str, loop: Background) -> None:
+def test_a_manually_deleted_lease_is_recreated(api: Api, namespace: str, loop: Background) -> None:
     LeaseCandidate(loop, namespace, ProcessIdentity("pod-1"), duration=3.0).wait_held()
     api.delete("Lease", NAME)
     api.wait_for("Lease", NAME, lambda _: True, what="the Lease is there again")
 
 
-def test_a_second_process_waits_until_the_first_has_been_silent_for_the_duration(
+def test_a_second_process_waits_until_the_lease_was_not_renewed_for_its_duration(
     api: Api, namespace: str, loop: Background, caplog: pytest.LogCaptureFixture
 ) -> None:
     first = LeaseCandidate(loop, namespace, ProcessIdentity("pod-1"), duration=3.0)
@@ -142,7 +142,9 @@ def test_a_second_process_waits_until_the_first_has_been_silent_for_the_duration
     assert api.get("Lease", NAME)["spec"]["leaseTransitions"] == 1
 
 
-def test_what_was_released_is_taken_at_once_and_still_lasts(api: Api, namespace: str, loop: Background) -> None:
+def test_a_released_lease_is_acquired_at_once_with_the_full_duration(
+    api: Api, namespace: str, loop: Background
+) -> None:
     first = LeaseCandidate(loop, namespace, ProcessIdentity("pod-1"), duration=LONG)
     first.wait_held()
     first.stop()
@@ -163,7 +165,7 @@ def test_the_next_container_of_the_same_pod_takes_over_at_once(namespace: str, l
     LeaseCandidate(loop, namespace, ProcessIdentity("pod-1")).wait_held()
 
 
-def test_a_process_that_died_on_this_machine_is_succeeded_at_once_and_a_live_one_is_not(
+def test_the_lease_of_a_dead_local_process_is_taken_at_once_and_that_of_a_live_one_is_not(
     namespace: str, loop: Background
 ) -> None:
     own = ProcessIdentity.of_this_process()
@@ -179,7 +181,7 @@ def test_a_process_that_died_on_this_machine_is_succeeded_at_once_and_a_live_one
     second.wait_held()
 
 
-def test_one_that_was_taken_over_holds_no_more(
+def test_a_process_whose_lease_was_taken_over_no_longer_holds_it(
     api: Api, namespace: str, loop: Background, caplog: pytest.LogCaptureFixture
 ) -> None:
     first = LeaseCandidate(loop, namespace, ProcessIdentity("pod-1"), duration=3.0)
@@ -190,7 +192,7 @@ def test_one_that_was_taken_over_holds_no_more(
 
 
 @pytest.mark.own_control_plane
-def test_an_outage_does_not_take_it_away(
+def test_an_outage_does_not_lose_the_lease(
     control_plane: ControlPlane, api: Api, namespace: str, loop: Background
 ) -> None:
     holding = LeaseCandidate(loop, namespace, ProcessIdentity("pod-1"), duration=3.0)

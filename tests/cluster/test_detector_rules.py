@@ -64,7 +64,7 @@ def following(control_plane: ControlPlane, namespace: str) -> Iterator[RulesFoll
         yield RulesFollower(loop, namespace)
 
 
-def test_the_selected_rules_come_by_name_and_others_do_not(
+def test_selected_rules_are_returned_by_name_and_others_are_not(
     control_plane: ControlPlane, api: Api, namespace: str
 ) -> None:
     for each in (rule("c"), rule("b", {"site": "b"}), rule("a"), detector()):
@@ -75,7 +75,7 @@ def test_the_selected_rules_come_by_name_and_others_do_not(
         assert len(following.sets) == 1, "nothing comes before all is known"
 
 
-def test_each_change_is_followed(api: Api, following: RulesFollower) -> None:
+def test_each_change_of_a_rule_is_followed(api: Api, following: RulesFollower) -> None:
     api.create(detector())
     following.wait_rules()
     api.create(rule("a"))
@@ -93,7 +93,7 @@ def test_each_change_is_followed(api: Api, following: RulesFollower) -> None:
     following.wait(lambda last: last.detector.spec.client_timeout == "7s", "the Detector is the changed one")
 
 
-def test_a_status_or_an_annotation_is_no_change(api: Api, following: RulesFollower) -> None:
+def test_a_changed_status_or_annotation_is_ignored(api: Api, following: RulesFollower) -> None:
     api.create(detector())
     api.create(rule("a"))
     following.wait_rules("a")
@@ -105,7 +105,7 @@ def test_a_status_or_an_annotation_is_no_change(api: Api, following: RulesFollow
     assert len(following.sets) == before + 1
 
 
-def test_the_last_known_set_holds_while_the_detector_is_gone(
+def test_the_last_known_rules_are_kept_while_the_detector_is_missing(
     api: Api, following: RulesFollower, caplog: pytest.LogCaptureFixture
 ) -> None:
     wait_until(lambda: caplog.text, lambda text: "no Detector 'intersection-a'" in text, what="the log reports it")
@@ -126,7 +126,7 @@ def test_the_last_known_set_holds_while_the_detector_is_gone(
     assert [names_of(each) for each in following.sets[before:]] == [["a", "b"]]
 
 
-def test_a_rule_that_cannot_be_read_is_reported_and_left_out(
+def test_an_unreadable_rule_is_reported_and_skipped(
     api: Api, following: RulesFollower, caplog: pytest.LogCaptureFixture
 ) -> None:
     # A CRD's schema cannot constrain a map's keys, so the API server accepts this.
@@ -144,7 +144,7 @@ def test_a_rule_that_cannot_be_read_is_reported_and_left_out(
 
 
 @pytest.mark.own_control_plane
-def test_what_changed_during_an_outage_is_seen_after_it(
+def test_changes_during_an_outage_are_seen_after_it(
     control_plane: ControlPlane, api: Api, following: RulesFollower
 ) -> None:
     api.create(detector())

@@ -118,7 +118,9 @@ def is_ended(task: Object) -> bool:
     return "endTime" in task["spec"]
 
 
-def test_a_demand_becomes_a_task_that_ends_with_it(api: Api, namespace: str, running: BackgroundReconciler) -> None:
+def test_a_demand_becomes_a_task_that_ends_with_the_demand(
+    api: Api, namespace: str, running: BackgroundReconciler
+) -> None:
     wanted = demand(namespace)
     running.update(by_name(wanted))
     [task] = tasks_are(api, {wanted.name})
@@ -142,7 +144,7 @@ def test_the_values_at_the_start_are_kept(api: Api, namespace: str, running: Bac
     assert running.restored() == [wanted]
 
 
-def test_changed_parameters_are_patched_and_removed_ones_go(
+def test_changed_parameters_are_patched_and_removed_ones_are_deleted(
     api: Api, namespace: str, running: BackgroundReconciler
 ) -> None:
     wanted = demand(namespace)
@@ -160,7 +162,7 @@ def test_changed_parameters_are_patched_and_removed_ones_go(
     running.counted(DeployCounts(created=1, patched=1))
 
 
-def test_what_cannot_be_changed_is_recreated_under_the_same_name(
+def test_a_task_with_changed_immutable_fields_is_recreated_under_the_same_name(
     api: Api, namespace: str, running: BackgroundReconciler
 ) -> None:
     wanted = demand(namespace)
@@ -176,7 +178,7 @@ def test_what_cannot_be_changed_is_recreated_under_the_same_name(
     assert after["metadata"]["uid"] != before["metadata"]["uid"]
 
 
-def test_a_live_task_deleted_by_hand_comes_back(api: Api, namespace: str, running: BackgroundReconciler) -> None:
+def test_a_manually_deleted_live_task_is_recreated(api: Api, namespace: str, running: BackgroundReconciler) -> None:
     wanted = demand(namespace)
     running.update(by_name(wanted))
     [before] = tasks_are(api, {wanted.name})
@@ -190,7 +192,7 @@ def test_a_live_task_deleted_by_hand_comes_back(api: Api, namespace: str, runnin
     wait_until(lambda: running.counts, lambda counts: counts.recreated == 1, what="counted as created again")
 
 
-def test_a_task_ended_by_hand_stays_ended(api: Api, namespace: str, running: BackgroundReconciler) -> None:
+def test_a_manually_ended_task_stays_ended(api: Api, namespace: str, running: BackgroundReconciler) -> None:
     wanted, other = demand(namespace), demand(namespace, "car3+car4")
     running.update(by_name(wanted))
     tasks_are(api, {wanted.name})
@@ -204,7 +206,7 @@ def test_a_task_ended_by_hand_stays_ended(api: Api, namespace: str, running: Bac
 
 
 @pytest.mark.own_control_plane
-def test_an_outage_delays_starts_and_ends_and_loses_none(
+def test_an_outage_delays_starts_and_ends_but_loses_none(
     control_plane: ControlPlane, api: Api, namespace: str, running: BackgroundReconciler
 ) -> None:
     stays, ends, starts, passes = (demand(namespace, subject) for subject in ("a+b", "c+d", "e+f", "g+h"))
@@ -224,7 +226,7 @@ def test_an_outage_delays_starts_and_ends_and_loses_none(
 
 
 @pytest.mark.own_control_plane
-def test_an_end_that_a_stopped_detector_could_not_report_is_reported_by_the_next(
+def test_an_end_that_a_stopped_detector_could_not_write_is_written_by_the_next(
     control_plane: ControlPlane, api: Api, namespace: str
 ) -> None:
     wanted = demand(namespace)
@@ -266,9 +268,7 @@ def test_a_detector_that_stops_leaves_its_live_tasks_alive_and_adopts_them(
         assert api.get("ApplicationTask", task["metadata"]["name"]) == task
 
 
-def test_others_tasks_are_neither_ended_nor_treated_as_own(
-    api: Api, namespace: str, running: BackgroundReconciler
-) -> None:
+def test_tasks_of_other_holders_are_left_alone(api: Api, namespace: str, running: BackgroundReconciler) -> None:
     wanted = demand(namespace)
     foreign = demand(namespace, "x+y", holder="intersection-b")
     usurped = task_manifest(to_task(wanted))
@@ -292,7 +292,7 @@ def test_others_tasks_are_neither_ended_nor_treated_as_own(
     assert [api.get("ApplicationTask", each["metadata"]["name"]) for each in before] == before
 
 
-def test_a_task_that_exists_is_distinguished_from_other_refusals(
+def test_an_existing_task_is_distinguished_from_other_rejections(
     namespace: str, running: BackgroundReconciler, api: Api
 ) -> None:
     wanted = demand(namespace)
@@ -302,7 +302,9 @@ def test_a_task_that_exists_is_distinguished_from_other_refusals(
         running._loop.call(running.store.create(to_task(wanted)))
 
 
-def test_what_is_forbidden_is_done_once_it_is_allowed(control_plane: ControlPlane, api: Api, namespace: str) -> None:
+def test_a_forbidden_write_is_retried_until_it_is_allowed(
+    control_plane: ControlPlane, api: Api, namespace: str
+) -> None:
     wanted = demand(namespace)
     role = {"apiGroup": "rbac.authorization.k8s.io", "kind": "Role", "name": "reads"}
     api.create(_role("reads", ["get", "list", "watch"]))
@@ -316,7 +318,7 @@ def test_what_is_forbidden_is_done_once_it_is_allowed(control_plane: ControlPlan
         tasks_are(api, {wanted.name})
 
 
-def test_a_burst_of_demands_is_served_each_once(api: Api, namespace: str, running: BackgroundReconciler) -> None:
+def test_each_demand_of_a_burst_is_served_once(api: Api, namespace: str, running: BackgroundReconciler) -> None:
     wanted = by_name(*(demand(namespace, f"car{number}+rsu") for number in range(300)))
     running.update(wanted)
     tasks_are(api, set(wanted))

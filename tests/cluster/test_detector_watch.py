@@ -57,7 +57,9 @@ def config_map(named: str, x: str, marked: str = "yes") -> Object:
     return {"apiVersion": "v1", "kind": "ConfigMap", "metadata": metadata, "data": {"x": x}}
 
 
-def test_creations_changes_and_deletions_come_without_another_list(api: Api, namespace: str, loop: Background) -> None:
+def test_creations_changes_and_deletions_arrive_without_another_list(
+    api: Api, namespace: str, loop: Background
+) -> None:
     api.create(config_map("a", "1"))
     api.create(config_map("other", "1", marked="no"))
     following = ReflectorReader(loop, namespace)
@@ -80,7 +82,7 @@ def test_all_is_listed_again_after_the_resync_period(api: Api, namespace: str, l
 
 
 @pytest.mark.own_control_plane
-def test_what_happens_around_an_outage_is_not_missed(
+def test_changes_around_an_outage_are_not_missed(
     control_plane: ControlPlane, api: Api, namespace: str, loop: Background
 ) -> None:
     api.create(config_map("a", "1"))
@@ -98,7 +100,7 @@ def test_what_happens_around_an_outage_is_not_missed(
 
 
 @pytest.mark.own_control_plane
-def test_history_that_the_server_no_longer_has_is_reported_as_such(
+def test_an_expired_resource_version_is_reported_as_such(
     control_plane: ControlPlane, api: Api, namespace: str, loop: Background
 ) -> None:
     old = api.create(config_map("a", "1"))["metadata"]["resourceVersion"]

@@ -74,7 +74,7 @@ def detector(**stream: str) -> Object:
 
 
 @pytest.mark.usefixtures("manager")
-def test_rules_detectors_and_templates_are_current_if_they_can_be_used_and_failed_if_not(
+def test_usable_rules_detectors_and_templates_are_current_and_unusable_ones_failed(
     api: Api, wait_judged: Judge
 ) -> None:
     api.create(rule("good"))
@@ -99,7 +99,7 @@ def test_rules_detectors_and_templates_are_current_if_they_can_be_used_and_faile
 
 
 @pytest.mark.usefixtures("manager")
-def test_a_task_is_as_its_application_is_now(api: Api, wait_judged: Judge) -> None:
+def test_a_tasks_verdict_follows_its_application(api: Api, wait_judged: Judge) -> None:
     api.create(template())
     api.create(task("north"))
     wait_judged("ApplicationTask", "north", "InProgress")
@@ -119,7 +119,7 @@ def test_a_task_is_as_its_application_is_now(api: Api, wait_judged: Judge) -> No
     assert condition(refused, "Ready")["reason"] == "InvalidParameters"
 
 
-def test_what_cannot_be_applied_is_not_ready_though_its_old_version_runs(
+def test_an_instance_that_cannot_be_applied_is_not_ready_though_its_old_version_runs(
     api: Api, manager: Process, kubelet: None, wait_judged: Judge
 ) -> None:
     api.create(template())
@@ -137,7 +137,7 @@ def test_what_cannot_be_applied_is_not_ready_though_its_old_version_runs(
     assert api.get("Deployment", NORTH)["status"]["availableReplicas"] == 1
 
 
-def test_a_task_whose_instance_is_going_reports_it(processes: Processes, namespace: str, api: Api) -> None:
+def test_a_task_whose_instance_is_being_deleted_reports_it(processes: Processes, namespace: str, api: Api) -> None:
     start_manager(processes, namespace)
     api.create(template())
     api.create(task("first", region="north"))

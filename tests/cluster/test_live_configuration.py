@@ -112,7 +112,7 @@ def requested(session: zenoh.Session, key: str) -> list[list[str]]:
     return [_sources_of(reply.ok) for reply in session.get(key) if reply.ok is not None]
 
 
-def test_a_change_touches_the_pods_and_not_their_template(api: Api, manager: Process) -> None:
+def test_a_configuration_change_annotates_the_pods_and_leaves_their_template_alone(api: Api, manager: Process) -> None:
     api.create(template())
     api.create(vehicle("car1"))
     pod = wait_for_pod(api)
@@ -129,7 +129,7 @@ def test_a_change_touches_the_pods_and_not_their_template(api: Api, manager: Pro
     wait_settled(api)
 
 
-def test_pods_of_others_are_left_alone(api: Api, manager: Process) -> None:
+def test_foreign_pods_with_the_same_labels_are_left_alone(api: Api, manager: Process) -> None:
     """A pod with the very labels of the instance's, which does not mount its configuration."""
     api.create(template())
     api.create(
@@ -155,7 +155,7 @@ def _was_announced(pod: Object) -> bool:
     return ANNOTATION in pod["metadata"].get("annotations", {})
 
 
-def test_zenoh_has_each_change_and_answers_who_comes_late(
+def test_zenoh_publishes_each_change_and_answers_late_joiners(
     api: Api, namespace: str, network: zenoh.Session, manager: Process
 ) -> None:
     key = f"wayside/instances/{namespace}/fusion/configuration"
@@ -174,7 +174,7 @@ def test_zenoh_has_each_change_and_answers_who_comes_late(
     assert requested(network, key) == []
 
 
-def test_a_killed_manager_comes_back_and_answers_again(
+def test_a_restarted_manager_answers_queries_again(
     api: Api, namespace: str, network: zenoh.Session, manager: Process
 ) -> None:
     key = f"wayside/instances/{namespace}/fusion/configuration"
@@ -190,7 +190,7 @@ def test_a_killed_manager_comes_back_and_answers_again(
     wait_until_announced(api, "car1", "car2")
 
 
-def test_zenoh_may_come_late_and_go(api: Api, namespace: str, endpoint: str, manager: Process) -> None:
+def test_the_zenoh_router_may_start_late_and_stop(api: Api, namespace: str, endpoint: str, manager: Process) -> None:
     key = f"wayside/instances/{namespace}/fusion/configuration"
     api.create(template())
     api.create(vehicle("car1"))

@@ -8,7 +8,7 @@ from tests.cluster.expected_objects import condition, deployment, start_manager,
 from tests.cluster.processes import Processes
 
 
-def test_an_account_that_is_not_listed_is_refused_in_a_kind_that_the_manager_does_not_know(
+def test_an_unlisted_account_is_rejected_in_a_kind_unknown_to_the_manager(
     api: Api, processes: Processes, namespace: str
 ) -> None:
     """ReplicaSets are not of the default kinds; what an administrator adds is looked at all the same."""

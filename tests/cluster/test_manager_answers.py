@@ -55,7 +55,7 @@ def wait_column(control_plane: ControlPlane, api: Api, what: str, name: str, **c
     )
 
 
-def test_columns_show_what_is_wanted_what_runs_and_what_is_missing(
+def test_columns_show_demanded_running_and_missing_applications(
     control_plane: ControlPlane, api: Api, manager: Process
 ) -> None:
     api.create(template(**RATED, linger="300s"))
@@ -107,7 +107,7 @@ def test_explain_goes_from_the_event_over_merged_values_to_the_pods(
     assert "task" not in as_json
 
 
-def test_what_cannot_be_explained_is_one_line_with_the_remedy(control_plane: ControlPlane, api: Api) -> None:
+def test_an_explain_error_is_one_line_with_the_remedy(control_plane: ControlPlane, api: Api) -> None:
     failed = explain(control_plane, api, "nothing")
     assert (failed.returncode, failed.stdout) == (2, "")
     assert "there is no ApplicationTask or ApplicationInstance 'nothing'" in failed.stderr
@@ -118,7 +118,7 @@ def test_what_cannot_be_explained_is_one_line_with_the_remedy(control_plane: Con
     assert "the manager has not processed its current generation" in reported
 
 
-def test_explain_knows_what_has_no_place_and_what_replaces_what(
+def test_explain_reports_instances_without_a_place_and_fallbacks(
     control_plane: ControlPlane, api: Api, processes: Processes, namespace: str
 ) -> None:
     start_manager(processes, namespace, "--max-instances", "2")

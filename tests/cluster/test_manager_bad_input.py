@@ -81,7 +81,7 @@ def changed(container: Object) -> Object:
     ids=["unknown template", "wrong type", "too large"],
 )
 @pytest.mark.usefixtures("unharmed")
-def test_a_task_that_cannot_be_served_reports_why(api: Api, spec: Object, reason: str, parts: list[str]) -> None:
+def test_a_task_that_cannot_be_served_reports_the_reason(api: Api, spec: Object, reason: str, parts: list[str]) -> None:
     api.create({**task("wrong"), "spec": spec})
     accepted = wait_for_false(api, "ApplicationTask", "wrong", "Accepted", parts)
     assert accepted["reason"] == reason
@@ -106,7 +106,7 @@ def test_a_task_that_cannot_be_served_reports_why(api: Api, spec: Object, reason
     ids=["unknown parameter", "forbidden kind"],
 )
 @pytest.mark.usefixtures("unharmed")
-def test_a_template_that_cannot_be_rendered_reports_why(api: Api, manifest: Object, parts: list[str]) -> None:
+def test_a_template_that_cannot_be_rendered_reports_the_reason(api: Api, manifest: Object, parts: list[str]) -> None:
     api.create(template("bad", manifests=[manifest]))
     api.create(task("north", of="bad"))
     wait_for_false(api, "ApplicationTemplate", "bad", "Accepted", parts)
@@ -129,14 +129,14 @@ def test_a_template_that_cannot_be_rendered_reports_why(api: Api, manifest: Obje
     ids=["another namespace", "a name for all", "wrong type", "unknown field", "refused by the API server"],
 )
 @pytest.mark.usefixtures("unharmed")
-def test_an_instance_that_cannot_be_applied_reports_why(api: Api, manifest: Object, parts: list[str]) -> None:
+def test_an_instance_that_cannot_be_applied_reports_the_reason(api: Api, manifest: Object, parts: list[str]) -> None:
     api.create(template("bad", manifests=[manifest]))
     api.create(task("north", of="bad"))
     wait_for_false(api, "ApplicationInstance", BAD, "Applied", parts)
     assert not api.find("ConfigMap", BAD, namespace="kube-system")
 
 
-def test_an_escaped_brace_reaches_the_shell_as_it_is(api: Api, manager: Process) -> None:
+def test_an_escaped_brace_reaches_the_shell_unchanged(api: Api, manager: Process) -> None:
     api.create(
         template("bad", manifests=[changed({"command": ["sh", "-c", 'cd "$${HOME}" && run ${parameters.region}']})])
     )
@@ -146,7 +146,7 @@ def test_an_escaped_brace_reaches_the_shell_as_it_is(api: Api, manager: Process)
 
 
 @pytest.mark.usefixtures("unharmed")
-def test_a_template_that_makes_no_sense_keeps_what_runs_until_it_does(api: Api) -> None:
+def test_an_invalid_template_keeps_running_applications_until_it_is_valid(api: Api) -> None:
     api.create(template("bad"))
     api.create(task("north", of="bad"))
     first = api.wait_for("Deployment", BAD, lambda _: True, what="the Deployment exists")["metadata"]
@@ -170,7 +170,7 @@ def test_a_template_that_makes_no_sense_keeps_what_runs_until_it_does(api: Api) 
     assert api.get("Deployment", BAD)["metadata"]["uid"] == first["uid"]
 
 
-def test_a_wrong_object_never_reaches_the_manager(api: Api) -> None:
+def test_an_invalid_object_never_reaches_the_manager(api: Api) -> None:
     wrong: dict[str, Any] = template("bad", manifests=[])
     with pytest.raises(ApiError, match=r"spec\.manifests"):
         api.create(wrong)

@@ -32,7 +32,7 @@ def wait_condition(api: Api, type_: str, status: str, kind: str = "ApplicationIn
     )
 
 
-def test_a_paused_instance_is_left_as_it_is_until_the_annotation_is_gone(api: Api, manager: Process) -> None:
+def test_a_paused_instance_is_not_changed_until_the_annotation_is_removed(api: Api, manager: Process) -> None:
     api.create(template(**SCALED))
     api.create(task("one", region="north", zones=["a"]))
     api.wait_for("ConfigMap", NORTH, lambda raw: raw["data"]["z"] == '["a"]!', what="it runs")
@@ -69,7 +69,7 @@ def test_a_paused_instance_is_left_as_it_is_until_the_annotation_is_gone(api: Ap
     wait_settled(api)
 
 
-def test_a_held_instance_runs_on_though_nobody_demands_it(api: Api, manager: Process) -> None:
+def test_a_held_instance_keeps_running_without_demand(api: Api, manager: Process) -> None:
     api.create(template(linger="1s"))
     api.create(task("north"))
     api.wait_for("Deployment", NORTH, lambda _: True, what="it runs")

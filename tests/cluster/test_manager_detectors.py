@@ -100,7 +100,7 @@ def copied(labels: dict[str, str], name: str, kind: str = "Deployment") -> Objec
     return {"apiVersion": "apps/v1", "kind": kind, "metadata": {"name": name, "labels": labels}, "spec": spec}
 
 
-def test_an_object_of_somebody_else_with_copied_labels_neither_disturbs_nor_is_touched(
+def test_a_foreign_object_with_copied_labels_is_ignored_and_left_alone(
     api: Api, processes: Processes, namespace: str
 ) -> None:
     manager = start_manager(processes, namespace, *RUNS)
@@ -138,7 +138,9 @@ def test_an_object_of_somebody_else_with_copied_labels_neither_disturbs_nor_is_t
         assert "deletionTimestamp" not in found["metadata"]
 
 
-def test_its_objects_come_change_and_go_with_it(api: Api, processes: Processes, namespace: str, kubelet: None) -> None:
+def test_a_detectors_objects_are_created_changed_and_deleted_with_it(
+    api: Api, processes: Processes, namespace: str, kubelet: None
+) -> None:
     start_manager(processes, namespace, *RUNS)
     api.create(detector(mode="Standalone"))
     is_made(api)
@@ -175,7 +177,7 @@ def test_its_objects_come_change_and_go_with_it(api: Api, processes: Processes, 
         api.wait_gone(kind, NAME)
 
 
-def test_the_status_reports_why_it_does_not_run(api: Api, processes: Processes, namespace: str) -> None:
+def test_the_status_reports_why_the_detector_does_not_run(api: Api, processes: Processes, namespace: str) -> None:
     other = {"apiVersion": "v1", "kind": "ServiceAccount", "metadata": {"name": NAME}}
     foreign = api.create(other)
     manager = start_manager(processes, namespace)
@@ -216,7 +218,7 @@ def test_the_pod_passes_the_restricted_standard(
     api.wait_list("Pod", lambda found: len(found) == 1, what="its pod is made")
 
 
-def test_the_manager_runs_it_with_the_rights_that_are_printed(
+def test_the_printed_rights_suffice_to_run_a_detector(
     api: Api, processes: Processes, namespace: str, control_plane: ControlPlane, kubelet: None
 ) -> None:
     api.create({"apiVersion": "v1", "kind": "ServiceAccount", "metadata": {"name": "manager"}})
@@ -252,7 +254,7 @@ def live(found: list[Object]) -> list[Object]:
     return [each for each in found if "endTime" not in each["spec"]]
 
 
-def test_a_detector_needs_all_the_rights_that_its_role_gives_and_no_more(
+def test_a_detector_needs_exactly_the_rights_of_its_role(
     api: Api, processes: Processes, namespace: str, control_plane: ControlPlane, endpoint: str
 ) -> None:
     roles = detector_roles(namespace, HOLDER)
@@ -283,7 +285,7 @@ def test_a_detector_needs_all_the_rights_that_its_role_gives_and_no_more(
     assert "orbidden" not in running.output()
 
 
-def test_each_verb_of_its_own_role_is_granted_and_for_one_fewer_it_is_refused(
+def test_each_verb_of_the_detectors_role_is_granted_and_a_removed_one_is_denied(
     api: Api, namespace: str, control_plane: ControlPlane
 ) -> None:
     roles = detector_roles(namespace, HOLDER)

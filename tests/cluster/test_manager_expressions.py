@@ -56,7 +56,9 @@ def applied(api: Api, name: str, reason: str) -> Object:
     )
 
 
-def test_what_runs_stays_as_it_is_and_the_template_reports_why(api: Api, namespace: str, processes: Processes) -> None:
+def test_after_a_timeout_running_objects_stay_and_the_template_reports_the_reason(
+    api: Api, namespace: str, processes: Processes
+) -> None:
     start_manager(processes, namespace, *LIMIT)
     north = instance_name("bomb", "north")
     api.create(bomb())
@@ -97,7 +99,7 @@ def test_the_tasks_of_another_namespace_are_served_meanwhile(
     wait_settled(other)
 
 
-def test_a_key_that_takes_too_long_refuses_its_task_alone(api: Api, namespace: str, processes: Processes) -> None:
+def test_a_key_that_times_out_rejects_only_its_task(api: Api, namespace: str, processes: Processes) -> None:
     start_manager(processes, namespace, *LIMIT)
     api.create(bomb(key=f"${{parameters.region}}-${{{BOMB}}}"))
     api.create(task("bad", of="bomb", region="north", **LARGE))
@@ -113,7 +115,7 @@ def test_a_key_that_takes_too_long_refuses_its_task_alone(api: Api, namespace: s
     api.wait_for("ConfigMap", south, lambda _: True, what="the other one is served")
 
 
-def test_a_restarted_manager_releases_nothing_before_it_knows_who_demands_it(
+def test_a_restarted_manager_releases_nothing_before_all_keys_are_computed(
     api: Api, namespace: str, processes: Processes
 ) -> None:
     manager = start_manager(processes, namespace, *LIMIT)
@@ -133,7 +135,7 @@ def test_a_restarted_manager_releases_nothing_before_it_knows_who_demands_it(
     assert {name: api.get("Deployment", name)["metadata"]["uid"] for name in names} == before
 
 
-def test_a_manager_that_is_ended_amid_a_bomb_ends_at_once_and_leaves_no_process(
+def test_a_manager_stopped_during_a_long_evaluation_ends_at_once_and_leaves_no_process(
     api: Api, namespace: str, processes: Processes
 ) -> None:
     manager = start_manager(processes, namespace, "--expression-cpu-time", "1h")
@@ -152,7 +154,7 @@ def children(pid: int) -> list[int]:
 
 
 @pytest.mark.parametrize("dry_run", [False, True])
-def test_admission_refuses_a_template_that_takes_too_long_with_its_own_defaults(
+def test_admission_rejects_a_template_that_times_out_with_its_own_defaults(
     api: Api, processes: Processes, tmp_path: Path, dry_run: bool
 ) -> None:
     webhook = Webhook(processes, api, tmp_path / "certificates", options=LIMIT)

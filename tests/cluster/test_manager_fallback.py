@@ -37,7 +37,7 @@ def become_ready(api: Api, instance: str) -> None:
     mark_pods_ready(api, f"app={instance}")
 
 
-def test_what_is_not_ready_in_time_reports_it(api: Api, processes: Processes, namespace: str) -> None:
+def test_an_instance_that_is_not_ready_in_time_reports_it(api: Api, processes: Processes, namespace: str) -> None:
     start_manager(processes, namespace)
     api.create(template(lifecycle=IN_TIME))
     api.create(task("north"))
@@ -64,7 +64,7 @@ def test_what_is_not_ready_in_time_reports_it(api: Api, processes: Processes, na
     assert wait_condition(api, FULL, "TimedOut", "False")["reason"] == "InTime"
 
 
-def test_the_fallback_serves_until_the_first_one_is_ready_also_after_restarts(
+def test_the_fallback_serves_until_the_primary_is_ready_across_restarts(
     api: Api, processes: Processes, namespace: str
 ) -> None:
     manager = start_manager(processes, namespace)
@@ -101,7 +101,7 @@ def test_the_fallback_serves_until_the_first_one_is_ready_also_after_restarts(
     api.wait_gone("ApplicationInstance", FULL)
 
 
-def test_a_fallback_that_cannot_serve_is_reported_and_used_once_it_can(
+def test_an_unusable_fallback_is_reported_and_used_once_it_is_valid(
     api: Api, processes: Processes, namespace: str
 ) -> None:
     start_manager(processes, namespace)

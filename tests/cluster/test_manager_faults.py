@@ -71,7 +71,7 @@ def there(api: Api, name: str) -> Object:
     return api.wait_for("Deployment", name, lambda _: True, what=f"Deployment {name} exists")
 
 
-def test_a_manager_killed_amid_a_hundred_tasks_finishes_when_it_is_back(api: Api, manager: Process) -> None:
+def test_a_manager_killed_while_serving_a_hundred_tasks_finishes_after_its_restart(api: Api, manager: Process) -> None:
     api.create(template())
     regions = [f"r{index}" for index in range(50)]
     tasks = [task(f"{region}-{twin}", region=region) for region in regions for twin in ("a", "b")]
@@ -127,7 +127,7 @@ def test_an_outage_of_the_api_server_releases_nothing(api: Api, manager: Process
     assert manager.alive
 
 
-def test_a_deployment_deleted_by_hand_comes_back_and_a_field_changed_by_hand_is_set_right(
+def test_a_manually_deleted_deployment_is_recreated_and_a_manually_changed_field_is_reset(
     api: Api, manager: Process
 ) -> None:
     api.create(template())
@@ -142,7 +142,7 @@ def test_a_deployment_deleted_by_hand_comes_back_and_a_field_changed_by_hand_is_
     api.wait_for("Deployment", NORTH, lambda raw: raw["spec"]["replicas"] == 1, what="it is set right")
 
 
-def test_an_object_of_somebody_else_is_left_alone(api: Api, manager: Process) -> None:
+def test_a_foreign_object_is_left_alone(api: Api, manager: Process) -> None:
     api.create({**deployment("theirs:1", NORTH), "metadata": {"name": NORTH, "labels": {"theirs": "yes"}}})
     before = api.get("Deployment", NORTH)
     api.create(template())
@@ -171,7 +171,7 @@ def test_an_object_of_somebody_else_is_left_alone(api: Api, manager: Process) ->
     wait_settled(api)
 
 
-def test_a_change_of_the_template_reaches_what_runs_and_nothing_else(api: Api, manager: Process) -> None:
+def test_a_template_change_is_applied_to_its_instances_only(api: Api, manager: Process) -> None:
     api.create(template())
     api.create(template("other"))
     api.create(task("north"))
@@ -203,7 +203,7 @@ def test_a_change_of_the_template_reaches_what_runs_and_nothing_else(api: Api, m
     assert api.get("Deployment", NORTH)["metadata"]["generation"] == generation
 
 
-def test_a_template_that_breaks_leaves_what_runs_as_it_was(api: Api, manager: Process) -> None:
+def test_a_template_that_becomes_invalid_leaves_running_objects_unchanged(api: Api, manager: Process) -> None:
     api.create(template(manifests=[deployment(), config({"a": "b"})]))
     api.create(task("north"))
     there(api, NORTH)
@@ -225,7 +225,7 @@ def test_a_template_that_breaks_leaves_what_runs_as_it_was(api: Api, manager: Pr
     wait_settled(api)
 
 
-def test_without_its_template_an_instance_lingers_and_goes(api: Api, manager: Process) -> None:
+def test_an_instance_lingers_and_is_released_when_its_template_is_deleted(api: Api, manager: Process) -> None:
     api.create(template(linger="8s"))
     api.create(task("north"))
     there(api, NORTH)
@@ -272,7 +272,7 @@ def test_a_linger_continues_through_a_restart(api: Api, manager: Process) -> Non
     assert not api.list("ApplicationInstance")
 
 
-def test_an_instance_deleted_by_hand_comes_back_after_its_objects_are_gone(api: Api, manager: Process) -> None:
+def test_a_manually_deleted_instance_is_recreated_after_its_objects_are_gone(api: Api, manager: Process) -> None:
     api.create(template())
     api.create(task("north"))
     uid = there(api, NORTH)["metadata"]["uid"]
@@ -308,7 +308,7 @@ def resynced(port: int) -> float:
     return 0.0
 
 
-def test_a_namespace_that_goes_is_left_quietly(api: Api, manager: Process, namespace: str) -> None:
+def test_a_namespace_being_deleted_is_left_without_errors(api: Api, manager: Process, namespace: str) -> None:
     api.create(template())
     for index in range(5):
         api.create(task(f"r{index}"))
@@ -322,7 +322,7 @@ def test_a_namespace_that_goes_is_left_quietly(api: Api, manager: Process, names
 
 
 @pytest.mark.own_control_plane
-def test_a_cluster_that_drops_selectable_fields_is_refused_at_the_start(
+def test_a_cluster_that_drops_selectable_fields_is_rejected_at_the_start(
     api: Api, processes: Processes, namespace: str
 ) -> None:
     """As Kubernetes 1.30 drops them; an instance would never be released there."""

@@ -56,7 +56,7 @@ def reason(raw: Any) -> Any:
     return condition(raw, "Accepted").get("reason")
 
 
-def test_a_lost_holder_releases_and_a_returning_one_counts_again(
+def test_the_demand_of_a_lost_holder_is_released_and_counts_again_when_it_returns(
     api: Api, manager: Process, renew: Callable[..., None]
 ) -> None:
     api.create(lossy())

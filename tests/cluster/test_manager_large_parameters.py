@@ -20,7 +20,7 @@ def too_large(raw: Object) -> bool:
     return applied.get("status") == "False" and "more than the 65536 allowed" in applied["message"]
 
 
-def test_a_union_that_is_too_large_stops_its_own_instance_and_no_other(api: Api, manager: Process) -> None:
+def test_a_union_that_is_too_large_stops_updates_of_its_own_instance_only(api: Api, manager: Process) -> None:
     parameters = {"region": {"type": "string"}, "sources": {"type": "array", "items": "string", "merge": "Union"}}
     manifests = [deployment(), config({"sources": "${parameters.sources}!"})]
     api.create(template(parameters=parameters, manifests=manifests))

@@ -63,9 +63,7 @@ def never_more_than(api: Api, count: int) -> Iterator[None]:
     assert 0 < most <= count
 
 
-def test_a_higher_priority_gets_the_place_of_a_lower_one_and_gives_it_back(
-    api: Api, processes: Processes, namespace: str
-) -> None:
+def test_a_higher_priority_preempts_a_lower_one_until_it_ends(api: Api, processes: Processes, namespace: str) -> None:
     manager = start_manager(processes, namespace)
     api.create(limited(1))
     api.create(wanting("low"))
@@ -93,7 +91,7 @@ def test_a_higher_priority_gets_the_place_of_a_lower_one_and_gives_it_back(
     assert condition(api.get("ApplicationTask", "other"), "Accepted")["reason"] == "LimitReached"
 
 
-def test_the_namespace_has_a_limit_over_all_templates(api: Api, processes: Processes, namespace: str) -> None:
+def test_the_namespace_limit_covers_all_templates(api: Api, processes: Processes, namespace: str) -> None:
     start_manager(processes, namespace, "--max-instances", "2")
     api.create(template())
     api.create(template("map"))
@@ -155,7 +153,7 @@ def beyond_the_quota(api: Api, name: str) -> Object:
     )
 
 
-def test_an_object_beyond_the_quota_is_reported_and_made_once_there_is_room(
+def test_an_object_beyond_the_quota_is_reported_and_created_once_there_is_room(
     api: Api, processes: Processes, namespace: str
 ) -> None:
     api.create(quota({"count/deployments.apps": "1"}))
@@ -220,7 +218,7 @@ def test_pods_beyond_the_quota_are_reported_to_the_tasks(api: Api, processes: Pr
     )
 
 
-def test_what_a_limit_range_refuses_is_reported_as_well(api: Api, processes: Processes, namespace: str) -> None:
+def test_a_rejection_by_a_limit_range_is_reported_too(api: Api, processes: Processes, namespace: str) -> None:
     most = {"type": "PersistentVolumeClaim", "max": {"storage": "1Gi"}}
     spec = {"limits": [most]}
     api.create({"apiVersion": "v1", "kind": "LimitRange", "metadata": {"name": "small"}, "spec": spec})
@@ -244,7 +242,7 @@ def test_what_a_limit_range_refuses_is_reported_as_well(api: Api, processes: Pro
     api.wait_for("PersistentVolumeClaim", LOW, lambda raw: True, what="the claim is made")
 
 
-def test_a_limit_that_is_lowered_and_raised_stops_and_starts_the_last(
+def test_lowering_and_raising_a_limit_stops_and_starts_the_last_instance(
     api: Api, processes: Processes, namespace: str
 ) -> None:
     start_manager(processes, namespace)
@@ -262,7 +260,7 @@ def test_a_limit_that_is_lowered_and_raised_stops_and_starts_the_last(
 
 
 @pytest.mark.parametrize("kind", ["StatefulSet", "Job"])
-def test_pods_whose_refusal_only_events_report_are_reported_and_made_once_there_is_room(
+def test_pod_rejections_known_only_from_events_are_reported_and_resolved_once_there_is_room(
     kind: str, api: Api, processes: Processes, namespace: str
 ) -> None:
     api.create(quota({"pods": "0"}))

@@ -89,7 +89,7 @@ def lingering(api: Api) -> list[Object]:
     return [made, api.patch("ApplicationInstance", NORTH, {"status": LINGERING}, subresource="status")]
 
 
-def test_a_task_that_the_watch_has_missed_keeps_its_instance(api: Api, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_task_missed_by_the_watch_keeps_its_instance(api: Api, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("KUBECONFIG", str(api.kubeconfig))
     known = lingering(api)
     api.create(task("north"))
@@ -98,13 +98,13 @@ def test_a_task_that_the_watch_has_missed_keeps_its_instance(api: Api, monkeypat
     assert api.get("Deployment", NORTH)["spec"]["replicas"] == 1
 
 
-def test_an_instance_that_nobody_demands_goes(api: Api, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_instance_without_demand_is_released(api: Api, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("KUBECONFIG", str(api.kubeconfig))
     reconcile(api, lingering(api))
     api.wait_gone("ApplicationInstance", NORTH)
 
 
-def test_what_has_the_instance_as_controller_is_pruned_though_nobody_wrote_it_down(
+def test_an_object_controlled_by_the_instance_is_pruned_though_its_status_does_not_list_it(
     api: Api, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("KUBECONFIG", str(api.kubeconfig))

@@ -36,7 +36,7 @@ def with_spec(made: Object, **fields: Any) -> Object:
     return {**made, "spec": {**made["spec"], **fields}}
 
 
-def test_the_api_server_refuses_values_that_are_too_large_and_names_them(api: Api) -> None:
+def test_the_api_server_rejects_values_that_are_too_large_by_field(api: Api) -> None:
     for field, made in (
         ("spec.event.values.x", with_spec(task("text"), event=event({"x": "x" * 900_000}))),
         ("spec.event.values.x", with_spec(task("list"), event=event({"x": list(range(100_000))}))),
@@ -59,7 +59,7 @@ def test_tasks_of_a_megabyte_take_little_memory(api: Api, manager: Process) -> N
     assert manager.resident_bytes() - before < GROWTH
 
 
-def test_parameters_and_templates_that_are_too_large_are_refused_with_their_size(api: Api, manager: Process) -> None:
+def test_parameters_and_templates_that_are_too_large_are_rejected_with_their_size(api: Api, manager: Process) -> None:
     api.create(template())
     large = template("large", configuration={f"data{index}.txt": "x" * 60_000 for index in range(5)})
     api.create(large)
@@ -77,7 +77,7 @@ def test_parameters_and_templates_that_are_too_large_are_refused_with_their_size
     api.wait_for("Deployment", instance_name("app", "north"), lambda _: True, what="others are served")
 
 
-def test_near_its_limit_it_serves_those_that_it_served_and_reports_it_to_the_others(
+def test_near_its_memory_limit_the_manager_serves_known_tasks_and_lets_new_ones_wait(
     api: Api, processes: Processes, namespace: str
 ) -> None:
     roomy = start_manager(processes, namespace)

@@ -35,7 +35,7 @@ def scraped(port: int) -> dict[tuple[str, ...], float]:
     }
 
 
-def test_what_becomes_of_tasks_is_counted_and_timed_from_their_events(
+def test_outcomes_of_tasks_are_counted_and_timed_from_their_events(
     processes: Processes, namespace: str, api: Api
 ) -> None:
     port = free_port()
@@ -86,7 +86,7 @@ def test_while_the_api_server_is_away_the_manager_is_healthy_but_not_ready(
     assert scraped(port)["api_errors_total", "none"] > 0
 
 
-def test_a_port_that_is_taken_is_one_line_with_the_option(processes: Processes, namespace: str) -> None:
+def test_a_port_in_use_is_reported_in_one_line_with_the_option(processes: Processes, namespace: str) -> None:
     port = free_port()
     start_manager(processes, namespace, "--metrics-port", str(port))
     second = processes.start("application-manager", "run", "--namespace", namespace, "--metrics-port", str(port))

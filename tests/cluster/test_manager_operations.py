@@ -78,7 +78,7 @@ def scale(api: Api, name: str, replicas: int) -> None:
     api.patch("Deployment", name, {"spec": {"replicas": replicas}}, subresource="scale")
 
 
-def test_a_reconfiguration_waits_lies_over_the_values_and_falls_back(api: Api, manager: Process) -> None:
+def test_a_reconfiguration_waits_overrides_the_values_and_is_reverted(api: Api, manager: Process) -> None:
     api.create(rated())
     api.create(acting("Reconfigure", "slow", region="north", rate=2))
     waiting = wait_phase(api, "slow", "Waiting")
@@ -99,7 +99,7 @@ def test_a_reconfiguration_waits_lies_over_the_values_and_falls_back(api: Api, m
     assert api.get("Deployment", NORTH)["metadata"]["generation"] == before["generation"]  # no rollout by all this
 
 
-def test_one_without_a_key_reconfigures_all_also_those_that_come(api: Api, manager: Process) -> None:
+def test_a_reconfiguration_without_a_key_covers_existing_and_new_instances(api: Api, manager: Process) -> None:
     api.create(rated())
     api.create(task("north"))
     api.create(acting("Reconfigure", "slow", rate=2))
@@ -121,7 +121,7 @@ def test_one_without_a_key_reconfigures_all_also_those_that_come(api: Api, manag
     wait_settled(api)
 
 
-def test_a_suspended_instance_is_at_zero_and_comes_back_with_the_replicas_it_had(api: Api, manager: Process) -> None:
+def test_a_suspended_instance_has_zero_replicas_and_resumes_with_its_former_number(api: Api, manager: Process) -> None:
     api.create(freely_scaled())
     api.create(task("north"))
     wait_replicas(api, NORTH, 1)
@@ -150,7 +150,9 @@ def test_a_suspended_instance_is_at_zero_and_comes_back_with_the_replicas_it_had
     wait_settled(api)
 
 
-def test_a_suspension_that_is_outbid_reports_it_and_wins_when_the_higher_ends(api: Api, manager: Process) -> None:
+def test_an_outranked_suspension_reports_it_and_applies_when_the_higher_priority_ends(
+    api: Api, manager: Process
+) -> None:
     api.create(template())
     first = task("important", region="north")
     first["spec"]["priority"] = 5
@@ -165,7 +167,7 @@ def test_a_suspension_that_is_outbid_reports_it_and_wins_when_the_higher_ends(ap
     wait_settled(api)
 
 
-def test_an_instance_that_comes_to_be_while_it_is_suspended_never_has_a_pod(api: Api, manager: Process) -> None:
+def test_an_instance_created_while_suspended_never_has_a_pod(api: Api, manager: Process) -> None:
     api.create(template())
     api.create(acting("Suspend", "night"))
     wait_phase(api, "night", "Waiting")
@@ -210,7 +212,7 @@ def test_a_manager_killed_while_it_suspends_or_resumes_loses_no_replicas(
     wait_settled(api)
 
 
-def test_what_an_autoscaler_owns_is_paused_and_continues_where_it_was(api: Api, manager: Process) -> None:
+def test_an_autoscaled_workload_is_paused_and_resumes_with_its_replicas(api: Api, manager: Process) -> None:
     autoscaler = {
         "apiVersion": "autoscaling/v2",
         "kind": "HorizontalPodAutoscaler",
@@ -248,7 +250,7 @@ def test_what_an_autoscaler_owns_is_paused_and_continues_where_it_was(api: Api, 
     wait_settled(api)
 
 
-def test_a_baseline_runs_without_tasks_and_comes_back(api: Api, manager: Process) -> None:
+def test_a_baseline_runs_without_tasks_and_is_recreated(api: Api, manager: Process) -> None:
     always = template(parameters={"rate": PARAMETERS["rate"]}, manifests=[config({"rate": "${parameters.rate} Hz"})])
     del always["spec"]["key"]
     always["spec"]["baseline"] = {"parameters": {"rate": 1}}

@@ -21,7 +21,7 @@ def statuses(proxy: Proxy) -> int:
     return sum("/applicationtemplates/app/status" in each.path for each in proxy.seen)
 
 
-def test_the_younger_one_waits_until_the_older_one_is_gone(
+def test_the_younger_release_waits_until_the_older_one_stops(
     api: Api, control_plane: ControlPlane, processes: Processes, namespace: str
 ) -> None:
     with (

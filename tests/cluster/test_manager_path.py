@@ -54,7 +54,7 @@ def test_a_task_becomes_a_deployment_that_is_ready_when_its_pods_are(api: Api, m
     wait_settled(api)
 
 
-def test_when_the_demand_ends_the_instance_lingers_and_goes_with_all_that_is_its(api: Api, manager: Process) -> None:
+def test_after_its_demand_an_instance_lingers_and_is_deleted_with_its_objects(api: Api, manager: Process) -> None:
     api.create(template(linger="8s"))
     api.create(task("north"))
     api.wait_for("Deployment", NORTH, lambda _: True, what="the Deployment exists")
@@ -94,7 +94,7 @@ def test_a_new_demand_within_the_linger_keeps_the_instance_untouched(api: Api, m
     assert (after["uid"], after["generation"]) == (before["uid"], before["generation"])
 
 
-def test_the_last_value_can_go_while_a_demand_without_values_stays(api: Api, manager: Process) -> None:
+def test_the_last_parameter_value_is_removed_while_a_demand_without_values_remains(api: Api, manager: Process) -> None:
     optional = {"parameters": {"sources": {"type": "array", "items": "string", "merge": "Union"}}}
     name = instance_name("app", None)
     given = {"sources": ["car1"]}
@@ -149,7 +149,7 @@ def test_two_pairs_at_one_place_share_an_instance_with_the_union_of_their_source
     assert api.get("Deployment", NORTH)["metadata"]["generation"] == before["generation"]
 
 
-def test_a_persons_instance_is_made_but_never_released(api: Api, manager: Process) -> None:
+def test_a_manually_created_instance_is_applied_but_never_released(api: Api, manager: Process) -> None:
     api.create(template())
     api.create(
         {

@@ -87,7 +87,7 @@ def wait_for_message(api: Api, name: str, *parts: str) -> Object:
 
 
 @pytest.mark.usefixtures("scheduler")
-def test_the_node_that_a_task_names_gets_the_application_and_one_that_is_not_there_is_reported(
+def test_a_task_places_its_application_on_the_named_node_and_a_missing_node_is_reported(
     api: Api, processes: Processes, namespace: str, nodes: list[str]
 ) -> None:
     start_manager(processes, namespace)
@@ -131,9 +131,7 @@ def test_affinity_and_tolerations_come_from_parameters_too(
         api.delete("Node", f"rsu-3-{namespace}"[:63])
 
 
-def test_a_node_name_that_is_not_there_is_reported_though_no_scheduler_looks(
-    api: Api, processes: Processes, namespace: str
-) -> None:
+def test_a_missing_node_name_is_reported_without_a_scheduler(api: Api, processes: Processes, namespace: str) -> None:
     start_manager(processes, namespace)
     api.create(placed(nodeName="${parameters.node}"))
     api.create(task("north", node="rsu-9"))

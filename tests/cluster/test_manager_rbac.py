@@ -300,9 +300,7 @@ def what_it_cannot_do(here: Api, elsewhere: Api, role: Object) -> None:
             elsewhere.patch(kind, "any", {"metadata": {"labels": {"a": "b"}}})
 
 
-def test_each_verb_that_lacks_is_noticed(
-    api: Api, namespace: str, account: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_each_missing_verb_is_noticed(api: Api, namespace: str, account: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("KUBECONFIG", str(account))
     needed = rights(PLURALS)
     whole = roles(PLURALS, [namespace], (namespace, "application-manager"), (namespace, "manager"))
@@ -324,7 +322,7 @@ def test_each_verb_that_lacks_is_noticed(
     each_verb_is_missed(api, whole, lacks)
 
 
-def test_what_nothing_works_without_ends_the_start_with_one_line(
+def test_a_missing_essential_right_ends_the_start_with_one_line(
     api: Api, processes: Processes, namespace: str, account: Path
 ) -> None:
     whole = printed("--namespace", namespace, "--account", f"{namespace}/manager", *ALLOWED)
@@ -340,7 +338,7 @@ def test_what_nothing_works_without_ends_the_start_with_one_line(
     assert "apply the output of `application-manager rbac`" in manager.output()
 
 
-def test_what_only_some_need_is_reported_at_the_start_and_where_it_shows(
+def test_a_missing_optional_right_is_reported_at_the_start_and_where_it_is_needed(
     api: Api, processes: Processes, namespace: str, account: Path
 ) -> None:
     whole = printed("--namespace", namespace, "--account", f"{namespace}/manager", *ALLOWED)

@@ -44,7 +44,7 @@ def wait_for_ready(api: Api, kind: str, name: str, *, status: str = "False", rea
     api.wait_for(kind, name, holds, what=f"Ready={status} of {kind} {name}, reason {reason}, contains {text!r}")
 
 
-def test_why_its_pods_do_not_run_is_reported_by_task_and_instance_until_they_do(api: Api, manager: Process) -> None:
+def test_task_and_instance_report_why_pods_do_not_run_until_they_do(api: Api, manager: Process) -> None:
     api.create(template(image="registry.example/app:9"))
     api.create(task("north"))
     pod = its_pod(api)

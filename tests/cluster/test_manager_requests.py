@@ -64,7 +64,7 @@ def test_a_task_with_an_instance_of_its_own_takes_two_applies_and_four_other_req
         assert len(others) <= BESIDE * MANY, "\n".join(f"{each.method} {each.path}" for each in others)
 
 
-def test_what_is_repeated_is_one_event_with_a_series(api: Api, processes: Processes, namespace: str) -> None:
+def test_repeated_events_are_one_event_with_a_series(api: Api, processes: Processes, namespace: str) -> None:
     start_manager(processes, namespace)
     api.create(template())
     api.create(task("north"))

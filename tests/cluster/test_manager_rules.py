@@ -14,7 +14,7 @@ def judged(raw: Object) -> str:
     return str(condition(raw, "Accepted").get("reason"))
 
 
-def test_a_rule_follows_its_detectors_and_what_is_wrong_is_reported(
+def test_a_rules_status_follows_its_detectors_and_reports_errors(
     api: Api, processes: Processes, namespace: str
 ) -> None:
     start_manager(processes, namespace)

@@ -73,9 +73,7 @@ def test_tasks_beyond_the_budget_of_their_namespace_wait_until_older_ones_end(
     _wait_accepted(api, "c", "Accepted")
 
 
-def test_a_holder_gets_what_the_administrator_allows_it_and_people_are_not_bound(
-    api: Api, namespace: str, processes: Processes
-) -> None:
+def test_a_holder_is_limited_to_its_budget_and_people_are_not(api: Api, namespace: str, processes: Processes) -> None:
     start_manager(processes, namespace, "--holder-policy", LIMITED)
     api.create(template())
     urgent, stopping = task("urgent", holder="det"), task("stopping", holder="det", region="first")

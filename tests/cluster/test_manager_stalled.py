@@ -46,7 +46,9 @@ def test_a_manager_whose_event_loop_hangs_ends_and_another_takes_over(
     wait_settled(api)
 
 
-def test_one_that_is_stopped_and_continues_is_not_ended(api: Api, processes: Processes, namespace: str) -> None:
+def test_a_manager_that_was_suspended_and_continues_is_not_ended(
+    api: Api, processes: Processes, namespace: str
+) -> None:
     manager = start_manager(processes, namespace, "--stalled-after", "5s")
     manager.wait_for_output("active: holds the Lease")
     other = start_manager(processes, namespace)

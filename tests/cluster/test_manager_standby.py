@@ -121,7 +121,7 @@ def test_the_standby_continues_the_work_of_a_killed_manager(api: Api, pair: Pair
     interrupted(api, pair, lambda pair: pair.active.kill9())
 
 
-def test_one_that_stood_still_writes_nothing_when_it_continues(api: Api, pair: Pair) -> None:
+def test_a_suspended_manager_writes_nothing_when_it_continues(api: Api, pair: Pair) -> None:
     interrupted(api, pair, stopped)
     for name in (*REGIONS[1:], "late"):
         end(api, name)
@@ -145,7 +145,7 @@ def test_one_that_stood_still_writes_nothing_when_it_continues(api: Api, pair: P
     wait_settled(api)
 
 
-def test_one_that_was_cut_off_comes_back_as_a_standby(api: Api, pair: Pair) -> None:
+def test_a_manager_that_was_cut_off_returns_as_a_standby(api: Api, pair: Pair) -> None:
     interrupted(api, pair, cut_off)
     pair.active.wait_for_output("no longer active")
     pair.old.cut = False
@@ -155,7 +155,7 @@ def test_one_that_was_cut_off_comes_back_as_a_standby(api: Api, pair: Pair) -> N
     pair.never_both()
 
 
-def test_one_that_is_cut_off_ends_when_it_is_stopped(api: Api, pair: Pair) -> None:
+def test_a_manager_that_is_cut_off_ends_on_sigterm(api: Api, pair: Pair) -> None:
     demanded(api)
     pair.old.cut = True
     assert pair.active.terminate() == 0
@@ -164,7 +164,7 @@ def test_one_that_is_cut_off_ends_when_it_is_stopped(api: Api, pair: Pair) -> No
     pair.never_both()
 
 
-def test_who_is_active_shows(api: Api, pair: Pair) -> None:
+def test_metrics_and_readiness_show_the_active_manager(api: Api, pair: Pair) -> None:
     holder = api.get("Lease", LEASE)["spec"]["holderIdentity"]
     assert [scraped(port)["active",] for port in pair.ports] == [1, 0]
     wait_until(lambda: get(pair.ports[0], "/readyz"), lambda found: found == (200, "ok\n"), what="one is active")
@@ -185,7 +185,7 @@ def test_a_standby_that_ends_leaves_the_lease_alone(api: Api, pair: Pair) -> Non
     assert api.get("Lease", LEASE)["spec"]["holderIdentity"] == before
 
 
-def test_a_lease_deleted_by_hand_comes_back(api: Api, processes: Processes, namespace: str) -> None:
+def test_a_manually_deleted_manager_lease_is_recreated(api: Api, processes: Processes, namespace: str) -> None:
     manager = start_manager(processes, namespace)
     manager.wait_for_output(ACTIVE)
     uid = api.get("Lease", LEASE)["metadata"]["uid"]
@@ -196,7 +196,7 @@ def test_a_lease_deleted_by_hand_comes_back(api: Api, processes: Processes, name
     wait_settled(api)
 
 
-def test_what_is_under_way_at_the_end_is_finished_or_made_good(api: Api, pair: Pair) -> None:
+def test_work_in_progress_at_shutdown_is_finished_or_repaired(api: Api, pair: Pair) -> None:
     pair.old.slow = 0.3
     began = 0.0
 

@@ -20,7 +20,7 @@ HOLD = 9  # s for which the API server wants to be left alone
 UNDER_WAY = 5.0  # s: what was sent before the answer had arrived at a manager on a machine that is busy otherwise
 
 
-def test_a_burst_of_tasks_is_worked_off_with_few_requests_at_once(
+def test_a_burst_of_tasks_is_served_with_few_concurrent_requests(
     api: Api, processes: Processes, namespace: str, control_plane: ControlPlane
 ) -> None:
     with faulty_proxy(control_plane.kubeconfig) as (proxy, kubeconfig):
@@ -39,7 +39,7 @@ def test_a_burst_of_tasks_is_worked_off_with_few_requests_at_once(
         wait_settled(api)
 
 
-def test_nothing_is_requested_before_the_time_that_the_api_server_gave_is_over(
+def test_no_request_is_sent_before_the_servers_retry_after_has_passed(
     api: Api, processes: Processes, namespace: str, control_plane: ControlPlane
 ) -> None:
     with faulty_proxy(control_plane.kubeconfig) as (proxy, kubeconfig):
@@ -64,7 +64,7 @@ def test_nothing_is_requested_before_the_time_that_the_api_server_gave_is_over(
         assert "Traceback" not in manager.output()
 
 
-def test_an_api_server_that_refuses_everything_for_a_while_is_waited_for(
+def test_an_api_server_that_rejects_everything_for_a_while_is_waited_for(
     api: Api, processes: Processes, namespace: str, control_plane: ControlPlane
 ) -> None:
     with faulty_proxy(control_plane.kubeconfig) as (proxy, kubeconfig):

@@ -20,7 +20,7 @@ from wayside.kubernetes.errors import ApiError
 from wayside.kubernetes.resources import LEASES
 
 
-def test_a_token_that_is_not_taken_any_more_is_replaced_by_the_files_new_one(
+def test_a_rejected_token_is_replaced_by_the_new_one_of_the_file(
     api: Api, namespace: str, control_plane: ControlPlane, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     api.create({"apiVersion": "v1", "kind": "ServiceAccount", "metadata": {"name": "manager"}})

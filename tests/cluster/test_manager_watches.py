@@ -34,7 +34,7 @@ signal.signal(signal.SIGUSR1, cancel)
 """What a stall does to a watch of kopf, see docs/decisions/0026: the task that reads it is cancelled."""
 
 
-def test_a_watch_whose_connection_brings_nothing_is_begun_again(
+def test_a_watch_on_a_silent_connection_is_restarted(
     api: Api, control_plane: ControlPlane, processes: Processes, namespace: str
 ) -> None:
     with faulty_proxy(control_plane.kubeconfig) as (proxy, kubeconfig):
@@ -56,7 +56,7 @@ def test_a_watch_whose_connection_brings_nothing_is_begun_again(
         assert manager.alive
 
 
-def test_a_watch_that_is_gone_for_good_ends_the_manager(
+def test_a_watch_that_cannot_be_restarted_ends_the_manager(
     api: Api, processes: Processes, namespace: str, tmp_path: Path
 ) -> None:
     (tmp_path / "sitecustomize.py").write_text(CANCELLING)

@@ -47,7 +47,7 @@ def start(processes: Processes, program: str) -> Process:
     return processes.start(sys.executable, "-c", program, name="program")
 
 
-def test_a_program_that_does_not_heed_sigterm_is_a_failure_and_killed(processes: Processes) -> None:
+def test_a_program_that_ignores_sigterm_is_killed_and_reported_as_a_failure(processes: Processes) -> None:
     program = start(processes, IGNORE_SIGTERM)
     program.wait_for_output("started")
     with pytest.raises(TimeoutError, match=r"program .* still runs"):
@@ -55,7 +55,7 @@ def test_a_program_that_does_not_heed_sigterm_is_a_failure_and_killed(processes:
     assert not program.alive
 
 
-def test_starting_what_still_runs_is_refused(processes: Processes) -> None:
+def test_starting_a_running_program_is_refused(processes: Processes) -> None:
     program = start(processes, IGNORE_SIGTERM)
     with pytest.raises(AssertionError, match="still runs"):
         program.start()
@@ -67,7 +67,7 @@ def test_a_program_that_ends_while_its_output_is_awaited_is_reported_at_once_wit
         program.wait_for_output("ready", timeout=60)
 
 
-def test_what_a_program_started_is_killed_with_it(processes: Processes) -> None:
+def test_child_processes_are_killed_with_their_program(processes: Processes) -> None:
     program = start(processes, START_A_CHILD)
     child = int(program.wait_for_output(r"child (\d+)")[1])
     program.kill9()

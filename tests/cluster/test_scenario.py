@@ -97,7 +97,7 @@ def drive(endpoint: str, *more: str) -> str:
     return done.stdout
 
 
-def test_the_deployments_over_time_are_those_that_the_positions_call_for(
+def test_the_deployments_over_time_match_the_vehicles_positions(
     api: Api, namespace: str, processes: Processes, tmp_path: Path
 ) -> None:
     endpoint = free_endpoint()

@@ -32,7 +32,7 @@ def accounts(api: Api) -> None:
     create_accounts(api)
 
 
-def test_bindings_follow_the_accounts_that_the_detector_names(
+def test_role_bindings_follow_the_accounts_of_the_detector(
     api: Api, processes: Processes, namespace: str, control_plane: ControlPlane, accounts: None
 ) -> None:
     start_manager(processes, namespace, *RUNS)
@@ -82,7 +82,7 @@ def test_bindings_follow_the_accounts_that_the_detector_names(
     )
 
 
-def test_what_one_mode_needs_goes_with_the_change_to_the_other(api: Api, processes: Processes, namespace: str) -> None:
+def test_changing_the_mode_removes_the_objects_of_the_old_mode(api: Api, processes: Processes, namespace: str) -> None:
     start_manager(processes, namespace, *RUNS)
     api.create(detector(mode="Standalone"))
     api.wait_for("Deployment", NAME, bool, what="it runs by itself")
@@ -100,7 +100,7 @@ def test_what_one_mode_needs_goes_with_the_change_to_the_other(api: Api, process
         api.wait_gone(kind, NAME)
 
 
-def test_the_manager_puts_it_into_pods_with_the_rights_that_are_printed(
+def test_the_printed_rights_suffice_to_inject_sidecars(
     api: Api, processes: Processes, namespace: str, control_plane: ControlPlane, tmp_path: Path, accounts: None
 ) -> None:
     api.create({"apiVersion": "v1", "kind": "ServiceAccount", "metadata": {"name": "manager"}})
@@ -122,7 +122,7 @@ def test_the_manager_puts_it_into_pods_with_the_rights_that_are_printed(
     assert "service account cannot" not in webhook.manager.output()
 
 
-def test_in_a_pod_it_holds_for_this_pod_alone_and_needs_its_rights_and_no_more(
+def test_a_sidecar_acts_for_its_own_pod_only_and_needs_exactly_its_rights(
     api: Api, processes: Processes, namespace: str, control_plane: ControlPlane, accounts: None, tmp_path: Path
 ) -> None:
     roles = sidecar_roles(namespace, HOLDER, ["vehicle"])

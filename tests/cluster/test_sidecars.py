@@ -77,7 +77,7 @@ def injected(
     return done.returncode, done.stdout, done.stderr
 
 
-def test_a_pod_that_requests_it_gets_the_detector_once_and_as_the_command_prints_it(
+def test_a_pod_that_requests_a_detector_gets_it_once_and_as_the_command_prints_it(
     api: Api, requested: Webhook, namespace: str, control_plane: ControlPlane
 ) -> None:
     made = api.create(pod())
@@ -108,7 +108,7 @@ def without_token(items: list[Object]) -> list[Object]:
     return [each for each in items if not each["name"].startswith("kube-api-access-")]
 
 
-def test_a_second_webhook_that_is_called_for_the_same_pod_adds_nothing(
+def test_a_second_webhook_call_for_the_same_pod_adds_nothing(
     api: Api, processes: Processes, tmp_path: Path, accounts: None
 ) -> None:
     metrics = free_port()
@@ -142,7 +142,7 @@ def reviews_of_pods(port: int) -> int:
     return sum(int(float(each.split()[-1])) for each in lines if each.startswith(name) and 'kind="Pod"' in each)
 
 
-def test_a_deployments_pods_get_it_however_they_are_made(api: Api, requested: Webhook) -> None:
+def test_pods_of_a_deployment_get_the_detector(api: Api, requested: Webhook) -> None:
     template = pod()
     api.create(
         {
@@ -160,7 +160,9 @@ def test_a_deployments_pods_get_it_however_they_are_made(api: Api, requested: We
     assert not api.get("Deployment", "cars")["spec"]["template"]["spec"].get("initContainers")
 
 
-def test_a_pod_that_cannot_have_it_is_created_and_its_event_reports_why(api: Api, requested: Webhook) -> None:
+def test_a_pod_that_cannot_get_a_detector_is_created_with_an_event_that_gives_the_reason(
+    api: Api, requested: Webhook
+) -> None:
     lost = pod("lost")
     lost["metadata"]["labels"] = {"wayside.dev/detector": "nowhere"}
     for each in (lost, pod("foreign", account="other")):
@@ -179,7 +181,7 @@ def test_a_pod_that_cannot_have_it_is_created_and_its_event_reports_why(api: Api
     event_of(api, "late", "is of mode Standalone: give it mode Sidecar")
 
 
-def test_a_detector_that_was_applied_a_moment_before_its_pod_is_found(api: Api, requested: Webhook) -> None:
+def test_a_detector_applied_just_before_its_pod_is_found(api: Api, requested: Webhook) -> None:
     for number in range(5):
         name = f"town-{number}"
         fresh = sidecar_detector("vehicle")
@@ -217,7 +219,7 @@ def test_an_event_is_not_reported_again_by_the_next_manager(
     event_of(api, "car", "has no valid Detector")
 
 
-def test_what_the_command_cannot_do_is_reported_and_the_rest_is_printed(
+def test_the_command_reports_pods_it_cannot_inject_and_prints_the_rest(
     api: Api, control_plane: ControlPlane, namespace: str, tmp_path: Path
 ) -> None:
     (file := tmp_path / "detector.yaml").write_text(yaml.safe_dump(sidecar_detector("vehicle")))

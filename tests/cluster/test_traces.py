@@ -110,7 +110,7 @@ def test_an_episode_that_is_restored_ends_the_same_span(chain: Chain, receiver: 
 
 
 @pytest.mark.usefixtures("kubelet")
-def test_what_is_done_for_several_tasks_at_once_is_linked(chain: Chain, receiver: Receiver) -> None:
+def test_a_span_for_several_tasks_is_linked_to_each(chain: Chain, receiver: Receiver) -> None:
     shared = template(linger="300s")
     del shared["spec"]["key"]
     shared["metadata"]["name"] = "fusion"
@@ -140,7 +140,7 @@ def test_what_is_done_for_several_tasks_at_once_is_linked(chain: Chain, receiver
     assert [each.name for each in second].count("ready") == 1
 
 
-def test_a_refusal_and_what_never_became_ready_are_failures_of_their_traces(
+def test_a_rejection_and_an_instance_that_never_became_ready_are_failures_in_their_traces(
     chain: Chain, receiver: Receiver, api: Api, processes: Processes
 ) -> None:
     start_manager(processes, chain.namespace)
@@ -174,9 +174,7 @@ def counted(port: int, name: str, cause: str) -> float:
 
 
 @pytest.mark.usefixtures("kubelet")
-def test_an_endpoint_that_is_away_holds_nobody_up_and_what_it_costs_is_counted(
-    chain: Chain, processes: Processes
-) -> None:
+def test_an_absent_endpoint_delays_nothing_and_dropped_spans_are_counted(chain: Chain, processes: Processes) -> None:
     nobody, of_manager, of_detector = free_ports(3)
     endpoint = {"OTEL_EXPORTER_OTLP_ENDPOINT": f"http://127.0.0.1:{nobody}", "OTEL_EXPORTER_OTLP_TIMEOUT": "1"}
     processes.environment |= {**endpoint, "OTEL_BSP_SCHEDULE_DELAY": "100"}

@@ -13,7 +13,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "examples" / "cooperative-rec
 from tutorial import GUIDE, blocks, play, staged
 
 
-def test_the_tutorial_shows_what_a_run_prints(control_plane: ControlPlane, api: Api, tmp_path: Path) -> None:
+def test_the_tutorial_shows_the_output_of_a_run(control_plane: ControlPlane, api: Api, tmp_path: Path) -> None:
     shown = blocks(GUIDE.read_text(encoding="utf-8"))
     with staged(api, control_plane.binaries.kubectl, tmp_path) as stage:
         printed = play(stage)

@@ -35,7 +35,7 @@ WALL = {"clock": "Wall", "clientTimeout": "30m"}  # nobody is lost while the clu
 
 
 @pytest.mark.parametrize("name", [each for each in use_cases() if scenario_of(each).moments])
-def test_what_runs_is_what_the_scenario_calls_for(
+def test_the_running_applications_match_the_scenario(
     name: str, api: Api, namespace: str, processes: Processes, tmp_path: Path
 ) -> None:
     endpoint = free_endpoint()

@@ -42,14 +42,14 @@ def check(path: Path | None) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_before_it_is_installed_it_is_missed(site: Path) -> None:
+def test_a_plugin_that_is_not_installed_is_reported_missing(site: Path) -> None:
     missed = check(None)
     assert missed.returncode == 1
     assert "spec.actions[0].plugin.name: no action logbook is installed" in missed.stderr + missed.stdout
     assert check(site).returncode == 0
 
 
-def test_it_writes_its_lines_and_its_outcomes_are_reported_and_counted(
+def test_the_action_writes_its_lines_and_its_outcomes_are_reported_and_counted(
     site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(site), *filter(None, sys.path)]))

@@ -28,7 +28,7 @@ container, or else end it by the signal itself."""
 
 
 @pytest.mark.parametrize("package", ["detector.commands", "application_manager"])
-def test_a_program_ends_that_is_stopped_while_it_still_imports(package: str) -> None:
+def test_a_program_stopped_during_its_imports_ends(package: str) -> None:
     code = WHILE_IT_IMPORTS.format(package=package)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
     assert (done.returncode, done.stdout) == (ENDED, "[]\n")

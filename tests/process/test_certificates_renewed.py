@@ -93,7 +93,7 @@ def client(at: str, authority: Authority, name: str) -> zenoh.Session:
 
 
 @pytest.mark.parametrize("mode", ["client", "peer"])
-def test_renewals_under_load_lose_nothing_and_give_nothing_twice(
+def test_renewals_under_load_lose_and_duplicate_no_sample(
     mode: str, at: str, authority: Authority, mounted: Path, arrivals: Arrivals
 ) -> None:
     authority.mount(mounted, "detector")
@@ -119,7 +119,7 @@ def test_renewals_under_load_lose_nothing_and_give_nothing_twice(
         assert running.dead is None
 
 
-def test_a_certificate_that_the_router_does_not_take_leaves_the_session_alone(
+def test_a_certificate_rejected_by_the_router_keeps_the_current_session(
     at: str,
     authority: Authority,
     mounted: Path,
@@ -159,7 +159,7 @@ def test_a_certificate_that_the_router_does_not_take_leaves_the_session_alone(
         assert came == list(range(came[0], came[-1] + 1))
 
 
-def test_a_certificate_to_which_the_router_gives_nothing_leaves_the_session_alone(
+def test_a_certificate_without_router_permissions_keeps_the_current_session(
     at: str, authority: Authority, mounted: Path, arrivals: Arrivals
 ) -> None:
     everything = ["put", "declare_subscriber"]

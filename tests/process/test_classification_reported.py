@@ -37,7 +37,9 @@ def tasks_in(folder: Path) -> list[dict[str, Any]]:
     ]
 
 
-def test_events_recordings_scenarios_tasks_and_notices_have_it(process: Process, name: str, database: Any) -> None:
+def test_events_recordings_scenarios_tasks_and_notifications_have_the_classification(
+    process: Process, name: str, database: Any
+) -> None:
     rule = a_rule(
         "r",
         classification=GIVEN,

@@ -50,7 +50,7 @@ def test_an_episode_becomes_a_scenario_with_each_sample_once(harness: MakeHarnes
     assert client["streams"] == ["speed"]
 
 
-def test_with_renew_after_an_episode_becomes_one_scenario_after_the_other(harness: MakeHarness, database: Any) -> None:
+def test_with_renew_after_an_episode_becomes_consecutive_scenarios(harness: MakeHarness, database: Any) -> None:
     keep = harness(streams=[a_stream("speed"), a_stream("map", latched=True)], renew_after="3s")
     episode = keep.begin()
     logged = EpisodeSample("car1", "map", "vehicles/car1/map", START - 10**12, START - 10**12, b'{"v": -1}')
@@ -75,7 +75,7 @@ def test_with_renew_after_an_episode_becomes_one_scenario_after_the_other(harnes
     assert sorted(numbers(database, part, "json/map") for part in parts) == [[-2], [-1], [-1], [-1, -2]]
 
 
-def test_after_a_restart_a_renewed_episode_leaves_alone_what_was_complete(harness: MakeHarness, database: Any) -> None:
+def test_after_a_restart_a_renewed_episode_keeps_complete_scenarios(harness: MakeHarness, database: Any) -> None:
     keep = harness(renew_after="3s")
     episode = keep.begin()
     keep.take(episode, speeds(500))
@@ -89,7 +89,7 @@ def test_after_a_restart_a_renewed_episode_leaves_alone_what_was_complete(harnes
     assert states == ["Complete", "Complete", "Interrupted", "Open"]
 
 
-def test_overlapping_episodes_have_their_samples_each(harness: MakeHarness, database: Any) -> None:
+def test_overlapping_episodes_each_have_their_samples(harness: MakeHarness, database: Any) -> None:
     keep = harness()
     one, two = keep.begin("e1"), keep.begin("e2")
     samples = speeds(30)
@@ -102,9 +102,7 @@ def test_overlapping_episodes_have_their_samples_each(harness: MakeHarness, data
     assert numbers(database, "e2.keep") == list(range(10, 30))
 
 
-def test_a_scenario_is_not_complete_while_it_lasts_nor_where_something_is_missing(
-    harness: MakeHarness, database: Any
-) -> None:
+def test_a_scenario_is_incomplete_while_open_or_if_data_is_missing(harness: MakeHarness, database: Any) -> None:
     keep = harness()
     lasting, cut = keep.begin("e1"), keep.begin("e2")
     keep.take(lasting, speeds(5))
@@ -123,7 +121,7 @@ def test_a_scenario_is_not_complete_while_it_lasts_nor_where_something_is_missin
     )
 
 
-def test_an_episode_whose_beginning_another_run_saw_is_never_complete(harness: MakeHarness, database: Any) -> None:
+def test_an_episode_that_started_in_an_earlier_run_is_never_complete(harness: MakeHarness, database: Any) -> None:
     keep = harness()
     episode = keep.begin(resumed=True)
     keep.take(episode, speeds(5))
@@ -146,7 +144,7 @@ def test_with_dry_run_everything_is_counted_and_nothing_is_written(
     assert not (tmp_path / "files").exists()
 
 
-def test_large_binary_data_goes_to_files_that_the_documents_name(
+def test_large_binary_data_is_stored_in_files_named_in_the_documents(
     harness: MakeHarness, database: Any, tmp_path: Path
 ) -> None:
     keep = harness(streams=[a_stream("blob", encoding="raw")], files=True, above="1k")
@@ -166,7 +164,7 @@ def test_large_binary_data_goes_to_files_that_the_documents_name(
     assert scenario(database)["files"] == 2
 
 
-def test_without_files_what_mongodb_does_not_take_is_cut_counted_and_reported(
+def test_without_files_documents_too_large_for_mongodb_are_truncated_counted_and_reported(
     harness: MakeHarness, database: Any
 ) -> None:
     keep = harness(streams=[a_stream("blob", encoding="raw")])
@@ -181,9 +179,7 @@ def test_without_files_what_mongodb_does_not_take_is_cut_counted_and_reported(
     assert keep.losses.total() == 1
 
 
-def test_a_file_that_cannot_be_written_costs_the_scenarios_completeness(
-    harness: MakeHarness, database: Any, tmp_path: Path
-) -> None:
+def test_a_file_write_error_makes_its_scenario_incomplete(harness: MakeHarness, database: Any, tmp_path: Path) -> None:
     (tmp_path / "files").write_text("no folder")
     keep = harness(streams=[a_stream("blob", encoding="raw")], files=True)
     episode = keep.begin()
@@ -231,7 +227,7 @@ def test_credentials_are_in_no_error_log_or_outcome(
         assert piece not in logged
 
 
-def test_the_redactor_takes_out_every_form_of_the_password() -> None:
+def test_the_redactor_removes_every_form_of_the_password() -> None:
     clean = Redactor("mongodb://ada:a%40b@host/?authMechanismProperties=AWS_SESSION_TOKEN:tok-en")
     assert clean("failed for ada:a%40b, that is a@b, at host with AWS_SESSION_TOKEN:tok-en") == (
         "failed for ***, that is ***, at host with ***"

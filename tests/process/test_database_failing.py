@@ -21,7 +21,7 @@ from tests.process.database_harness import (
 )
 
 
-def test_while_the_server_is_away_documents_wait_on_disk_and_follow_in_order_each_once(
+def test_documents_are_spooled_to_disk_during_an_outage_and_written_once_in_order(
     harness: MakeHarness, database: Any, proxy: ServerProxy, tmp_path: Path
 ) -> None:
     keep = harness(spool=2**26)
@@ -44,7 +44,7 @@ def test_while_the_server_is_away_documents_wait_on_disk_and_follow_in_order_eac
     assert not list((tmp_path / "spool").iterdir())
 
 
-def test_a_full_spool_drops_what_is_new_counts_it_and_keeps_earlier_scenarios_whole(
+def test_a_full_spool_drops_and_counts_new_documents_and_keeps_earlier_scenarios_complete(
     harness: MakeHarness, database: Any, proxy: ServerProxy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("detector.actions.database.queue.MEMORY", 100_000)
@@ -70,7 +70,7 @@ def test_a_full_spool_drops_what_is_new_counts_it_and_keeps_earlier_scenarios_wh
     assert (reported["complete"], reported["missing"]) == (False, outcome.missing)
 
 
-def test_what_waited_when_the_detector_ended_is_written_by_the_next_run(
+def test_documents_spooled_at_shutdown_are_written_by_the_next_run(
     harness: MakeHarness, database: Any, proxy: ServerProxy
 ) -> None:
     proxy.cut()
@@ -90,7 +90,7 @@ def test_what_waited_when_the_detector_ended_is_written_by_the_next_run(
     assert not after.losses
 
 
-def test_a_document_that_the_server_refuses_costs_its_scenarios_completeness_and_no_other(
+def test_a_document_rejected_by_the_server_makes_only_its_scenario_incomplete(
     harness: MakeHarness, database: Any, proxy: ServerProxy
 ) -> None:
     keep = harness()
@@ -112,7 +112,7 @@ def test_a_document_that_the_server_refuses_costs_its_scenarios_completeness_and
     assert (reported["complete"], reported["rejected"]) == (False, True)
 
 
-def test_a_server_that_hangs_holds_up_nothing_but_the_queue(
+def test_a_hanging_server_delays_only_the_queue(
     harness: MakeHarness, database: Any, proxy: ServerProxy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("detector.actions.database.server._SECONDS", 4.0)
@@ -127,7 +127,7 @@ def test_a_server_that_hangs_holds_up_nothing_but_the_queue(
     assert numbers(database) == list(range(2000))
 
 
-def test_with_write_concern_one_a_scenario_that_lost_documents_afterwards_is_not_called_complete(
+def test_with_write_concern_one_a_scenario_that_lost_documents_is_not_marked_complete(
     harness: MakeHarness, database: Any
 ) -> None:
     keep = harness(concern="One")
@@ -142,7 +142,7 @@ def test_with_write_concern_one_a_scenario_that_lost_documents_afterwards_is_not
     assert scenario(database)["complete"] is False
 
 
-def test_a_damaged_request_in_the_spool_costs_its_scenario_and_no_other(
+def test_a_damaged_spool_entry_makes_only_its_scenario_incomplete(
     harness: MakeHarness, database: Any, proxy: ServerProxy
 ) -> None:
     keep = harness(spool=2**26)
@@ -173,7 +173,7 @@ def test_a_damaged_request_in_the_spool_costs_its_scenario_and_no_other(
     assert keep.losses.total() == 1
 
 
-def test_a_spool_whose_disk_fails_holds_up_nothing_and_continues_at_the_next_start(
+def test_a_spool_on_a_failing_disk_delays_nothing_and_continues_after_a_restart(
     harness: MakeHarness, database: Any, proxy: ServerProxy, tmp_path: Path
 ) -> None:
     keep = harness(spool=2**26)

@@ -41,14 +41,14 @@ def test_the_examples_are_accepted(tmp_path: Path) -> None:
     assert checked(tmp_path, *EXAMPLES) == []
 
 
-def test_a_rule_whose_detector_has_no_database_is_refused_with_its_place(tmp_path: Path) -> None:
+def test_a_database_action_without_a_database_in_the_detector_is_rejected_by_field(tmp_path: Path) -> None:
     without = {**DETECTOR, "spec": {"streams": DETECTOR["spec"]["streams"]}}
     (problem,) = checked(tmp_path, without, RECORD_ALL)
     logged = r"all\.yaml:\d+:\d+: spec\.actions\[0\]\.database: Detector d has no spec\.database: add it"
     assert re.search(logged, problem)
 
 
-def test_a_rule_that_wants_files_needs_a_place_for_them(tmp_path: Path) -> None:
+def test_an_action_with_files_needs_a_folder_in_the_detector(tmp_path: Path) -> None:
     without = {**DETECTOR, "spec": {**DETECTOR["spec"], "database": {"uriVariable": "MONGODB_URI"}}}
     rule = {**RECORD_ALL, "spec": {**RECORD_ALL["spec"], "actions": [{"name": "a", "database": {"files": {}}}]}}
     (problem,) = checked(tmp_path, without, rule)
@@ -66,9 +66,7 @@ def test_a_rule_that_wants_files_needs_a_place_for_them(tmp_path: Path) -> None:
         ({"before": "1h"}, "exceeds the"),
     ],
 )
-def test_what_is_wrong_in_an_action_is_reported_with_its_place(
-    tmp_path: Path, fields: dict[str, Any], logged: str
-) -> None:
+def test_errors_of_a_database_action_are_reported_by_field(tmp_path: Path, fields: dict[str, Any], logged: str) -> None:
     action = {"name": "keep", "database": fields}
     problem, *_ = checked(tmp_path, DETECTOR, {**RECORD_ALL, "spec": {**RECORD_ALL["spec"], "actions": [action]}})
     assert re.search(r"all\.yaml:\d+:\d+: .*spec\.actions\[0\]\.database", problem)
@@ -83,7 +81,7 @@ def test_what_is_wrong_in_an_action_is_reported_with_its_place(
         ({"uriVariable": "A", "writeConcern": "Two"}, "writeConcern"),
     ],
 )
-def test_what_is_wrong_in_the_detectors_database_is_reported_with_its_place(
+def test_errors_of_the_detectors_database_are_reported_by_field(
     tmp_path: Path, database: dict[str, Any], logged: str
 ) -> None:
     (tmp_path / "d.yaml").write_text(
@@ -153,7 +151,7 @@ def test_record_all_has_every_sample_once_from_one_evaluation_to_the_next(
     assert scenario["reason"] == "ClientLost"
 
 
-def test_threshold_has_the_window_around_the_time_at_which_it_was_passed(
+def test_threshold_records_the_window_around_the_crossing(
     name: str, database: Any, proxy: ServerProxy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     drive = Drive(as_json(THRESHOLD, name), proxy, monkeypatch)

@@ -159,7 +159,7 @@ def check(database: Any) -> int:
 
 
 @pytest.mark.parametrize("away", [False, True])
-def test_after_kill_9_nothing_that_looks_complete_is_incomplete(
+def test_after_kill_9_every_scenario_marked_complete_is_complete(
     process: Process, name: str, database: Any, proxy: ServerProxy, *, away: bool
 ) -> None:
     keep = {"name": "keep", "database": {"database": name, "before": "20ms", "after": "20ms"}}

@@ -23,7 +23,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return installed(EXAMPLE, tmp_path_factory.mktemp("site"))
 
 
-def test_before_it_is_installed_it_is_missed() -> None:
+def test_a_plugin_that_is_not_installed_is_reported_missing() -> None:
     with pytest.raises(RefusedError, match=r"plugin\.name: no plugin stop-and-go is installed"):
         run(RULES, DETECTOR, DRIVE)
 
@@ -35,7 +35,7 @@ def test_the_rule_is_tested_in_three_lines(site: Path, monkeypatch: pytest.Monke
     assert events[0].values == {"stops": 3.0}
 
 
-def test_a_rule_that_the_detector_does_not_select_is_no_silent_success(tmp_path: Path) -> None:
+def test_a_rule_not_selected_by_the_detector_is_an_error(tmp_path: Path) -> None:
     picky = tmp_path / "detector.yaml"
     picky.write_text(DETECTOR.read_text() + "  ruleSelector: {matchLabels: {site: x}}\n")
     with pytest.raises(RefusedError, match="stop-and-go"):
@@ -50,7 +50,7 @@ def test_the_readme_has_the_same_three_lines() -> None:
     assert code in (EXAMPLE.parents[1] / "docs" / "plugins.md").read_text()
 
 
-def test_the_commands_find_it_and_give_the_same_events(
+def test_the_commands_find_the_plugin_and_give_the_same_events(
     site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = os.pathsep.join([str(site), *filter(None, sys.path)])

@@ -91,7 +91,9 @@ def has(faulty: Faulty, page: str, code: int, text: str) -> Callable[[], bool]:
     ("fault", "shows"),
     [("stall-evaluation", "the last evaluation was"), ("stall-loop", "the event loop has been blocked for")],
 )
-def test_what_stands_still_is_not_live_and_live_again_once_it_continues(faulty: Faulty, fault: str, shows: str) -> None:
+def test_a_hanging_thread_makes_the_detector_not_live_until_it_continues(
+    faulty: Faulty, fault: str, shows: str
+) -> None:
     faulty.write(ALWAYS, streams=(a_stream("speed"),))
     faulty.start()
     wait_for(has(faulty, "/readyz", 200, "the last evaluation"))
@@ -102,9 +104,7 @@ def test_what_stands_still_is_not_live_and_live_again_once_it_continues(faulty: 
     wait_for(has(faulty, "/healthz", 200, "the last evaluation"))
 
 
-def test_a_router_that_is_away_makes_it_unready_and_leaves_it_live_with_its_buffer(
-    faulty: Faulty, tmp_path: Path
-) -> None:
+def test_an_absent_router_makes_the_detector_unready_but_keeps_it_live(faulty: Faulty, tmp_path: Path) -> None:
     endpoint = free_endpoint()
     faulty.endpoint = endpoint
     faulty.write(ALWAYS, streams=(a_stream("speed"),))
@@ -123,7 +123,7 @@ def test_a_router_that_is_away_makes_it_unready_and_leaves_it_live_with_its_buff
         wait_for(has(faulty, "/readyz", 200, "the last evaluation"))
 
 
-def test_a_silent_stream_is_no_illness(faulty: Faulty) -> None:
+def test_a_silent_stream_is_healthy(faulty: Faulty) -> None:
     faulty.write(ALWAYS, streams=(a_stream("speed", staleAfter="100ms"),), clientTimeout="100ms")
     faulty.start()
     wait_for(has(faulty, "/readyz", 200, "the last evaluation"))

@@ -20,7 +20,7 @@ class Clock:
         return self.now
 
 
-def test_many_threads_at_once_get_receive_times_that_never_go_back_in_the_order_of_the_queue() -> None:
+def test_concurrent_producers_get_monotonic_receive_times_in_queue_order() -> None:
     intake = Intake(time.time_ns)
     begin = threading.Barrier(8)
 
@@ -54,7 +54,7 @@ def test_many_threads_at_once_get_receive_times_that_never_go_back_in_the_order_
         assert own == [f"k/{number}" for number in range(2_000)]
 
 
-def test_a_clock_that_goes_back_does_not_take_the_times_back() -> None:
+def test_receive_times_stay_monotonic_when_the_clock_steps_back() -> None:
     clock = Clock(100)
     intake = Intake(clock)
     put = intake.putter("s")
@@ -64,7 +64,7 @@ def test_a_clock_that_goes_back_does_not_take_the_times_back() -> None:
     assert [arrival.received for arrival in intake.drain(0)] == [100, 100, 100, 101, 500]
 
 
-def test_what_comes_after_a_drain_is_later_than_its_tick() -> None:
+def test_a_message_after_a_drain_is_later_than_its_tick() -> None:
     intake = Intake(Clock(100))
     put = intake.putter("s")
     assert intake.drain(1_000) == []
@@ -73,7 +73,7 @@ def test_what_comes_after_a_drain_is_later_than_its_tick() -> None:
     assert intake.last == 1_001
 
 
-def test_a_full_queue_drops_what_comes_and_counts_it() -> None:
+def test_a_full_queue_drops_and_counts_new_messages() -> None:
     intake = Intake(Clock(0), maximum_bytes=2 * SAMPLE_OVERHEAD)
     put = intake.putter("s")
     for key in "abcd":
@@ -85,7 +85,7 @@ def test_a_full_queue_drops_what_comes_and_counts_it() -> None:
     assert intake.dropped == 2
 
 
-def test_the_bytes_that_wait_are_bounded_over_all_streams() -> None:
+def test_the_queued_bytes_are_bounded_over_all_streams() -> None:
     intake = Intake(Clock(0), maximum_bytes=10 + 2 * SAMPLE_OVERHEAD)
     first, second = intake.putter("s"), intake.putter("t")
     first([("a", b"12345")])
@@ -109,7 +109,7 @@ def test_after_a_step_back_of_the_clock_time_continues_from_there() -> None:
     assert [arrival.received for arrival in intake.drain(0)] == [201]
 
 
-def test_what_is_drained_later_is_later_than_all_that_was_drained() -> None:
+def test_each_drain_returns_later_times_than_the_one_before() -> None:
     clock = Clock(100)
     intake = Intake(clock)
     put = intake.putter("s")
@@ -119,14 +119,14 @@ def test_what_is_drained_later_is_later_than_all_that_was_drained() -> None:
     assert [arrival.received for arrival in intake.drain(50)] == [101, 101]
 
 
-def test_each_message_has_the_time_of_being_queued_and_shares_it_with_none_that_came_later() -> None:
+def test_each_message_has_its_own_enqueue_time() -> None:
     ticks = itertools.count(100)
     intake = Intake(lambda: next(ticks))
     intake.putter("s")([("a", b""), ("b", b""), ("c", b"")])
     assert [(each.key, each.received) for each in intake.drain(0)] == [("a", 100), ("b", 101), ("c", 102)]
 
 
-def test_what_comes_out_of_one_message_shares_its_time() -> None:
+def test_all_samples_of_a_message_share_its_time() -> None:
     ticks = itertools.count(100)
     intake = Intake(lambda: next(ticks), maximum_bytes=4 * SAMPLE_OVERHEAD)
     put = intake.putter("s", "t")
@@ -141,7 +141,7 @@ def test_what_comes_out_of_one_message_shares_its_time() -> None:
     assert intake.dropped == 2  # the samples of c
 
 
-def test_what_should_not_be_dropped_waits_until_there_is_room_but_not_for_ever() -> None:
+def test_a_lossless_put_waits_for_room_up_to_a_timeout() -> None:
     intake = Intake(Clock(1), maximum_bytes=SAMPLE_OVERHEAD)
     put = intake.patient_putter("tokens", patience=0.02)
     put([("k", b"first")])

@@ -63,7 +63,7 @@ def test_a_late_joiner_gets_the_history_that_it_requests(endpoint: str, arrivals
     assert payloads == {"none": [10], "newest": [7, 8, 9, 10], "young": [*range(11)], "all": [*range(11)]}
 
 
-def test_samples_lost_on_the_way_are_counted_or_requested_again(endpoint: str, arrivals: Arrivals) -> None:
+def test_samples_lost_in_transit_are_counted_or_requested_again(endpoint: str, arrivals: Arrivals) -> None:
     loss_counter = LossCounter()
     streams = [stream("counted", history=History(samples=1)), stream("recovered", recover=True)]
     with router(listen__endpoints=[endpoint], downsampling=LOSSY):

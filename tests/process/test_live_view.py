@@ -138,7 +138,7 @@ def listens_on(port: int) -> set[str]:
     return found
 
 
-def test_a_client_sees_live_what_the_results_of_the_replay_have(watched: Watched) -> None:
+def test_the_live_view_shows_the_results_of_the_replay(watched: Watched) -> None:
     process, viewer = watched.process, Viewer(watched.port)
     assert listens_on(watched.port) == {"0100007F"}  # 127.0.0.1 alone
     drive(watched, viewer, lambda: viewer.channels.keys() >= SUBJECTS | OTHERS)

@@ -69,14 +69,14 @@ def test_a_client_is_lost_with_its_last_token_only_and_not_if_it_is_declared_aga
     assert drive.take(alive(20.1, "car1", TokenState.DROPPED), until=21) == ["here car1 ClientLost 21"]
 
 
-def test_where_our_own_connection_was_lost_the_timeout_decides() -> None:
+def test_after_the_loss_of_our_own_connection_the_client_timeout_decides() -> None:
     drive = Drive(detector(), HERE)
     drive.take(alive(0.1, "car1", TokenState.DECLARED), alive(0.1001, "car2", TokenState.DECLARED), until=10)
     unsure = [alive(10.1, "car1", TokenState.UNSURE), alive(10.1001, "car2", TokenState.UNSURE)]
     assert drive.take(*unsure, alive(12.0, "car2", TokenState.DECLARED), until=20) == ["here car1 ClientLost 14"]
 
 
-def test_what_names_no_client_or_means_nothing_is_counted() -> None:
+def test_tokens_without_a_client_or_meaning_are_counted() -> None:
     drive = Drive(detector(), HERE)
     wrong = [alive(0.1, "car 1", TokenState.DECLARED), Arrival(at(0.2), LIVELINESS, "alive/car1/s1", b"?")]
     assert drive.take(*wrong, until=1) == []
@@ -92,7 +92,7 @@ def test_tokens_beyond_the_bound_are_ignored_and_counted(monkeypatch: pytest.Mon
     assert drive.engine.counters.crowded[LIVELINESS] == 1
 
 
-def test_when_the_detector_requests_other_tokens_the_timeout_decides_about_the_old_ones() -> None:
+def test_clients_of_a_former_token_pattern_expire_by_timeout() -> None:
     drive = Drive(detector(), HERE)
     drive.take(alive(0.1, "car1", TokenState.DECLARED), until=10)
     changed = a_detector(a_stream("speed"), clientTimeout="3s")
@@ -121,7 +121,7 @@ def _reported(drive: Drive) -> list[str]:
     ]
 
 
-def test_a_pattern_that_is_none_is_reported_with_its_field() -> None:
+def test_an_invalid_token_pattern_is_reported_by_field() -> None:
     with pytest.raises(DetectorError, match=r"spec\.zenoh\.liveliness: key 'a/x\$\{client:\*\}', column 3"):
         stream_readers(a_detector(zenoh={"liveliness": "a/x${client:*}"}))
     with pytest.raises(ValueError, match="liveliness does not capture the client"):
@@ -170,7 +170,7 @@ def test_tokens_are_followed_over_the_network(endpoint: str, arrivals: Arrivals,
     del kept, last
 
 
-def test_a_token_that_was_there_before_the_detector_counts(endpoint: str, arrivals: Arrivals) -> None:
+def test_a_token_declared_before_the_detector_started_counts(endpoint: str, arrivals: Arrivals) -> None:
     with router(listen__endpoints=[endpoint]), vehicle(endpoint) as car1:
         kept = car1.liveliness().declare_token("alive/car1")
         network = Network(Zenoh(connect=[endpoint], liveliness="alive/${client:*}"), [stream()], arrivals.putter)

@@ -19,7 +19,7 @@ from tests.ports import free_endpoint
 SHORT = datetime.timedelta(seconds=20)
 
 
-def test_at_the_end_of_its_certificate_it_continues_with_the_new_one(
+def test_the_manager_reconnects_with_the_new_certificate_when_the_old_one_expires(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level("INFO")

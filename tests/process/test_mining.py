@@ -121,7 +121,7 @@ def test_near_misses_are_those_of_a_replay_and_are_printed(fleet: Path, monkeypa
     assert "Nearest without an episode" in (fleet / "out/report.html").read_text()
 
 
-def test_the_question_of_the_guide_is_answered(fleet: Path) -> None:
+def test_the_query_of_the_guide_gives_its_result(fleet: Path) -> None:
     guide = (Path(__file__).parents[2] / "docs/mining.md").read_text()
     (question,) = re.findall(r"```sql\n(.*?);\n```", guide, re.DOTALL)
     rows = requested(fleet, question)
@@ -134,7 +134,7 @@ def test_the_question_of_the_guide_is_answered(fleet: Path) -> None:
     assert max(row[2] for row in rows) == round(longest, 1)
 
 
-def test_broken_recordings_are_set_apart_with_their_reason(fleet: Path) -> None:
+def test_broken_recordings_are_listed_with_their_reason(fleet: Path) -> None:
     found = requested(fleet, "SELECT recording, kind, message FROM 'out/errors.parquet'")
     assert [(name, kind) for name, kind, _ in found] == [
         ("drives/broken-000-drive.mcap", "unreadable"),
@@ -158,7 +158,7 @@ def test_one_process_and_shares_give_the_same_bytes(fleet: Path) -> None:
     assert files(fleet / "shared") == files(fleet / "out")
 
 
-def test_a_second_run_does_nothing_and_a_changed_rule_runs_alone(fleet: Path) -> None:
+def test_a_second_run_reuses_all_results_and_a_changed_rule_is_evaluated_alone(fleet: Path) -> None:
     def times() -> dict[Path, int]:
         return {path: path.stat().st_mtime_ns for path in (fleet / "out").rglob("*")}
 
@@ -180,7 +180,7 @@ def test_a_second_run_does_nothing_and_a_changed_rule_runs_alone(fleet: Path) ->
     assert [name for name in files(fleet / "again") if "rule=" in name] == ["episodes/rule=harsh/part-0.parquet"]
 
 
-def test_a_long_recording_is_cut_for_the_rules_for_which_that_is_exact(fleet: Path) -> None:
+def test_a_long_recording_is_split_for_rules_that_permit_exact_splits(fleet: Path) -> None:
     (fleet / "long").mkdir()
     write_mcap(fleet / "long" / "drive.mcap", 7, 600.0, cars=2)
     logged = mine(fleet, "cut", "--processes", "2", drives="long")
@@ -244,7 +244,7 @@ def end_once(path: str) -> int:
     return -1
 
 
-def test_recordings_behind_urls_are_mined_as_those_on_disk(fleet: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_recordings_behind_urls_are_mined_like_local_files(fleet: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     columns = 'subject, start_time, end_time, reason, rule, "speed.max"'
     expected = requested(fleet, f"SELECT {columns} FROM 'out/episodes/*/*.parquet' ORDER BY ALL")
     drives = [*sorted((fleet / "drives").iterdir())]
@@ -296,7 +296,7 @@ def end(number: int) -> int:
     return number
 
 
-def test_a_call_that_kills_its_process_takes_no_other_with_it() -> None:
+def test_a_call_that_kills_its_worker_fails_alone() -> None:
     pool = LocalWorkers(2)
     try:
         found = {call.argument: result for call, result in pool.run(RemoteCall(end, number) for number in range(8))}

@@ -64,7 +64,7 @@ def test_messages_arrive_on_their_keys_also_after_the_broker_was_killed(port: in
     assert failures[0].count >= 2
 
 
-def test_what_stands_before_the_key_is_taken_off_and_other_topics_are_dropped(port: int, arrivals: Arrivals) -> None:
+def test_the_topic_prefix_is_removed_and_other_topics_are_dropped(port: int, arrivals: Arrivals) -> None:
     loss_counter = LossCounter()
     with (
         broker(port),

@@ -89,7 +89,7 @@ def test_a_router_whose_certificate_another_authority_signed_is_refused(
             open_session(config)
 
 
-def test_with_mtls_only_who_has_a_certificate_comes_in(
+def test_with_mtls_only_clients_with_a_certificate_connect(
     endpoint: str,
     arrivals: Arrivals,
     authority: Authority,
@@ -152,7 +152,7 @@ def test_only_the_right_password_opens_a_router_that_requires_one(
     assert "sesame" not in caplog.text
 
 
-def test_access_control_of_the_router_decides_what_is_seen(endpoint: str, arrivals: Arrivals) -> None:
+def test_the_routers_access_control_limits_the_received_keys(endpoint: str, arrivals: Arrivals) -> None:
     rules = {
         "enabled": True,
         "default_permission": "allow",
@@ -275,7 +275,7 @@ def test_a_running_detector_moves_to_another_network_with_its_buffer(endpoint: s
         ),
     ],
 )
-def test_what_is_not_there_is_reported_with_its_field(given: dict[str, Any], problem: str) -> None:
+def test_missing_files_are_reported_by_field(given: dict[str, Any], problem: str) -> None:
     config = Zenoh.model_validate({"connect": ["tcp/127.0.0.1:1"], "listen": ["tcp/127.0.0.1:0"], **given})
     with pytest.raises(NetworkError, match=re.escape(problem)):
         open_session(config)
@@ -291,7 +291,7 @@ def test_what_is_not_there_is_reported_with_its_field(given: dict[str, Any], pro
         ({"credentials": {"username": "u", "password": "secret"}}, "password"),
     ],
 )
-def test_what_makes_no_sense_is_refused(given: dict[str, Any], problem: str) -> None:
+def test_invalid_settings_are_rejected(given: dict[str, Any], problem: str) -> None:
     with pytest.raises(ValidationError, match=problem):
         Zenoh.model_validate(given)
 

@@ -109,7 +109,7 @@ def test_an_alert_whose_end_comes_while_it_is_sent_as_firing_is_resolved_next(th
     harness.end()
 
 
-def test_an_alertmanager_that_is_away_for_a_while_hears_of_it_when_it_is_back(there: Endpoint) -> None:
+def test_alerts_reach_an_alertmanager_after_its_outage(there: Endpoint) -> None:
     there.behaviour = answers(503)
     harness = a_harness(notify(there))
     harness.action.started(open_of(an_episode()))
@@ -123,7 +123,7 @@ def test_an_alertmanager_that_is_away_for_a_while_hears_of_it_when_it_is_back(th
     assert not harness.lost
 
 
-def test_what_is_over_and_refused_is_a_dead_letter(there: Endpoint, tmp_path: Path) -> None:
+def test_a_rejected_resolved_alert_becomes_a_dead_letter(there: Endpoint, tmp_path: Path) -> None:
     there.behaviour = answers(400, b"bad label")
     harness = a_harness(notify(there), state=tmp_path)
     harness.action.started(open_of(an_episode()))
@@ -135,7 +135,7 @@ def test_what_is_over_and_refused_is_a_dead_letter(there: Endpoint, tmp_path: Pa
     harness.end()
 
 
-def test_more_alerts_than_may_be_are_dead_letters(there: Endpoint) -> None:
+def test_alerts_beyond_the_limit_become_dead_letters(there: Endpoint) -> None:
     there.behaviour = hangs()
     harness = a_harness(notify(there) | {"waiting": 2})
     for number in range(3):
@@ -144,7 +144,7 @@ def test_more_alerts_than_may_be_are_dead_letters(there: Endpoint) -> None:
     harness.end()
 
 
-def test_at_the_end_what_is_over_is_reported_and_what_fires_is_left_to_the_next_start(there: Endpoint) -> None:
+def test_at_shutdown_resolved_alerts_are_sent_and_firing_ones_are_left_to_the_next_run(there: Endpoint) -> None:
     there.behaviour = answers(503, Retry_After="60")
     harness = a_harness(notify(there))
     harness.action.started(open_of(an_episode("over")))
@@ -161,7 +161,7 @@ def test_at_the_end_what_is_over_is_reported_and_what_fires_is_left_to_the_next_
     assert len(there.requests) == 2
 
 
-def test_a_resumed_episode_has_the_labels_that_it_had(there: Endpoint, tmp_path: Path) -> None:
+def test_a_resumed_episode_keeps_its_labels(there: Endpoint, tmp_path: Path) -> None:
     rule = notify(there, labels={"road": "${road}"})
     first = a_harness(rule, state=tmp_path)
     first.action.started(open_of(an_episode(rendered={"labels": {"road": "A1"}})))

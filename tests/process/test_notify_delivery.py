@@ -88,7 +88,7 @@ def test_only_the_wanted_events_are_reported(there: Endpoint, wanted: list[str],
 
 
 @pytest.mark.parametrize("fault", [answers(500, b"out of memory"), hangs()], ids=["500", "hangs"])
-def test_what_fails_is_tried_again_until_it_arrives(there: Endpoint, fault: Behaviour) -> None:
+def test_failed_notifications_are_retried_until_delivered(there: Endpoint, fault: Behaviour) -> None:
     there.behaviour = fault
     harness = a_harness({"http": http(there, "200ms"), "events": ["Started"]})
     harness.run(an_episode())
@@ -102,7 +102,7 @@ def test_what_fails_is_tried_again_until_it_arrives(there: Endpoint, fault: Beha
     harness.end()
 
 
-def test_what_is_refused_is_a_dead_letter_at_once(there: Endpoint, tmp_path: Path) -> None:
+def test_a_rejected_notification_becomes_a_dead_letter_at_once(there: Endpoint, tmp_path: Path) -> None:
     there.behaviour = answers(400, b"no such field: x")
     harness = a_harness({"http": http(there), "text": "${a}"}, state=tmp_path)
     harness.run(an_episode(rendered={"text": "car1 brakes"}))
@@ -118,7 +118,7 @@ def test_what_is_refused_is_a_dead_letter_at_once(there: Endpoint, tmp_path: Pat
     harness.end()
 
 
-def test_what_does_not_arrive_in_time_is_given_up(tmp_path: Path) -> None:
+def test_notifications_not_delivered_in_time_are_given_up(tmp_path: Path) -> None:
     with nobody() as gone:
         harness = a_harness({"http": http(gone), "giveUpAfter": "100ms", "events": ["Ended"]}, state=tmp_path)
         harness.run(an_episode())
@@ -129,7 +129,7 @@ def test_what_does_not_arrive_in_time_is_given_up(tmp_path: Path) -> None:
         harness.end()
 
 
-def test_a_message_that_the_endpoint_cannot_take_holds_up_no_other_episode(there: Endpoint) -> None:
+def test_a_message_the_endpoint_cannot_process_delays_no_other_episode(there: Endpoint) -> None:
     def poisoned(here: Endpoint, connection: Any, request: Received) -> None:
         answers(500 if b'"e1.' in request.body else 200)(here, connection, request)
 
@@ -154,9 +154,7 @@ def test_the_end_is_reported_after_the_start(there: Endpoint) -> None:
     harness.end()
 
 
-def test_an_endpoint_that_gives_a_time_is_left_alone_until_then(
-    there: Endpoint, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_retry_after_of_an_endpoint_is_honoured(there: Endpoint, monkeypatch: pytest.MonkeyPatch) -> None:
     there.behaviour = first_then(answers(429, Retry_After="1"), answers(200))
     harness = a_harness({"http": http(there), "events": ["Started"]})
     harness.run(an_episode("e1"), an_episode("e2"))
@@ -182,7 +180,7 @@ def test_the_publisher_does_not_wait_for_an_endpoint_that_hangs(there: Endpoint)
     assert time.monotonic() - begun < 20, "the end does not wait for the endpoint either"
 
 
-def test_a_hundred_vehicles_are_one_message(there: Endpoint) -> None:
+def test_notifications_of_a_hundred_vehicles_are_grouped_into_one_message(there: Endpoint) -> None:
     harness = a_harness(
         {
             "http": http(there),
@@ -208,7 +206,7 @@ def test_a_hundred_vehicles_are_one_message(there: Endpoint) -> None:
     harness.end()
 
 
-def test_no_more_messages_go_out_than_the_rate_allows(there: Endpoint) -> None:
+def test_the_message_rate_is_limited(there: Endpoint) -> None:
     harness = a_harness({"http": http(there), "events": ["Started"], "rate": {"messages": 3, "per": "1h"}})
     harness.run(*(an_episode(f"e{number}") for number in range(10)))
     there.received(3)
@@ -218,7 +216,7 @@ def test_no_more_messages_go_out_than_the_rate_allows(there: Endpoint) -> None:
     assert harness.lost[LOST] == 7
 
 
-def test_at_the_end_what_waits_is_tried_once_more(there: Endpoint, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_at_shutdown_queued_messages_are_tried_once_more(there: Endpoint, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(outbox, "FIRST", 60.0)
     monkeypatch.setattr(outbox, "LONGEST", 60.0)
     there.behaviour = answers(500)
@@ -233,14 +231,14 @@ def test_at_the_end_what_waits_is_tried_once_more(there: Endpoint, monkeypatch: 
     assert len(there.requests) == 4
 
 
-def test_at_the_end_a_group_does_not_wait(there: Endpoint) -> None:
+def test_at_shutdown_a_group_is_sent_without_waiting(there: Endpoint) -> None:
     harness = a_harness({"http": http(there), "grouping": {"wait": "1h"}})
     harness.run(an_episode("e1"), an_episode("e2"))
     harness.end()
     assert [event["data"]["count"] for event in events(there.requests)] == [4]
 
 
-def test_what_cannot_be_delivered_by_the_end_is_a_dead_letter_where_nothing_keeps_it() -> None:
+def test_at_shutdown_undelivered_messages_without_a_journal_become_dead_letters() -> None:
     with nobody() as gone:
         harness = a_harness({"http": http(gone), "events": ["Started"]})
         harness.run(an_episode("e1"), an_episode("e2"))
@@ -249,7 +247,9 @@ def test_what_cannot_be_delivered_by_the_end_is_a_dead_letter_where_nothing_keep
     assert "before it was delivered" in harness.outcome("e1", OutcomeState.FAILED).message
 
 
-def test_what_cannot_be_delivered_by_the_end_is_delivered_after_the_next_start(there: Endpoint, tmp_path: Path) -> None:
+def test_journalled_messages_undelivered_at_shutdown_are_delivered_after_a_restart(
+    there: Endpoint, tmp_path: Path
+) -> None:
     there.behaviour = answers(503)
     notify = {"http": http(there), "text": "x"}
     first = a_harness(notify, state=tmp_path)
@@ -272,7 +272,7 @@ def test_what_cannot_be_delivered_by_the_end_is_delivered_after_the_next_start(t
     assert not list((tmp_path / "notify").iterdir())
 
 
-def test_an_action_that_the_rule_no_longer_has_leaves_dead_letters(tmp_path: Path) -> None:
+def test_messages_of_an_action_removed_from_its_rule_become_dead_letters(tmp_path: Path) -> None:
     with nobody() as gone:
         harness = a_harness({"http": http(gone), "events": ["Started"]}, state=tmp_path)
         harness.run(an_episode("e1"))
@@ -282,9 +282,7 @@ def test_an_action_that_the_rule_no_longer_has_leaves_dead_letters(tmp_path: Pat
     assert len(list((tmp_path / "notify").iterdir())) == 1
 
 
-def test_of_a_resumed_episode_only_the_end_is_reported_with_the_texts_of_its_start(
-    there: Endpoint, tmp_path: Path
-) -> None:
+def test_a_resumed_episode_reports_only_its_end_with_the_texts_of_its_start(there: Endpoint, tmp_path: Path) -> None:
     notify = {"http": http(there), "text": "x"}
     first = a_harness(notify, state=tmp_path)
     first.action.started(
@@ -310,7 +308,7 @@ def test_a_text_that_could_not_be_rendered_is_missing_and_reported(there: Endpoi
     harness.end()
 
 
-def test_an_episode_that_does_not_end_is_done_when_its_start_is_reported(there: Endpoint) -> None:
+def test_an_open_episode_is_complete_once_its_start_is_delivered(there: Endpoint) -> None:
     harness = a_harness({"http": http(there)})
     open_ = replace(an_episode(), ended=None, end_time=None, reason=None)
     harness.action.started(open_)
@@ -320,9 +318,7 @@ def test_an_episode_that_does_not_end_is_done_when_its_start_is_reported(there: 
     harness.end()
 
 
-def test_a_secret_that_is_mounted_late_is_waited_for(
-    there: Endpoint, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_secret_mounted_late_is_waited_for(there: Endpoint, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("WAYSIDE_SECRETS", str(tmp_path))
     harness = a_harness({"http": {"urlSecretKeyRef": {"name": "hook", "key": "url"}}, "events": ["Started"]})
     harness.run(an_episode())

@@ -28,7 +28,7 @@ sys.stdin.read()
 """
 
 
-def test_what_was_reported_before_a_kill_is_delivered_after_it_each_event_once(tmp_path: Path) -> None:
+def test_events_journalled_before_a_kill_are_delivered_once_after_it(tmp_path: Path) -> None:
     with endpoint(hangs()) as there:  # so that nothing else is on its way when the process ends
         process = subprocess.Popen(
             [sys.executable, "-c", _KILLED, there.url, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
@@ -51,7 +51,7 @@ def test_what_was_reported_before_a_kill_is_delivered_after_it_each_event_once(t
     assert not list((tmp_path / "notify").iterdir())
 
 
-def test_entries_that_are_no_events_are_counted_and_removed(tmp_path: Path) -> None:
+def test_invalid_journal_entries_are_counted_and_removed(tmp_path: Path) -> None:
     store = action_store(tmp_path / "notify", "default_h_braking_notify", lambda *_: None)
     store.put("notice/e1.started", b"3")
     store.put("notice/e2.started", b"{}")
@@ -63,7 +63,7 @@ def test_entries_that_are_no_events_are_counted_and_removed(tmp_path: Path) -> N
     assert not list((tmp_path / "notify").iterdir())
 
 
-def test_a_folder_that_cannot_be_written_is_reported_and_costs_only_the_keeping(tmp_path: Path) -> None:
+def test_an_unwritable_folder_is_reported_and_only_disables_the_journal(tmp_path: Path) -> None:
     (tmp_path / "notify").write_text("a file where a folder should be")
     with endpoint() as there:
         harness = a_harness({"http": {"url": there.url}}, state=tmp_path)

@@ -33,7 +33,7 @@ def events(requests: list[Received]) -> list[dict[str, Any]]:
     return [json.loads(request.body) for request in requests]
 
 
-def test_who_hangs_holds_up_nobody_and_hears_of_it_after_a_kill(tmp_path: Path) -> None:
+def test_a_hanging_endpoint_delays_no_other_and_gets_its_events_after_a_kill(tmp_path: Path) -> None:
     process = Process(tmp_path)
     with endpoint() as good, endpoint(hangs()) as bad:
         process.write(a_notifying_rule(good, bad), state={"path": str(tmp_path / "state")})
@@ -66,7 +66,7 @@ def test_who_hangs_holds_up_nobody_and_hears_of_it_after_a_kill(tmp_path: Path) 
         assert process.stop() == 0
 
 
-def test_an_alert_continues_after_a_kill_with_the_labels_that_it_had(tmp_path: Path) -> None:
+def test_an_alert_continues_after_a_kill_with_its_labels(tmp_path: Path) -> None:
     process = Process(tmp_path)
     with endpoint() as there:
         rule = a_rule(

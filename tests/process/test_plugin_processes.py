@@ -53,7 +53,7 @@ def some_arrivals() -> list[Arrival]:
     return [arrival(1.3 + n / 4, "ab"[n % 2], {"v": n}) for n in range(24)]
 
 
-def test_in_a_process_the_events_are_those_of_the_own_process(host: ProcessHost) -> None:
+def test_a_plugin_in_a_separate_process_gives_the_same_events(host: ProcessHost) -> None:
     rule = plugin_rule(when="p.count >= 3 && p.v != 12", parameters={"raiseAt": 6})
     driven = [PluginDrive(a_detector(), rule, host=each) for each in (host, LocalHost())]
     for drive in driven:
@@ -74,7 +74,7 @@ def stuck(host: ProcessHost, **parameters: Any) -> PluginDrive:
     return drive
 
 
-def test_one_that_ends_is_reported_and_the_others_continue(host: ProcessHost) -> None:
+def test_a_plugin_that_exits_is_reported_and_the_others_continue(host: ProcessHost) -> None:
     drive = stuck(host, exitAt=7)
     assert drive.take(until=6) == ["z a started 5"]
     counters = drive.engine.counters.rule("r")
@@ -83,7 +83,7 @@ def test_one_that_ends_is_reported_and_the_others_continue(host: ProcessHost) ->
     assert counters.unknowns == 3 + 4  # the signal's, and those of the condition
 
 
-def test_one_that_hangs_is_stopped_and_reported(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_hanging_plugin_is_stopped_and_reported(caplog: pytest.LogCaptureFixture) -> None:
     with closing(ProcessHost(wait=True, patience=PATIENT)) as host:
         drive = PluginDrive(a_detector(), plugin_rule("r", parameters={"hangAt": 7}), plugin_rule("z"), host=host)
         drive.take(arrival(0.5, "a", {"v": 1}), until=1)
@@ -98,7 +98,7 @@ def test_one_that_hangs_is_stopped_and_reported(caplog: pytest.LogCaptureFixture
         assert "EventRule r, signal p, plugin counting" in caplog.text
 
 
-def test_live_it_is_started_again_after_a_pause_three_times() -> None:
+def test_a_live_plugin_is_restarted_up_to_three_times_with_a_pause() -> None:
     clock = Clock()
     with closing(ProcessHost(patience=PATIENT, monotonic=clock)) as host:
         drive = PluginDrive(a_detector(), plugin_rule(parameters={"exitAt": 7}), host=host)
@@ -118,7 +118,7 @@ def wait_for_it(host: ProcessHost, drive: PluginDrive, seconds: int) -> None:
     assert host._signals["r", "p"].is_ready(PATIENT, again=False)
 
 
-def test_what_did_not_run_is_the_same_when_it_is_given_beforehand() -> None:
+def test_a_replay_with_the_recorded_plugin_outages_gives_the_same_events() -> None:
     """Live, the plugin starts, gives values, ends, and is started again; a replay with the same outages agrees."""
     clock = Clock()
     rule = plugin_rule(when="p.count >= 2", until="p.count >= 4", parameters={"exitAt": 6})
@@ -143,7 +143,7 @@ def test_what_did_not_run_is_the_same_when_it_is_given_beforehand() -> None:
     assert values(live.events) == values(replayed.events)
 
 
-def test_a_rule_that_goes_takes_its_process_along(host: ProcessHost) -> None:
+def test_removing_a_rule_stops_its_plugin_process(host: ProcessHost) -> None:
     drive = PluginDrive(a_detector(), plugin_rule(), host=host)
     drive.take(arrival(0.5, "a", {"v": 1}), until=1)
     process = host._signals["r", "p"]._process
@@ -153,7 +153,7 @@ def test_a_rule_that_goes_takes_its_process_along(host: ProcessHost) -> None:
         os.kill(process.pid, 0)
 
 
-def test_what_the_shipped_plugin_takes_long_to_load_is_there_before_it_is_called() -> None:
+def test_the_shipped_plugin_loads_its_dependencies_before_its_first_call() -> None:
     """A value must be there within half a second; loading scipy takes longer than that."""
     program = """
         import sys

@@ -82,7 +82,7 @@ def recovered(path: Path) -> Bench:
 
 
 @pytest.mark.parametrize("compression", ["None", "Lz4", "Zstd"])
-def test_what_was_written_when_the_process_was_killed_is_found_and_marked(tmp_path: Path, compression: str) -> None:
+def test_the_recording_of_a_killed_process_is_recovered_and_marked(tmp_path: Path, compression: str) -> None:
     process = subprocess.Popen(
         [sys.executable, "-c", KILLED, str(tmp_path), compression],
         stdout=subprocess.PIPE,
@@ -130,9 +130,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[int]]:
 
 @settings(deadline=None, max_examples=60)
 @given(st.data())
-def test_a_file_that_is_cut_anywhere_gives_all_chunks_before_that(
-    whole: tuple[Path, list[int]], data: st.DataObject
-) -> None:
+def test_a_truncated_file_gives_all_chunks_before_the_cut(whole: tuple[Path, list[int]], data: st.DataObject) -> None:
     file, ends = whole
     size = file.stat().st_size
     cut = data.draw(st.one_of(st.integers(0, size), st.sampled_from(ends).map(lambda end: end + 5)))
@@ -187,7 +185,7 @@ def somebody_else_fills_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Destination, "_free", lambda self: 10**12)
 
 
-def test_a_full_disk_costs_the_recording_its_end_and_nothing_else(
+def test_a_full_disk_truncates_the_recording_and_affects_nothing_else(
     small_disk: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     somebody_else_fills_the_disk(monkeypatch)
@@ -208,7 +206,7 @@ def test_a_full_disk_costs_the_recording_its_end_and_nothing_else(
     assert bench.outcome(an_episode(2)).state is OutcomeState.DONE
 
 
-def test_the_reserve_keeps_the_disk_from_getting_full(small_disk: Path) -> None:
+def test_the_reserve_of_free_space_is_kept(small_disk: Path) -> None:
     bench = Bench(small_disk)
     bench.limit(reserve="1M")
     for number in range(1, 5):
@@ -229,7 +227,7 @@ def test_a_disk_that_is_full_from_the_start_is_reported(small_disk: Path, monkey
     assert sorted(each.name for each in small_disk.rglob("*")) == ["filler", "r"]
 
 
-def test_a_write_error_costs_that_recording_only(tmp_path: Path) -> None:
+def test_a_write_error_affects_only_its_recording(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     one, other = an_episode(1), an_episode(2)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -257,7 +255,7 @@ def test_a_folder_that_cannot_be_made_is_reported(tmp_path: Path) -> None:
     assert bench.action.wake() is not None
 
 
-def test_a_sample_waits_no_longer_than_a_second(tmp_path: Path) -> None:
+def test_a_sample_is_written_within_a_second(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     bench.action.started(an_episode())
     bench.action.samples(an_episode(), SAMPLES[:5])
@@ -268,7 +266,7 @@ def test_a_sample_waits_no_longer_than_a_second(tmp_path: Path) -> None:
     bench.action.close()
 
 
-def test_a_slow_disk_costs_samples_that_are_counted_and_nobody_waits(
+def test_a_slow_disk_drops_and_counts_samples_and_delays_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     proceed, write = threading.Event(), os.pwritev
@@ -305,9 +303,7 @@ def test_a_slow_disk_costs_samples_that_are_counted_and_nobody_waits(
     assert published[-1]["data"]["message"] == "3 samples of the window are missing"
 
 
-def test_what_the_disk_did_not_confirm_waits_for_the_next_start(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_unsynced_recording_is_recovered_at_the_next_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bench = Bench(tmp_path)
     bench.action.started(an_episode())
     bench.action.samples(an_episode(), SAMPLES)

@@ -26,7 +26,7 @@ DETECTOR, RECORD_ALL, THRESHOLD = (
 )
 
 
-def test_the_examples_have_nothing_wrong(tmp_path: Path) -> None:
+def test_the_examples_have_no_findings(tmp_path: Path) -> None:
     path = tmp_path / "all.yaml"
     path.write_text(yaml.safe_dump_all([DETECTOR, RECORD_ALL, THRESHOLD]))
     assert findings(load_documents([path])).problems == []
@@ -69,7 +69,7 @@ def until_evaluated(process: Process, speed: float) -> None:
         seen = [each.values.get("speed") for each in explanation.subjects]
 
 
-def test_record_all_has_everything_and_threshold_what_it_is_about(process: Process) -> None:
+def test_record_all_has_all_samples_and_threshold_its_window(process: Process) -> None:
     for value in (5, 20, 25, 5, 6):
         process.send("car1", {"v": value})
         until_evaluated(process, value)

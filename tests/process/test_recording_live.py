@@ -228,7 +228,7 @@ def clips_of(process: Process) -> dict[str, tuple[Any, list[Recorded]]]:
     return {clip.name: contents(clip) for clip in process.folder.glob("replayed/clips/*/*")}
 
 
-def test_a_killed_detector_leaves_what_it_wrote_and_continues_in_another_recording(process: Process) -> None:
+def test_a_killed_detector_keeps_its_recording_and_continues_in_another_one(process: Process) -> None:
     write(process, recording("v-rule", "v > -1"), state={"path": "state"})
     process.start()
     vehicle = Vehicle(process, "car1", 3)

@@ -96,7 +96,7 @@ def guarded(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[GuardedR
 
 
 @pytest.mark.parametrize("guarded", ["info"], indirect=True)
-def test_who_is_not_let_in_and_who_has_no_rights_is_in_the_routers_log(guarded: GuardedRouter, tmp_path: Path) -> None:
+def test_rejected_and_unauthorized_clients_are_in_the_routers_log(guarded: GuardedRouter, tmp_path: Path) -> None:
     with pytest.raises(NetworkError):
         guarded.connect(None)
     wait_for(lambda: "peer sent no certificates" in guarded.log)
@@ -125,6 +125,6 @@ def test_a_foreign_key_is_reported_with_the_name_of_the_certificate(guarded: Gua
         wait_for(lambda: reported("is authorized", "vehicles/car1/pose"))
 
 
-def test_the_guide_gives_the_filter_that_is_tested() -> None:
+def test_the_guide_shows_the_tested_log_filter() -> None:
     guide = Path(__file__).parents[2] / "docs" / "security.md"
     assert LOG_ALL in guide.read_text()

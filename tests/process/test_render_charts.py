@@ -47,7 +47,7 @@ def render(folder: Path, helm: str, manifests: list[Mapping[str, Any]]) -> subpr
     return programs.run("application-manager", "render", *files, *options, folder=folder)
 
 
-def test_what_a_chart_makes_of_the_merged_values_is_printed(helm: Path, tmp_path: Path) -> None:
+def test_the_chart_rendered_with_the_merged_values_is_printed(helm: Path, tmp_path: Path) -> None:
     chart = write_chart(tmp_path / "charts", "app")
     done = render(tmp_path, str(helm), [template(str(chart)), task("car1"), task("car2")])
     assert (done.returncode, done.stderr) == (0, "")
@@ -57,14 +57,14 @@ def test_what_a_chart_makes_of_the_merged_values_is_printed(helm: Path, tmp_path
     assert made["Deployment"]["spec"]["template"]["spec"]["containers"][0]["image"] == "app:2"
 
 
-def test_a_chart_that_would_be_refused_is_refused(helm: Path, tmp_path: Path) -> None:
+def test_a_chart_that_the_manager_would_reject_is_rejected(helm: Path, tmp_path: Path) -> None:
     chart = write_chart(tmp_path / "charts", "app", {**APPLICATION, "templates/migrate.yaml": HOOK})
     done = render(tmp_path, str(helm), [template(str(chart)), task("car1")])
     assert done.returncode == 1
     assert "hook" in done.stderr
 
 
-def test_without_helm_it_reports_what_is_missing(tmp_path: Path) -> None:
+def test_without_helm_the_command_reports_that_helm_is_missing(tmp_path: Path) -> None:
     chart = write_chart(tmp_path / "charts", "app")
     done = render(tmp_path, "no-such-helm", [template(str(chart)), task("car1")])
     assert done.returncode == 1

@@ -134,7 +134,7 @@ def drained(receiver: Receiver, count: int) -> list[Any]:
     return arrivals
 
 
-def test_samples_come_in_by_their_topic_and_gaps_in_their_numbers_are_losses(
+def test_samples_are_received_by_topic_and_sequence_gaps_count_as_losses(
     receiver: Receiver, vehicle: zenoh.Session
 ) -> None:
     one, other = Node(vehicle, "vehicles/car1/pose"), Node(vehicle, "vehicles/car2/pose", domain=7)
@@ -224,7 +224,7 @@ def test_a_key_contains_topic_and_type(key: str, reported: tuple[str, str]) -> N
 
 
 @pytest.mark.parametrize("key", ["", "0", "0/a/b", "x/chatter/std_msgs::msg::dds_::String_/h", "0/chatter/String/h"])
-def test_what_is_no_such_key_is_reported(key: str) -> None:
+def test_an_invalid_rmw_zenoh_key_is_reported(key: str) -> None:
     with pytest.raises(KeyMismatchError):
         split(key)
 
@@ -242,7 +242,7 @@ def test_other_attachments_have_no_number_or_some_number(noise: bytes) -> None:
 
 
 @given(st.lists(st.integers(1, 40), min_size=1))
-def test_losses_less_late_ones_are_what_is_missing_in_any_order(numbers: list[int]) -> None:
+def test_late_samples_reduce_the_losses_in_any_order(numbers: list[int]) -> None:
     loss_counter = LossCounter()
     sequences = Sequences("s", loss_counter)
     first, *rest = [0, *dict.fromkeys(numbers)]
@@ -253,7 +253,7 @@ def test_losses_less_late_ones_are_what_is_missing_in_any_order(numbers: list[in
     )
 
 
-def test_a_publisher_that_restarts_has_lost_nothing_and_one_sent_twice_neither() -> None:
+def test_restarts_and_duplicates_do_not_count_as_losses() -> None:
     loss_counter = LossCounter()
     sequences = Sequences("s", loss_counter)
     for number in (5_000, 5_001, 5_001, 1, 2, 2**62, 3):
@@ -261,7 +261,7 @@ def test_a_publisher_that_restarts_has_lost_nothing_and_one_sent_twice_neither()
     assert loss_counter.entries() == []
 
 
-def test_made_up_publishers_cost_no_more_than_the_bound() -> None:
+def test_the_memory_for_made_up_publishers_is_bounded() -> None:
     sequences = Sequences("s", LossCounter())
     for number in range(MAXIMUM_PUBLISHERS + 10):
         sequences.follow(number.to_bytes(16, "little"), 1, "t")
@@ -282,7 +282,7 @@ spec:
 """
 
 
-def test_what_does_not_go_together_is_reported_with_its_place(tmp_path: Path) -> None:
+def test_conflicting_settings_are_reported_by_field(tmp_path: Path) -> None:
     (tmp_path / "detector.yaml").write_text(DETECTOR)
     with pytest.raises(DocumentError) as caught:
         findings(load_documents([tmp_path / "detector.yaml"]))

@@ -35,7 +35,7 @@ def process(tmp_path: Path) -> Iterator[Process]:
     assert process.stop() == 0
 
 
-def test_status_and_metrics_are_what_was_sent(process: Process) -> None:
+def test_status_and_metrics_match_the_samples_sent(process: Process) -> None:
     for number in range(50):
         process.send("car1", {"v": number})
         process.send("car2", {"v": 1})
@@ -196,9 +196,7 @@ def test_metrics_and_health_by_tls_follow_a_renewed_certificate(tmp_path: Path) 
         ),
     ],
 )
-def test_metrics_certificates_that_cannot_be_used_are_an_error(
-    options: list[str], problem: str, tmp_path: Path
-) -> None:
+def test_unusable_metrics_certificates_are_an_error(options: list[str], problem: str, tmp_path: Path) -> None:
     Process(tmp_path).write(FAST)
     files = ["--detector", "detector.yaml", "--rules", "rules.yaml"]
     done = programs.run("detector", "run", *files, *options, folder=tmp_path)

@@ -30,7 +30,7 @@ def detector(*arguments: str | Path) -> list[str | Path]:
     return [sys.executable, "-m", "detector.commands.cli", *arguments]
 
 
-def test_what_the_plugin_requests_is_checked_with_line_and_column(
+def test_parameters_of_the_source_plugin_are_checked_with_line_and_column(
     environment: Mapping[str, str], tmp_path: Path
 ) -> None:
     wrong = tmp_path / "detector.yaml"
@@ -44,7 +44,7 @@ def test_what_the_plugin_requests_is_checked_with_line_and_column(
     assert "65535" in found.stderr
 
 
-def test_the_detector_runs_it(environment: Mapping[str, str], tmp_path: Path) -> None:
+def test_the_detector_runs_the_source_plugin(environment: Mapping[str, str], tmp_path: Path) -> None:
     port = free_port()
     configuration = tmp_path / "detector.yaml"
     configuration.write_text((EXAMPLE / "detector.yaml").read_text().replace("47808", str(port)))

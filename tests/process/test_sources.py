@@ -146,7 +146,7 @@ def test_messages_reach_their_streams_and_others_are_counted(arrivals: Arrivals)
 @pytest.mark.parametrize(
     ("plugin", "error"), [("failing", "RuntimeError: the cable is out"), ("leaving", "SystemExit: 3")]
 )
-def test_a_source_that_fails_is_run_again_and_counted(plugin: str, error: str, arrivals: Arrivals) -> None:
+def test_a_failing_source_is_restarted_and_counted(plugin: str, error: str, arrivals: Arrivals) -> None:
     loss_counter = LossCounter()
     thread = a_thread(plugin, arrivals, loss_counter)
 
@@ -161,7 +161,7 @@ def test_a_source_that_fails_is_run_again_and_counted(plugin: str, error: str, a
     assert len(arrivals.seen) in ((0,) if plugin == "leaving" else (failures(), failures() + 1))
 
 
-def test_a_source_that_hangs_is_left_behind_and_what_it_brings_later_is_not_taken(arrivals: Arrivals) -> None:
+def test_a_hanging_source_is_abandoned_and_its_late_messages_are_dropped(arrivals: Arrivals) -> None:
     loss_counter = LossCounter()
     Hanging.began.clear()
     Hanging.ended.clear()
@@ -240,7 +240,7 @@ def test_a_running_detector_follows_changes_of_its_sources_and_reports_their_sta
         ({"plugin": "once", "parameters": {"txt": "a"}}, "spec.sources[0].parameters.txt: unknown field"),
     ],
 )
-def test_what_is_wrong_with_a_source_is_reported_with_its_field(source: dict[str, Any], problem: str) -> None:
+def test_errors_of_a_source_are_reported_by_field(source: dict[str, Any], problem: str) -> None:
     found = [str(each) for each in source_plugin_problems(a_detector_of({"name": "s", **source}))]
     assert len(found) == 1
     assert problem in found[0]

@@ -72,7 +72,7 @@ def test_an_episode_without_a_task_continues_after_a_restart() -> None:
     assert drive.events[0].episode.start_time == at(-99)
 
 
-def test_one_whose_rule_changed_meanwhile_ends() -> None:
+def test_a_restored_episode_ends_if_its_rule_changed_meanwhile() -> None:
     drive = Drive(a_detector(), speeding(when="speed > 11"))
     assert drive.note(drive.engine.restore([], at(0), open_in(speeding()))) == [
         "r bus RuleChanged 0",
@@ -81,7 +81,7 @@ def test_one_whose_rule_changed_meanwhile_ends() -> None:
     assert drive.engine.open_episodes() == []
 
 
-def test_tasks_come_first_and_an_episode_that_has_one_is_restored_once() -> None:
+def test_an_episode_in_a_task_and_in_the_state_is_restored_once_from_the_task() -> None:
     rule = speeding(actions=[a_deploy("x", parameters={"v": "${speed}"})])
     before = Drive(a_detector(), rule, start=-100)
     before.take(speed(-99.5, 20), until=-99)
@@ -131,11 +131,11 @@ episodes = st.builds(
 
 
 @given(episodes)
-def test_an_episode_is_read_as_it_was_written(episode: OpenEpisode) -> None:
+def test_a_saved_episode_reads_back_unchanged(episode: OpenEpisode) -> None:
     assert from_document(json.loads(json.dumps(episode.to_document()))) == episode
 
 
-def test_what_was_saved_last_is_loaded_and_no_draft_stays(tmp_path: Path) -> None:
+def test_the_last_saved_state_is_loaded_and_no_temporary_file_remains(tmp_path: Path) -> None:
     before = open_in(speeding())
     folder = tmp_path / "new" / "state"
     state = StateFile(folder, "default", "h")
@@ -188,7 +188,7 @@ def test_a_broken_file_is_reported_and_set_aside(
     assert StateFile(tmp_path, "default", "h").load() == before
 
 
-def test_a_disk_that_refuses_is_reported_once_and_the_newest_is_written_later(
+def test_a_failing_disk_is_reported_once_and_the_newest_state_is_written_later(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     before = open_in(speeding())
@@ -271,7 +271,7 @@ def events_in(file: Path) -> list[str]:
     return file.read_text().split("\n")[:-1] if file.exists() else []
 
 
-def test_an_episode_survives_that_its_detector_is_killed_and_its_replay_is_the_same_to_the_byte(tmp_path: Path) -> None:
+def test_an_episode_survives_a_kill_and_its_replay_is_byte_identical(tmp_path: Path) -> None:
     endpoint = free_endpoint()
     detector = a_detector(
         zenoh={"mode": "peer", "listen": [endpoint]}, state={"path": str(tmp_path / "state")}
@@ -311,7 +311,7 @@ def test_an_episode_survives_that_its_detector_is_killed_and_its_replay_is_the_s
     assert events_in(tmp_path / "again" / "events.jsonl") == events_in(events)[1:]
 
 
-def test_a_folder_that_cannot_be_made_is_reported_with_its_field(tmp_path: Path) -> None:
+def test_a_state_folder_that_cannot_be_created_is_reported_by_field(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     detector = a_detector(state={"path": str(tmp_path / "file" / "state")})
     with pytest.raises(OSError, match=r"spec\.state\.path: cannot write .*/file/state \(Not a directory\): give"):

@@ -34,7 +34,9 @@ def test_samples_arrive_in_order_on_every_stream_that_their_key_belongs_to(
         assert of_stream == [(name, "vehicles/car1/pose", str(number).encode()) for number in range(100)]
 
 
-def test_deletions_are_no_samples_but_empty_payloads_are(listening: Network, endpoint: str, arrivals: Arrivals) -> None:
+def test_empty_payloads_are_samples_and_deletions_are_not(
+    listening: Network, endpoint: str, arrivals: Arrivals
+) -> None:
     with session(connect__endpoints=[endpoint]) as vehicle:
         vehicle.delete("vehicles/car1/pose")
         vehicle.put("vehicles/car1/pose", b"")
@@ -93,7 +95,7 @@ def test_closing_while_no_router_answers_is_prompt(endpoint: str, arrivals: Arri
     assert time.monotonic() - start < 5
 
 
-def test_an_endpoint_that_cannot_be_listened_on_is_an_error_that_names_it(arrivals: Arrivals) -> None:
+def test_an_endpoint_that_cannot_be_bound_is_an_error_that_names_it(arrivals: Arrivals) -> None:
     with closing(socket.socket()) as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()

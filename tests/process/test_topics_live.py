@@ -49,7 +49,7 @@ def test_the_streams_of_a_network_are_proposed_and_detectors_are_left_out(endpoi
     assert (streams["odom"].type, streams["odom"].layout) == ("nav_msgs/msg/Odometry", Layout.RMW_ZENOH)
 
 
-def test_a_silent_network_is_an_error_that_reports_what_to_change(endpoint: str) -> None:
+def test_a_silent_network_is_an_error_with_the_remedy(endpoint: str) -> None:
     with session("peer", listen__endpoints=[endpoint]):
         result = CliRunner().invoke(app, ["topics", "--live", "--connect", endpoint, "--seconds", "0.3"])
     assert f"received nothing from {endpoint} within 0.3 s" in str(result.exception)

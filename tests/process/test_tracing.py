@@ -51,7 +51,7 @@ def test_a_traceparent_reads_back(context: TraceContext) -> None:
         "00-" + "1" * 32 + "-" + "1" * 16 + "-01\n",
     ],
 )
-def test_what_is_no_traceparent_is_none(text: object) -> None:
+def test_an_invalid_traceparent_is_none(text: object) -> None:
     assert parse_traceparent(text) is None
 
 
@@ -81,7 +81,7 @@ def test_the_standard_variables_turn_traces_off(monkeypatch: pytest.MonkeyPatch,
     assert tracing("x") is None
 
 
-def test_a_protocol_that_is_not_spoken_and_a_missing_extra_are_reported(
+def test_an_unsupported_protocol_and_a_missing_extra_are_reported(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setenv("OTEL_EXPORTER_OTLP_ENDPOINT", "http://127.0.0.1:1")
@@ -123,7 +123,7 @@ def test_the_service_may_be_named_otherwise(monkeypatch: pytest.MonkeyPatch) -> 
         assert [each.service for each in receiver.spans()] == ["ours"]
 
 
-def test_what_finds_the_queue_full_is_dropped_and_counted_and_the_rest_arrives(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_spans_beyond_the_queue_are_dropped_and_counted_and_the_rest_arrives(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OTEL_BSP_MAX_QUEUE_SIZE", "8")
     monkeypatch.setenv("OTEL_BSP_MAX_EXPORT_BATCH_SIZE", "1")
     with Receiver() as receiver:
@@ -142,7 +142,7 @@ def test_what_finds_the_queue_full_is_dropped_and_counted_and_the_rest_arrives(m
     assert len(receiver.spans()) == 1 + 8
 
 
-def test_an_endpoint_that_is_away_costs_its_spans_and_they_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_spans_for_an_absent_endpoint_are_dropped_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     (port,) = free_ports(1)
     monkeypatch.setenv("OTEL_EXPORTER_OTLP_ENDPOINT", f"http://127.0.0.1:{port}")
     monkeypatch.setenv("OTEL_EXPORTER_OTLP_TIMEOUT", "0.1")
@@ -167,7 +167,7 @@ def test_events_and_the_input_of_actions_have_the_trace_of_their_episode(monkeyp
     assert "traceparent" not in event.cloud_event()
 
 
-def test_a_trace_that_is_not_sampled_reports_it_to_those_who_follow(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_unsampled_flag_is_propagated(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OTEL_TRACES_SAMPLER", "always_off")
     with Receiver() as receiver:
         monkeypatch.setenv("OTEL_EXPORTER_OTLP_ENDPOINT", receiver.endpoint)

@@ -158,7 +158,7 @@ def recording(endpoint: str) -> bool:
     return any(report.state is Progress.RECORDING for report in listed(endpoint))
 
 
-def test_another_detector_records_what_led_to_the_episode_and_the_episode(rsu: Peer, town: Peer) -> None:
+def test_another_detector_records_the_episode_and_the_time_before_it(rsu: Peer, town: Peer) -> None:
     for number in range(20):
         town.send("car1", {"n": number}, "pose")
     rsu.status_when(lambda status: status.streams[0].samples == 20)
@@ -206,7 +206,7 @@ def test_a_recording_whose_stop_never_comes_ends_by_itself(unhurt: Peer) -> None
     assert (done.message, done.until) == ("ended by its maximumDuration", report.until)
 
 
-def test_what_is_not_allowed_is_refused(rsu: Peer, town: Peer) -> None:
+def test_a_request_that_is_not_allowed_is_rejected(rsu: Peer, town: Peer) -> None:
     refused = requested(rsu.endpoint, RecordingRequest(do="start", id="x", streams=["poes"]))
     assert (refused.state, refused.message) == (
         Progress.REFUSED,
@@ -236,7 +236,7 @@ def test_a_killed_requester_comes_back_and_stops_what_it_started(rsu: Peer, town
     assert [each.state for each in listed(rsu.endpoint)] == [Progress.DONE]
 
 
-def test_a_requester_that_finds_its_episode_gone_stops_what_it_had_started(rsu: Peer, town: Peer) -> None:
+def test_a_restarted_requester_without_its_episode_stops_the_recording(rsu: Peer, town: Peer) -> None:
     """Its rule is another when it comes back: the journal has the recordings to stop."""
     town.send("car1", {"v": 20})
     wait_for(lambda: recording(town.endpoint), PATIENCE)
@@ -267,7 +267,7 @@ def test_a_recorder_that_is_killed_continues_when_it_is_back(rsu: Peer, town: Pe
     ]
 
 
-def test_nobody_who_records_costs_only_the_recording(endpoint: str, tmp_path: Path) -> None:
+def test_without_a_recorder_only_the_recording_is_missing(endpoint: str, tmp_path: Path) -> None:
     town = Peer(tmp_path / "town", endpoint, "town")
     town.write(fast("nobody", giveUpAfter="2s"))
     town.start()
@@ -304,7 +304,7 @@ def test_people_request_recordings_by_commands(unhurt: Peer) -> None:
     assert "_requested/record" in shown
 
 
-def test_an_order_of_a_stranger_is_not_believed(unhurt: Peer) -> None:
+def test_path_characters_of_a_request_do_not_reach_file_names(unhurt: Peer) -> None:
     """Its subject stands in names of files."""
     request = RecordingRequest(
         do="start", id="stranger", event={"subject": "../../../x", "data": {"classification": 3}}

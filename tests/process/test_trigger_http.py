@@ -103,7 +103,7 @@ def end(episode: Episode) -> Episode:
     return replace(episode, end_time=time.time_ns(), reason="Until", ended={})
 
 
-def test_an_endpoint_is_notified_of_the_start_and_of_the_end() -> None:
+def test_an_endpoint_is_called_at_the_start_and_at_the_end() -> None:
     with endpoint() as there:
         driven = DrivenAction(http(there.url, maximumDuration="5m"))
         episode = an_episode(driven.parameters)
@@ -126,7 +126,7 @@ def test_an_endpoint_is_notified_of_the_start_and_of_the_end() -> None:
     }
 
 
-def test_a_body_of_ones_own_is_sent_as_it_is_rendered() -> None:
+def test_a_custom_body_is_sent_as_rendered() -> None:
     with endpoint() as there:
         call = {"url": f"{there.url}/snap", "body": {"vehicle": "${client}", "speed": "${v}"}}
         driven = DrivenAction({"http": {"stop": call}})
@@ -140,7 +140,7 @@ def test_a_body_of_ones_own_is_sent_as_it_is_rendered() -> None:
 
 
 @pytest.mark.parametrize("fault", [answers(500), answers(503, Retry_After="1"), hangs()], ids=["500", "busy", "hangs"])
-def test_what_fails_is_sent_again_under_the_same_key(fault: Any) -> None:
+def test_a_failed_request_is_retried_with_the_same_idempotency_key(fault: Any) -> None:
     with endpoint(fault) as there:
         driven = DrivenAction(http(there.url, "1s"))
         episode = an_episode(driven.parameters)
@@ -158,7 +158,7 @@ def test_what_fails_is_sent_again_under_the_same_key(fault: Any) -> None:
     assert driven.lost == []
 
 
-def test_a_start_that_is_refused_for_good_is_not_sent_again() -> None:
+def test_a_permanently_rejected_start_is_not_retried() -> None:
     with endpoint(answers(403, b"not you")) as there:
         driven = DrivenAction(http(there.url))
         driven.action.started(an_episode(driven.parameters))
@@ -196,7 +196,7 @@ def test_a_recording_ends_after_its_maximum_duration_also_while_the_episode_last
     )
 
 
-def test_at_the_end_of_the_detector_an_episode_that_will_not_be_known_again_is_stopped() -> None:
+def test_at_shutdown_a_recording_that_cannot_be_restored_is_stopped() -> None:
     with endpoint() as there:
         driven = DrivenAction(http(there.url))
         episode = an_episode(driven.parameters)
@@ -209,7 +209,7 @@ def test_at_the_end_of_the_detector_an_episode_that_will_not_be_known_again_is_s
     assert driven.outcomes[-1].state is OutcomeState.DONE
 
 
-def test_what_the_next_run_restores_continues_and_is_stopped_by_that_one(tmp_path: Path) -> None:
+def test_a_restored_recording_continues_and_is_stopped_by_the_next_run(tmp_path: Path) -> None:
     """The journal keeps what was rendered, of which the next run knows nothing else."""
     with endpoint() as there:
         trigger = http(there.url)
@@ -259,7 +259,7 @@ def test_a_changed_rule_leaves_the_recordings_of_its_running_episodes_alone(
     assert not list((tmp_path / "triggers").iterdir())
 
 
-def test_a_state_folder_that_cannot_be_written_is_counted_and_costs_nothing_else(tmp_path: Path) -> None:
+def test_an_unwritable_state_folder_is_counted_and_affects_nothing_else(tmp_path: Path) -> None:
     (tmp_path / "triggers").write_text("a file where a folder should be")
     with endpoint() as there:
         driven = DrivenAction(http(there.url), tmp_path)
@@ -269,7 +269,7 @@ def test_a_state_folder_that_cannot_be_written_is_counted_and_costs_nothing_else
     assert lost.startswith(f"1 recordings on other systems that a restart would not stop: cannot use {tmp_path}")
 
 
-def test_one_dead_endpoint_costs_one_attempt_at_a_time() -> None:
+def test_a_dead_endpoint_gets_one_attempt_at_a_time() -> None:
     """Fifty episodes wait for it together, and not each for its own timeout."""
     with endpoint(hangs()) as there:
         driven = DrivenAction(http(there.url, "1s"))
@@ -289,6 +289,6 @@ def test_one_dead_endpoint_costs_one_attempt_at_a_time() -> None:
         ({"start": {"url": "https://${client}/x"}}, "must not contain"),
     ],
 )
-def test_what_makes_no_sense_is_refused(fields: dict[str, Any], reported: str) -> None:
+def test_invalid_settings_are_rejected(fields: dict[str, Any], reported: str) -> None:
     with pytest.raises(ValueError, match=reported):
         api.TriggerAction.model_validate({"http": fields})

@@ -89,7 +89,7 @@ def test_episodes_that_overlap_are_one_recording_of_a_bridged_recorder(process: 
     assert node.names == ["rosbag2_recorder/resume", "rosbag2_recorder/pause"]
 
 
-def test_a_silent_service_is_called_again_and_what_had_arrived_is_no_failure(process: Process) -> None:
+def test_a_silent_service_is_called_again_and_an_earlier_success_is_no_failure(process: Process) -> None:
     """rosbag2 answers 1 to a second Record: after a call without a response this shows that it had arrived."""
     start = call("record", "Record", request={"uri": "/bags/${client}-${int(v)}"})
     start_with(process, fast(timeout="1s", layout="Plain", start=start, stop=call("stop", "Stop")))
@@ -123,7 +123,7 @@ def test_a_silent_service_is_called_again_and_what_had_arrived_is_no_failure(pro
     assert set(uris) == {"/bags/car1-20"}
 
 
-def test_what_a_service_refuses_is_reported(process: Process) -> None:
+def test_a_rejection_by_a_service_is_reported(process: Process) -> None:
     start = {"service": "/recorder/on", "type": "std_srvs/srv/Trigger"}
     start_with(process, fast("5s", layout="Plain", start=start))
     node = Node(process.vehicle, bridged=True)
@@ -135,7 +135,7 @@ def test_what_a_service_refuses_is_reported(process: Process) -> None:
     assert len(node.calls) >= 2
 
 
-def test_what_is_wrong_with_a_call_is_reported_with_its_place(tmp_path: Path) -> None:
+def test_errors_of_a_service_call_are_reported_by_field(tmp_path: Path) -> None:
     documents = [
         a_detector().to_json(),
         fast(
@@ -165,6 +165,6 @@ def test_what_is_wrong_with_a_call_is_reported_with_its_place(tmp_path: Path) ->
         ),
     ],
 )
-def test_what_makes_no_sense_is_refused(ros2: dict[str, Any], reported: str) -> None:
+def test_invalid_settings_are_rejected(ros2: dict[str, Any], reported: str) -> None:
     with pytest.raises(ValueError, match=reported):
         fast(**ros2)

@@ -35,7 +35,7 @@ def alive(pid: int) -> bool:
     return Path(f"/proc/{pid}").exists()
 
 
-def test_what_takes_too_much_cpu_time_is_ended_and_its_process_replaced() -> None:
+def test_a_job_that_exceeds_its_cpu_time_is_killed_and_its_worker_replaced() -> None:
     async def work(pool: Pool) -> None:
         before = await pool.run("a", Where())
         with pytest.raises(ExceededError, match=r"took more than 0\.5 s of CPU time and was stopped"):
@@ -48,7 +48,7 @@ def test_what_takes_too_much_cpu_time_is_ended_and_its_process_replaced() -> Non
     with_pool(work)
 
 
-def test_the_event_loop_continues_while_an_expression_holds_the_interpreters_lock() -> None:
+def test_the_event_loop_continues_while_an_expression_holds_the_gil() -> None:
     async def work(pool: Pool) -> None:
         bomb = asyncio.create_task(pool.run("a", BOMB))
         turns = 0
@@ -62,7 +62,7 @@ def test_the_event_loop_continues_while_an_expression_holds_the_interpreters_loc
     with_pool(work)
 
 
-def test_a_namespace_full_of_bombs_leaves_a_process_to_the_others() -> None:
+def test_a_namespace_of_expensive_expressions_leaves_a_worker_to_the_others() -> None:
     async def work(pool: Pool) -> None:
         bombs = [asyncio.create_task(pool.run("a", BOMB)) for _ in range(6)]
         others = [await pool.run(namespace, Where()) for namespace in "bcdbcd"]
@@ -83,14 +83,14 @@ def test_there_are_never_more_than_two_processes() -> None:
     with_pool(work)
 
 
-def test_a_job_whose_process_is_killed_from_outside_is_done_by_another(tmp_path: Path) -> None:
+def test_a_job_whose_worker_is_killed_is_retried_in_another(tmp_path: Path) -> None:
     async def work(pool: Pool) -> None:
         assert await pool.run("a", KilledOnce(tmp_path / "killed")) == "done"
 
     with_pool(work)
 
 
-def test_what_takes_too_much_memory_is_ended_too() -> None:
+def test_a_job_that_exceeds_its_memory_is_killed_too() -> None:
     async def work(pool: Pool) -> None:
         with pytest.raises(ExceededError, match="was stopped, since its process was ended by SIGABRT"):
             await pool.run("a", Greedy())
@@ -99,7 +99,7 @@ def test_what_takes_too_much_memory_is_ended_too() -> None:
     with_pool(work)
 
 
-def test_a_defect_is_an_error_of_its_job_alone() -> None:
+def test_an_exception_in_a_job_fails_only_that_job() -> None:
     async def work(pool: Pool) -> None:
         with pytest.raises(JobError, match="RuntimeError: a defect"):
             await pool.run("a", Defective())
@@ -108,7 +108,7 @@ def test_a_defect_is_an_error_of_its_job_alone() -> None:
     with_pool(work)
 
 
-def test_at_the_end_the_processes_go_whatever_they_do() -> None:
+def test_at_shutdown_busy_workers_end_too() -> None:
     async def work(pool: Pool) -> None:
         pid = await pool.run("a", Where())
         bomb = asyncio.create_task(pool.run("a", BOMB))
@@ -121,7 +121,7 @@ def test_at_the_end_the_processes_go_whatever_they_do() -> None:
     with_pool(work, cpu_time=600.0)
 
 
-def test_an_answer_is_kept_for_its_question_and_one_that_exceeds_is_not_worked_out_again() -> None:
+def test_answers_are_cached_and_a_timeout_is_not_computed_again() -> None:
     async def work(pool: Pool) -> None:
         answers = AnswerCache(pool)
         done = asyncio.Event()
@@ -145,7 +145,7 @@ def test_an_answer_is_kept_for_its_question_and_one_that_exceeds_is_not_worked_o
     with_pool(work)
 
 
-def test_answers_are_dropped_beyond_their_bytes_those_longest_unused_first() -> None:
+def test_the_answer_cache_evicts_least_recently_used_answers() -> None:
     async def work(pool: Pool) -> None:
         answers, done = AnswerCache(pool, kept=40), asyncio.Event()
 
