@@ -29,6 +29,15 @@ class Evaluation:
 
 
 @dataclass(frozen=True)
+class Scheduled:
+    """When its process runs."""
+
+    def __call__(self) -> int:
+        """The scheduling class."""
+        return os.sched_getscheduler(0)
+
+
+@dataclass(frozen=True)
 class Where:
     """Which process it is."""
 

@@ -19,7 +19,7 @@ from tests.cluster.crds import CRDS
 from tests.cluster.expected_objects import start_manager
 from tests.cluster.namespaces import new_namespace
 from tests.cluster.pods import kubelet as playing_kubelet
-from tests.cluster.processes import Process, Processes
+from tests.cluster.processes import Process, Processes, environment_of
 from tests.sharing import run_folder, shared
 
 HERE = Path(__file__).parent
@@ -95,7 +95,7 @@ def processes(control_plane: ControlPlane, namespace: str, tmp_path: Path) -> It
     """Starts Wayside's programs with the kubeconfig of the control plane; none outlives the test."""
     folder = tmp_path / "logs"
     folder.mkdir()
-    started = Processes(folder, {"KUBECONFIG": str(control_plane.kubeconfig)})
+    started = Processes(folder, environment_of(control_plane.kubeconfig))
     yield started
     started.kill_all()
 

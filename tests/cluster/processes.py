@@ -11,6 +11,15 @@ from tests.cluster.children import Child
 from tests.cluster.waiting import PATIENCE, wait_until
 from tests.programs import BIN, PROGRAMS
 
+SCHEDULING = Path(__file__).with_name("scheduling")
+"""On Python's path it leaves worker processes out of the idle class."""
+
+
+def environment_of(kubeconfig: Path) -> dict[str, str]:
+    """What the programs of a test get: the way to the API server, and worker processes that share the CPU."""
+    path = (str(SCHEDULING), os.environ.get("PYTHONPATH"))
+    return {"KUBECONFIG": str(kubeconfig), "PYTHONPATH": os.pathsep.join(filter(None, path))}
+
 
 class Process:
     """One program, through all its restarts; they share one log, with a line between them.

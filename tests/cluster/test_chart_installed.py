@@ -24,7 +24,7 @@ from tests.cluster.controlplane import ControlPlane
 from tests.cluster.crds import CRD_NAMES, CRDS, apply_crds, remove_crds, wait_crd_gone
 from tests.cluster.manifests import DETECTOR, EVENT_RULE, VALID
 from tests.cluster.namespaces import fresh_namespace
-from tests.cluster.processes import Processes
+from tests.cluster.processes import Processes, environment_of
 from tests.cluster.waiting import wait_until
 from tests.helm import ensure_tools
 from tests.helm.wayside_chart import CHART, Helm, names
@@ -242,7 +242,7 @@ def test_the_installed_rights_suffice_for_the_manager_and_the_test_pod_reaches_i
     arguments = [f"{option}={here.get(option, value)}" for option, value in options]
     (logs := tmp_path / "logs").mkdir()
     account = bare.kubeconfig_of_service_account(there.namespace, f"{RELEASE}-manager")
-    processes = Processes(logs, {"KUBECONFIG": str(account)})
+    processes = Processes(logs, environment_of(account))
     try:
         manager = processes.start(*container["command"], container["args"][0], *arguments)
         manager.wait_for_output("active: holds the Lease")  # the chart's, which is empty at first

@@ -11,7 +11,7 @@ from application_manager.core.claims.claims import instance_name
 from tests.cluster.api import Api, ApiError, Object
 from tests.cluster.controlplane import ControlPlane
 from tests.cluster.expected_objects import condition, config, deployment, start_manager, task, template, wait_settled
-from tests.cluster.processes import Process, Processes
+from tests.cluster.processes import Process, Processes, environment_of
 
 pytestmark = pytest.mark.own_control_plane  # the manager here serves all namespaces
 
@@ -21,7 +21,7 @@ BAD = instance_name("bad", "north")
 @pytest.fixture(scope="module")
 def manager(own_control_plane: ControlPlane, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Process]:
     """One for all these tests and their namespaces: that it survives each of them is part of what they show."""
-    processes = Processes(tmp_path_factory.mktemp("logs"), {"KUBECONFIG": str(own_control_plane.kubeconfig)})
+    processes = Processes(tmp_path_factory.mktemp("logs"), environment_of(own_control_plane.kubeconfig))
     yield start_manager(processes)
     processes.kill_all()
 

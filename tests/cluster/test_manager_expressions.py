@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -142,6 +143,7 @@ def test_a_manager_stopped_during_a_long_evaluation_ends_at_once_and_leaves_no_p
     api.create(bomb())
     accepted(api, "bomb", "True")
     (worker,) = children(manager.pid)
+    assert os.sched_getscheduler(worker) == os.SCHED_OTHER, "in tests it does not wait for an idle machine"
     api.create(task("bad", of="bomb", region="north", **LARGE))
     api.wait_for("ApplicationTask", "bad", lambda _: True, what="the task exists")
     assert manager.terminate() == 0

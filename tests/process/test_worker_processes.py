@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 from application_manager.measures import Measures
 from application_manager.workers.answers import AnswerCache, Exceeded
 from application_manager.workers.pool import ExceededError, JobError, Pool
-from tests.worker_jobs import Defective, Evaluation, Greedy, KilledOnce, Where
+from tests.worker_jobs import Defective, Evaluation, Greedy, KilledOnce, Scheduled, Where
 
 LIMIT = 0.5
 """Seconds of CPU time; what is not to exceed it takes a fiftieth of that."""
@@ -71,6 +72,13 @@ def test_a_namespace_of_expensive_expressions_leaves_a_worker_to_the_others() ->
         for bomb in bombs:
             bomb.cancel()
         await asyncio.gather(*bombs, return_exceptions=True)
+
+    with_pool(work)
+
+
+def test_a_process_runs_only_while_nothing_else_in_the_container_wants_the_cpu() -> None:
+    async def work(pool: Pool) -> None:
+        assert await pool.run("a", Scheduled()) == os.SCHED_IDLE
 
     with_pool(work)
 
