@@ -2,7 +2,7 @@
 
 Both write to the same server, round about, each round into fresh collections. The action begins with the messages as
 they were received: decoding, conversion and its queue are part of what is measured. The baseline inserts the documents
-that the action made, as maps in memory, with `insert_many(ordered=False)` in thousands, and with the same index.
+that the action makes, as maps in memory, with `insert_many(ordered=False)` in thousands, and with the same index.
 
     python -m benchmarks.database_insert [--samples N] [--rounds N]
 """
@@ -53,12 +53,12 @@ def the_samples(count: int) -> list[EpisodeSample]:
     types = store.types
     header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](START // 10**9, 5), "map")
     point, turn, vector = (types[f"geometry_msgs/msg/{name}"] for name in ("Point", "Quaternion", "Vector3"))
-    made = []
+    samples = []
     for number in range(count):
         at = START + number * 10_000_000
         if number % 10 == 9:
             text = b'{"t": %d, "objects": [{"id": 1, "x": 1.5, "y": 2.5, "speed": 13.9, "kind": "car"}]}' % number
-            made.append(EpisodeSample("car1", "json", "v/car1/json", at, at, text))
+            samples.append(EpisodeSample("car1", "json", "v/car1/json", at, at, text))
             continue
         pose = types["geometry_msgs/msg/Pose"](point(number * 0.1, 2.0, 3.0), turn(0.0, 0.0, 0.0, 1.0))
         twist = types["geometry_msgs/msg/Twist"](vector(12.5, 0.0, 0.0), vector(0.0, 0.0, 0.1))
@@ -70,8 +70,8 @@ def the_samples(count: int) -> list[EpisodeSample]:
             types["geometry_msgs/msg/TwistWithCovariance"](twist, covariance),
         )
         payload = bytes(store.serialize_cdr(message, "nav_msgs/msg/Odometry"))
-        made.append(EpisodeSample("car1", "odom", "v/car1/odom", at, at, payload))
-    return made
+        samples.append(EpisodeSample("car1", "odom", "v/car1/odom", at, at, payload))
+    return samples
 
 
 class NoMessenger:
@@ -89,8 +89,8 @@ def with_the_action(detector: Detector, samples: list[EpisodeSample], name: str)
     rule = EventRule.model_validate(
         {"kind": "EventRule", "metadata": {"name": "bench"}, "spec": {"when": "true", "actions": []}}
     )
-    entries = stream_readers(detector)
-    around = DetectorConfiguration(detector, entries.decoders, entries.types)
+    readers = stream_readers(detector)
+    configuration = DetectorConfiguration(detector, readers.decoders, readers.types)
     done = threading.Event()
     reported: list[Outcome] = []
 
@@ -102,7 +102,7 @@ def with_the_action(detector: Detector, samples: list[EpisodeSample], name: str)
     def lose(what: str, count: int, why: str) -> None:
         raise AssertionError(f"{count} {what} lost: {why}")
 
-    context = ActionContext(rule, "keep", "h", lambda: around, NoMessenger(), report, lose, threading.Event())
+    context = ActionContext(rule, "keep", "h", lambda: configuration, NoMessenger(), report, lose, threading.Event())
     action = Database(DatabaseAction(database=name), context)
     action.wake()
     episode = Episode(
@@ -138,12 +138,12 @@ def run(server: MongoServer, count: int, rounds: int) -> float:
     spec = {"streams": list(STREAMS), "database": {"uriVariable": "WAYSIDE_BENCH_URI"}}
     detector = Detector.model_validate({"kind": "Detector", "metadata": {"name": "d"}, "spec": spec})
     samples = the_samples(count)
-    entries = stream_readers(detector)
-    maker = Documents("e.keep", "", {stream.name: stream for stream in detector.spec.streams}, entries.decoders, None)
+    readers = stream_readers(detector)
+    maker = Documents("e.keep", "", {stream.name: stream for stream in detector.spec.streams}, readers.decoders, None)
     documents: dict[str, list[dict[str, Any]]] = {}
     for sample in samples:
-        made = maker.make(sample)
-        documents.setdefault(made.collection, []).append(bson.decode(made.document))
+        converted = maker.make(sample)
+        documents.setdefault(converted.collection, []).append(bson.decode(converted.document))
     begin = time.process_time()
     for sample in samples:
         maker.make(sample)

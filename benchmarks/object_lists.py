@@ -57,20 +57,20 @@ def main() -> int:
     parser.add_argument("--cdr", action="store_true", help="as CDR")
     options = parser.parse_args()
     detector = a_detector("cdr" if options.cdr else "json")
-    entries, rules = stream_readers(detector), ten_rules()
-    encode = cdr(entries) if options.cdr else as_json
+    readers, rules = stream_readers(detector), ten_rules()
+    encode = cdr(readers) if options.cdr else as_json
     arrivals = [*sent(options.objects, options.hz, options.seconds, encode)]
     size = len(arrivals[0].payload)
-    run(detector, entries, rules, arrivals[: options.hz])  # imports are done before it counts
+    run(detector, readers, rules, arrivals[: options.hz])  # imports are done before it counts
     tune_garbage_collection()  # as a detector does
     decoding, evaluating, events = [], [], 0
     for _ in range(options.repeat):
         begin = time.process_time()
         for each in arrivals:
-            entries.decoders["objects"].decode(each.payload)
+            readers.decoders["objects"].decode(each.payload)
         decoding.append(time.process_time() - begin)
         begin = time.process_time()
-        events, inserting = run(detector, entries, rules, arrivals)
+        events, inserting = run(detector, readers, rules, arrivals)
         evaluating.append(time.process_time() - begin)
     baseline, spent = (statistics.median(each) / options.seconds for each in (decoding, evaluating))
     print(
@@ -82,11 +82,11 @@ def main() -> int:
 
 
 def run(
-    detector: Detector, entries: StreamReaders, rules: Sequence[EventRule], arrivals: Sequence[Arrival]
+    detector: Detector, readers: StreamReaders, rules: Sequence[EventRule], arrivals: Sequence[Arrival]
 ) -> tuple[int, float]:
     """The number of events, and the CPU time of the calls in which no tick was due."""
-    engine = make_engine(detector, entries, holder="h", start=START)
-    engine.set_rules([compile_rule(rule, detector, entries.fields) for rule in rules])
+    engine = make_engine(detector, readers, holder="h", start=START)
+    engine.set_rules([compile_rule(rule, detector, readers.fields) for rule in rules])
     events, inserting = 0, 0.0
     for each in arrivals:
         begin, tick = time.process_time(), engine.next_tick()
@@ -161,9 +161,9 @@ def as_json(now: float, found: list[tuple[int, float, float, float]]) -> bytes:
     return json.dumps({"header": {"stamp": now, "frame_id": "map"}, "objects": objects}).encode()
 
 
-def cdr(entries: StreamReaders) -> Callable[[float, list[Any]], bytes]:
+def cdr(readers: StreamReaders) -> Callable[[float, list[Any]], bytes]:
     """Encodes the same as the message of ROS 2."""
-    store = entries.types.store
+    store = readers.types.store
     types = store.types
     vector, point = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Point"]
     none, covariance = vector(x=0.0, y=0.0, z=0.0), np.zeros(36)

@@ -41,7 +41,7 @@ class Bench:
             rule=a_rule(rule, when="true"),
             action="bag",
             holder="h",
-            configuration=self._surroundings,
+            configuration=self._configuration,
             messenger=_NoMessenger(),
             report=lambda episode, outcome: self.reports.append((episode.id, outcome)),
             lose=lambda what, count, why: self.lost.append((what, count, why)),
@@ -51,7 +51,7 @@ class Bench:
         self.path = path
         self._streams = streams
 
-    def _surroundings(self) -> DetectorConfiguration:
+    def _configuration(self) -> DetectorConfiguration:
         if self._known is None or self._known.detector is not self.detector:
             self._known = configuration(self.detector)
         return self._known
@@ -92,8 +92,8 @@ def recording_detector(path: Path, *streams: dict[str, Any], **recordings: Any) 
 
 
 def configuration(detector: Detector) -> DetectorConfiguration:
-    entries = stream_readers(detector)
-    return DetectorConfiguration(detector, entries.decoders, entries.types)
+    readers = stream_readers(detector)
+    return DetectorConfiguration(detector, readers.decoders, readers.types)
 
 
 def an_episode(

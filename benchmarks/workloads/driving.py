@@ -29,11 +29,11 @@ class Live:
 
     def __init__(self, detector: Detector, rules: Sequence[EventRule], start: int) -> None:
         """`start`: nanoseconds since the epoch. Raises RefusedError."""
-        entries = stream_readers(detector)
-        compiled, refused = RuleIndex().compile(rules, detector, entries.fields)
+        readers = stream_readers(detector)
+        compiled, refused = RuleIndex().compile(rules, detector, readers.fields)
         if refused:
             raise RefusedError(str(refused[0]))
-        self._engine = make_engine(detector, entries, holder=detector.name, start=start)
+        self._engine = make_engine(detector, readers, holder=detector.name, start=start)
         self._engine.set_rules(compiled)
 
     def watch(self) -> None:

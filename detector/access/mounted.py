@@ -3,8 +3,8 @@
 A Secret is a folder with its name, in the folder named by the environment variable `WAYSIDE_SECRETS` (default:
 /etc/wayside/secrets), with one file per key, as Kubernetes mounts it.
 
-The files of a network may change at any time, one after the other. So `read_material` reads them, tests them as a pair,
-and reads them again: the result is consistent, and does not change while a session uses it.
+The files of a network may change at any time, one after the other. So `read_credentials` reads them, tests them as a
+pair, and reads them again: the result is consistent, and does not change while a session uses it.
 """
 
 from __future__ import annotations
@@ -166,7 +166,7 @@ class LoadedCredentials:
         return None if self.certificate is None else expiry(self.certificate)
 
 
-def read_material(access: Access, at: str) -> LoadedCredentials:
+def read_credentials(access: Access, at: str) -> LoadedCredentials:
     """The current credentials of `access`, which is in the field `at`. Raises AccessError if it cannot be used."""
     files, credentials = tls_files(access, at), login(access, at)
     if files is None:

@@ -57,7 +57,7 @@ class ActionHost:
         self._holder = holder
         self._messenger = messenger
         self._maximum = maximum_bytes
-        self._surroundings: DetectorConfiguration | None = None
+        self._configuration: DetectorConfiguration | None = None
         self._closing = threading.Event()
         self._assignments: dict[ActionKey, _Assignment] = {}
         self._at_work: dict[ActionRun, Worker] = {}
@@ -67,7 +67,7 @@ class ActionHost:
 
     def follow(self, rules: Iterable[EventRule], configuration: DetectorConfiguration) -> None:
         """Use these rules from now on. Unchanged actions continue; others finish their running episodes."""
-        self._surroundings = configuration
+        self._configuration = configuration
         wanted = {
             ActionKey(rule.name, action.name): (rule, action)
             for rule in rules
@@ -131,7 +131,7 @@ class ActionHost:
             rule=rule,
             action=action.name,
             holder=self._holder,
-            configuration=self._around,
+            configuration=self._current_configuration,
             messenger=self._messenger,
             report=partial(self.outcomes.report, which),
             lose=partial(self.outcomes.lose, which),
@@ -144,10 +144,10 @@ class ActionHost:
 
         return make
 
-    def _around(self) -> DetectorConfiguration:
-        if self._surroundings is None:
+    def _current_configuration(self) -> DetectorConfiguration:
+        if self._configuration is None:
             raise RuntimeError("no EventRule has been applied yet")
-        return self._surroundings
+        return self._configuration
 
 
 def _same(assignment: _Assignment, rule: EventRule, action: api.ActionSpec) -> bool:

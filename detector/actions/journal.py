@@ -34,7 +34,7 @@ class Journal:
             unkept: what is counted for a document that cannot be stored.
             version: only documents of earlier runs with the same one are taken over.
         """
-        self._setting, self._unkept = context, unkept
+        self._context, self._unkept = context, unkept
         self._store: DurableStore | None = None
         detector = context.configuration().detector
         whose = (detector.namespace, context.holder, context.rule.name, context.action)
@@ -67,7 +67,7 @@ class Journal:
             if sync:
                 self._store.sync()
         except StoreError as error:
-            self._setting.lose(self._unkept, 1, str(error))
+            self._context.lose(self._unkept, 1, str(error))
 
     def load(self, key: str, make: Callable[[Any], T]) -> T | None:
         """What `make` returns for the document; None if there is none, or none that can be read."""
@@ -77,9 +77,9 @@ class Journal:
             record = self._store.get(key)
             return None if record is None else make(json.loads(record))
         except StoreError as error:
-            self._setting.lose(_UNREAD, 1, str(error))
+            self._context.lose(_UNREAD, 1, str(error))
         except (ValueError, KeyError, TypeError, AttributeError) as error:
-            self._setting.lose(_UNREAD, 1, f"{type(error).__name__} in {key}")
+            self._context.lose(_UNREAD, 1, f"{type(error).__name__} in {key}")
             self.drop([key])
         return None
 
@@ -93,7 +93,7 @@ class Journal:
         try:
             return [] if self._store is None else self._store.keys(prefix)
         except StoreError as error:
-            self._setting.lose(_UNREAD, 1, str(error))
+            self._context.lose(_UNREAD, 1, str(error))
             return []
 
     def drop(self, keys: Iterable[str]) -> None:
@@ -104,7 +104,7 @@ class Journal:
         try:
             self._store.drop(*gone)
         except StoreError as error:
-            self._setting.lose("journal entries that could not be dropped", len(gone), str(error))
+            self._context.lose("journal entries that could not be dropped", len(gone), str(error))
 
     def close(self) -> None:
         """Close the file: the next run takes over the remaining entries. The last call."""
@@ -113,4 +113,4 @@ class Journal:
         try:
             self._store.close()
         except StoreError as error:
-            _log.error("cannot close the journal of action %s: %s", self._setting.action, error)
+            _log.error("cannot close the journal of action %s: %s", self._context.action, error)

@@ -231,7 +231,7 @@ def _compiled(
 
 def make_engine(
     detector: Detector,
-    entries: StreamReaders,
+    readers: StreamReaders,
     *,
     holder: str,
     start: int,
@@ -245,8 +245,8 @@ def make_engine(
     return Engine(
         detector,
         holder=holder,
-        decoders=entries.decoders,
-        read_key=entries.read_key,
+        decoders=readers.decoders,
+        read_key=readers.read_key,
         start=start,
         plugins=plugins or LocalHost(),
         order=order,

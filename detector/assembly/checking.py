@@ -46,9 +46,9 @@ def findings(documents: Sequence[Document]) -> CheckResult:
                     document.problem(each.path, each.message, INVALID_DETECTOR.name)
                     for each in source_plugin_problems(document.object)
                 ]
-                entries = stream_readers(document.object)
-                detectors.append((document, document.object, entries))
-                warnings += _unignored(document, _without_stamps(document, document.object, entries))
+                readers = stream_readers(document.object)
+                detectors.append((document, document.object, readers))
+                warnings += _unignored(document, _without_stamps(document, document.object, readers))
             except DetectorError as error:
                 problems += [
                     document.problem(each.path, each.message, INVALID_DETECTOR.name) for each in error.problems
@@ -74,13 +74,13 @@ def findings(documents: Sequence[Document]) -> CheckResult:
     return CheckResult(list(dict.fromkeys(problems)), list(dict.fromkeys(warnings)))
 
 
-def _without_stamps(document: Document, detector: Detector, entries: StreamReaders) -> Iterator[Problem]:
+def _without_stamps(document: Document, detector: Detector, readers: StreamReaders) -> Iterator[Problem]:
     """With clock Data, the streams without stamps beside others that have them."""
     streams = [] if detector.spec.clock is Clock.WALL else list(enumerate(detector.spec.streams))
     without = [
         (index, stream)
         for index, stream in streams
-        if not stream.latched and not _has_stamp(stream, entries.fields.get(stream.name))
+        if not stream.latched and not _has_stamp(stream, readers.fields.get(stream.name))
     ]
     if len(without) < sum(not stream.latched for _, stream in streams):
         for index, stream in without:
@@ -129,10 +129,10 @@ def _rule_problems(
         names = ", ".join(detector.name for _, detector, _ in detectors)
         unselected = f"no Detector selects the rule: compare spec.ruleSelector of {names}"
         yield document.problem(("metadata", "labels"), unselected, RULE_NOT_SELECTED.name)
-    for of_detector, detector, entries in selecting:
+    for of_detector, detector, readers in selecting:
         try:
             known = (*wrong[detector.name].get(rule.name, ()), *offer_problems(rule, detector))
-            compiled = compile_rule(rule, detector, entries.fields, known, entries.places)
+            compiled = compile_rule(rule, detector, readers.fields, known, readers.places)
             bind_models(compiled)
         except RuleError as error:
             for each in error.problems:

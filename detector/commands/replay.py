@@ -87,13 +87,13 @@ def replay_files(
         DocumentError, DetectorError, RecordingError, OSError: a file cannot be used; the text gives the reason.
     """
     check_installed(kinds)
-    looking = ResultCollector() if kinds else None
+    collector = ResultCollector() if kinds else None
     with ProgressLine(Console(stderr=True)) as progress:
         clips = Clips(output / CLIPS) if record else None
         options = PlayOptions(as_one, clips, tuple(sets), tuple(sweeps))
-        played, variants = _replayed(recordings, detector, rules, options, progress, looking)
+        played, variants = _replayed(recordings, detector, rules, options, progress, collector)
         output.mkdir(parents=True, exist_ok=True)
-        results = [] if looking is None else looking.results(played.outcomes)
+        results = [] if collector is None else collector.results(played.outcomes)
         if results:
             progress.note("writing the results")
             write_results(output, results, kinds)
@@ -210,7 +210,7 @@ def _replayed(
     rules: Sequence[Path],
     options: PlayOptions,
     progress: ProgressLine,
-    looking: ResultCollector | None,
+    collector: ResultCollector | None,
 ) -> tuple[PlayResult, Sequence[Variant]]:
     """The outcome of the recordings, and the variants of rules."""
     intake = intake_file_of(recordings)
@@ -219,7 +219,7 @@ def _replayed(
             refuse("an intake file has no variants of rules, only --set RULE=OTHER: give the recording itself")
         name = recording_name((intake,))
         outcome = _intake_replayed(
-            intake, detector, rules, progress, None if looking is None else looking.watch(name), options.clips
+            intake, detector, rules, progress, None if collector is None else collector.watch(name), options.clips
         )
         return PlayResult({name: outcome}, []), variants_of([*outcome.rules.values()], options.sets, ())
     if detector is None:
@@ -238,8 +238,8 @@ def _replayed(
         with_variants(loaded.rule_set.detector, made),
         evaluated,
         lambda: _plugins(Outages(lambda: ())),
-        lambda batches: progress.watch_batches(batches if looking is None else looking.batches(batches)),
-        lambda name: None if looking is None else looking.watch(name).tracer,
+        lambda batches: progress.watch_batches(batches if collector is None else collector.batches(batches)),
+        lambda name: None if collector is None else collector.watch(name).tracer,
         options.clips,
     )
     return played, variants
@@ -250,7 +250,7 @@ def _intake_replayed(
     detector: Path | None,
     rules: Sequence[Path],
     progress: ProgressLine,
-    look: RecordingTrace | None,
+    trace: RecordingTrace | None,
     clips: Clips | None,
 ) -> ReplayResult:
     if detector is None and rules:
@@ -259,11 +259,11 @@ def _intake_replayed(
     records = progress.watch(read_intake(recording))
     with _plugins(Outages(lambda: recorded_outages(recording) if detector is None else ())) as plugins:
         return replay_intake(
-            records if look is None else look.arrivals.watch(records),
+            records if trace is None else trace.arrivals.watch(records),
             None if given is None else given.detector,
             given.rules if given is not None and rules else None,
             plugins,
-            None if look is None else look.tracer,
+            None if trace is None else trace.tracer,
             clips,
         )
 

@@ -51,7 +51,7 @@ def try_expression(expression: str, recordings: Sequence[Path], stream: str | No
     detector = with_recorded_types(Detector.model_validate(detector_document(found)), files)
     name = _stream(expression, found, detector, stream, every)
     tracers: dict[str, Tracer] = {}
-    play(gathered, detector, [_rule(expression, name, every)], onlooker=lambda of: tracers.setdefault(of, Tracer()))
+    play(gathered, detector, [_rule(expression, name, every)], observer=lambda of: tracers.setdefault(of, Tracer()))
     typer.echo(f"{expression} of stream {name}")
     for recording, tracer in tracers.items():
         if len(tracers) > 1:

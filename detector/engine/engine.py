@@ -75,8 +75,8 @@ class Engine:
         self._ticks = Ticks()
         self.schedule = Schedule(self._ticks)
         self._starts = EpisodeStarts()
-        self._known = RuleInputs(detector, decoders, read_key, start, self.counters, self._starts, exact=self._exact)
-        self.buffer, self.clients = self._known.buffer, self._known.clients
+        self._inputs = RuleInputs(detector, decoders, read_key, start, self.counters, self._starts, exact=self._exact)
+        self.buffer, self.clients = self._inputs.buffer, self._inputs.clients
         self._starts.is_known = self.clients.__contains__
         self._plugins = PluginSignals(plugins or NoPlugins(), self.queries)
         self.consequences = Consequences(self.buffer)
@@ -85,7 +85,7 @@ class Engine:
         self.observers = Observers()
         """Observers; set them before the rules."""
         self._executor = Executor(
-            self._known,
+            self._inputs,
             self._ticks,
             self.schedule,
             self._starts,
@@ -105,7 +105,7 @@ class Engine:
             RuleError: an expression of one of the Detector's streams does not compile; the engine is then unchanged.
         """
         before = self.detector.spec
-        self._known.follow(detector, decoders, read_key, self._timeline.now)
+        self._inputs.follow(detector, decoders, read_key, self._timeline.now)
         self._executor.follow_detector()
         if isinstance(self._timeline, DataTimeline):
             self._timeline.max_behind = _longest(detector)
@@ -122,7 +122,7 @@ class Engine:
     @property
     def detector(self) -> Detector:
         """The Detector in its current version."""
-        return self._known.detector
+        return self._inputs.detector
 
     def advance(self, arrivals: Sequence[Arrival], until: int) -> list[Event]:
         """Take in what arrived, in order, and run the ticks up to `until`, or to the last arrival if that is later.
@@ -169,8 +169,8 @@ class Engine:
         for name in sorted(self._starts.configure(rules, self.detector.spec.buffer.duration.ns)):
             for event in runs[name].open_starts() if name in runs else ():
                 self._starts.started(event)
-        self._known.forget_rules(kept)
-        self._known.ingest.linked = frozenset(stream for rule in rules for stream in rule.linked)
+        self._inputs.forget_rules(kept)
+        self._inputs.ingest.linked = frozenset(stream for rule in rules for stream in rule.linked)
         self._plugins.configure(rules, kept)
         self.schedule.set_rules([run.rule for run in self._runs.values()])
         self._executor.set_rules(self._runs)
@@ -261,9 +261,9 @@ class Engine:
             raise NotEvaluableError(f"rule {name} is not evaluated on demand: write evaluation: {{onDemand: true}}")
         if not run.rule.enabled or name in self.schedule.paused:
             raise NotEvaluableError(f"rule {name} is {'paused: resume it' if run.rule.enabled else 'not enabled'}")
-        events, answers = run.answer(self.now, self._known.views(run, self.now), self.clients, self._plugins)
+        events, answers = run.answer(self.now, self._inputs.views(run, self.now), self.clients, self._plugins)
         self._executor.noted(run, events)
-        self._known.looked(self.now)
+        self._inputs.looked(self.now)
         return events, answers
 
     def demands(self) -> dict[str, Demand]:
@@ -301,7 +301,7 @@ class Engine:
 
     def latency(self, sample: Sample, stream: str) -> float | None:
         """Seconds from the sample's stamp to its receipt; None if it has no stamp. Counts nothing."""
-        return self._known.latency(sample, stream)
+        return self._inputs.latency(sample, stream)
 
     @property
     def in_columns(self) -> frozenset[str]:
@@ -315,7 +315,7 @@ class Engine:
 
     def queries(self) -> BufferQueries:
         """Read access to the buffer in its current state."""
-        return self._known.queries(self.now)
+        return self._inputs.queries(self.now)
 
     def _make_timeline(self, start: int) -> Timeline:
         spec = self.detector.spec
@@ -330,8 +330,8 @@ class Engine:
             max_behind=_longest(self.detector),
             alone_after=spec.client_timeout.ns,
             maximum_bytes=spec.buffer.bytes.bytes,
-            stamp_of=self._known.stamp_of,
-            client_of=self._known.ingest.sender_of,
+            stamp_of=self._inputs.stamp_of,
+            client_of=self._inputs.ingest.sender_of,
             latched=_latched(self.detector),
             exact=self._exact,
         )

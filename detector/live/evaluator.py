@@ -111,7 +111,7 @@ class Evaluator:
         recorder: IntakeRecorder | None = None,
         on_failure: Callable[[BaseException], None],
         outages: Outages | None = None,
-        onlooker: LiveObserver | None = None,
+        observer: LiveObserver | None = None,
     ) -> None:
         """`now` returns nanoseconds since the epoch; `on_failure` is called if the thread dies of an error.
 
@@ -119,12 +119,12 @@ class Evaluator:
         """
         self._engine = engine
         self._intake = intake
-        self._outlet = sink
+        self._sink = sink
         self._now = now
         self._recorder = recorder
         self._on_failure = on_failure
         self._outages = outages or Outages()
-        self._onlooker = engine.observers.observer = onlooker
+        self._observer = engine.observers.observer = observer
         self._rule_index = RuleIndex()
         self._wake = threading.Condition()
         self._wanted: RuleSet | None = None
@@ -172,7 +172,7 @@ class Evaluator:
         self._demands = {demand.name: demand for demand in restored.demands}
         events += self._engine.restore(restored.demands, start, restored.episodes)
         self._hand_over(events)
-        self._outlet.open_episodes(self._engine.open_episodes)
+        self._sink.open_episodes(self._engine.open_episodes)
         self._thread.start()
 
     def call(self, work: Callable[[], Result]) -> Future[Result]:
@@ -230,7 +230,7 @@ class Evaluator:
                     self.losses.log_new()
                 self._sweeper.look()
             self._finish()
-            self._outlet.consequences(self._engine.consequences.cut(self._engine.now, "the detector stopped"))
+            self._sink.consequences(self._engine.consequences.cut(self._engine.now, "the detector stopped"))
         except BaseException as error:  # noqa: BLE001  the supervisor must learn of any end of the evaluation
             self._on_failure(error)
         finally:
@@ -252,7 +252,7 @@ class Evaluator:
         for events in self._engine.finish():
             self._hand_over(events)
         if self._engine.measures:
-            self._outlet.open_episodes(self._engine.open_episodes)
+            self._sink.open_episodes(self._engine.open_episodes)
         self._record_outages()
         self._record(end, {"kind": "end", "finished": True})
 
@@ -332,10 +332,10 @@ class Evaluator:
         """Switch to a changed Detector or rules."""
         changed = wanted.detector.spec != self._engine.detector.spec
         if changed:
-            entries = stream_readers(wanted.detector)
-            self._engine.set_detector(wanted.detector, entries.decoders, entries.read_key)
+            readers = stream_readers(wanted.detector)
+            self._engine.set_detector(wanted.detector, readers.decoders, readers.read_key)
             if self._recorder is not None:
-                self._recorder.follow(wanted.detector.spec.streams, entries.types)
+                self._recorder.follow(wanted.detector.spec.streams, readers.types)
         self._record(
             self._engine.now,
             {
@@ -347,31 +347,31 @@ class Evaluator:
         return self._apply_rules(wanted)
 
     def _apply_rules(self, rule_set: RuleSet) -> list[Event]:
-        entries = stream_readers(rule_set.detector)
-        compiled, refused = self._rule_index.compile(rule_set.rules, rule_set.detector, entries.fields, entries.places)
+        readers = stream_readers(rule_set.detector)
+        compiled, refused = self._rule_index.compile(rule_set.rules, rule_set.detector, readers.fields, readers.places)
         for refusal in refused:
             _log.error("%s", refusal)
         self.status.refused(refused)
-        self._outlet.follow(
-            self._rule_index.good, DetectorConfiguration(rule_set.detector, entries.decoders, entries.types)
+        self._sink.follow(
+            self._rule_index.good, DetectorConfiguration(rule_set.detector, readers.decoders, readers.types)
         )
         events = self._engine.set_rules(compiled)
-        if self._onlooker is not None:
-            self._onlooker.attend(self._engine)
+        if self._observer is not None:
+            self._observer.attend(self._engine)
         self._intake.urgent = self._engine.triggers
         return events
 
     def _hand_over(self, events: Sequence[Event]) -> None:
-        if self._onlooker is not None:
-            self._onlooker.looked(self._engine, events)
+        if self._observer is not None:
+            self._observer.looked(self._engine, events)
         if events:
-            self._outlet.events(events)
+            self._sink.events(events)
         if events or abs(self._engine.now - self._saved) >= _SAVE_EVERY:
             self._saved = self._engine.now
             if events or self._engine.measures:
-                self._outlet.open_episodes(self._engine.open_episodes)
+                self._sink.open_episodes(self._engine.open_episodes)
         if consequences := self._engine.consequences.take(self._engine.now):
-            self._outlet.consequences(consequences)
+            self._sink.consequences(consequences)
         version = self._engine.demands_version
         if version != self._version:
             self._version = version
@@ -384,7 +384,7 @@ class Evaluator:
             }
             self._demands = demands
             self.status.demands = (*demands,)
-            self._outlet.demands(demands, ended)
+            self._sink.demands(demands, ended)
 
     def _record(self, time: int, document: Mapping[str, Any]) -> None:
         if self._recorder is not None:

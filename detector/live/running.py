@@ -87,36 +87,36 @@ class Running:
         self._rule_set = rule_set
         self._restored = restored
         detector = rule_set.detector
-        entries = _checked(detector)
+        readers = _checked(detector)
         self._loss_counter = LossCounter()
         self._intake = Intake(time.time_ns)
         self._plugins = ProcessHost()
-        self._engine = make_engine(detector, entries, holder=holder, start=time.time_ns(), plugins=self._plugins)
-        self._writer = None if record is None else _writer(record, detector, entries)
+        self._engine = make_engine(detector, readers, holder=holder, start=time.time_ns(), plugins=self._plugins)
+        self._writer = None if record is None else _writer(record, detector, readers)
         self._log = None if output is None else EventLog(output / "events.jsonl")
-        self._outlet = LiveSink(self._network(detector), holder, self._log, reconciler, state, traces)
+        self._sink = LiveSink(self._network(detector), holder, self._log, reconciler, state, traces)
         self._state = state
         self._reconciler = reconciler
         self._evaluator = Evaluator(
             self._engine,
             self._intake,
-            self._outlet,
+            self._sink,
             now=time.time_ns,
             recorder=self._writer,
             on_failure=self._fail,
             outages=self._plugins.outages,
-            onlooker=view,
+            observer=view,
         )
         requested = RequestedRecordings(self._engine, self._evaluator.call)
-        self._outlet.actions.outcomes.on_outcome = requested.on_outcome
+        self._sink.actions.outcomes.on_outcome = requested.on_outcome
         pulse = LoopMonitor(self._loop)
         self.answers = Answers(
-            self._evaluator, lambda: self._outlet, lambda: self._sources.threads, requested, pulse.silence, lease
+            self._evaluator, lambda: self._sink, lambda: self._sources.threads, requested, pulse.silence, lease
         )
         self._server = None if pages is None else _server(pages, self.answers)
 
         self._evaluator.losses.watch(self._loss_counter)
-        self._evaluator.losses.watch_also(lambda: _of_actions(self._outlet.actions.outcomes))
+        self._evaluator.losses.watch_also(lambda: _of_actions(self._sink.actions.outcomes))
         if state is not None:
             self._evaluator.losses.watch_also(lambda: _of_state(state))
         self._view = view
@@ -128,7 +128,7 @@ class Running:
 
     def __enter__(self) -> Running:
         self._evaluator.start(self._rule_set, self._restored)
-        self._outlet.network.start()
+        self._sink.network.start()
         self._sources.follow(self._rule_set.detector)
         if self._server is not None:
             self._server.start()
@@ -153,10 +153,10 @@ class Running:
         if self._view is not None:
             self._view.close()
         self._plugins.close()
-        self._outlet.actions.close()
+        self._sink.actions.close()
         if self._state is not None:
             self._state.close()
-        self._outlet.network.close()
+        self._sink.network.close()
         if self._log is not None:
             self._log.close()
         if self._writer is not None:
@@ -180,7 +180,7 @@ class Running:
             _log.info("applied a change: Detector %s runs with %d rules", detector.name, len(wanted.rules))
             spec = detector.spec
             if spec.zenoh != before.zenoh or _subscribed(spec.streams) != _subscribed(before.streams):
-                await asyncio.to_thread(self._outlet.move, self._network(detector))
+                await asyncio.to_thread(self._sink.move, self._network(detector))
             await asyncio.to_thread(self._sources.follow, detector)
 
     def _network(self, detector: Detector) -> Network:
@@ -192,7 +192,7 @@ class Running:
             streams,
             self._putter,
             on_failure=self._fail,
-            answering=lambda session: QueryHandler(session, holder, self.answers.answer),
+            make_query_handler=lambda session: QueryHandler(session, holder, self.answers.answer),
             loss_counter=self._loss_counter,
         )
 
@@ -218,15 +218,15 @@ class Running:
 
     def _summarise(self) -> None:
         self._evaluator.losses.sum_up()
-        if self._outlet.network.dropped_events:
-            _log.warning("in total, %d events were not published", self._outlet.network.dropped_events)
+        if self._sink.network.dropped_events:
+            _log.warning("in total, %d events were not published", self._sink.network.dropped_events)
 
 
-def _writer(path: Path, detector: Detector, entries: StreamReaders) -> IntakeWriter:
+def _writer(path: Path, detector: Detector, readers: StreamReaders) -> IntakeWriter:
     # Not at the top: only a detector that records its intake needs the MCAP library.
     from detector.replay.intake_writer import IntakeWriter  # noqa: PLC0415
 
-    return IntakeWriter(_unused(path), detector.spec.streams, entries.types)
+    return IntakeWriter(_unused(path), detector.spec.streams, readers.types)
 
 
 def _server(address: PagesAddress, answers: Answers) -> StatusServer:
@@ -273,11 +273,11 @@ def _unused(path: Path) -> Path:
 
 def _checked(detector: Detector) -> StreamReaders:
     """The inputs of its streams. Raises DetectorError, also if a plugin is missing or rejects its parameters."""
-    entries = stream_readers(detector)
+    readers = stream_readers(detector)
     problems = list(source_plugin_problems(detector))
     if problems:
         raise DetectorError(problems)
-    return entries
+    return readers
 
 
 def _subscribed(streams: Iterable[Stream]) -> list[tuple[object, ...]]:

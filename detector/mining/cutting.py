@@ -61,9 +61,9 @@ def cutting_of(recording: Recording, detector: Detector, rules: Sequence[EventRu
     if pieces < 2 or not chunks or any(each is None for each in chunks):
         return None
     completed = with_recorded_types(detector, recording)
-    entries = stream_readers(completed)
-    compiled, _ = RuleIndex().compile(rules, completed, entries.fields, entries.places)
-    engine = make_engine(completed, entries, holder=detector.name, start=0)
+    readers = stream_readers(completed)
+    compiled, _ = RuleIndex().compile(rules, completed, readers.fields, readers.places)
+    engine = make_engine(completed, readers, holder=detector.name, start=0)
     engine.set_rules(compiled)
     reasons = {rule.name: why_whole(engine, rule) for rule in compiled}
     exact = frozenset(name for name, why in reasons.items() if why is None)

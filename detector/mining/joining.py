@@ -44,8 +44,8 @@ def flaw_of(pieces: Sequence[PieceResult]) -> str | None:
 def joined(job: MiningJob, recording: Recording, pieces: Sequence[PieceResult]) -> RecordingResult:
     """The result of a recording; the pieces, in order, have no flaw. The job's rules are those that they evaluated."""
     detector = with_recorded_types(job.detector, recording)
-    entries = stream_readers(detector)
-    compiled, _ = RuleIndex().compile(job.rules, detector, entries.fields, entries.places)
+    readers = stream_readers(detector)
+    compiled, _ = RuleIndex().compile(job.rules, detector, readers.fields, readers.places)
     there = [piece for piece in pieces if piece.samples]
     end = there[-1].last
     texts = _Texts()

@@ -112,7 +112,7 @@ def _observed(job: PieceJob) -> PieceResult:
         first = part[0].received
         if replay is None:
             replay = Replay(
-                detector, job.rules, holder=detector.name, start=first - 1, outcome=ReplayResult(), onlooker=recorder
+                detector, job.rules, holder=detector.name, start=first - 1, outcome=ReplayResult(), observer=recorder
             )
         elif first - replay.engine.now > PAUSE:
             return PieceResult(flaw="it pauses for more than an hour")

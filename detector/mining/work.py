@@ -134,7 +134,7 @@ def _plain(text: str, recording: Recording) -> str:
 
 
 def _replayed(job: MiningJob, recording: Recording) -> RecordingResult:
-    tracer, arrivals = Tracer(dict.fromkeys(job.wanted), ways=False), Arrivals()
+    tracer, arrivals = Tracer(dict.fromkeys(job.wanted), paths=False), Arrivals()
     clips = None if job.clips is None else _clips(Path(job.clips))
     played = play(
         [recording],

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar, cast
 
 from pydantic import BaseModel, ValidationError
 
@@ -69,12 +69,12 @@ class PluginClasses(Generic[T]):
         return found
 
     def parameters(
-        self, offered: type[T], given: Mapping[str, Any], at: FieldPath, context: Mapping[str, Any] | None = None
+        self, loaded: type[T], given: Mapping[str, Any], at: FieldPath, context: Mapping[str, Any] | None = None
     ) -> Any:
         """An instance of the class's Parameters, from the value of the field `at`. Raises PluginError."""
         written = dict(given)
         try:
-            return offered.Parameters.model_validate(written, context=context)  # type: ignore[attr-defined]
+            return loaded.Parameters.model_validate(written, context=context)  # type: ignore[attr-defined]
         except ValidationError as error:
             raise PluginError(*(((*at, *path), text) for path, text in messages(error, written))) from error
 
@@ -84,27 +84,26 @@ def _foreign(entry: EntryPoint) -> bool:
 
 
 @cache
-def _load(offers: PluginClasses[T], name: str) -> type[T]:
+def _load(classes: PluginClasses[T], name: str) -> type[T]:
     """Raises LookupError, with a text for the user."""
-    entries = offers.installed()
+    entries = classes.installed()
     entry = entries.get(name)
-    what = f"{offers.noun} {name}"
+    what = f"{classes.noun} {name}"
     if entry is None:
         hint = did_you_mean(name, entries) or f"there are {', '.join(entries) or 'none'}"
-        raise LookupError(f"no {what} is installed; {hint} ({offers.guide})")
+        raise LookupError(f"no {what} is installed; {hint} ({classes.guide})")
     try:
-        offered: Any = entry.load()
+        loaded: Any = entry.load()
     except Exception as error:  # a third-party module, which may raise anything
         raise LookupError(f"cannot load {what}: {type(error).__name__}: {error}{_remedy(entry, error)}") from error
-    base = f"{offers.base.__module__}.{offers.base.__qualname__}"
-    complete = inspect.isclass(offered) and issubclass(offered, offers.base) and not inspect.isabstract(offered)
+    base = f"{classes.base.__module__}.{classes.base.__qualname__}"
+    complete = inspect.isclass(loaded) and issubclass(loaded, classes.base) and not inspect.isabstract(loaded)
     if not complete:
-        raise LookupError(f"{what} must be a complete subclass of {base}; got {entry.value} ({offers.guide})")
-    model = getattr(offered, "Parameters", None)
-    if not (inspect.isclass(model) and issubclass(model, offers.model)):
-        raise LookupError(f"{what}: give {entry.value} a class Parameters({offers.model.__name__}) ({offers.guide})")
-    loaded: type[T] = offered
-    return loaded
+        raise LookupError(f"{what} must be a complete subclass of {base}; got {entry.value} ({classes.guide})")
+    model = getattr(loaded, "Parameters", None)
+    if not (inspect.isclass(model) and issubclass(model, classes.model)):
+        raise LookupError(f"{what}: give {entry.value} a class Parameters({classes.model.__name__}) ({classes.guide})")
+    return cast("type[T]", loaded)
 
 
 def _remedy(entry: EntryPoint, error: Exception) -> str:

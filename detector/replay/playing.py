@@ -55,14 +55,14 @@ def play(
     rules: Sequence[EventRule],
     plugins: Plugins = nullcontext,
     watch: ReplayWatch = lambda batches: batches,
-    onlooker: Callable[[str], ReplayObserver | None] = lambda _: None,
+    observer: Callable[[str], ReplayObserver | None] = lambda _: None,
     clips: Clips | None = None,
     holder: str | None = None,
 ) -> PlayResult:
     """The outcome of each recording. Without `plugins` they run in this process. `holder` is by default the Detector.
 
     For several recordings, the events of each name it, and from the second on its number is part of the holder: ids and
-    task names differ even if all begin at the same time. `onlooker` returns the onlooker for the recording of that
+    task names differ even if all begin at the same time. `observer` returns the observer for the recording of that
     name. With `clips`, the rules' record actions run.
 
     Raises:
@@ -77,7 +77,7 @@ def play(
         name = recording_name(recording)
         try:
             of = (holder or detector.name) + (f".{number}" if number > 1 else "")
-            outcome, unrouted[name] = _played(recording, detector, rules, plugins, watch, of, onlooker(name), clips)
+            outcome, unrouted[name] = _played(recording, detector, rules, plugins, watch, of, observer(name), clips)
         except RecordingError as error:
             errors.append(error)
             continue
@@ -97,7 +97,7 @@ def _played(
     plugins: Plugins,
     watch: ReplayWatch,
     holder: str,
-    onlooker: ReplayObserver | None,
+    observer: ReplayObserver | None,
     clips: Clips | None,
 ) -> tuple[ReplayResult, list[str]]:
     """The outcome of a recording, and its keys that belong to no stream."""
@@ -106,7 +106,7 @@ def _played(
     router = MessageRouter(completed.spec.streams, recording_name(recording))
     arrivals = recorded_arrivals(recording, router, completed, cuts.append)
     with plugins() as host:
-        outcome = replay_arrivals(watch(arrivals), completed, rules, host, holder, onlooker, clips)
+        outcome = replay_arrivals(watch(arrivals), completed, rules, host, holder, observer, clips)
     outcome.cuts = cuts
     if not outcome.samples:
         keys = router.unrouted

@@ -79,7 +79,7 @@ class Replay:
         plugins: PluginHost | None = None,
         version: int = ORDER,
         order: int = ORDER,
-        onlooker: ReplayObserver | None = None,
+        observer: ReplayObserver | None = None,
         clips: Clips | None = None,
     ) -> None:
         """`start` is when the detector started, in nanoseconds since the epoch; `plugins` runs them.
@@ -95,15 +95,15 @@ class Replay:
         self._clips = clips
         self._recorders: Recorders | None = None if clips is None else clips.recorders(holder)
         self._detector = detector = detector if clips is None else clips.placed(detector)
-        self._entries: StreamReaders = stream_readers(detector)
+        self._readers: StreamReaders = stream_readers(detector)
         self._rule_index = RuleIndex()
         self._engine: Engine = make_engine(
-            detector, self._entries, holder=holder, start=start, plugins=plugins, order=order
+            detector, self._readers, holder=holder, start=start, plugins=plugins, order=order
         )
         self._engine.counters.watch_ages = True
         self._engine.observers.journal = []
         self._engine.consequences.wanted = clips is not None
-        self._engine.observers.observer = self._onlooker = onlooker
+        self._engine.observers.observer = self._observer = observer
         self._demands: dict[str, Demand] = {}
         self._demands_version: tuple[int, int] | None = None
         self.set_rules(rules)
@@ -146,20 +146,20 @@ class Replay:
     def set_detector(self, detector: Detector) -> None:
         """Switch to a changed Detector; `set_rules` follows."""
         self._detector = detector = detector if self._clips is None else self._clips.placed(detector)
-        self._entries = stream_readers(detector)
-        self._engine.set_detector(detector, self._entries.decoders, self._entries.read_key)
+        self._readers = stream_readers(detector)
+        self._engine.set_detector(detector, self._readers.decoders, self._readers.read_key)
 
     def set_rules(self, rules: Sequence[EventRule]) -> None:
         """Switch to these rules."""
-        compiled, refused = self._rule_index.compile(rules, self._detector, self._entries.fields, self._entries.places)
+        compiled, refused = self._rule_index.compile(rules, self._detector, self._readers.fields, self._readers.places)
         self.outcome.refusals += refused
         self.outcome.rules |= {rule.name: rule for rule in rules}
         if self._recorders is not None:
-            configuration = DetectorConfiguration(self._detector, self._entries.decoders, self._entries.types)
+            configuration = DetectorConfiguration(self._detector, self._readers.decoders, self._readers.types)
             self._recorders.follow(self._rule_index.good, configuration)
         self._note(self._engine.set_rules([rule_as_of(rule, self._version) for rule in compiled]))
-        if self._onlooker is not None:
-            self._onlooker.attend(self._engine)
+        if self._observer is not None:
+            self._observer.attend(self._engine)
 
     def restore(self, demands: Sequence[Demand], time: int, episodes: Sequence[OpenEpisode] = ()) -> None:
         """Restore the episodes that were open before the recording."""
@@ -211,7 +211,7 @@ def replay_intake(
     detector: Detector | None,
     rules: Sequence[EventRule] | None,
     plugins: PluginHost | None = None,
-    onlooker: ReplayObserver | None = None,
+    observer: ReplayObserver | None = None,
     clips: Clips | None = None,
 ) -> ReplayResult:
     """Replay an intake file with its own Detector and rules, or with others if given.
@@ -233,7 +233,7 @@ def replay_intake(
             batch.append(record)
             continue
         if replay is None:
-            replay = _begin(record, detector, rules, outcome, plugins, onlooker, clips)
+            replay = _begin(record, detector, rules, outcome, plugins, observer, clips)
             continue
         replay.take(batch, _until(record, batch))
         batch = []
@@ -259,7 +259,7 @@ def _begin(
     rules: Sequence[EventRule] | None,
     outcome: ReplayResult,
     plugins: PluginHost | None,
-    onlooker: ReplayObserver | None,
+    observer: ReplayObserver | None,
     clips: Clips | None,
 ) -> Replay:
     document = record.document
@@ -275,7 +275,7 @@ def _begin(
         plugins=plugins,
         version=version if rules is None else ORDER,
         order=version,
-        onlooker=onlooker,
+        observer=observer,
         clips=clips,
     )
 
@@ -323,7 +323,7 @@ def replay_arrivals(
     rules: Sequence[EventRule],
     plugins: PluginHost | None = None,
     holder: str | None = None,
-    onlooker: ReplayObserver | None = None,
+    observer: ReplayObserver | None = None,
     clips: Clips | None = None,
 ) -> ReplayResult:
     """Replay any other recording in the way the live intake would have queued it; `plugins` as for an intake file.
@@ -346,7 +346,7 @@ def replay_arrivals(
         holder=holder or detector.name,
         outcome=outcome,
         plugins=plugins,
-        onlooker=onlooker,
+        observer=observer,
         clips=clips,
     )
     for part in parts_of(batches):

@@ -167,7 +167,7 @@ class LiveView:
         for topic in topics - {EPISODES, LOG, SCENE}:
             _, _, rule, subject = topic.split("/", 3)
             subjects.setdefault(rule, set()).add(subject)
-        return Tracer(subjects, ways=SCENE in topics)
+        return Tracer(subjects, paths=SCENE in topics)
 
     def _hand_over(self, tracer: Tracer, engine: Engine) -> None:
         tracer.settle()
@@ -182,7 +182,7 @@ class LiveView:
     def _witness(self, rule: CompiledRule) -> Any:
         def saw(evaluated: Evaluated) -> None:
             if self._tracer is not None and self._tracer.looks_at(rule.name):
-                self._tracer.witnessed(rule).saw(evaluated)
+                self._tracer.recorded(rule).saw(evaluated)
 
         return saw
 

@@ -170,7 +170,7 @@ class PathLog:
         self._clients.append(numbers[known])
         self._axes.append(these.places.axes[:2, known])
 
-    def ways(self, names: Sequence[str]) -> dict[str, ClientPath]:
+    def paths(self, names: Sequence[str]) -> dict[str, ClientPath]:
         """By client, its places; without repeated ones."""
         if not self._times:
             return {}

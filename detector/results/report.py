@@ -42,10 +42,10 @@ class ActionRow(NamedTuple):
     """None: still running at the end of the recording."""
 
 
-def deeds_of(result: Result) -> list[ActionRow]:
+def action_rows(result: Result) -> list[ActionRow]:
     """The actions that would have run, in time order."""
     found = [*_tasks(result), *_windows(result)]
-    return sorted(found, key=lambda deed: (deed.begin, deed.rule, deed.subject, deed.action))
+    return sorted(found, key=lambda row: (row.begin, row.rule, row.subject, row.action))
 
 
 def _tasks(result: Result) -> Iterator[ActionRow]:
@@ -81,11 +81,11 @@ MOST = 140_000
 """Approximate maximum number of points of series in a page."""
 _WIDEST = 1500
 """Maximum number of periods in a series: more than a plot has pixels."""
-_WAY = 600
+_PLACES = 600
 """Maximum number of places of a client on the map."""
 _VALUES = 2000
 """Maximum number of episodes with values in a page; the others have only times."""
-_DEEDS = 2000
+_ACTIONS = 2000
 """Maximum number of listed actions that would have run; the page gives the total number."""
 
 
@@ -143,7 +143,7 @@ def data_of(result: Result) -> dict[str, Any]:
         _subject(result, each, by_subject.get((each.rule, each.subject), ()), table, detailed)
         for each in trace.subjects
     ]
-    deeds = deeds_of(result)
+    actions = action_rows(result)
     return {
         "recording": Path(result.recording).name,
         "begin": format_time(trace.begin),
@@ -154,20 +154,20 @@ def data_of(result: Result) -> dict[str, Any]:
         "rules": [_rule(result, name, episodes) for name in sorted(result.rules)],
         "subjects": subjects,
         "series": table.entries,
-        "ways": _ways(result, table),
+        "paths": _paths(result, table),
         "geographic": trace.geographic,
         "polygons": [
             {"rule": each.rule, "name": each.name, "corners": each.corners, "closed": each.closed}
             for each in polygons_of(result.rules.values())
             if each.geographic == trace.geographic
         ],
-        "deeds": [
+        "actions": [
             [each.rule, each.action, each.subject, each.what, each.about, table.seconds(each.begin),
              None if each.end is None else table.seconds(each.end)]
-            for each in deeds[:_DEEDS]
+            for each in actions[:_ACTIONS]
         ],
-        "deedCount": len(deeds),
-        "demands": _demands(deeds, table),
+        "actionCount": len(actions),
+        "demands": _demands(actions, table),
         "nearest": [[each.rule, each.subject, table.seconds(each.time), each.margin] for each in result.nearest],
         "streams": [
             {
@@ -328,16 +328,16 @@ def _rule(result: Result, name: str, episodes: Sequence[EpisodeRow]) -> dict[str
     }
 
 
-def _ways(result: Result, table: _Table) -> list[dict[str, Any]]:
+def _paths(result: Result, table: _Table) -> list[dict[str, Any]]:
     found = []
-    for client, way in sorted(result.trace.ways.items()):
-        stride = max(1, -(-len(way.times) // _WAY))
-        axes = way.axes[:, ::stride]
+    for client, path in sorted(result.trace.paths.items()):
+        stride = max(1, -(-len(path.times) // _PLACES))
+        axes = path.axes[:, ::stride]
         x, y = (axes[1], axes[0]) if result.trace.geographic else (axes[0], axes[1])
         found.append(
             {
                 "client": client,
-                "t": [table.seconds(time) for time in way.times[::stride].tolist()],
+                "t": [table.seconds(time) for time in path.times[::stride].tolist()],
                 "x": np.round(x, 7 if result.trace.geographic else 2).tolist(),
                 "y": np.round(y, 7 if result.trace.geographic else 2).tolist(),
             }
@@ -345,16 +345,16 @@ def _ways(result: Result, table: _Table) -> list[dict[str, Any]]:
     return found
 
 
-def _demands(deeds: Sequence[ActionRow], table: _Table) -> list[dict[str, Any]]:
+def _demands(actions: Sequence[ActionRow], table: _Table) -> list[dict[str, Any]]:
     """By template, the number of tasks that demand it over time."""
     edges: dict[str, list[tuple[float, int]]] = {}
-    for deed in deeds:
-        if deed.what != "deploy":
+    for row in actions:
+        if row.what != "deploy":
             continue
-        own = edges.setdefault(deed.about.partition(":")[0], [])
-        own.append((table.seconds(deed.begin), 1))
-        if deed.end is not None:
-            own.append((table.seconds(deed.end), -1))
+        own = edges.setdefault(row.about.partition(":")[0], [])
+        own.append((table.seconds(row.begin), 1))
+        if row.end is not None:
+            own.append((table.seconds(row.end), -1))
     found = []
     for template, changes in sorted(edges.items()):
         times, counts, count = [0.0], [0], 0

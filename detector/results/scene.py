@@ -53,18 +53,18 @@ class Scene:
     def updates(self, result: Result) -> Iterator[tuple[int, SceneUpdate]]:
         """The updates of a result, which follows the previous one; nothing if no position is known."""
         trace, events = result.trace, deque(result.events)
-        if not trace.ways:
+        if not trace.paths:
             self._pass(events, trace.end)
             return
         if self._origin is None:
-            self._origin = next(iter(trace.ways.values())).axes[:, 0]
+            self._origin = next(iter(trace.paths.values())).axes[:, 0]
         origin = self._origin
         step = max(_STEP, (trace.end - trace.begin) // _MOST)
         at_events = np.array([event.time for event in events], np.int64)
         times = np.unique(np.concatenate((np.arange(trace.begin, trace.end + 1, step), at_events)))
-        flat = {name: _metres(way.axes, origin, geographic=trace.geographic) for name, way in trace.ways.items()}
-        rows = {name: np.searchsorted(way.times, times, "right") - 1 for name, way in trace.ways.items()}
-        last = {name: int(way.times[-1]) for name, way in trace.ways.items()}
+        flat = {name: _metres(path.axes, origin, geographic=trace.geographic) for name, path in trace.paths.items()}
+        rows = {name: np.searchsorted(path.times, times, "right") - 1 for name, path in trace.paths.items()}
+        last = {name: int(path.times[-1]) for name, path in trace.paths.items()}
         yield int(times[0]), SceneUpdate(entities=[*_polygons(result, int(times[0]), origin)])
         for at, time in enumerate(times.tolist()):
             self._pass(events, time)

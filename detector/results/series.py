@@ -129,7 +129,7 @@ _AXES = {("x", "y"): False, ("latitude", "longitude"): True}
 """Signals that form a position, and whether it is in degrees."""
 
 
-def ways_of(subjects: Sequence[SubjectTrace]) -> tuple[dict[str, ClientPath], bool]:
+def paths_of(subjects: Sequence[SubjectTrace]) -> tuple[dict[str, ClientPath], bool]:
     """By client, its path, from the signals `x` and `y`, or `latitude` and `longitude`, of the first rule that has
     them.
 
@@ -138,16 +138,16 @@ def ways_of(subjects: Sequence[SubjectTrace]) -> tuple[dict[str, ClientPath], bo
     for axes, geographic in _AXES.items():
         having = [each for each in subjects if len(each.clients) == 1 and _have(each, axes)]
         if having:
-            ways: dict[str, ClientPath] = {}
+            paths: dict[str, ClientPath] = {}
             for subject in having:
-                if subject.rule == having[0].rule and subject.clients[0] not in ways:
+                if subject.rule == having[0].rule and subject.clients[0] not in paths:
                     series = [subject.signals[axis] for axis in axes]
                     times = np.unique(np.concatenate([each.times for each in series]))
                     places = np.stack([each.at(times) for each in series])
                     known = ~np.isnan(places).any(axis=0)
                     if known.any():
-                        ways[subject.clients[0]] = ClientPath(times[known], places[:, known])
-            return ways, geographic
+                        paths[subject.clients[0]] = ClientPath(times[known], places[:, known])
+            return paths, geographic
     return {}, False
 
 
@@ -161,7 +161,7 @@ class Trace:
 
     subjects: list[SubjectTrace] = field(default_factory=list)
     """In order of the rules' names, then of the subjects."""
-    ways: dict[str, ClientPath] = field(default_factory=dict)
+    paths: dict[str, ClientPath] = field(default_factory=dict)
     """By client, if known."""
     geographic: bool = False
     """Whether paths are in degrees."""

@@ -34,8 +34,8 @@ from detector.results.series import (
     Trace,
     Wanted,
     codes_of,
+    paths_of,
     steps_of,
-    ways_of,
 )
 from wayside.expressions.columns.values import Tag
 from wayside.names import parse_subject
@@ -62,15 +62,15 @@ class _Plan(NamedTuple):
 class Tracer:
     """The engine's observer in a replay; returns the trace at the end."""
 
-    def __init__(self, subjects: Mapping[str, Set[str] | None] | None = None, *, ways: bool = True) -> None:
-        """`subjects`: those to trace by rule, None: all; `ways`: record the clients' places."""
+    def __init__(self, subjects: Mapping[str, Set[str] | None] | None = None, *, paths: bool = True) -> None:
+        """`subjects`: those to trace by rule, None: all; `paths`: record the clients' places."""
         self._subjects = subjects
         chosen = {rule: texts for rule, texts in (subjects or {}).items() if texts is not None}
         self._clients_by_rule = {rule: _clients_of(texts) for rule, texts in chosen.items()}
         self._traced: dict[str, set[int]] = {rule: set() for rule in chosen}
         """The numbers of the traced clients, for each rule with a selection."""
         self._everybody = subjects is None or len(chosen) < len(subjects)
-        self._with_ways = ways
+        self._with_paths = paths
         self.engine: Engine | None = None  # of the replay, for its counts
         self._plans: dict[int, _Plan] = {}
         self._signals: dict[str, Changes] = {}
@@ -87,8 +87,8 @@ class Tracer:
         self._clients: tuple[Sequence[str], Integers] = ((), np.zeros(0, np.int64))
         self._pairs: dict[tuple[str, str], PairLog] = {}
         """By rule and its digest."""
-        self._ways = PathLog()
-        self._witnessed: dict[str, RecordedValues] = {}
+        self._paths = PathLog()
+        self._recorded: dict[str, RecordedValues] = {}
         self._begin: int | None = None
         self._end = 0
 
@@ -99,11 +99,11 @@ class Tracer:
         self.engine = engine
         for name, run in engine.rules.items():
             if name not in engine.in_columns:
-                run.witness = self.witnessed(run.rule).saw
+                run.witness = self.recorded(run.rule).saw
 
-    def witnessed(self, rule: CompiledRule) -> RecordedValues:
+    def recorded(self, rule: CompiledRule) -> RecordedValues:
         """The record of a rule that is not in columns."""
-        return self._witnessed.setdefault(rule.name, RecordedValues(rule))
+        return self._recorded.setdefault(rule.name, RecordedValues(rule))
 
     def clients(self, tracks: Sequence[Track], block: Block, codes: Codes, looked: Truths | None) -> None:
         """Record the changes in a block of rules about clients."""
@@ -183,15 +183,15 @@ class Tracer:
         """Record the values of a rule about pairs at a tick."""
         time = these.block.ticks[0]
         self._time(time, time)
-        if not self._with_ways and not self.looks_at(track.rule.name):
+        if not self._with_paths and not self.looks_at(track.rule.name):
             return
         numbers = self._numbers_of(these.block.clients)
         if self.looks_at(track.rule.name):
             log = self._pairs.setdefault((track.rule.name, track.rule.digest), PairLog(track))
             log.add(time, these, numbers)
-        if self._with_ways:
+        if self._with_paths:
             assert isinstance(track.rule.subject, PairSubject)  # noqa: S101  the rule is about pairs
-            self._ways.add(track.rule.name, track.rule.subject.position.geographic, time, these, numbers)
+            self._paths.add(track.rule.name, track.rule.subject.position.geographic, time, these, numbers)
 
     def looks_at(self, rule: str) -> bool:
         """Whether the rule is traced."""
@@ -207,17 +207,17 @@ class Tracer:
         for (name, _), log in self._pairs.items():
             for pair in log.subjects(name, self._names, wanted):
                 found[name, pair.subject] = pair
-        for name, witnessed in self._witnessed.items():
-            for each in witnessed.subjects():
+        for name, recorded in self._recorded.items():
+            for each in recorded.subjects():
                 if not wanted(name, each.subject):
                     continue
                 found.setdefault((name, each.subject), each)
-                self._time(*witnessed.span)
+                self._time(*recorded.span)
         subjects = [found[key] for key in sorted(found)]
-        ways, geographic = self._ways.ways(self._names), self._ways.geographic
-        if not ways and self._with_ways:
-            ways, geographic = ways_of(subjects)
-        return Trace(subjects, ways, geographic, self._begin or 0, self._end)
+        paths, geographic = self._paths.paths(self._names), self._paths.geographic
+        if not paths and self._with_paths:
+            paths, geographic = paths_of(subjects)
+        return Trace(subjects, paths, geographic, self._begin or 0, self._end)
 
     def _of_clients(self, found: dict[tuple[str, str], SubjectTrace], wanted: Wanted) -> None:
         subjects: dict[tuple[str, str | None, int], SubjectTrace] = {}

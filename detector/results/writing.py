@@ -39,20 +39,20 @@ class ResultCollector:
     """Observes the replay of several recordings, one after another."""
 
     def __init__(self) -> None:
-        self._looks: dict[str, RecordingTrace] = {}
+        self._traces: dict[str, RecordingTrace] = {}
 
     def watch(self, name: str) -> RecordingTrace:
         """The observers of the recording of that name, which comes next."""
-        look = self._looks[name] = RecordingTrace(Tracer(), Arrivals())
-        return look
+        trace = self._traces[name] = RecordingTrace(Tracer(), Arrivals())
+        return trace
 
     def batches(self, batches: Iterable[Sequence[Arrival]]) -> Iterator[Sequence[Arrival]]:
         """The batches of the current recording, unchanged."""
-        return [*self._looks.values()][-1].arrivals.watch_batches(batches)
+        return [*self._traces.values()][-1].arrivals.watch_batches(batches)
 
     def results(self, outcomes: Mapping[str, ReplayResult]) -> list[Result]:
         """The result of each recording."""
-        return [result_of(name, outcome, *self._looks[name]) for name, outcome in outcomes.items()]
+        return [result_of(name, outcome, *self._traces[name]) for name, outcome in outcomes.items()]
 
 
 def write_results(folder: Path, results: Sequence[Result], kinds: frozenset[ResultKind]) -> list[Path]:

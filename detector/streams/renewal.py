@@ -38,7 +38,7 @@ _PATIENCE = 10.0
 
 
 class SessionSubscriptions:
-    """Subscribed to all streams and to the clients' tokens. `subscriptions` queue samples, in the streams' order."""
+    """Subscribed to all streams and to the clients' tokens. `of_streams` queue samples, in the streams' order."""
 
     def __init__(
         self,
@@ -52,17 +52,15 @@ class SessionSubscriptions:
         self.session = session
         self.credentials = credentials
         self.connections = Connections(session)
-        self.subscriptions: list[Subscription] = [
-            subscribe(session, stream, _CHANNEL, loss_counter) for stream in streams
-        ]
+        self.of_streams: list[Subscription] = [subscribe(session, stream, _CHANNEL, loss_counter) for stream in streams]
         self.tokens = None if tokens is None else subscribe_tokens(session, tokens)
-        self._answering: QueryHandler | None = None
+        self._query_handler: QueryHandler | None = None
         self._users = 0
         self._unused = threading.Condition()
 
-    def answer(self, answering: Callable[[zenoh.Session], QueryHandler]) -> None:
+    def answer(self, make_handler: Callable[[zenoh.Session], QueryHandler]) -> None:
         """Handle queries on this session from now on."""
-        self._answering = answering(self.session)
+        self._query_handler = make_handler(self.session)
 
     @contextmanager
     def used(self) -> Iterator[zenoh.Session]:
@@ -86,8 +84,8 @@ class SessionSubscriptions:
         """Leave at once; this unblocks the threads that wait to receive or to send."""
         self.connections.close()
         self.session.close()  # type: ignore[no-untyped-call]
-        if self._answering is not None:
-            self._answering.join(timeout)
+        if self._query_handler is not None:
+            self._query_handler.join(timeout)
 
     def await_connection(self, stop: threading.Event, seconds: float) -> bool:
         """Whether a connection exists within `seconds`."""
@@ -245,7 +243,7 @@ class Renewal:
         for stream_input in self._inputs:
             stream_input.expect()
             stream_input.withdraw()
-        for stream_input, subscription in zip(self._inputs, second.subscriptions, strict=True):
+        for stream_input, subscription in zip(self._inputs, second.of_streams, strict=True):
             stream_input.follow(subscription)
         if self._tokens is not None and first.tokens is not None and second.tokens is not None:
             self._tokens.follow(second.tokens, second.connections)
@@ -259,7 +257,7 @@ class Renewal:
                 f"zenoh: cannot connect to {[*self._config.connect]} with the new certificates or password"
             )
         begin = time.monotonic()
-        pairs = [*zip(self._inputs, second.subscriptions, strict=True)]
+        pairs = [*zip(self._inputs, second.of_streams, strict=True)]
         while not self._stop.wait(_LOOK_AT_BOTH):
             for stream_input, subscription in pairs:
                 stream_input.try_second(subscription)
@@ -308,7 +306,7 @@ class Renewal:
             return
         self._member = second
         self._use(second)
-        for stream_input, subscription in zip(self._inputs, second.subscriptions, strict=True):
+        for stream_input, subscription in zip(self._inputs, second.of_streams, strict=True):
             stream_input.follow(subscription)
         if self._tokens is not None and second.tokens is not None:
             self._tokens.follow(second.tokens, second.connections)

@@ -10,7 +10,7 @@ import time
 
 import zenoh
 
-from detector.access.mounted import AccessError, LoadedCredentials, read_material
+from detector.access.mounted import AccessError, LoadedCredentials, read_credentials
 from wayside.api.zenoh import Zenoh, ZenohMode
 from wayside.inputerror import InputError
 from wayside.process.backoff import Backoff, retry
@@ -30,7 +30,7 @@ class NetworkError(InputError, ValueError):
 def credentials_of(config: Zenoh) -> LoadedCredentials:
     """The current certificates and credentials. Raises NetworkError."""
     try:
-        return read_material(config, _FIELD)
+        return read_credentials(config, _FIELD)
     except AccessError as error:
         raise NetworkError(str(error)) from error
 

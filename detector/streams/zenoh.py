@@ -46,13 +46,13 @@ class Network:
         *,
         capacity: int = 4096,
         on_failure: Callable[[BaseException], None] = lambda error: None,
-        answering: Callable[[zenoh.Session], QueryHandler] | None = None,
+        make_query_handler: Callable[[zenoh.Session], QueryHandler] | None = None,
         loss_counter: LossCounter | None = None,
         look_every: float = LOOK_EVERY,
     ) -> None:
         """`putter` returns the function that receives a stream's messages; at most `capacity` events are queued.
 
-        `answering` handles queries once there is a session. `loss_counter` counts losses before the detector.
+        `make_query_handler` is called with each session. `loss_counter` counts losses before the detector.
         `on_failure` is called if a thread dies of an error. Certificates are checked every `look_every` seconds.
         """
         self._on_failure = on_failure
@@ -68,10 +68,10 @@ class Network:
         self._events: deque[tuple[str, bytes, str]] = deque()
         self._changed = threading.Condition()
         self._stop = threading.Event()
-        self._member: SessionSubscriptions | None = None
-        self._inlets: list[StreamInput] = []
+        self._subscriptions: SessionSubscriptions | None = None
+        self._inputs: list[StreamInput] = []
         self._receivers: list[threading.Thread] = []
-        self._make_answering = answering
+        self._make_query_handler = make_query_handler
         self._thread = threading.Thread(target=self._run, name="network", daemon=True)
         self.dropped_events = 0
         """Events dropped because the queue was full, or that Zenoh refused."""
@@ -99,11 +99,11 @@ class Network:
 
         Raises NetworkError if there is no session, no answer in time, or an error as the answer.
         """
-        member = self._member
-        if member is None:
+        subscriptions = self._subscriptions
+        if subscriptions is None:
             raise NetworkError("there is no Zenoh session yet")
         try:
-            with member.used() as session:
+            with subscriptions.used() as session:
                 replies = session.get(
                     selector, payload=payload, attachment=attachment, timeout=timeout, target=zenoh.QueryTarget.ALL
                 )
@@ -124,13 +124,13 @@ class Network:
     @property
     def joined(self) -> bool:
         """Whether there is a session: samples arrive as soon as there is a connection."""
-        return self._member is not None
+        return self._subscriptions is not None
 
     @property
     def connected(self) -> bool:
         """Whether a router, a peer or a client is currently connected."""
-        member = self._member
-        return member is not None and member.connections.any
+        subscriptions = self._subscriptions
+        return subscriptions is not None and subscriptions.connections.any
 
     @property
     def listens(self) -> bool:
@@ -167,11 +167,11 @@ class Network:
             self._thread.join(timeout)
         if self._renewal is not None:
             self._renewal.join(timeout)
-        for stream_input in self._inlets:
+        for stream_input in self._inputs:
             stream_input.close()
-        if (member := self._member) is not None:
-            self._member = None
-            member.close(timeout)  # unblocks the threads that wait to put or to receive
+        if (subscriptions := self._subscriptions) is not None:
+            self._subscriptions = None
+            subscriptions.close(timeout)  # unblocks the threads that wait to put or to receive
         for receiver in self._receivers:
             receiver.join(timeout)
         if self._tokens is not None:
@@ -184,21 +184,21 @@ class Network:
         return SessionSubscriptions(session, credentials, self._streams, self._config.liveliness, self._loss_counter)
 
     def _begin(self, session: zenoh.Session, credentials: LoadedCredentials) -> None:
-        member = self._join(session, credentials)
-        for stream, pump, subscription in zip(self._streams, self._pumps, member.subscriptions, strict=True):
+        subscriptions = self._join(session, credentials)
+        for stream, pump, subscription in zip(self._streams, self._pumps, subscriptions.of_streams, strict=True):
             stream_input = StreamInput(subscription, history=stream.history is not None)
             name = f"stream {stream.name}"
             thread = threading.Thread(target=self._receive, args=(stream_input, pump), name=name, daemon=True)
             thread.start()
-            self._inlets.append(stream_input)
+            self._inputs.append(stream_input)
             self._receivers.append(thread)
-        if member.tokens is not None:
-            self._tokens = TokenWatch(member.tokens, member.connections, self._put_token)
-        self._use(member)
+        if subscriptions.tokens is not None:
+            self._tokens = TokenWatch(subscriptions.tokens, subscriptions.connections, self._put_token)
+        self._use(subscriptions)
         self._renewal = Renewal(
             self._config,
-            member,
-            self._inlets,
+            subscriptions,
+            self._inputs,
             self._tokens,
             self._join,
             self._use,
@@ -207,11 +207,11 @@ class Network:
         )
         self._renewal.start()
 
-    def _use(self, member: SessionSubscriptions) -> None:
+    def _use(self, subscriptions: SessionSubscriptions) -> None:
         """Publish events and handle queries here from now on."""
-        self._member = member
-        if self._make_answering is not None:
-            member.answer(self._make_answering)
+        self._subscriptions = subscriptions
+        if self._make_query_handler is not None:
+            subscriptions.answer(self._make_query_handler)
 
     def _receive(self, stream_input: StreamInput, pump: Pump) -> None:
         """Delivers the samples of a stream, until the session is closed."""
@@ -230,7 +230,7 @@ class Network:
             self._on_failure(error)
 
     def _serve(self) -> None:
-        if self._member is None:
+        if self._subscriptions is None:
             opened = await_session(self._config, self._stop)
             if opened is None:
                 return
@@ -245,11 +245,11 @@ class Network:
             return self._events.popleft() if self._events else None
 
     def _send(self, key: str, payload: bytes, encoding: str) -> None:
-        member = self._member
-        while member is not None:  # None: closed in the meantime, after the time for queued events
+        subscriptions = self._subscriptions
+        while subscriptions is not None:  # None: closed in the meantime, after the time for queued events
             try:
                 # BLOCK: events are few and should survive a short congestion; only this thread waits for it.
-                with member.used() as session:
+                with subscriptions.used() as session:
                     session.put(
                         key,
                         payload,
@@ -259,16 +259,16 @@ class Network:
                     )
                 return
             except zenoh.ZError as error:
-                before, member = member, self._successor(member)
-                if member is before:
+                before, subscriptions = subscriptions, self._successor(subscriptions)
+                if subscriptions is before:
                     log.warning("cannot publish the event on %s: %s", key, error)
                     break
         self.dropped_events += 1
 
-    def _successor(self, member: SessionSubscriptions) -> SessionSubscriptions | None:
+    def _successor(self, subscriptions: SessionSubscriptions) -> SessionSubscriptions | None:
         """The membership that replaces it, now or in a moment; itself if there is none, None once all is closed."""
         renewal = self._renewal
-        while renewal is not None and renewal.reopening.is_set() and self._member is member:
+        while renewal is not None and renewal.reopening.is_set() and self._subscriptions is subscriptions:
             if self._stop.wait(0.01):
                 break
-        return self._member
+        return self._subscriptions

@@ -48,8 +48,8 @@ class Harness:
         self.outcomes: dict[str, list[Outcome]] = {}
         self.losses: Counter[str] = Counter()
         self._changed = threading.Condition()
-        entries = stream_readers(self.detector)
-        self.configuration = DetectorConfiguration(self.detector, entries.decoders, entries.types)
+        readers = stream_readers(self.detector)
+        self.configuration = DetectorConfiguration(self.detector, readers.decoders, readers.types)
         self.closing = threading.Event()
         context = ActionContext(
             rule=self.rule,

@@ -111,8 +111,8 @@ class Drive:
         self.engine.consequences.wanted = True
         self.published: list[dict[str, Any]] = []
         self.host = ActionHost("h", self, now=lambda: 0)
-        entries = stream_readers(self.detector)
-        self.host.follow([rule], DetectorConfiguration(self.detector, entries.decoders, entries.types))
+        readers = stream_readers(self.detector)
+        self.host.follow([rule], DetectorConfiguration(self.detector, readers.decoders, readers.types))
         self.engine.set_rules(compiled(self.detector, rule))
 
     def publish(self, key: str, payload: bytes, encoding: str) -> None:

@@ -96,8 +96,8 @@ def test_clients_of_a_former_token_pattern_expire_by_timeout() -> None:
     drive = Drive(detector(), HERE)
     drive.take(alive(0.1, "car1", TokenState.DECLARED), until=10)
     changed = a_detector(a_stream("speed"), clientTimeout="3s")
-    entries = stream_readers(changed)
-    drive.engine.set_detector(changed, entries.decoders, entries.read_key)
+    readers = stream_readers(changed)
+    drive.engine.set_detector(changed, readers.decoders, readers.read_key)
     assert drive.take(until=20) == ["here car1 ClientLost 14"]
 
 

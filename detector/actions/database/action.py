@@ -98,7 +98,7 @@ class Database(Action[DatabaseAction]):
         self._place: Place | None = None
         self._writer: DatabaseWriter | None = None
         self._folder: AttachmentFolder | None = None
-        self._writings: dict[str, ScenarioProgress] = {}
+        self._progress: dict[str, ScenarioProgress] = {}
         self._batches: dict[str, _Batch] = {}
         self._due = 0.0
         self._awake = False
@@ -115,7 +115,7 @@ class Database(Action[DatabaseAction]):
             scenario.lost[f"metadata: {why}"] += 1
         streams = self.context.configuration().detector.spec.streams
         latched = frozenset(stream.name for stream in streams if stream.latched)
-        self._writings[episode.id] = ScenarioProgress(
+        self._progress[episode.id] = ScenarioProgress(
             episode, scenario, documents, latched, renew.ns if renew else None
         )
         self._report(episode, OutcomeState.RUNNING)
@@ -124,66 +124,66 @@ class Database(Action[DatabaseAction]):
         rule, database = self.context.rule, self.parameters.database
         name = scenarios.scenario_id(episode, self.context.action, part)
         scenario = Scenario(name, self.context.holder, self.context.action, database, rule, resumed)
-        around = self.context.configuration()
+        configuration = self.context.configuration()
         above = None
-        if around.detector.spec.database is not None and around.detector.spec.database.files is not None:
+        if configuration.detector.spec.database is not None and configuration.detector.spec.database.files is not None:
             above = (self.parameters.files or Attachments()).above.bytes
-        streams = {stream.name: stream for stream in around.detector.spec.streams}
+        streams = {stream.name: stream for stream in configuration.detector.spec.streams}
         if self._writer is not None:
             metadata: Mapping[str, JsonValue] = episode.rendered.get("metadata") or {}
             for write in scenarios.start_scenario(scenario, episode, metadata):
                 self._writer.put_change(write)
-        return scenario, Documents(name, f"{database}/{rule.name}/{name}", streams, around.decoders, above)
+        return scenario, Documents(name, f"{database}/{rule.name}/{name}", streams, configuration.decoders, above)
 
     def samples(self, episode: Episode, samples: Sequence[EpisodeSample]) -> None:
         """Convert them to documents; batches that are large enough are queued."""
-        writing = self._writings[episode.id]
+        progress = self._progress[episode.id]
         while samples:
-            now, samples = writing.parted(samples)
-            self._take(writing, now)
+            now, samples = progress.parted(samples)
+            self._take(progress, now)
             if samples:
-                self._renew(writing, min(sample.time for sample in samples))
+                self._renew(progress, min(sample.time for sample in samples))
 
-    def _take(self, writing: ScenarioProgress, samples: Iterable[EpisodeSample]) -> None:
+    def _take(self, progress: ScenarioProgress, samples: Iterable[EpisodeSample]) -> None:
         for sample in samples:
-            made = writing.documents.make(sample)
-            writing.scenario.saw(sample.client, sample.stream, sample.time)
-            writing.undecoded += made.undecoded
-            if made.cut:
-                self._lose(writing.scenario, 1, f"too large: {made.cut}")
-            self._add(writing.scenario, made)
+            converted = progress.documents.make(sample)
+            progress.scenario.saw(sample.client, sample.stream, sample.time)
+            progress.undecoded += converted.undecoded
+            if converted.cut:
+                self._lose(progress.scenario, 1, f"too large: {converted.cut}")
+            self._add(progress.scenario, converted)
 
-    def _renew(self, writing: ScenarioProgress, begin: int) -> None:
+    def _renew(self, progress: ScenarioProgress, begin: int) -> None:
         """Complete the scenario; the episode continues in the next one."""
-        self._finish(writing, Completion(), continues=True)
-        writing.continue_in(*self._open(writing.episode, str(begin), resumed=False))
-        self._take(writing, list(writing.latest.values()))
+        self._finish(progress, Completion(), continues=True)
+        progress.continue_in(*self._open(progress.episode, str(begin), resumed=False))
+        self._take(progress, list(progress.latest.values()))
 
-    def _add(self, scenario: Scenario, made: ConvertedDocument) -> None:
-        document = made.document if not made.files else self._with_files(scenario, made)
-        scenario.messages[made.collection] += 1
+    def _add(self, scenario: Scenario, converted: ConvertedDocument) -> None:
+        document = converted.document if not converted.files else self._with_files(scenario, converted)
+        scenario.messages[converted.collection] += 1
         scenario.bytes += len(document)
-        batch = self._batches.get(made.collection)
+        batch = self._batches.get(converted.collection)
         if batch is not None and batch.bytes + len(document) > BATCH_BYTES:
-            self._flush(made.collection)
+            self._flush(converted.collection)
             batch = None
         if batch is None:
             if not self._batches:
                 self._due = time.monotonic() + FLUSH
-            batch = self._batches[made.collection] = _Batch()
+            batch = self._batches[converted.collection] = _Batch()
         batch.documents.append(document)
         batch.owners[scenario.id] += 1
         batch.bytes += len(document)
         if len(batch.documents) >= BATCH_DOCUMENTS:
-            self._flush(made.collection)
+            self._flush(converted.collection)
 
-    def _with_files(self, scenario: Scenario, made: ConvertedDocument) -> bytes:
+    def _with_files(self, scenario: Scenario, converted: ConvertedDocument) -> bytes:
         """The document, after writing the files that it refers to; it names those that could not be written."""
         if self.parameters.dry_run or self._folder is None:
-            scenario.files += len(made.files)
-            return made.document
+            scenario.files += len(converted.files)
+            return converted.document
         without: dict[str, str] = {}
-        for each in made.files:
+        for each in converted.files:
             try:
                 self._folder.write(each)
                 scenario.files += 1
@@ -192,9 +192,9 @@ class Database(Action[DatabaseAction]):
                 without[each.path] = str(error)
                 self._lose(scenario, 1, str(error))
         if not without:
-            return made.document
+            return converted.document
         missing = [{"file": path, "error": why} for path, why in without.items()]
-        return bson_bytes({**bson.decode(made.document), "filesMissing": missing})
+        return bson_bytes({**bson.decode(converted.document), "filesMissing": missing})
 
     def _flush(self, collection: str) -> None:
         """Enqueue the documents of a collection."""
@@ -208,7 +208,7 @@ class Database(Action[DatabaseAction]):
         write = Write(self.parameters.database, collection, batch.documents, losing=losing)
         if self._writer.put(write, self.context.closing):
             return
-        open_ones = {each.scenario.id: each.scenario for each in self._writings.values()}
+        open_ones = {each.scenario.id: each.scenario for each in self._progress.values()}
         why = "the queue is full" if not self._writer.away else "the queue is full while the database is unavailable"
         for name, count in batch.owners.items():
             if name in open_ones:  # otherwise it failed in the meantime
@@ -218,23 +218,23 @@ class Database(Action[DatabaseAction]):
 
     def completed(self, episode: Episode, completion: Completion) -> None:
         """Enqueue the request that completes the scenario, or records why it is incomplete."""
-        writing = self._writings[episode.id]
-        writing.episode = episode
-        self._finish(writing, completion, continues=False)
-        del self._writings[episode.id]
+        progress = self._progress[episode.id]
+        progress.episode = episode
+        self._finish(progress, completion, continues=False)
+        del self._progress[episode.id]
 
-    def _finish(self, writing: ScenarioProgress, completion: Completion, *, continues: bool) -> None:
+    def _finish(self, progress: ScenarioProgress, completion: Completion, *, continues: bool) -> None:
         for collection in list(self._batches):
             self._flush(collection)
-        scenario, episode = writing.scenario, writing.episode
+        scenario, episode = progress.scenario, progress.episode
         incomplete = scenarios.why_incomplete(scenario, None if continues else episode, completion)
 
         def confirm(complete: bool, why: str) -> None:
-            writing.trouble = writing.trouble or incomplete or ("" if complete else why)
+            progress.trouble = progress.trouble or incomplete or ("" if complete else why)
             if not continues:
-                state = OutcomeState.FAILED if writing.trouble else OutcomeState.DONE
-                message = writing.trouble or ("dryRun: nothing was written" if self.parameters.dry_run else "")
-                self._report(episode, state, message, writing, completion)
+                state = OutcomeState.FAILED if progress.trouble else OutcomeState.DONE
+                message = progress.trouble or ("dryRun: nothing was written" if self.parameters.dry_run else "")
+                self._report(episode, state, message, progress, completion)
 
         if self._writer is None:
             confirm(not incomplete, incomplete)
@@ -266,8 +266,8 @@ class Database(Action[DatabaseAction]):
         away = self._writer.away if self._writer is not None else ""
         if bool(away) != self._reported_away:
             self._reported_away = bool(away)
-            for writing in self._writings.values():
-                self._report(writing.episode, OutcomeState.RUNNING, away and f"the database is unavailable: {away}")
+            for progress in self._progress.values():
+                self._report(progress.episode, OutcomeState.RUNNING, away and f"the database is unavailable: {away}")
 
     def close(self) -> None:
         """Release the queue; the last action that does so waits a few seconds for it to empty."""
@@ -305,26 +305,26 @@ class Database(Action[DatabaseAction]):
         episode: Episode,
         state: OutcomeState,
         message: str = "",
-        writing: ScenarioProgress | None = None,
+        progress: ScenarioProgress | None = None,
         completion: Completion | None = None,
     ) -> None:
-        writing = writing or self._writings[episode.id]
-        scenario = writing.scenario
-        messages = writing.messages + scenario.messages
-        files = writing.files + scenario.files
+        progress = progress or self._progress[episode.id]
+        scenario = progress.scenario
+        messages = progress.messages + scenario.messages
+        files = progress.files + scenario.files
         details: dict[str, JsonValue] = {
             "database": scenario.database,
             "scenario": scenario.id,
-            "scenarios": writing.scenarios,
+            "scenarios": progress.scenarios,
             "documents": dict(sorted(messages.items())),
             "filesWritten": files,
             "complete": state is OutcomeState.DONE and not self.parameters.dry_run,
         }
-        if writing.undecoded:
-            details["undecoded"] = writing.undecoded
+        if progress.undecoded:
+            details["undecoded"] = progress.undecoded
         if self._writer is not None:
             details["waitingBytes"] = self._writer.waiting
-        lost = writing.lost + sum(scenario.lost.values()) + (0 if completion is None else completion.missing)
+        lost = progress.lost + sum(scenario.lost.values()) + (0 if completion is None else completion.missing)
         where = (str(self._folder.path / scenario.database / episode.rule),) if files and self._folder else ()
-        size = writing.bytes + scenario.bytes
+        size = progress.bytes + scenario.bytes
         self.context.report(episode, Outcome(state, message, sum(messages.values()), size, lost, where, details))

@@ -1,7 +1,7 @@
 """The notify action: sends notifications about the episodes of a rule.
 
 Notify (the action's thread) ─▶ queue: EventQueue or AlertQueue ◀─ Sender (a separate thread) ─▶ target
-                                  └▶ keeping: journal, dead letters
+                                  └▶ storage: journal, dead letters
 
 Notifications wait in the queue. The sender sends one request at a time, so an endpoint that hangs delays only its own
 notifications.
@@ -34,38 +34,38 @@ class Notify(Action[api.NotifyAction]):
 
     def __init__(self, parameters: api.NotifyAction, context: ActionContext) -> None:
         super().__init__(parameters, context)
-        self._keeping = NotifyStore(context)
+        self._storage = NotifyStore(context)
         name = f"notify {context.rule.name} {context.action}"
         field = f"EventRule {context.rule.name}, action {context.action}: notify"
         self._queue: EventQueue | AlertQueue
         self._sender: Sender[OutboxMessage] | Sender[AlertBatch]
         if parameters.alertmanager is None:
             target = _target(parameters, context, field)
-            self._queue = events = EventQueue(parameters, context, self._keeping)
+            self._queue = events = EventQueue(parameters, context, self._storage)
             self._sender = Sender(name, events, lambda message, give_up: target.send(message.event, give_up))
         else:
-            self._queue = alerts = AlertQueue(parameters, parameters.alertmanager, context, self._keeping)
+            self._queue = alerts = AlertQueue(parameters, parameters.alertmanager, context, self._storage)
             self._sender = Sender(name, alerts, AlertTarget(parameters.alertmanager, field).send)
 
     def started(self, episode: Episode) -> None:
         """Notify of the start, unless another run of the action has done so."""
         with self._sender.changing():
-            kept = self._keeping.rendered(episode.id) if episode.resumed else None
+            kept = self._storage.rendered(episode.id) if episode.resumed else None
             rendered = texts(episode.rendered) if kept is None else kept
-            self._keeping.open(episode.id, rendered)
+            self._storage.open(episode.id, rendered)
             self._queue.opened(episode, rendered)
 
     def ended(self, episode: Episode) -> None:
         """Notify of the end."""
         with self._sender.changing():
-            kept = None if episode.rendered_again else self._keeping.rendered(episode.id)
+            kept = None if episode.rendered_again else self._storage.rendered(episode.id)
             self._queue.over(episode, kept or texts(episode.rendered))
 
     def completed(self, episode: Episode, completion: Completion) -> None:
         """No further notifications of the episode follow."""
         with self._sender.changing():
             if episode.ended is not None:
-                self._keeping.over(episode.id)
+                self._storage.over(episode.id)
             self._queue.completed(episode)
 
     def close(self) -> None:
@@ -73,7 +73,7 @@ class Notify(Action[api.NotifyAction]):
         keep = self.context.closing.is_set()  # otherwise the rule no longer has this action
         self._sender.finish()
         self._queue.drain(keep)
-        self._keeping.close(keep)
+        self._storage.close(keep)
 
 
 def _target(parameters: api.NotifyAction, context: ActionContext, field: str) -> Target:

@@ -125,7 +125,7 @@ class Alerts:
 
         Firing alerts stay: after a refusal they are sent again when they are next due.
         """
-        if delivery.fate is AttemptResult.AGAIN:
+        if delivery.result is AttemptResult.AGAIN:
             self._paused_until = now + max(min(delivery.retry_after, LONGEST_RETRY_AFTER), self._pause.fail())
         else:
             self._pause.succeed()
@@ -134,13 +134,13 @@ class Alerts:
         for alert in sent.alerts:
             alert.attempts += 1
             if alert.episode in sent.over:
-                if delivery.fate is AttemptResult.DELIVERED:
+                if delivery.result is AttemptResult.DELIVERED:
                     ended.append(alert)
-                elif delivery.fate is AttemptResult.REFUSED or now - alert.since >= self._give_up_after:
+                elif delivery.result is AttemptResult.REFUSED or now - alert.since >= self._give_up_after:
                     given_up.append(alert)
                 continue
-            alert.delivered |= delivery.fate is AttemptResult.DELIVERED
-            if alert.ends_at is None and delivery.fate is not AttemptResult.AGAIN:
+            alert.delivered |= delivery.result is AttemptResult.DELIVERED
+            if alert.ends_at is None and delivery.result is not AttemptResult.AGAIN:
                 alert.due = now + self._repeat
         for alert in (*ended, *given_up):
             self._alerts.pop(alert.episode, None)
@@ -160,16 +160,16 @@ class AlertQueue:
     """Firing and resolved alerts. Guarded by the lock of the sender."""
 
     def __init__(
-        self, notify: NotifyAction, alertmanager: NotifyAlertmanager, context: ActionContext, keeping: NotifyStore
+        self, notify: NotifyAction, alertmanager: NotifyAlertmanager, context: ActionContext, storage: NotifyStore
     ) -> None:
         self._alerts = Alerts(alertmanager.repeat.seconds, notify.give_up_after.seconds, notify.waiting)
-        self._setting = context
-        self._keeping = keeping
+        self._context = context
+        self._storage = storage
         self._episodes: dict[str, tuple[Episode, NoticeTexts]] = {}
 
     def opened(self, episode: Episode, texts: NoticeTexts) -> None:
         """Add a firing alert."""
-        labels = labels_of(texts, episode.rule, self._setting.holder, episode.subject, episode.id, episode.element)
+        labels = labels_of(texts, episode.rule, self._context.holder, episode.subject, episode.id, episode.element)
         given = {"summary": texts.title, "description": texts.text}
         annotations = {name: value for name, value in given.items() if value is not None}
         now = time.time_ns()
@@ -204,8 +204,8 @@ class AlertQueue:
     def settle(self, sent: AlertBatch, delivery: Delivery, now: float) -> None:
         """Apply the result of a request."""
         ended, given_up = self._alerts.settle(sent, delivery, now)
-        if delivery.fate is AttemptResult.REFUSED:
-            self._setting.lose("alerts rejected by the Alertmanager", len(sent.alerts), delivery.why)
+        if delivery.result is AttemptResult.REFUSED:
+            self._context.lose("alerts rejected by the Alertmanager", len(sent.alerts), delivery.why)
         for alert in given_up:
             self._lose(alert, delivery.why)
         for alert in ended:
@@ -213,7 +213,7 @@ class AlertQueue:
         done = {alert.episode for alert in (*ended, *given_up)}
         for alert in sent.alerts:
             if alert.episode not in done and alert.episode in self._episodes:
-                text = "fires" if delivery.fate is AttemptResult.DELIVERED else f"not delivered yet: {delivery.why}"
+                text = "fires" if delivery.result is AttemptResult.DELIVERED else f"not delivered yet: {delivery.why}"
                 self._report(alert, OutcomeState.RUNNING, text)
 
     def drain(self, keep: bool) -> None:
@@ -237,7 +237,7 @@ class AlertQueue:
                 "the Alertmanager accepted the alert only after the end of the episode, because of failures: it does "
                 "not notify about such alerts"
             )
-            self._setting.lose("alerts that were accepted too late to notify", 1, why)
+            self._context.lose("alerts that were accepted too late to notify", 1, why)
             self._report(alert, OutcomeState.FAILED, why)
         self._episodes.pop(alert.episode, None)
 
@@ -247,13 +247,13 @@ class AlertQueue:
             return
         episode, texts = known
         event = episode.started if episode.ended is None else episode.ended
-        self._keeping.lose([Notice(episode.id, event, texts, time.time())], why, alert.attempts)
+        self._storage.lose([Notice(episode.id, event, texts, time.time())], why, alert.attempts)
         outcome = Outcome(OutcomeState.FAILED, f"not delivered: {why}", missing=1, details={"attempts": alert.attempts})
-        self._setting.report(episode, outcome)
+        self._context.report(episode, outcome)
 
     def _report(self, alert: Alert, state: OutcomeState, message: str) -> None:
         episode, _ = self._episodes[alert.episode]
-        self._setting.report(episode, Outcome(state, remarked(message, episode), details={"attempts": alert.attempts}))
+        self._context.report(episode, Outcome(state, remarked(message, episode), details={"attempts": alert.attempts}))
 
 
 class AlertTarget:

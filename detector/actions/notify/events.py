@@ -117,7 +117,7 @@ FULL = "the queue is full (waiting)"
 class EventQueue:
     """The events of one action, up to their delivery. Guarded by the lock of the sender."""
 
-    def __init__(self, notify: NotifyAction, context: ActionContext, keeping: NotifyStore) -> None:
+    def __init__(self, notify: NotifyAction, context: ActionContext, storage: NotifyStore) -> None:
         rate, grouping = notify.rate, notify.grouping
         budget = None if rate is None else RateLimit(rate.messages, rate.per.seconds)
         self._outbox = Outbox(notify.waiting, notify.give_up_after.seconds, budget)
@@ -125,10 +125,10 @@ class EventQueue:
         self._groups = None if grouping is None else Groups(grouping.by, grouping.wait.seconds)
         self._action = context.action
         self._moments = notify.moments
-        self._keeping = keeping
+        self._storage = storage
         self._hurrying = False
         self.ledger = DeliveryLedger(context.report)
-        for notice in keeping.waiting():
+        for notice in storage.waiting():
             self._admit(notice, time.monotonic())
 
     def opened(self, episode: Episode, rendered: NoticeTexts) -> None:
@@ -149,7 +149,7 @@ class EventQueue:
     def _add(self, moment: NotifiedEvent, episode: Episode, event: Mapping[str, Any], rendered: NoticeTexts) -> None:
         if moment in self._moments:
             notice = Notice(episode.id, event, rendered, time.time())
-            self._keeping.keep(notice)
+            self._storage.keep(notice)
             self._admit(notice, time.monotonic())
 
     def _admit(self, notice: Notice, now: float) -> None:
@@ -187,14 +187,14 @@ class EventQueue:
 
     def settle(self, sent: OutboxMessage, delivery: Delivery, now: float) -> None:
         """Apply the result of an attempt."""
-        fate = self._outbox.settle(sent, delivery, now, time.time())
-        if fate is AttemptResult.DELIVERED:
+        result = self._outbox.settle(sent, delivery, now, time.time())
+        if result is AttemptResult.DELIVERED:
             size = len(event_json(sent.event))
             for notice in sent.notices:
                 self.ledger.delivered(notice.episode, size)
-            self._keeping.delivered(sent.notices)
-        elif fate is AttemptResult.REFUSED:
-            attempts = f"after {sent.attempts} attempts, " if delivery.fate is AttemptResult.AGAIN else ""
+            self._storage.delivered(sent.notices)
+        elif result is AttemptResult.REFUSED:
+            attempts = f"after {sent.attempts} attempts, " if delivery.result is AttemptResult.AGAIN else ""
             self._lose(sent, f"{attempts}{delivery.why}")
         else:
             for episode in sent.episodes:
@@ -209,14 +209,14 @@ class EventQueue:
     def drain(self, keep: bool) -> None:
         """Remove all events at the end: with `keep`, stored ones are sent after the next start; the others are lost."""
         for message in self._outbox.drain():
-            if keep and all(map(self._keeping.keeps_notice, message.notices)):
+            if keep and all(map(self._storage.keeps_notice, message.notices)):
                 for episode in message.episodes:
                     self.ledger.kept(episode)
             else:
                 self._lose(message, UNDELIVERED)
 
     def _lose(self, message: OutboxMessage, why: str) -> None:
-        self._keeping.lose(message.notices, why, message.attempts)
+        self._storage.lose(message.notices, why, message.attempts)
         for notice in message.notices:
             self.ledger.failed(notice.episode, why)
 

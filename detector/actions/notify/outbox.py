@@ -34,7 +34,7 @@ class AttemptResult(Enum):
 class Delivery:
     """The result of an attempt."""
 
-    fate: AttemptResult
+    result: AttemptResult
     why: str = ""
     retry_after: float = 0.0
     """Minimum seconds until the next attempt, as the endpoint requests."""
@@ -148,17 +148,17 @@ class Outbox:
         """Apply the result for the message from `take`: DELIVERED or REFUSED remove it; AGAIN queues it again."""
         if not delivery.whole:
             self._pause.succeed()
-        fate = delivery.fate
-        if fate is AttemptResult.AGAIN:
+        result = delivery.result
+        if result is AttemptResult.AGAIN:
             wait = min(delivery.retry_after, LONGEST_RETRY_AFTER)
             message.due = now + max(wait, message.backoff.fail())
             if delivery.whole:
                 self._paused_until = now + max(wait, self._pause.fail())
             if wall - message.created >= self._give_up_after:
-                fate = AttemptResult.REFUSED
-        if fate is not AttemptResult.AGAIN:
+                result = AttemptResult.REFUSED
+        if result is not AttemptResult.AGAIN:
             self._waiting.remove(message)
-        return fate
+        return result
 
     def drain(self) -> list[OutboxMessage]:
         """Remove and return the remaining messages."""

@@ -25,7 +25,7 @@ class NotifyStore:
     """Not thread-safe."""
 
     def __init__(self, context: ActionContext) -> None:
-        self._setting = context
+        self._context = context
         self._journal = Journal(context, "notify", "events that would not survive a restart")
         path = self._journal.path
         self._letters = None if path is None else DeadLetters(path.with_name(f"{path.name}.dead.jsonl"))
@@ -66,12 +66,12 @@ class NotifyStore:
     def lose(self, notices: Iterable[Notice], why: str, attempts: int) -> None:
         """Give up these events: they become dead letters, and are counted."""
         lost = list(notices)
-        self._setting.lose(_LOST, len(lost), why)
+        self._context.lose(_LOST, len(lost), why)
         for notice in lost:
             letter = {
                 "created": format_seconds(notice.created),
-                "rule": self._setting.rule.name,
-                "action": self._setting.action,
+                "rule": self._context.rule.name,
+                "action": self._context.action,
                 "why": why,
                 "attempts": attempts,
                 "texts": notice.texts.to_json(),
@@ -83,7 +83,7 @@ class NotifyStore:
                 else:
                     self._letters.write(letter)
             except (OSError, ValueError) as error:
-                self._setting.lose("dead letters that could not be written", 1, str(error))
+                self._context.lose("dead letters that could not be written", 1, str(error))
         self.delivered(lost)
 
     def close(self, keep: bool) -> None:

@@ -86,7 +86,7 @@ class Recording:
         """Use this Detector from now on: a stream whose format changed continues in another channel."""
         spec, wanted = configuration.detector.spec, self._parameters.streams
         streams = {s.name: s for s in spec.streams if wanted is None or s.latched or s.name in wanted}
-        self._surroundings = configuration
+        self._configuration = configuration
         self._stamps = Stamps(configuration)
         self._owners = Owners(streams)
         self._topics = latched_topics(configuration.detector, configuration.decoders)
@@ -98,7 +98,7 @@ class Recording:
 
     def take(self, samples: Sequence[EpisodeSample], configuration: DetectorConfiguration) -> None:
         """Add samples. Raises NoRoomError, OSError: then it accepts no more, and `finish` keeps what was written."""
-        if configuration.detector is not self._surroundings.detector:
+        if configuration.detector is not self._configuration.detector:
             self.follow(configuration)
         mine = [sample for sample in samples if self._owners.owns(sample.stream, sample.key)]
         self.given += len(mine)
@@ -303,7 +303,7 @@ class Stamps:
     """Reads the stamps of messages, as defined by the Detector for each stream."""
 
     def __init__(self, configuration: DetectorConfiguration) -> None:
-        self._surroundings = configuration
+        self._configuration = configuration
         self._data = configuration.detector.spec.clock is Clock.DATA
         self._stamps: dict[str, _Stamp] = {}
 
@@ -321,7 +321,7 @@ class Stamps:
         return sample.received if stamp is None or not 0 <= stamp <= _LATEST else stamp
 
     def _reader(self, name: str) -> _Stamp:
-        stream, decoder = self._surroundings.detector.spec.stream(name), self._surroundings.decoders.get(name)
+        stream, decoder = self._configuration.detector.spec.stream(name), self._configuration.decoders.get(name)
         if stream is None or decoder is None:
             return lambda sample: None
         expression = compile_stream(stream, 0).stamp

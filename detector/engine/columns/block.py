@@ -54,18 +54,18 @@ class Track:
         counters: RuleCounters,
         place: Mapping[str, str],
         row: int,
-        past: EarlierValues,
+        earlier: EarlierValues,
     ) -> None:
         """`place`: by condition, the text about its inputs that errors contain. `row`: the track's index in its group.
 
-        `past` has the earlier values of the rule's signals over other signals.
+        `earlier` has the earlier values of the rule's signals over other signals.
         """
         self.rule = rule
         self.element = element
         self.counters = counters
         self.place = place
         self.row = row
-        self.past = past
+        self.earlier = earlier
         self.signals: dict[str, int] = {}
         """Indices of the rule's signals in the group, by name, in the order of the rule."""
         self._subjects: dict[str, Subject] = {}

@@ -84,7 +84,7 @@ class Conditions:
         self._context = context
         self._tracks = tracks
         self._chosen = chosen
-        self._leaves = ClientValues(context, tracks)
+        self._client_values = ClientValues(context, tracks)
         self._graph = Graph()
         self._of: list[dict[str, ClientCondition]] = [self._conditions(track) for track in tracks]
         """By track and field."""
@@ -97,7 +97,7 @@ class Conditions:
     def _conditions(self, track: Track) -> dict[str, ClientCondition]:
         found = dict[str, ClientCondition]()
         for field, expression in self._chosen(track.rule).items():
-            node = self._graph.add(expression, lambda path: self._leaves.leaf(track, path))
+            node = self._graph.add(expression, lambda path: self._client_values.leaf(track, path))
             found[field] = ClientCondition(
                 field,
                 expression,
@@ -117,7 +117,7 @@ class Conditions:
         points = len(block.clients) * len(block.ticks)
         shape = (len(self._tracks), points)
         found: dict[str, Ternary] = {}
-        values, tags = stacked([self._leaves.at_points(block, each) for each in self._program.leaves], points)
+        values, tags = stacked([self._client_values.at_points(block, each) for each in self._program.leaves], points)
         results = self._program.run(values, tags)
         strange = tags is not None and bool((tags > Tag.NUMBER).any())
         for field, these in self._by_field.items():

@@ -1,4 +1,4 @@
-"""Signals over other signals, in columns: expressions over the points of a block, and windows over their past."""
+"""Signals over other signals, in columns: expressions over the points of a block, windows over their earlier values."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class DerivedColumns:
         for signal, formula in self._formulas:
             column = formula.column(rows)
             if not signal.episode:
-                column = track.past.window(signal, track.element.name, now, column, self._texts, track.counters)
+                column = track.earlier.window(signal, track.element.name, now, column, self._texts, track.counters)
             yield Derived(signal, column)
 
 
@@ -59,11 +59,11 @@ class ClientDerived:
                 if not signal.episode:
                     track.signals[signal.name] = first
                     first += 1
-        self._leaves = ClientValues(context, tracks)
+        self._client_values = ClientValues(context, tracks)
         self._of = [(track, DerivedColumns(track, self._leaf(track), context)) for track in tracks]
 
     def _leaf(self, track: Track) -> Callable[[Path], Hashable | Constant | None]:
-        return lambda path: self._leaves.leaf(track, path)
+        return lambda path: self._client_values.leaf(track, path)
 
     def look(self, block: Block) -> None:
         """Add the signals to those of the block."""
@@ -71,7 +71,7 @@ class ClientDerived:
             own = block.points(track.row)
             points = np.arange(block.shape[0] * block.shape[1]) if own is None else np.flatnonzero(own)
             clients, ticks = np.divmod(points, len(block.ticks))
-            keys = np.array([track.past.number(client) for client in block.clients], np.int64)[clients]
+            keys = np.array([track.earlier.number(client) for client in block.clients], np.int64)[clients]
             now = Evaluations(keys, block.times[ticks], block.ticks[-1])
             for each in derived.look(self._rows(track, block, points), now):
                 column = _scattered(each.column, points, block.shape[0] * block.shape[1])
@@ -93,7 +93,7 @@ class ClientDerived:
             track.counters.note(reason, message, f"signal {field} of {track.subject(client).text}", times)
 
         def column(leaf: Hashable) -> Column:
-            whole = self._leaves.at_points(block, leaf)
+            whole = self._client_values.at_points(block, leaf)
             return whole if len(points) == len(whole.values) else _picked(whole, points)
 
         return Rows(

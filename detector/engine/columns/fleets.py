@@ -89,7 +89,7 @@ class FleetGroup:
         self._signals = SignalColumns(context, tracks)
         if any(_reads_streams(track.rule) for track in tracks):
             self._signals.watch_all_streams()
-        self._leaves = ClientValues(context, tracks)
+        self._client_values = ClientValues(context, tracks)
         self._members = Conditions(context, tracks, _members)
         self._of_points, self._of_ticks = Graph(), Graph()
         self._of = [
@@ -132,7 +132,7 @@ class FleetGroup:
     def _inside(self, track: Track, fold: Fold, path: Path) -> Hashable | Constant | None:
         """The leaf of a path in a predicate."""
         if path[0] == fold.variable:
-            return self._leaves.of_client(track, path[1:]) if len(path) > 1 else None
+            return self._client_values.of_client(track, path[1:]) if len(path) > 1 else None
         return self._own(track, path)
 
     def _outside(self, track: Track, field: str, folds: Mapping[str, object], path: Path) -> Hashable | Constant | None:
@@ -170,7 +170,7 @@ class FleetGroup:
         if block.clients:
             points = len(block.clients) * count
             inner = self._inner.run(
-                *stacked([self._leaves.at_points(block, each) for each in self._inner.leaves], points)
+                *stacked([self._client_values.at_points(block, each) for each in self._inner.leaves], points)
             )
         columns = [self._fold(fleet, inner, leaf) for leaf in self._outer.leaves]
         outer = self._outer.run(*stacked(columns, count))

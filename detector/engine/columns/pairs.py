@@ -88,12 +88,12 @@ class PairColumns:
         self._plain = not rule.has_actions
         """Its events contain only signals, and it renders nothing."""
         self._reads_streams = bool(rule.signals) or _reads_streams(rule)
-        self._where_abouts = PositionColumns(rule.subject.position, context, track.counters, self._signals.ages)
-        self._leaves = ClientValues(context, [track])
+        self._positions = PositionColumns(rule.subject.position, context, track.counters, self._signals.ages)
+        self._client_values = ClientValues(context, [track])
         self._derived_names = frozenset(signal.name for signal in rule.derived if not signal.episode)
         texts = context.tables.texts
         self._roles = {
-            role: Formulas({"where": where}, lambda path: self._leaves.leaf(track, path), texts)
+            role: Formulas({"where": where}, lambda path: self._client_values.leaf(track, path), texts)
             for role, where in zip(_ROLES, (rule.subject.a, rule.subject.b), strict=True)
         }
         conditions = {"where": rule.subject.where, "when": rule.when, "until": rule.until}
@@ -108,7 +108,7 @@ class PairColumns:
         `more` are indices of clients. Windows start after `floor`. Counts unknown values and failures.
         """
         clients = block.clients
-        places, newest = self._where_abouts.now(block)
+        places, newest = self._positions.now(block)
         seen, at = block, np.arange(len(clients))
         roles: Mapping[str, Ternary] = {}
         if any(self._roles.values()):
@@ -141,12 +141,12 @@ class PairColumns:
         return these
 
     def _derive(self, these: PairBlock, derived: DerivedColumns) -> None:
-        past, clients, tick = self._track.past, these.block.clients, these.block.ticks[0]
-        if self._numbers[0] is not clients or self._numbers[1] != past.version:
-            own = np.array([past.number(client) for client in clients], np.int64)
-            self._numbers = clients, past.version, own
+        earlier, clients, tick = self._track.earlier, these.block.clients, these.block.ticks[0]
+        if self._numbers[0] is not clients or self._numbers[1] != earlier.version:
+            own = np.array([earlier.number(client) for client in clients], np.int64)
+            self._numbers = clients, earlier.version, own
         numbers = self._numbers[2]
-        keys = past.pairs(numbers[these.first], numbers[these.second])
+        keys = earlier.pairs(numbers[these.first], numbers[these.second])
         now = Evaluations(keys, np.full(len(keys), tick), tick)
         expressions = {signal.name: signal.of for signal in self._track.rule.derived}
         for each in derived.look(self._rows(these, expressions), now):
@@ -190,13 +190,13 @@ class PairColumns:
         return found
 
     def _distances(self, places: Places, one: Integers, other: Integers) -> Doubles:
-        return self._where_abouts.distances(places.of(one), places.of(other))
+        return self._positions.distances(places.of(one), places.of(other))
 
     def _near(self, block: Block, places: Places, roles: Mapping[str, Ternary]) -> Nearby:
         possible = [places.known & ~roles[role].false if role in roles else places.known for role in _ROLES]
         clients = ClientPositions(
             block.clients,
-            lambda at: self._where_abouts.points(places, at),
+            lambda at: self._positions.points(places, at),
             lambda one, other: self._distances(places, one, other),
             *possible,
         )
@@ -206,25 +206,25 @@ class PairColumns:
         """By how much the distances shrank in the last second for which both clients sent places: see `Views`."""
         at = np.flatnonzero(these.placed)
         one, other = these.first[at], these.second[at]
-        now, abouts = int(these.block.times[0]), self._where_abouts
+        now, positions = int(these.block.times[0]), self._positions
         if self._context.positions.limit(self._subject.position) is None:
             end = np.full(len(at), now)
         else:
-            end = np.minimum(abouts.times(newest[one]), abouts.times(newest[other]))
+            end = np.minimum(positions.times(newest[one]), positions.times(newest[other]))
         before = end != now
         times = np.concatenate((end[before], end[before], end - CLOSING_NS, end - CLOSING_NS))
         whose = np.concatenate((one[before], other[before], one, other))
-        places = abouts.then(these.block, newest, whose, times, floor)
+        places = positions.then(these.block, newest, whose, times, floor)
         parts = np.cumsum([before.sum(), before.sum(), len(at)])
         a_end, b_end, a_begin, b_begin = (places.of(each) for each in np.split(np.arange(len(times)), parts))
         after, known = these.distance[at].copy(), a_begin.known & b_begin.known
-        after[before] = abouts.distances(a_end, b_end)
+        after[before] = positions.distances(a_end, b_end)
         known[before] &= a_end.known & b_end.known
         these.closing, these.closing_known = (
             np.zeros(len(these.placed)),
             np.zeros(len(these.placed), bool),
         )
-        these.closing[at] = (abouts.distances(a_begin, b_begin) - after) / (CLOSING_NS / 1e9)
+        these.closing[at] = (positions.distances(a_begin, b_begin) - after) / (CLOSING_NS / 1e9)
         these.closing_known[at] = known
 
     # Conditions
@@ -240,7 +240,7 @@ class PairColumns:
 
         rows = Rows(
             len(block.clients),
-            lambda leaf: self._leaves.column(block, leaf),
+            lambda leaf: self._client_values.column(block, leaf),
             lambda row: {**block.view(self._track, row), **self._track.element.variables},
             note,
             not self._context.possible.limited,
@@ -311,7 +311,7 @@ class PairColumns:
             return None
         if below[0] == "position":
             return path if len(below) == 2 and below[1] in (*self._subject.position.axes, "z") else None
-        found = self._leaves.of_client(self._track, below)
+        found = self._client_values.of_client(self._track, below)
         return found if found is None or isinstance(found, Constant) else (name, found)
 
     def _pair_column(self, these: PairBlock, leaf: Any) -> Column:
@@ -329,7 +329,7 @@ class PairColumns:
             axes = [*self._subject.position.axes]
             values = places.axes[axes.index(leaf[2])] if leaf[2] in axes else np.zeros(len(at))
             return Column(values, np.where(places.known, np.uint8(Tag.NUMBER), np.uint8(Tag.UNREACHABLE)))
-        whole, rows = self._leaves.column(these.seen, leaf[1]), these.at[at]
+        whole, rows = self._client_values.column(these.seen, leaf[1]), these.at[at]
         return Column(
             whole.values[rows],
             None if whole.tags is None else whole.tags[rows],

@@ -16,7 +16,7 @@ from wayside.rules import CompiledRule
 
 
 def with_derived(
-    rule: CompiledRule, past: EarlierValues, now: int, candidates: Iterable[Candidate], counters: RuleCounters
+    rule: CompiledRule, earlier: EarlierValues, now: int, candidates: Iterable[Candidate], counters: RuleCounters
 ) -> Iterator[Candidate]:
     """The subjects with these signals among their variables, and with the values that statistics of episodes
     aggregate."""
@@ -24,12 +24,12 @@ def with_derived(
     for candidate in candidates:
         by_element.setdefault(candidate.subject.element, []).append(candidate)
     for element in rule.elements:
-        yield from _of_one(rule, past, now, element.name, by_element.get(element.name, []), counters)
+        yield from _of_one(rule, earlier, now, element.name, by_element.get(element.name, []), counters)
 
 
 def _of_one(
     rule: CompiledRule,
-    past: EarlierValues,
+    earlier: EarlierValues,
     now: int,
     element: str | None,
     candidates: list[Candidate],
@@ -38,7 +38,7 @@ def _of_one(
     texts = Texts()
     variables: list[dict[str, Any]] = [dict(candidate.variables) for candidate in candidates]
     measured: list[dict[str, Any]] = [{} for _ in candidates]
-    keys = np.array([past.key(candidate.subject) for candidate in candidates], np.int64)
+    keys = np.array([earlier.key(candidate.subject) for candidate in candidates], np.int64)
     evaluations = Evaluations(keys, np.full(len(keys), now, np.int64), now)
     for signal in rule.derived:
         if signal.of is None:
@@ -48,7 +48,7 @@ def _of_one(
             for candidate, seen in zip(candidates, variables, strict=True)
         ]
         if not signal.episode:
-            column = past.window(signal, element, evaluations, column_of(values, texts), texts, counters)
+            column = earlier.window(signal, element, evaluations, column_of(values, texts), texts, counters)
             values = [value_at(column, row, texts) for row in range(len(values))]
         for known, value in zip(measured if signal.episode else variables, values, strict=True):
             if value is not UNKNOWN:

@@ -32,7 +32,7 @@ class Executor:
 
     def __init__(
         self,
-        known: RuleInputs,
+        inputs: RuleInputs,
         ticks: Ticks,
         schedule: Schedule,
         starts: EpisodeStarts,
@@ -42,8 +42,8 @@ class Executor:
         now: Callable[[], int],
     ) -> None:
         """`now`: up to there all ticks have run; nanoseconds on the engine's time axis."""
-        self._known = known
-        self._clients = known.clients
+        self._inputs = inputs
+        self._clients = inputs.clients
         self._ticks = ticks
         self._schedule = schedule
         self._starts = starts
@@ -52,7 +52,7 @@ class Executor:
         self._instruments = observers
         self._now = now
         self._runs: Mapping[str, RuleRun] = {}
-        self._blocks = Blocks(known.context, lambda: known.floor)
+        self._blocks = Blocks(inputs.context, lambda: inputs.floor)
         self._order: dict[str, int] = {}
         """The position of each rule in the order of evaluation."""
         self._others: list[CompiledRule] = []
@@ -80,17 +80,17 @@ class Executor:
 
     def follow_detector(self) -> None:
         """The Detector changed; until `set_rules`, rules are evaluated one by one."""
-        self._blocks = Blocks(self._known.context, lambda: self._known.floor)
+        self._blocks = Blocks(self._inputs.context, lambda: self._inputs.floor)
         self._others = [run.rule for run in self._runs.values() if run.rule.enabled]
 
     def plan(self) -> None:
         """After a change of rules or thinning: decide which rules are evaluated in columns, and which of them
         together."""
-        if self._known.tables.full:
-            self._known.new_tables()
+        if self._inputs.tables.full:
+            self._inputs.new_tables()
         self._make_blocks()
-        if self._known.tables.wasteful:
-            self._known.new_tables()
+        if self._inputs.tables.wasteful:
+            self._inputs.new_tables()
             self._make_blocks()
         self._order = {name: order for order, name in enumerate(self._runs)}
         names = self._blocks.names
@@ -99,10 +99,10 @@ class Executor:
         self._alone = {name for name, run in self._runs.items() if run.alone}
         for run in self._runs.values():
             run.journal = self._instruments.journal
-        self._known.settle()
+        self._inputs.settle()
 
     def _make_blocks(self) -> None:
-        self._blocks = Blocks(self._known.context, lambda: self._known.floor, self._instruments.observer)
+        self._blocks = Blocks(self._inputs.context, lambda: self._inputs.floor, self._instruments.observer)
         thinning = self._schedule.thinning
         self._blocks.set_rules(self._runs, self._schedule.paused, lambda run: thinning(run.rule))
 
@@ -114,35 +114,35 @@ class Executor:
         for step in steps:
             match step:
                 case Insert(arrivals, times):
-                    size = self._known.ingest.size_of(arrivals)
+                    size = self._inputs.ingest.size_of(arrivals)
                     if self._blocks.waiting and not self._may_wait(arrivals, times, size):
                         events += self._evaluate_waiting()
-                    self._known.ingest.insert(arrivals, times, size)
+                    self._inputs.ingest.insert(arrivals, times, size)
                 case Tick():
                     events += self._tick(step)
                 case Gap(time, backwards):
                     events += self._evaluate_waiting()
                     self.gap(time, backwards)
         events += self._evaluate_waiting()
-        if self._known.tables.full:
+        if self._inputs.tables.full:
             self.plan()
-        self._known.looked(self._now())
+        self._inputs.looked(self._now())
         return events
 
     def _may_wait(self, arrivals: Sequence[Arrival], times: Sequence[int] | None, size: int) -> bool:
         """Whether these arrivals (at most `size` bytes) change nothing that the queued ticks read."""
         first, last = (arrivals[0].received, arrivals[-1].received) if times is None else (min(times), max(times))
         in_order = times is None or first > self._last_wait
-        return in_order and last - self._blocks.since <= LONGEST and self._known.buffer.takes(size)
+        return in_order and last - self._blocks.since <= LONGEST and self._inputs.buffer.takes(size)
 
     def _evaluate_waiting(self) -> list[Event]:
         """Evaluate the queued ticks."""
         if not self._blocks.waiting:
             return []
-        self._known.settle()
+        self._inputs.settle()
         happened = self._in_columns()
-        self._known.forget_rows(self._last_wait)
-        self._known.looked(self._now())
+        self._inputs.forget_rows(self._last_wait)
+        self._inputs.looked(self._now())
         self._starts.settle(self._last_wait)
         events = [each.event for each in happened]
         if self._consequences.wanted:
@@ -164,11 +164,11 @@ class Executor:
     def _tick(self, tick: Tick) -> list[Event]:
         time, regular = tick.time, self._ticks.is_regular(tick.time)
         events: list[Event] = []
-        if self._known.tables.full:
+        if self._inputs.tables.full:
             events += self._evaluate_waiting()
             self.plan()
         if regular:  # otherwise it is there for a single sample or subject, and must not scan all the others
-            if self._known.clients.may_lose(time):
+            if self._inputs.clients.may_lose(time):
                 events += self._evaluate_waiting()  # clients that are lost now were known at the earlier ticks
                 self._keep_house(time)
             elif time % HOUSEKEEPING == 0:
@@ -177,7 +177,7 @@ class Executor:
         groups = self._blocks.due(time)
         if self._is_alone(tick, groups):
             events += self._evaluate_waiting()
-            self._known.settle()
+            self._inputs.settle()
             return events + self._tick_alone(tick, regular, groups)
         self._last_wait = time
         if self._blocks.wait(time, groups) or self._consequences.wanted:
@@ -185,9 +185,9 @@ class Executor:
         elif self._blocks.hurries:
             if self._unsorted is None and self._instruments.journal is not None:
                 self._unsorted = len(self._instruments.journal)
-            self._known.settle()
+            self._inputs.settle()
             self._blocks.run_ahead(self._instruments.stopwatch)
-            self._known.looked(self._now())
+            self._inputs.looked(self._now())
         return events
 
     def _is_alone(self, tick: Tick, groups: Sequence[RuleGroup | PairGroup]) -> bool:
@@ -202,7 +202,7 @@ class Executor:
 
     def _tick_alone(self, tick: Tick, regular: bool, groups: Sequence[RuleGroup | PairGroup]) -> list[Event]:
         """Evaluate a tick by itself, rule by rule in their order."""
-        time, sampled = tick.time, self._known.sampled(tick.sampled)
+        time, sampled = tick.time, self._inputs.sampled(tick.sampled)
         due = {run.rule.name for group in groups for run in group.runs}
         happened: dict[str, list[Event]] = {name: self._lost(name, time) for name in due}
         self._blocks.wait(time, groups)
@@ -222,8 +222,8 @@ class Executor:
                     for event in own:
                         self._consequences.note(run.rule, event)
         self._starts.settle(time)
-        self._known.forget_rows(time)
-        self._known.looked(self._now())
+        self._inputs.forget_rows(time)
+        self._inputs.looked(self._now())
         return events
 
     def _lost(self, name: str, time: int) -> list[Event]:
@@ -294,19 +294,19 @@ class Executor:
 
     def _evaluated(self, run: RuleRun, time: int, only: SubjectFilter | None = None) -> list[Event]:
         begin = self._instruments.stopwatch()
-        events = run.tick(time, self._known.views(run, time), self._clients, self._plugins, only)
+        events = run.tick(time, self._inputs.views(run, time), self._clients, self._plugins, only)
         run.counters.timed(time, self._instruments.stopwatch() - begin)
         return events
 
     def _keep_house(self, time: int) -> None:
         """Forget old samples and lost clients."""
-        lost = self._known.age(time)
+        lost = self._inputs.age(time)
         if lost:
             self._losing.update(self._runs)
             self._starts.lose(lost)
             self._plugins.lose(lost)
             for run in self._runs.values():
-                run.past.lose(lost)
+                run.earlier.lose(lost)
 
     def _wake(self, run: RuleRun, time: int, subjects: Iterable[Subject]) -> None:
         for subject, at in run.wakes(time, subjects):
@@ -322,7 +322,7 @@ class Executor:
         """Continue at this time without the ticks between; `backwards`: it may be earlier. Nanoseconds."""
         if backwards:
             self._starts.step_back(time)
-        self._known.gap(time, backwards)
+        self._inputs.gap(time, backwards)
         self._plugins.gap()
         for run in self._runs.values():
             run.gap(time)

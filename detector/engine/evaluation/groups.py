@@ -57,7 +57,10 @@ class RuleGroup:
         """Queued ticks."""
         elements = [(run, element) for run in runs for element in run.rule.elements]
         self.columns = columns(
-            [Track(run.rule, each, run.counters, run.read, row, run.past) for row, (run, each) in enumerate(elements)],
+            [
+                Track(run.rule, each, run.counters, run.read, row, run.earlier)
+                for row, (run, each) in enumerate(elements)
+            ],
             context,
         )
         self.observer: Observer | None = None

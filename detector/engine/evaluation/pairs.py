@@ -67,7 +67,7 @@ class PairGroup:
         self._order = order
         self._context = context
         self._element = run.rule.elements[0]
-        self._track = Track(run.rule, self._element, run.counters, run.read, 0, run.past)
+        self._track = Track(run.rule, self._element, run.counters, run.read, 0, run.earlier)
         self._columns = PairColumns(self._track, context)
         self.observer: Observer | None = None
         self._watched = _NOBODY

@@ -63,7 +63,7 @@ class RuleRun:
         self._identity = identity
         self.timing = Timing(rule.for_ns, rule.cooldown_ns, rule.unknown_timeout_ns)
         self._follows = any(deploy.follow for deploy in rule.deploys)
-        self.past = EarlierValues()
+        self.earlier = EarlierValues()
         """Earlier values for signals over other signals."""
         self.witness: Callable[[Evaluated], None] | None = None
         """If set, called with each evaluation. It influences no result."""
@@ -95,7 +95,7 @@ class RuleRun:
         seen = candidates(self.rule, views, clients, self._in_progress(), only)
         seen = plugins.added(self.rule, seen, self.counters, every_subject=only is None)
         if self.rule.derived:
-            seen = with_derived(self.rule, self.past, now, seen, self.counters)
+            seen = with_derived(self.rule, self.earlier, now, seen, self.counters)
         for candidate in seen:
             self.counters.evaluations += 1
             self.looked_at.append(candidate.subject)
@@ -155,7 +155,7 @@ class RuleRun:
     def gap(self, time: int) -> None:
         """Time moved on (or back) without ticks: keep open episodes, discard pending ones, reset windows."""
         self.disturbed = True
-        self.past.clear()
+        self.earlier.clear()
         for state in self.states.values():
             state.gap()
             state.rests_until = min(state.rests_until, time + self.timing.cooldown)

@@ -242,7 +242,7 @@
 
   async function drawMap() {
     const place = at("map");
-    if (!data.ways.length) {
+    if (!data.paths.length) {
       at("no-map").hidden = false;
       at("no-map").textContent = "No rule defines the positions of clients: they come from a pairs scope.";
       return;
@@ -257,19 +257,19 @@
       else made.line(xs, ys, { line_color: colour("place"), line_width: 2 });
     }
     const own = new Set(chosen ? chosen.clients : []);
-    const lines = (ways, options) => made.multi_line({ field: "xs" }, { field: "ys" }, { ...options, source: new Bokeh.ColumnDataSource({
-      data: { xs: ways.map((way) => way.x), ys: ways.map((way) => way.y), client: ways.map((way) => way.client) } }) });
-    const others = lines(data.ways.filter((way) => !own.has(way.client)), { line_color: colour("unknown"), line_alpha: 0.6, line_width: 1 });
-    const mine = lines(data.ways.filter((way) => own.has(way.client)), { line_color: colour("series"), line_width: 2 });
+    const lines = (paths, options) => made.multi_line({ field: "xs" }, { field: "ys" }, { ...options, source: new Bokeh.ColumnDataSource({
+      data: { xs: paths.map((path) => path.x), ys: paths.map((path) => path.y), client: paths.map((path) => path.client) } }) });
+    const others = lines(data.paths.filter((path) => !own.has(path.client)), { line_color: colour("unknown"), line_alpha: 0.6, line_width: 1 });
+    const mine = lines(data.paths.filter((path) => own.has(path.client)), { line_color: colour("series"), line_width: 2 });
     made.add_tools(new Bokeh.HoverTool({ renderers: [others, mine], tooltips: [["client", "@client"]] }));
     const starts = { x: [], y: [], text: [] };
     for (const subject of chosen ? data.subjects.filter((each) => each.rule === chosen.rule) : [])
       for (const each of subject.episodes) {
-        const way = data.ways.find((one) => one.client === subject.clients[0]);
-        if (!way) continue;
-        let near = way.t.findIndex((time) => time > each.start);
-        near = near < 0 ? way.t.length - 1 : Math.max(0, near - 1);
-        starts.x.push(way.x[near]); starts.y.push(way.y[near]);
+        const path = data.paths.find((one) => one.client === subject.clients[0]);
+        if (!path) continue;
+        let near = path.t.findIndex((time) => time > each.start);
+        near = near < 0 ? path.t.length - 1 : Math.max(0, near - 1);
+        starts.x.push(path.x[near]); starts.y.push(path.y[near]);
         starts.text.push(`${subject.rule} of ${subject.subject} at ${timeOfDay(each.start)}`);
       }
     const marks = made.scatter({ field: "x" }, { field: "y" }, { source: new Bokeh.ColumnDataSource({ data: starts }), size: 7,
@@ -290,11 +290,11 @@
   }
 
   async function drawActions() {
-    table("deeds", ["from", "for", "rule", "subject", "action", "about"], data.deeds.map(([rule, action, subject, what, about, from, to]) =>
+    table("actions", ["from", "for", "rule", "subject", "action", "about"], data.actions.map(([rule, action, subject, what, about, from, to]) =>
       [timeOfDay(from), to === null ? "open" : span(to - from), rule, subject, `${action} (${what})`, about]), [0, 1]);
-    if (data.deedCount > data.deeds.length)
-      at("deeds").prepend(element("caption", { text: `The first ${data.deeds.length} of ${data.deedCount}.` }));
-    if (!data.deeds.length) at("deeds").replaceChildren(element("caption", { text: "The rules have no actions, or nothing started." }));
+    if (data.actionCount > data.actions.length)
+      at("actions").prepend(element("caption", { text: `The first ${data.actions.length} of ${data.actionCount}.` }));
+    if (!data.actions.length) at("actions").replaceChildren(element("caption", { text: "The rules have no actions, or nothing started." }));
     const place = at("demands");
     if (!data.demands.length) return place.replaceChildren();
     const made = figure({ height: 200, x_axis_type: "datetime", tools: "xpan,xwheel_zoom,reset", y_axis_label: "demands" });

@@ -147,8 +147,8 @@ class HostHarness:
         raise ActionError("nobody")
 
     def follow(self, *rules: EventRule) -> None:
-        entries = stream_readers(DETECTOR)
-        self.host.follow(rules, DetectorConfiguration(DETECTOR, entries.decoders, entries.types))
+        readers = stream_readers(DETECTOR)
+        self.host.follow(rules, DetectorConfiguration(DETECTOR, readers.decoders, readers.types))
         self.engine.set_rules(compiled(DETECTOR, *rules))
         self.host.dispatch(self.engine.consequences.take(self.engine.now))
 

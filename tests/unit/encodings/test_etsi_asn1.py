@@ -240,5 +240,5 @@ def test_modules_come_from_files_and_from_the_detector_itself(tmp_path: Path) ->
     file = tmp_path / "dictionary.asn"
     file.write_text(DICTIONARY)
     stream = {"name": "cpm", "key": "its/${client:*}/cpm", "encoding": "uper", "type": "etsi/cpm"}
-    entries = stream_readers(a_detector(stream, asn1=[{"definition": PERCEPTION}, {"file": str(file)}]))
-    assert entries.decoders["cpm"].decode(perception())["payload"]["parts"][0]["partData"] == {"length": 4.5}
+    readers = stream_readers(a_detector(stream, asn1=[{"definition": PERCEPTION}, {"file": str(file)}]))
+    assert readers.decoders["cpm"].decode(perception())["payload"]["parts"][0]["partData"] == {"length": 4.5}

@@ -264,8 +264,8 @@ def test_samples_of_a_type_that_is_redefined_are_not_read_by_the_new_definition(
     drive.take(Arrival(at(0.5), "tracks", "vehicles/car/tracks", cdr(store, message(store))), until=1)
     assert len(list(drive.engine.buffer)) == 1
     changed = a_detector(STREAM, messages=[{"name": TRACKS, "definition": "int32[] tracks"}])
-    entries = stream_readers(changed)
-    drive.engine.set_detector(changed, entries.decoders, entries.read_key)
+    readers = stream_readers(changed)
+    drive.engine.set_detector(changed, readers.decoders, readers.read_key)
     assert list(drive.engine.buffer) == []
 
 
@@ -387,8 +387,8 @@ def test_the_documentation_s_examples_are_streams_that_run() -> None:
     streams = [each for each in blocks if "streams" in each]
     assert len(streams) >= 2
     for example in streams:
-        entries = stream_readers(a_detector(*example.pop("streams"), **example))
-        assert entries.decoders
+        readers = stream_readers(a_detector(*example.pop("streams"), **example))
+        assert readers.decoders
 
 
 def test_many_definitions_are_taken_in_quickly() -> None:

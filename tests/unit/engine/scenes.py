@@ -146,8 +146,8 @@ def driven(scene: Scene, cut: Callable[[], int], *, one_by_one: bool = False) ->
 
     `one_by_one`: every rule is evaluated by CEL, subject by subject, as if somebody watched each evaluation.
     """
-    entries, index = stream_readers(scene.detector), RuleIndex()
-    engine = make_engine(scene.detector, entries, holder="h", start=START - 1)
+    readers, index = stream_readers(scene.detector), RuleIndex()
+    engine = make_engine(scene.detector, readers, holder="h", start=START - 1)
     engine.counters.watch_ages = True
     events: list[str] = []
     demands = []
@@ -155,7 +155,7 @@ def driven(scene: Scene, cut: Callable[[], int], *, one_by_one: bool = False) ->
         found = []
         match kind:
             case "rules":
-                found += engine.set_rules(index.compile(what, scene.detector, entries.fields)[0])
+                found += engine.set_rules(index.compile(what, scene.detector, readers.fields)[0])
                 for run in engine.rules.values() if one_by_one else ():
                     run.witness = _nobody
             case "pause":

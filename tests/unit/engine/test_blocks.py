@@ -144,7 +144,7 @@ def test_what_is_left_out_for_a_while_leaves_nothing_behind() -> None:
     for second in range(1, 20):
         engine.set_level(second % 3)
         engine.advance([speed(second, second)], at(second + 0.5))
-    assert len(engine._known.tables.table("speed").marks) == 1  # else they grow with each change
+    assert len(engine._inputs.tables.table("speed").marks) == 1  # else they grow with each change
 
 
 def tasks_of(rule: Any, arrivals: list[Any], cut: int) -> dict[str, Any]:
@@ -222,7 +222,7 @@ def test_columns_of_rules_that_are_gone_are_not_read_for_ever() -> None:
         changed = a_rule(signals=[{**SPEED, "value": f"msg.v + {number}.5"}], when="speed > 10")
         engine.set_rules(compiled(a_detector(), changed))
     assert engine.advance([speed(0.5, 20)], at(1))
-    assert engine._known.tables.readers["speed"].count < 20
+    assert engine._inputs.tables.readers["speed"].count < 20
 
 
 def test_a_stream_whose_samples_a_cap_pushed_out_is_as_old_as_its_last_one_until_the_next() -> None:

@@ -17,8 +17,8 @@ RULE = a_rule(signals=[SPEED], when="v > 10", actions=[a_deploy("x")])
 def change(drive: Drive, *streams: Any, rules: Any = (RULE,), **spec: Any) -> list[str]:
     """Switch to another Detector and the rules compiled against it."""
     detector = a_detector(*streams, **spec)
-    entries = stream_readers(detector)
-    drive.engine.set_detector(detector, entries.decoders, entries.read_key)
+    readers = stream_readers(detector)
+    drive.engine.set_detector(detector, readers.decoders, readers.read_key)
     return drive.note(drive.engine.set_rules(compiled(detector, *rules)))
 
 

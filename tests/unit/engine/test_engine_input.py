@@ -217,7 +217,7 @@ def test_new_keys_of_one_client_are_bounded(monkeypatch: pytest.MonkeyPatch) -> 
     drive = Drive(detector, rule)
     arrivals = [Arrival(at(0.1) + n, "s", f"v/car/{n}", b"{}") for n in range(100)]
     assert drive.note(drive.engine.advance(arrivals, at(1))) == ["r car started 1"]
-    known: Any = drive.engine._known.ingest._lanes["s"]
+    known: Any = drive.engine._inputs.ingest._lanes["s"]
     assert len(known) <= 10
 
 
@@ -229,7 +229,7 @@ def test_the_states_of_subjects_that_are_gone_are_forgotten() -> None:
         drive.take(arrival(n + 0.5, f"car{n}", {"v": 20}), until=n + 1)
     run: Any = drive.engine.rules["r"]
     assert len(run.states) < 10
-    signals: Any = drive.engine._known.signals
+    signals: Any = drive.engine._inputs.signals
     assert len(signals._extracted) < 5
     assert len(drive.events) > 50
 

@@ -264,8 +264,8 @@ def test_a_detector_that_changes_its_lateness_keeps_what_waited() -> None:
     from detector.assembly import stream_readers
 
     patient = a_detector(a_stream("speed", stamp="msg.t"), clock="Data", lateness="900ms")
-    entries = stream_readers(patient)
-    drive.engine.set_detector(patient, entries.decoders, entries.read_key)
+    readers = stream_readers(patient)
+    drive.engine.set_detector(patient, readers.decoders, readers.read_key)
     assert len([sample for lane in drive.engine.buffer for sample in lane.samples]) == 2
 
 
@@ -313,8 +313,8 @@ def test_windows_do_not_reach_behind_a_gap_after_the_detector_has_changed() -> N
     drive.take(arrival(1.5, "car", {}), until=1.9)
     drive.engine.gap(at(2.1))
     changed = a_detector(a_stream("pose"), a_stream("speed"), clientTimeout="20s")
-    entries = stream_readers(changed)
-    drive.engine.set_detector(changed, entries.decoders, entries.read_key)
+    readers = stream_readers(changed)
+    drive.engine.set_detector(changed, readers.decoders, readers.read_key)
     assert drive.take(arrival(2.3, "car", {}), until=2.9) == []
     assert drive.take(until=3) == []
 

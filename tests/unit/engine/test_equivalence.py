@@ -77,9 +77,9 @@ def by_the_engine(scene: Scene, cut: int) -> list[Event]:
     ]
     buffer = _given({"duration": "6s", "bytes": scene.all_bytes})
     detector = a_detector(*streams, clientTimeout="4s", buffer=buffer, places=[*PLACES], **clock)
-    entries = stream_readers(detector)
+    readers = stream_readers(detector)
     decoders = dict.fromkeys(STREAMS, PythonJsonDecoder())
-    engine = Engine(detector, holder="h", decoders=decoders, read_key=entries.read_key, start=START)
+    engine = Engine(detector, holder="h", decoders=decoders, read_key=readers.read_key, start=START)
     engine.set_rules(compiled(detector, *(a_rule(name, **spec) for name, spec in scene.rules.items())))
     events: list[Event] = []
     gap, together = scene.gap, list[Arrival]()

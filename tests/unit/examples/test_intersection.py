@@ -39,10 +39,10 @@ def events(tracer: Tracer) -> list[Event]:
     objects = [document.object for document in DOCUMENTS]
     detector = next(each for each in objects if isinstance(each, Detector))
     rules = [each for each in objects if isinstance(each, EventRule)]
-    entries = stream_readers(detector)
-    compiled, refused = RuleIndex().compile(rules, detector, entries.fields, entries.places)
+    readers = stream_readers(detector)
+    compiled, refused = RuleIndex().compile(rules, detector, readers.fields, readers.places)
     assert refused == []
-    engine = Engine(detector, holder="h", decoders=entries.decoders, read_key=entries.read_key, start=START_NS)
+    engine = Engine(detector, holder="h", decoders=readers.decoders, read_key=readers.read_key, start=START_NS)
     engine.observers.observer = tracer
     engine.set_rules(compiled)
     tracer.attend(engine)

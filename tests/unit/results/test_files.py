@@ -235,15 +235,15 @@ def test_the_report_has_the_rules_the_data_and_what_actions_would_have_done(resu
     assert stream["gapKey"] == "vehicles/car2/odom"
     assert stream["gap"] == pytest.approx(8.0)
     started = sum(row["rule"] == "too-fast" for row in results.rows)
-    assert len(data["deeds"]) == started
-    assert data["deeds"][0][3:5] == ["deploy", f'speed-watch: vehicle="{data["deeds"][0][2]}"']
+    assert len(data["actions"]) == started
+    assert data["actions"][0][3:5] == ["deploy", f'speed-watch: vehicle="{data["actions"][0][2]}"']
     assert [each["template"] for each in data["demands"]] == ["speed-watch"]
     assert [(each["name"], each["closed"]) for each in data["polygons"]] == [
         ("yard", True),
         ("gate", False),
         ("area", True),
     ]
-    assert [each["client"] for each in data["ways"]] == ["car0", "car1", "car2"]
+    assert [each["client"] for each in data["paths"]] == ["car0", "car1", "car2"]
 
 
 def test_results_change_neither_events_nor_tasks_and_are_the_same_each_time(tmp_path: Path, results: Results) -> None:

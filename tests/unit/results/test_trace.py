@@ -24,7 +24,7 @@ class OneByOne(Tracer):
     def attend(self, engine: Engine) -> None:
         super().attend(engine)
         for name, run in engine.rules.items():
-            run.witness = self._witnessed.setdefault(name, self._witness(run.rule)).saw
+            run.witness = self._recorded.setdefault(name, self._witness(run.rule)).saw
 
     def _witness(self, rule: object) -> object:
         from detector.results.recorded_values import RecordedValues
@@ -34,7 +34,7 @@ class OneByOne(Tracer):
 
 def replayed(folder: Path, tracer: Tracer, batches: Sequence[Sequence[Arrival]] | None = None) -> ReplayResult:
     detector, rules = documents(folder)
-    return replay_arrivals(batches or [arrivals()], detector, rules, onlooker=tracer)
+    return replay_arrivals(batches or [arrivals()], detector, rules, observer=tracer)
 
 
 @pytest.fixture(scope="module")
@@ -146,7 +146,7 @@ def assert_alike(one: Trace, other: Trace) -> None:
             assert steps.times.tolist() == theirs.conditions[field].times.tolist()
             assert steps.codes.tolist() == theirs.conditions[field].codes.tolist()
             assert steps.reasons == theirs.conditions[field].reasons
-    assert one.ways.keys() == other.ways.keys()
+    assert one.paths.keys() == other.paths.keys()
 
 
 def test_without_a_rule_about_pairs_the_signals_x_and_y_are_the_ways() -> None:
@@ -154,11 +154,11 @@ def test_without_a_rule_about_pairs_the_signals_x_and_y_are_the_ways() -> None:
     signals = [{"name": axis, "stream": "odom", "value": f"msg.{axis}"} for axis in ("x", "y")]
     rule = a_rule("far", signals=signals, when="x > 100", evaluation={"every": "100ms"})
     tracer = Tracer()
-    replay_arrivals([arrivals()], a_detector(stream), [rule], onlooker=tracer)
+    replay_arrivals([arrivals()], a_detector(stream), [rule], observer=tracer)
     trace = tracer.trace()
-    assert trace.ways.keys() == {"car0", "car1", "car2"}
+    assert trace.paths.keys() == {"car0", "car1", "car2"}
     assert not trace.geographic
     sent = {(key.split("/")[1], message["x"], message["y"]) for _, key, message in messages()}
-    for client, way in trace.ways.items():
-        assert len(way.times) > 100
-        assert {(client, x, y) for x, y in way.axes.T.tolist()} <= sent
+    for client, path in trace.paths.items():
+        assert len(path.times) > 100
+        assert {(client, x, y) for x, y in path.axes.T.tolist()} <= sent

@@ -39,10 +39,10 @@ class ModelDrive(Drive):
 
     def __init__(self, detector: Detector, *rules: EventRule) -> None:
         super().__init__(detector)
-        entries = stream_readers(detector)
-        compiled, refused = RuleIndex().compile(rules, detector, entries.fields)
+        readers = stream_readers(detector)
+        compiled, refused = RuleIndex().compile(rules, detector, readers.fields)
         assert not refused, [str(each) for each in refused]
-        self.engine = make_engine(detector, entries, holder="h", start=at(0))
+        self.engine = make_engine(detector, readers, holder="h", start=at(0))
         self.engine.set_rules(compiled)
 
     def values(self) -> Any:

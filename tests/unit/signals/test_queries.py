@@ -60,7 +60,7 @@ def test_a_view_sees_nothing_later_than_its_tick() -> None:
     drive.take(a_scan(5, "a"), a_scan(15, "a"), until=1.5)
     engine = drive.engine
     queries = BufferQueries(
-        at(1), None, engine.buffer, engine.clients, engine._known.messages, {"scan": None}, engine._known.transforms
+        at(1), None, engine.buffer, engine.clients, engine._inputs.messages, {"scan": None}, engine._inputs.transforms
     )
     assert [sample.message["n"] for sample in queries.last("a", "scan", 9)] == [5]
     assert queries.nearest("a", "scan", at(1.5)) == queries.newest("a", "scan") != None  # noqa: E711

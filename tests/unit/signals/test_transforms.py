@@ -168,13 +168,13 @@ def test_what_comes_later_than_the_tick_is_not_seen() -> None:
     drive = driven(*MOVING, until=1.5)
     drive.take(tf(1.6, transform("map", "base", 1.6, x=99)), until=1.59)
     with pytest.raises(TransformError):
-        drive.engine._known.transforms.lookup("car", "map", "base", at(1.6), at(1.55))
+        drive.engine._inputs.transforms.lookup("car", "map", "base", at(1.6), at(1.55))
 
 
 def test_what_was_read_is_not_kept_for_longer_than_it_is_used() -> None:
     drive = driven(*MOVING)
     assert place(drive, "map", "base", 1.5) == (20, 0, 0)
-    transforms = drive.engine._known.transforms
+    transforms = drive.engine._inputs.transforms
     assert len(transforms._parsed) == 2
     drive.take(until=11)
     assert len(transforms._parsed) == 2

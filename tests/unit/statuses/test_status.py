@@ -37,14 +37,14 @@ class ObservedEngine:
     def __init__(self, drive: Drive) -> None:
         self.drive = drive
         self.time = 0.0
-        self.keeper = StatusUpdater(drive.engine, Losses(drive.engine), lambda: at(self.time))
+        self.updater = StatusUpdater(drive.engine, Losses(drive.engine), lambda: at(self.time))
 
     def take(self, *arrivals: object, until: float) -> Status:
-        self.keeper.arrived(arrivals)  # type: ignore[arg-type]
+        self.updater.arrived(arrivals)  # type: ignore[arg-type]
         self.drive.take(*arrivals, until=until)  # type: ignore[arg-type]
         self.time = until
-        self.keeper.looked()
-        return self.keeper.latest
+        self.updater.looked()
+        return self.updater.latest
 
 
 def test_streams_are_reported_with_rate_age_buffer_and_latency() -> None:
@@ -115,7 +115,7 @@ def test_with_clock_data_latencies_are_from_the_stamp_to_the_receipt() -> None:
 
 def test_a_rule_that_is_refused_or_disabled_reports_it() -> None:
     kept = ObservedEngine(Drive(a_detector(), a_rule("off", when="true", enabled=False)))
-    kept.keeper.refused(
+    kept.updater.refused(
         [RefusedRule(a_rule("bad", when="1"), (RuleProblem(("spec", "when"), "no boolean"),), kept=False)]
     )
     status = kept.take(until=1)
@@ -185,7 +185,7 @@ def answering(endpoint: str) -> Iterator[None]:
         Zenoh(listen=[endpoint]),
         [],
         lambda stream: print,
-        answering=lambda session: QueryHandler(session, "d", an_answer),
+        make_query_handler=lambda session: QueryHandler(session, "d", an_answer),
     )
     network.start()
     yield
@@ -298,7 +298,7 @@ def test_the_status_names_what_is_demanded_and_who_is_missing() -> None:
         clients=[{"name": "rsu-1", "expected": True}, {"name": "rsu-2", "expected": True}], clientTimeout="4s"
     )
     kept = ObservedEngine(Drive(detector, FAST))
-    kept.keeper.demands = ("fast-b", "fast-a")
+    kept.updater.demands = ("fast-b", "fast-a")
     status = kept.take(arrival(0.5, "rsu-1", {"v": 20}), until=1)
     assert (status.demands, status.demand_count, status.missing) == (["fast-a", "fast-b"], 2, [])
     status = kept.take(arrival(9.5, "rsu-1", {"v": 20}), until=10)

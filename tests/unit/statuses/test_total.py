@@ -103,7 +103,7 @@ class Answers:
                 Zenoh(listen=[endpoint]),
                 [],
                 lambda stream: print,
-                answering=lambda session: QueryHandler(session, holder, lambda *_: payload),
+                make_query_handler=lambda session: QueryHandler(session, holder, lambda *_: payload),
             )
             network.start()
             self.networks.append(network)

@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from detector.access import mounted as mounted_files
-from detector.access.mounted import AccessError, LoadedCredentials, expiry, read_material
+from detector.access.mounted import AccessError, LoadedCredentials, expiry, read_credentials
 from tests.certificates import Authority
 from wayside.api.access import Access
 
@@ -68,7 +68,7 @@ def test_files_that_change_while_they_are_read_are_read_again(tmp_path: Path, mo
         return found
 
     monkeypatch.setattr(mounted_files, "_content", exchanged)
-    credentials = read_material(access(mounted), "spec.zenoh")
+    credentials = read_credentials(access(mounted), "spec.zenoh")
     assert credentials.certificate == (mounted / "tls.crt").read_bytes()
     assert credentials.key == (mounted / "tls.key").read_bytes()
 
@@ -79,7 +79,7 @@ def test_files_that_never_hold_still_are_reported(tmp_path: Path, monkeypatch: p
     count = iter(range(1000))
     monkeypatch.setattr(mounted_files, "_content", lambda path: str(next(count)).encode())
     with pytest.raises(AccessError, match=r"spec\.zenoh: .*tls\.crt keeps changing"):
-        read_material(access(mounted), "spec.zenoh")
+        read_credentials(access(mounted), "spec.zenoh")
 
 
 def test_what_is_shown_of_it_holds_no_secret() -> None:

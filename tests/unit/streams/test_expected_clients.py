@@ -40,8 +40,8 @@ def test_a_client_that_is_expected_from_a_change_on_is_there_then_and_times_out_
     drive = Drive(before, silent(until="false"))
 
     def change(wanted: Any) -> None:
-        entries = stream_readers(wanted)
-        drive.engine.set_detector(wanted, entries.decoders, entries.read_key)
+        readers = stream_readers(wanted)
+        drive.engine.set_detector(wanted, readers.decoders, readers.read_key)
         assert drive.note(drive.engine.set_rules(compiled(wanted, silent(until="false")))) == []
 
     drive.take(until=10)
