@@ -189,6 +189,9 @@ class ClusterCache:
 
     def note(self, name: Name, decided: Decided) -> None:
         """Note a decision in the indexes that further decisions read."""
+        for claim in self.claims.claims(name):
+            if (holder := claim.task.spec.requester.holder) is not None:
+                self.leases.expect((name[0], holder), self.healthy.elapsed)
         if template_of_all(name[1]) is not None:
             return
         instance, fallback = self.instance(name), _fallback(decided)
@@ -265,8 +268,7 @@ class ClusterCache:
 
     def lease_views(self, namespace: str, holders: Iterable[str | None]) -> dict[str, LeaseView]:
         """The Leases of the holders, by holder."""
-        at = self.healthy.elapsed
-        return {each: self.leases.view((namespace, each), at) for each in set(holders) if each is not None}
+        return {each: self.leases.view((namespace, each)) for each in set(holders) if each is not None}
 
     def known_findings(self, template: ApplicationTemplate) -> Findings | None:
         """What was noted of this generation of the template; None where nothing was yet."""

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
+from application_manager.cache.store import MembersByGroup
 from application_manager.core.conditions import ConditionState
 from application_manager.core.health.pods import Trouble, summary, trouble
 from application_manager.core.objects.detectors import DETECTOR_LABEL
@@ -39,19 +40,19 @@ class DetectorIndex:
     """
 
     defaults: PodDefaults | None = None
-    objects: dict[str, dict[str, Object]] = field(default_factory=dict)
+    objects: MembersByGroup[str, str, Object] = field(default_factory=MembersByGroup)
     processed: dict[Name, Processed] = field(default_factory=dict)
     requesting: dict[Name, list[Object]] = field(default_factory=dict)
     _troubles: dict[Name, list[Trouble]] = field(default_factory=dict)
 
-    def take(self, objects: Iterable[Object], pods: Iterable[Object], requesting: Iterable[Object] = ()) -> None:
+    def replace(self, objects: Iterable[Object], pods: Iterable[Object], requesting: Iterable[Object] = ()) -> None:
         """Replace all objects, their pods, and the pods that request detectors, by those just listed."""
-        self.objects = {}
+        self.objects = MembersByGroup()
         deployments: set[tuple[str, str]] = set()
         for raw in objects:
             controller = controller_of(raw)
             if controller.get("kind") == "Detector":
-                self.objects.setdefault(str(controller["uid"]), {})[raw["kind"]] = raw
+                self.objects.put(str(controller["uid"]), raw["kind"], raw)
                 if raw["kind"] == "Deployment":
                     deployments.add((raw["metadata"]["namespace"], raw["metadata"]["name"]))
         found: dict[Name, list[Trouble]] = {}
@@ -71,9 +72,9 @@ class DetectorIndex:
             return None
         return known.running
 
-    def owned(self, uid: str) -> dict[str, Object]:
-        """The objects that the Detector of this uid controls, by kind; what is added stays until the next look."""
-        return self.objects.setdefault(uid, {})
+    def owned(self, uid: str) -> Mapping[str, Object]:
+        """The objects that the Detector of this uid controls, by kind."""
+        return self.objects.get(uid, {})
 
     def troubles(self, name: Name) -> list[Trouble]:
         """The different troubles of the detector's pods, the most important first."""

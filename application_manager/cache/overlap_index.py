@@ -87,18 +87,22 @@ class OverlapIndex:
         elif namespace not in self._yielded:  # it may be gone
             self._yield(_Yielded(written, template, now))
 
-    def turn(self, template: Name, now: float) -> tuple[NamespaceRole, float]:
+    def role(self, template: Name, now: float) -> tuple[NamespaceRole, float]:
         """What may be done about a template as of `now`, and when that changes, both in seconds since 1970."""
         state = self._yielded.get(template[0])
         if state is None:
             return NamespaceRole.ACT, now
         if state.template != template or now < state.until:
             return NamespaceRole.WAIT, max(state.until, now + 1.0)
-        if not state.tried:
-            state.tried, state.until = True, now + ANSWER
-            return NamespaceRole.CHALLENGE, state.until
-        self._resume(template[0], f"the manager of the Lease {state.rival.lease} does not respond")
-        return NamespaceRole.ACT, now
+        return (NamespaceRole.ACT, now) if state.tried else (NamespaceRole.CHALLENGE, now + ANSWER)
+
+    def take(self, namespace: str, role: NamespaceRole, until: float) -> None:
+        """Note that the manager takes this role in the namespace; `until` as above."""
+        state = self._yielded.get(namespace)
+        if state is not None and role is NamespaceRole.CHALLENGE:
+            state.tried, state.until = True, until
+        elif state is not None and role is NamespaceRole.ACT:
+            self._resume(namespace, f"the manager of the Lease {state.rival.lease} does not respond")
 
     def waits_for(self, namespace: str) -> str:
         """The Lease of the manager for which this one waits in the namespace."""

@@ -86,13 +86,16 @@ class NamespacePermissions:
         self._changed = changed
         self._granted: set[str] = set()
         self._refused: set[str] = set()
-        self._asking = asyncio.Lock()
+        self._querying = asyncio.Lock()
 
     async def may_write(self, namespace: str) -> bool:
         """Whether the account may write in the namespace. Raises ApiError or Unreachable where nobody answers."""
-        async with self._asking:
-            if namespace not in self._granted | self._refused and not await self._is_granted(namespace):
-                self._refused.add(namespace)
+        async with self._querying:
+            if namespace not in self._granted | self._refused:
+                granted = await self._is_granted(namespace)
+                (self._granted if granted else self._refused).add(namespace)
+                if granted:
+                    return True
                 log.warning(
                     "ignoring namespace %s, which is not granted to this manager: apply the output of "
                     "`application-manager rbac --grant %s`, or add the namespace to manager.grant of the chart",
@@ -110,11 +113,9 @@ class NamespacePermissions:
         if granted:
             log.info("namespace %s is granted to this manager", ", ".join(granted))
             self._refused.difference_update(granted)
+            self._granted.update(granted)
             self._changed()
 
     async def _is_granted(self, namespace: str) -> bool:
         right = granting()
-        if await may(self._client, right, right.verbs[0], namespace):
-            self._granted.add(namespace)
-            return True
-        return False
+        return await may(self._client, right, right.verbs[0], namespace)

@@ -41,8 +41,7 @@ class Overview(Collector):
         yield gauges("queue_depth", "Keys that wait for a worker", "queue", depth)
         later = [(name, timed) for name, _, timed in queues]
         yield gauges("queue_later", "Keys that wait for a time or a retry", "queue", later)
-        at = self._cache.healthy.elapsed
-        views = [self._cache.leases.view(key, at) for key in self._cache.claims.holders()]
+        views = [self._cache.leases.view(key) for key in self._cache.claims.holders()]
         overdue = sum(view.unchanged >= view.duration for view in views)
         states = [("renewed", len(views) - overdue), ("overdue", overdue)]
         yield gauges("leases", "Holders of demands by the state of their Lease", "state", states)

@@ -45,7 +45,7 @@ class DetectorWatch:
         for resource in _KINDS:
             objects += await self._list(resource, SELECTOR)
         before = set(self.index.requesting)
-        self.index.take(objects, await self._list(_PODS, SELECTOR), await self._list(_PODS, SIDECAR_LABEL))
+        self.index.replace(objects, await self._list(_PODS, SELECTOR), await self._list(_PODS, SIDECAR_LABEL))
         for name in {
             *before,
             *self.index.requesting,

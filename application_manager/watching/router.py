@@ -190,9 +190,8 @@ class Router:
         if holder is None:
             return
         key = (name[0], holder)
-        at = self.cache.healthy.elapsed
-        first, before = not self.cache.leases.seen(key), self.cache.leases.view(key, at)
-        renewed = self.cache.leases.observe(key, raw, at)
+        first, before = not self.cache.leases.seen(key), self.cache.leases.view(key)
+        renewed = self.cache.leases.observe(key, raw, self.cache.healthy.elapsed)
         returns = renewed and (not before.renewed or before.unchanged >= before.duration)
         if returns:
             log.info("holder %s/%s renews its Lease again", *key)

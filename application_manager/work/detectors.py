@@ -122,11 +122,11 @@ class DetectorWork:
 
     async def _apply_one(self, name: Name, detector: Detector, manifest: Manifest) -> ConditionState | None:
         kind, called = manifest["kind"], manifest["metadata"]["name"]
-        known = self.index.owned(detector.metadata.uid)
-        live = known.get(kind) or await self.client.get(_RESOURCES[kind], name[0], called)
+        uid = detector.metadata.uid
+        live = self.index.owned(uid).get(kind) or await self.client.get(_RESOURCES[kind], name[0], called)
         digest = hashlib.sha256(json.dumps(manifest, sort_keys=True).encode()).hexdigest()
-        if live is not None and controller_uid(live) == detector.metadata.uid:
-            known[kind] = live
+        if live is not None and controller_uid(live) == uid:
+            self.index.objects.put(uid, kind, live)
             as_applied = self._applied.get(live["metadata"]["uid"]) == (digest, our_fields(live))
             if as_applied and not live["metadata"].get("deletionTimestamp"):
                 return None
@@ -138,20 +138,22 @@ class DetectorWork:
             return ConditionState(RUNNING, False, "Waiting", "the namespace is being deleted")
         if isinstance(raw, ApplyProblem):
             if raw.reason == "Waiting":
-                known.pop(kind, None)  # to be read again
+                self.index.objects.drop(uid, kind)  # to be read again
             return ConditionState(RUNNING, False, raw.reason, raw.message)
         if live is None:
             log.info("detector %s/%s: created %s %s", *name, kind, called)
-        known[kind] = raw
+        self.index.objects.put(uid, kind, raw)
         self._applied[raw["metadata"]["uid"]] = digest, our_fields(raw)
         return None
 
     async def _remove(self, name: Name, uid: str, kinds: Iterable[str]) -> None:
         """Remove what the Detector controls of these kinds: with its mode as it is they are not needed."""
         for kind in list(kinds):
-            raw = self.index.owned(uid)[kind]
+            raw = self.index.owned(uid).get(kind)
+            if raw is None:
+                continue  # it went while another one was deleted
             await self.client.delete(_RESOURCES[kind], name[0], raw["metadata"]["name"], raw["metadata"]["uid"])
-            self.index.owned(uid).pop(kind, None)
+            self.index.objects.drop(uid, kind)
             self._applied.pop(raw["metadata"]["uid"], None)
             log.info("detector %s/%s: removed %s %s", *name, kind, raw["metadata"]["name"])
 

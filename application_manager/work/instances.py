@@ -85,7 +85,7 @@ class Attempts:
         known, _, until = self._refused.get(name, (None, 0, 0.0))
         return until if known == what and now < until else None
 
-    def refused(self, name: Name, what: object, now: float) -> float:
+    def note_refusal(self, name: Name, what: object, now: float) -> float:
         """Note that it was refused; when it is to be tried again, in seconds since 1970."""
         known, times, _ = self._refused.get(name, (None, 0, 0.0))
         times = times + 1 if known == what else 1
@@ -147,7 +147,7 @@ class InstanceWork:
             # What we know may have holes (a watch that broke, for one): nothing is stopped without looking.
             await self._list_tasks(name)
             decision = self._decide(name)  # while the tasks were listed, the instance itself may have gone
-            if decision is not None and self._is_over(name, decision) and await self._released(name, decision):
+            if decision is not None and self._is_over(name, decision) and await self._release(name, decision):
                 return
         # From the decision to the first request nothing is awaited, so the decision is about what there is.
         instance = self.cache.instance(name)
@@ -256,7 +256,7 @@ class InstanceWork:
         elif applied.state.reason == "Waiting":
             self.again(name, time.time() + _LOOK_AGAIN)
         else:
-            self.again(name, self.attempts.refused(name, trying, time.time()))
+            self.again(name, self.attempts.note_refusal(name, trying, time.time()))
 
     async def _look_whether_it_was_made(self, name: Name) -> None:
         """Look for the instance where an attempt to make it failed, and so may have made it or not."""
@@ -321,7 +321,7 @@ class InstanceWork:
             for raw in page:
                 self.observe(raw)
 
-    async def _released(self, name: Name, over: Decision) -> bool:
+    async def _release(self, name: Name, over: Decision) -> bool:
         """Delete the instance, unless claims of tasks are still being computed; whether it was deleted."""
         instance = self.cache.instance(name)
         if instance is None:

@@ -44,7 +44,7 @@ BURST = 10
 REFILL = 60.0
 """Seconds after which one more may follow: an object that changes all the time has an Event a minute."""
 
-_KEPT_ALLOWANCES = 10_000  # objects that are remembered; the one with the oldest Event is forgotten, and starts over
+_KEPT_BUCKETS = 10_000  # objects that are remembered; the one with the oldest Event is forgotten, and starts over
 _REPORT_EVERY = 60.0  # s between two lines in the log about Events that were dropped
 _NAME_LENGTH = 236  # characters of the object's name, for a pod's may have as many as the Event's
 _NOTE_LENGTH = 1024  # characters, as events.k8s.io allows
@@ -180,7 +180,7 @@ class Recorder:
     def __init__(self, client: Client, measures: Measures | None = None) -> None:
         self._client = client
         self._measures = measures or Measures()
-        self._allowance = TokenBuckets()
+        self._buckets = TokenBuckets()
         self._waiting: FairQueue[_Event] = FairQueue()
         self._wake = asyncio.Event()
         self._ending = False
@@ -194,9 +194,9 @@ class Recorder:
         `once`: not if there is the same already, also of an earlier run: for what follows from no change of a status.
         """
         event = _Event(regarding, reason, note, now, once)
-        if self._repeats(event):
+        if self._count_repetition(event):
             return
-        if not self._allowance.takes(regarding.metadata.uid, now):
+        if not self._buckets.take(regarding.metadata.uid, now):
             self._measures.unposted("limited")
         elif self._waiting.count(regarding.namespace) >= _WAITING:
             self._measures.unposted("full")
@@ -205,8 +205,8 @@ class Recorder:
             self._waiting.add(regarding.namespace, event)
             self._wake.set()
 
-    def _repeats(self, event: _Event) -> bool:
-        """Whether the Event was posted a short while ago, and nothing is to be written about its repetition yet."""
+    def _count_repetition(self, event: _Event) -> bool:
+        """Count an Event that was posted a short while ago; whether nothing is to be written about it yet."""
         known = self._series.get(event.what)
         if known is None:
             return False
@@ -337,12 +337,12 @@ class TokenBuckets:
     def __init__(self) -> None:
         self._left: OrderedDict[Hashable, tuple[float, float]] = OrderedDict()  # tokens, as of when
 
-    def takes(self, key: Hashable, now: float) -> bool:
-        """Whether one more may be posted about the object at `now`, in seconds; if so, it is counted."""
+    def take(self, key: Hashable, now: float) -> bool:
+        """Take a token of the object at `now`, in seconds; whether there was one."""
         tokens, since = self._left.pop(key, (float(BURST), now))
         tokens = min(float(BURST), tokens + max(0.0, now - since) / REFILL)
         allowed = tokens >= 1
         self._left[key] = (tokens - 1 if allowed else tokens, now)
-        if len(self._left) > _KEPT_ALLOWANCES:
+        if len(self._left) > _KEPT_BUCKETS:
             self._left.popitem(last=False)
         return allowed

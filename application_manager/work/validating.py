@@ -102,10 +102,11 @@ class TemplateWork:
         regarding, now = _bare(entry), time.time()
         old = ApplicationTemplateStatus.model_validate(entry.raw.get("status") or {})
         own = self.cache.overlap.own()
-        turn, when = self.cache.overlap.turn(name, now)
-        if turn is not NamespaceRole.ACT:
-            self.again(name, when)
-            if turn is NamespaceRole.CHALLENGE and own is not None:
+        role, until = self.cache.overlap.role(name, now)
+        self.cache.overlap.take(name[0], role, until)
+        if role is not NamespaceRole.ACT:
+            self.again(name, until)
+            if role is NamespaceRole.CHALLENGE and own is not None:
                 await self._challenge(regarding, own, now)
             return
         findings = await self._findings(name)

@@ -44,7 +44,7 @@ class ServingCertificate:
     def refresh(self) -> None:
         """Use the files' new contents if they have changed and are valid; log what happens, and a problem once."""
         try:
-            changed = self.renewed()
+            changed = self.reload()
         except (OSError, ssl.SSLError) as error:
             reason = _reason(error)
             if reason != self._logged:
@@ -61,7 +61,7 @@ class ServingCertificate:
             await asyncio.sleep(EVERY)
             self.refresh()
 
-    def renewed(self) -> bool:
+    def reload(self) -> bool:
         """Use the files if they have changed; whether they have.
 
         Raises OSError or ssl.SSLError for files that are not valid; then the previous ones stay.

@@ -78,7 +78,7 @@ class _Observation:
     looked: float  # healthy seconds at which it was seen last
     duration: float = DEFAULT_DURATION
     renewed: bool = False
-    seen: bool = True  # else it was only requested: what is seen first is neither old nor a renewal
+    seen: bool = True  # else it was only expected: what is seen first is neither old nor a renewal
 
 
 @dataclass(slots=True)
@@ -104,12 +104,15 @@ class LeaseIndex:
         known.identity = identity
         return lease is not None
 
-    def view(self, key: HolderKey, at: float) -> LeaseView:
-        """The holder's Lease, as it was when it was looked at last.
+    def expect(self, key: HolderKey, at: float) -> None:
+        """Note that a demand names the holder: it counts as observed, without a Lease, from `at` on."""
+        self._observed.setdefault(key, _Observation(_identity(None), at, at, seen=False))
 
-        A holder never heard of counts as observed, without a Lease, from `at` on.
-        """
-        known = self._observed.setdefault(key, _Observation(_identity(None), at, at, seen=False))
+    def view(self, key: HolderKey) -> LeaseView:
+        """The holder's Lease, as it was when it was looked at last."""
+        known = self._observed.get(key)
+        if known is None:
+            return LeaseView(0.0, renewed=False)
         return LeaseView(known.looked - known.since, known.duration, known.renewed)
 
     def due(self, key: HolderKey, at: float) -> bool:

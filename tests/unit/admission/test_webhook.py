@@ -150,17 +150,17 @@ def test_a_certificate_is_for_the_hosts_given_and_its_key_for_its_owner_alone(fo
 
 def test_renewed_files_are_taken_whole_or_not_at_all(folder: Path) -> None:
     certificate = ServingCertificate(folder, "--admission-certificates")
-    assert not certificate.renewed()
+    assert not certificate.reload()
     old = {each.name: each.read_bytes() for each in folder.iterdir()}
     make_certificates(folder, ["127.0.0.1"])
     new = (folder / "tls.key").read_bytes()
     (folder / "tls.key").write_bytes(old["tls.key"])
     for _ in range(2):  # the new certificate without its key
         with pytest.raises(ssl.SSLError):
-            certificate.renewed()
+            certificate.reload()
     (folder / "tls.key").write_bytes(new)
-    assert certificate.renewed()
-    assert not certificate.renewed()
+    assert certificate.reload()
+    assert not certificate.reload()
 
 
 @pytest.mark.parametrize(

@@ -137,12 +137,12 @@ def test_pages_are_served_and_what_is_missing_is_503() -> None:
 
 
 def test_an_object_that_changes_all_the_time_is_reported_now_and_then() -> None:
-    allowance = TokenBuckets()
-    assert [allowance.takes("a", 0.0) for _ in range(BURST + 2)] == [True] * BURST + [False] * 2
-    assert allowance.takes("b", 0.0)
-    assert not allowance.takes("a", REFILL - 1)
-    assert allowance.takes("a", REFILL + 1)
-    assert not allowance.takes("a", REFILL + 2)
+    buckets = TokenBuckets()
+    assert [buckets.take("a", 0.0) for _ in range(BURST + 2)] == [True] * BURST + [False] * 2
+    assert buckets.take("b", 0.0)
+    assert not buckets.take("a", REFILL - 1)
+    assert buckets.take("a", REFILL + 1)
+    assert not buckets.take("a", REFILL + 2)
 
 
 def test_the_guide_describes_every_metric() -> None:

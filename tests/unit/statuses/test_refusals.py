@@ -106,7 +106,7 @@ def test_the_same_is_tried_again_ever_later_and_another_at_once() -> None:
     assert attempts.waits_until(("site", "a"), "x", now) is None
     pauses = []
     for _ in range(12):
-        until = attempts.refused(("site", "a"), "x", now)
+        until = attempts.note_refusal(("site", "a"), "x", now)
         assert attempts.waits_until(("site", "a"), "x", now) == until
         assert attempts.waits_until(("site", "a"), "y", now) is None
         assert attempts.waits_until(("site", "b"), "x", now) is None
@@ -115,6 +115,6 @@ def test_the_same_is_tried_again_ever_later_and_another_at_once() -> None:
         assert attempts.waits_until(("site", "a"), "x", now) is None
     assert 0 < pauses[0] <= FIRST_PAUSE < pauses[2]
     assert LONGEST_PAUSE / 2 < pauses[-1] <= LONGEST_PAUSE
-    assert attempts.refused(("site", "a"), "y", now) - now <= FIRST_PAUSE
+    assert attempts.note_refusal(("site", "a"), "y", now) - now <= FIRST_PAUSE
     attempts.forget(("site", "a"))
     assert attempts.waits_until(("site", "a"), "y", now) is None
