@@ -31,7 +31,7 @@ class ApplicationInstanceSpec(Model):
     key: str | None = Field(default=None, max_length=1024)
     """The value of the template's key; a list or map is written as JSON. Absent if the template has no key.
     Immutable."""
-    # Server-side apply makes a map null that loses the last entry which its manager had put there.
+    # Server-side apply sets a map to null when its field manager removes the last entry that it owned.
     parameters: dict[Identifier, NestedValue] = Field(
         default_factory=dict, max_length=64, json_schema_extra={"nullable": True}
     )

@@ -116,7 +116,7 @@ class Helm(Model):
         ),
     )
 
-    # No `-` at the beginning: it is an argument of a program.
+    # Must not begin with `-`: it becomes an argument of a program.
     chart: str = Field(
         min_length=1, max_length=512, pattern=r"^(oci://[a-zA-Z0-9][^ ?#@]*|/[^ ]+|[a-zA-Z0-9][a-zA-Z0-9._-]*)$"
     )

@@ -103,7 +103,7 @@ class Duration(_PatternString):
 
     @property
     def ns(self) -> int:
-        """The duration in nanoseconds; what is below is cut off, as Go does."""
+        """The duration in nanoseconds; fractions of a nanosecond are truncated, as in Go."""
         return sum(int(Decimal(number) * self._UNITS[unit]) for number, unit in re.findall(r"([0-9.]+)([a-z]+)", self))
 
     @property
@@ -128,7 +128,7 @@ class PositiveDuration(Duration):
 
 
 class WindowLength(PositiveDuration):
-    """The length of a window, or `Episode`: from the start of the open episode on."""
+    """The length of a window, or `Episode`: since the start of the open episode."""
 
     pattern = rf"({PositiveDuration.pattern}|Episode)"
     expectation = "a duration above zero, such as 500ms, 10s, 1.5s or 1h30m, or Episode"
@@ -174,7 +174,7 @@ class Quantity(_PatternString):
     def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
         described = super().__get_pydantic_json_schema__(schema, handler)
         del described["type"]
-        # No CEL rule: to Kubernetes 1.31 the text may be as long as a whole request, and the rule costs too much.
+        # No CEL rule: Kubernetes 1.31 assumes a string as long as a whole request here, and refuses the rule's cost.
         return {"x-kubernetes-int-or-string": True, "minimum": cls.minimum, **described}
 
 
@@ -196,16 +196,16 @@ Expression = Annotated[str, Field(min_length=1, max_length=2048)]
 """CEL source text."""
 
 ObjectName = Annotated[str, Field(min_length=1, max_length=63, pattern=r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?$")]
-"""A name of a Kubernetes object of ours (an RFC 1123 label)."""
+"""The name of a Kubernetes object (an RFC 1123 label)."""
 
 TemplateName = Annotated[str, Field(min_length=1, max_length=40, pattern=r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?$")]
-"""A template's name: shorter, since instances' and their objects' names are made from it."""
+"""The name of a template. It is shorter, because the names of instances and their objects are derived from it."""
 
 ClientName = Annotated[str, Field(min_length=1, max_length=63, pattern=r"^[A-Za-z0-9._:-]+$")]
 """The name of a vehicle or station."""
 
 Key = Annotated[str, Field(min_length=1, max_length=512), AfterValidator(lambda key: key.removeprefix("/"))]
-"""A Zenoh key expression. The leading slash of a ROS topic is taken off."""
+"""A Zenoh key expression. The leading slash of a ROS topic is removed."""
 
 Identifier = Annotated[str, Field(min_length=1, max_length=63, pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
 """A name that expressions can use as a variable."""
@@ -224,18 +224,19 @@ JsonValue = Any
 
 
 ATOMIC_LIST: JsonDict = {"x-kubernetes-list-type": "atomic"}
-"""Of a field: server-side apply replaces the list as a whole."""
+"""The schema of a list that server-side apply replaces as a whole."""
 SET_LIST: JsonDict = {"x-kubernetes-list-type": "set"}
-"""Of a field: each applier owns the items that it applies; no item occurs twice."""
+"""The schema of a list of unique items. Each field manager owns the items that it applies."""
 
 
 def map_list(key: str) -> JsonDict:
-    """Of a field: server-side apply merges the items by this field of theirs, whose values are unique."""
+    """The schema of a list that server-side apply merges by this field of its items; the values of the field are
+    unique."""
     return {"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": [key]}
 
 
 class Metadata(BaseModel):
-    """The part of Kubernetes' ObjectMeta that we read; the rest passes through."""
+    """The part of Kubernetes' ObjectMeta that the programs read; other fields are kept."""
 
     model_config = ConfigDict(alias_generator=to_camel, validate_by_name=True, validate_by_alias=True, extra="allow")
 

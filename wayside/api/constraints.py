@@ -11,12 +11,12 @@ from pydantic.config import JsonDict
 
 
 class Constraint(NamedTuple):
-    """What an object of one model must fulfil."""
+    """A condition that every object of a model must meet."""
 
     validation: JsonDict | None
     """For the CRD; None: only the programs check it."""
     problem: Callable[[Any], str | None]
-    """What is wrong with an object, and the remedy; None: nothing."""
+    """Returns the problem of an object, with the remedy; None if it meets the condition."""
 
 
 def validation(rule: str, message: str, field: str = "", reason: str = "") -> JsonDict:
@@ -24,9 +24,9 @@ def validation(rule: str, message: str, field: str = "", reason: str = "") -> Js
 
     Args:
         rule: the CEL source.
-        message: what is wrong, and the remedy.
-        field: the path of the field that the refusal names, relative to the object, e.g. `.over`; empty: the object
-            itself, for rules about several fields of equal standing.
+        message: the problem and the remedy.
+        field: the path of the field that the error names, relative to the object, e.g. `.over`; empty: the object
+            itself, for a rule about several fields of equal rank.
         reason: Required, Forbidden or Duplicate; empty: Invalid.
     """
     made: JsonDict = {"rule": rule, "message": message}
@@ -34,7 +34,7 @@ def validation(rule: str, message: str, field: str = "", reason: str = "") -> Js
 
 
 def checked(rule: str, message: str, reason: str = "") -> JsonDict:
-    """The same for one field: what its schema has in addition."""
+    """A validation of one field, to be added to its schema."""
     return {"x-kubernetes-validations": [validation(rule, message, reason=reason)]}
 
 
@@ -46,12 +46,13 @@ def immutable(message: str) -> JsonDict:
 def constraint(
     rule: str, message: str, field: str = "", reason: str = "", *, holds: Callable[[Any], bool] = lambda _: True
 ) -> Constraint:
-    """As `validation`; `holds` is the rule in Python, unless a validator checks it and its message has more details."""
+    """As `validation`. `holds` is the rule in Python; without it, a validator of the model checks the rule in more
+    detail."""
     return Constraint(validation(rule, message, field, reason), lambda given: None if holds(given) else message)
 
 
 def exactly_one(*fields: str) -> Constraint:
-    """Of these fields."""
+    """Exactly one of these fields must be given."""
     has = [f"has(self.{to_camel(field)})" for field in fields]
     rule = " != ".join(has) if len(has) == 2 else f"[{', '.join(has)}].filter(given, given).size() == 1"
     *names, last = map(to_camel, fields)
@@ -60,7 +61,7 @@ def exactly_one(*fields: str) -> Constraint:
 
 
 def not_both(field: str, other: str) -> Constraint:
-    """Of two fields."""
+    """At most one of two fields may be given."""
     one, two = to_camel(field), to_camel(other)
     return constraint(
         f"!(has(self.{one}) && has(self.{two}))",
@@ -74,9 +75,9 @@ def not_both(field: str, other: str) -> Constraint:
 def unique(
     *fields: str, by: str = "name", wording: str = "the name {!r} is used twice: names must be unique"
 ) -> Constraint:
-    """The items of each of these lists differ by a field, or themselves if they are texts.
+    """The items of each of these lists must differ in a field; strings must differ themselves.
 
-    The API server knows it from the type of the list. `wording` is the message, with the value that occurs twice.
+    The API server checks this by the list type. `wording` is the message, with a placeholder for the repeated value.
     """
 
     def problem(given: Any) -> str | None:

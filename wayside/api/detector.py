@@ -37,7 +37,8 @@ from wayside.api.stream import (
 from wayside.api.zenoh import Zenoh
 
 STALE_AFTER = PositiveDuration("5s")
-"""The default of a stream's `staleAfter`: a stream with one sample per second, such as slow CAMs, may miss a few."""
+"""The default of a stream's `staleAfter`. A stream with one sample per second, such as slow CAMs, can lose a few
+samples."""
 
 
 class KnownClient(Model):

@@ -26,10 +26,10 @@ _MEANINGFUL = frozenset("\"'![]{}&*%@`|>#,?")
 
 _DEEPEST = 100
 _MOST_FIELDS = 200_000
-"""No object comes near; aliases that multiply themselves do."""
+"""No real object comes near this number. YAML aliases that multiply themselves exceed it."""
 
 MAXIMUM_BYTES = 256 * 1024
-"""The most that the spec of a template, rule or detector may take as JSON: the manager keeps them in memory."""
+"""The maximum size of the spec of a template, rule or detector as JSON: the manager keeps these specs in memory."""
 
 _BOUNDED = ("ApplicationTemplate", "Detector", "EventRule")  # tasks and instances have bounds for their parameters
 
@@ -40,7 +40,7 @@ _YAML_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """Something wrong at one place of a file."""
+    """A problem at a position in a file."""
 
     file: str
     line: int
@@ -48,13 +48,13 @@ class Problem:
     field: str
     message: str
     check: str = ""
-    """The name of the check that found it; empty for what makes a file unreadable."""
+    """The name of the check that found it; empty if the file cannot be read, or an object is invalid."""
 
     def __str__(self) -> str:
         return self._text("")
 
     def as_warning(self) -> str:
-        """The same for a warning."""
+        """The text of a warning."""
         return self._text("warning: ")
 
     def _text(self, severity: str) -> str:
@@ -88,7 +88,8 @@ class Document:
         return check in ignored_by(self.object.metadata.annotations)
 
     def problem(self, path: FieldPath, message: str, check: str = "") -> Problem:
-        """A problem at a field, e.g. ("spec", "signals", 0, "value"); its closest ancestor where it is absent."""
+        """A problem at a field, e.g. ("spec", "signals", 0, "value"), or at its closest ancestor if the field is
+        absent."""
         line, column = _mark(self.marks, path)
         return Problem(self.file, line, column, field_text(path), message, check)
 
@@ -97,8 +98,8 @@ def load_documents(paths: Iterable[str | Path]) -> list[Document]:
     """Read all objects of the files (a folder stands for its *.yaml, *.yml and *.json files).
 
     Raises:
-        DocumentError: with every problem of every file: unreadable, no YAML, not of our kinds, or fields that do
-            not fit them.
+        DocumentError: with every problem of every file: it cannot be read or is not YAML, or an object is not of
+            Wayside's kinds or has invalid fields.
     """
     documents: list[Document] = []
     problems: list[Problem] = []
@@ -122,7 +123,7 @@ def parse_object(raw: dict[str, Any]) -> Kind:
     """An object from the API server as its kind.
 
     Raises:
-        ValueError: it is of none of our kinds, too large, or its fields do not fit; the text names each field.
+        ValueError: it is not of Wayside's kinds, is too large, or has invalid fields; the text names each field.
     """
     kind = _kind_of(raw)
     if kind.__name__ in _BOUNDED:

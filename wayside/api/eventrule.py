@@ -56,14 +56,14 @@ class Aggregate(StrEnum):
 
 
 class Samples(StrEnum):
-    """Which samples the episodes of another rule give."""
+    """Whether the samples are the starts or the ends of another rule's episodes."""
 
     STARTS = "Starts"
     ENDS = "Ends"
 
 
 OF_A_SAMPLE = frozenset({Aggregate.LAST, Aggregate.FIRST, Aggregate.PREVIOUS})
-"""The aggregates that are the value of one sample."""
+"""The aggregates whose result is the value of one sample."""
 
 WITHOUT_VALUE = frozenset({Aggregate.COUNT, Aggregate.AGE, Aggregate.ACTIVE})
 """The aggregates that use no value."""
@@ -77,7 +77,7 @@ OF_AN_EPISODE = frozenset(
         Aggregate.MEAN, Aggregate.SUM, Aggregate.COUNT, Aggregate.ALL, Aggregate.ANY, Aggregate.AGE,
     }
 )  # fmt: skip
-"""The aggregates of an open episode: they need no more than a few numbers, however long it lasts."""
+"""The aggregates over an open episode. Their state is a few numbers, however long the episode lasts."""
 
 _SOURCE = "give exactly one of stream, ruleName, model, plugin and of (none for aggregate Age with over: Episode)"
 _OF = "a signal with of cannot have value, where, or the aggregates Age and Active: remove them"
@@ -188,7 +188,8 @@ class Signal(Model):
 
     @property
     def is_derived(self) -> bool:
-        """Whether it belongs to the rule's subject and is computed from what conditions see, or from the episode."""
+        """Whether it belongs to the rule's subject: it is computed from the variables of conditions, or from the
+        episode."""
         return self.of is not None or (self.over is not None and self.over.is_episode)
 
     @model_validator(mode="after")
@@ -257,7 +258,7 @@ class Evaluation(Model):
 
     @property
     def period_ns(self) -> int | None:
-        """The period in nanoseconds; None where the rule has none."""
+        """The period in nanoseconds; None if the rule has none."""
         if self.on_sample is not None or self.on_demand:
             return None
         return (self.every or _DEFAULT_PERIOD).ns
@@ -355,7 +356,7 @@ class EventRule(Kind):
     """The observed state of the rule."""
 
     def semantics(self) -> dict[str, Any]:
-        """The fields that decide which episodes there are; another value of any of them ends open episodes."""
+        """The fields that define the rule's episodes. A change of any of them ends open episodes."""
         spec = self.spec.to_json()
         fields = ("scope", "each", "parameters", "signals", "when", "until", "for")
         return {field: spec.get(field) for field in fields} | (

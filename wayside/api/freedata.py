@@ -1,6 +1,6 @@
-"""Free data: maps of any JSON values, and their bounds; and constants, which expressions can take as well.
+"""Free data: maps of any JSON values, with bounds; and constants, which expressions can read.
 
-The schema bounds each value; the total is for the programs to check, which `check`, the webhook and the manager do.
+The schema bounds each value. `check`, the webhook and the manager check the total size.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from pydantic.config import JsonDict
 from wayside.api.base import Identifier, JsonValue
 
 MAXIMUM_BYTES = 64 * 1024
-"""Of one map as JSON."""
+"""The maximum size of one map as JSON."""
 
 MAXIMUM_DEPTH = 5
-"""Levels of lists and maps in one value: the coordinates of a GeoJSON MultiPolygon have four."""
+"""The maximum levels of lists and maps in one value. The coordinates of a GeoJSON MultiPolygon have four."""
 
 _WIDTH: JsonDict = {"maxLength": MAXIMUM_BYTES, "maxItems": MAXIMUM_BYTES // 2, "maxProperties": MAXIMUM_BYTES // 5}
-"""What a value within `MAXIMUM_BYTES` never exceeds: an item takes two bytes, a named value five."""
+"""Limits that no value within `MAXIMUM_BYTES` exceeds: an item takes at least two bytes, a named value five."""
 
 Value = Annotated[JsonValue, Field(json_schema_extra=_WIDTH)]
 """A JSON value whose first level the API server bounds."""
@@ -38,7 +38,7 @@ def _nested(levels: int) -> JsonDict:
 _FREE: JsonDict = {"x-kubernetes-preserve-unknown-fields": True}
 
 NestedValue = Annotated[JsonValue, Field(json_schema_extra={"x-wayside-schema": _nested(MAXIMUM_DEPTH)})]
-"""A JSON value whose every level the API server bounds: for kinds that no webhook reviews."""
+"""A JSON value of which the API server bounds every level, for kinds that no webhook reviews."""
 
 
 def size(data: Mapping[str, Any]) -> int:
@@ -66,7 +66,7 @@ def of_bounded_size(data: dict[str, Any]) -> dict[str, Any]:
 
 
 def fitting(data: Mapping[str, Any]) -> dict[str, Any]:
-    """The values that fit: without those that are nested too deeply, and without the largest ones beyond the total."""
+    """The map without values that are nested too deeply, and without the largest values beyond the maximum size."""
     kept = {name: value for name, value in data.items() if _depth(value) <= MAXIMUM_DEPTH}
     total = size(kept)
     if total > MAXIMUM_BYTES:
@@ -96,14 +96,14 @@ def _check_depth(name: str, value: object, levels: int) -> None:
 
 
 FreeData = Annotated[dict[str, Value], Field(max_length=64), AfterValidator(bounded)]
-"""By any names."""
+"""Free data with any names."""
 
 NamedData = Annotated[dict[Identifier, Value], Field(max_length=64), AfterValidator(bounded)]
-"""By names that expressions can use."""
+"""Free data whose names expressions can use."""
 
 
 def _checked_constants(constants: dict[str, Any]) -> dict[str, Any]:
-    """The constants, if expressions can take them. Raises ValueError, which names the value and the remedy."""
+    """The constants, if expressions can read them. Raises ValueError, which names the value and the remedy."""
     bounded(constants)
     for name, value in constants.items():
         _check_constant(name, value)
@@ -121,4 +121,4 @@ def _check_constant(name: str, value: object) -> None:
 
 
 Constants = Annotated[dict[Identifier, Value], Field(max_length=64), AfterValidator(_checked_constants)]
-"""Constants that a rule's expressions share, by name: numbers, texts, booleans, and lists and maps of them."""
+"""Constants that a rule's expressions share, by name: numbers, strings, booleans, and lists and maps of them."""

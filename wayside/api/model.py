@@ -12,7 +12,7 @@ from wayside.api.base import ATOMIC_LIST, Identifier, Model, ObjectName, Positiv
 from wayside.api.constraints import unique
 
 TensorName = Annotated[str, Field(min_length=1, max_length=128)]
-"""The name of an input or output, as the model file has it."""
+"""The name of an input or output in the model file."""
 
 
 class ModelWindow(Model):
@@ -40,7 +40,7 @@ class ModelWindow(Model):
 
     @property
     def steps(self) -> int:
-        """How many values there are of each signal."""
+        """The number of values of each signal."""
         return self.last or self.samples or 0
 
 
@@ -60,7 +60,7 @@ class ImageLayout(StrEnum):
 
 
 class ModelImage(Model):
-    """The newest sensor_msgs/msg/Image of a stream: (pixel * scale - mean) / std of each channel."""
+    """The newest sensor_msgs/msg/Image of a stream. Each value is (pixel * scale - mean) / std of its channel."""
 
     stream: ObjectName
     """A stream of type sensor_msgs/msg/Image."""
@@ -88,7 +88,7 @@ class ModelImage(Model):
 
     @property
     def depth(self) -> int:
-        """How many channels there are."""
+        """The number of channels."""
         return 1 if self.channels is Channels.GRAY else 3
 
 

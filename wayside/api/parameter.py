@@ -56,10 +56,10 @@ _FITTING: dict[Merge, tuple[ParameterType, ...]] = {
     Merge.ALL: (ParameterType.BOOLEAN,),
     Merge.ANY: (ParameterType.BOOLEAN,),
 }
-"""The types that a strategy is for; one that is not here is for all."""
+"""The types that a merge strategy supports; a strategy that is not listed supports all types."""
 
 _MAKING = (Merge.UNION, Merge.INTERSECTION, Merge.SUM)
-"""The strategies whose result may be a value that no task gave."""
+"""The merge strategies that can produce a value that no task has."""
 
 
 class Parameter(Model):

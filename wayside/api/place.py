@@ -16,7 +16,7 @@ Corner = Annotated[list[float], Field(min_length=2, max_length=2, json_schema_ex
 
 
 class CoordinateFrame(StrEnum):
-    """What the coordinates of places are."""
+    """The meaning of the coordinates of a place."""
 
     METRES = "Metres"
     WGS84 = "Wgs84"
@@ -53,7 +53,7 @@ class Place(Model):
 
 
 class Origin(Model):
-    """The point of the Earth at which the metres of a map begin."""
+    """The point on the Earth at which x and y of a map are 0."""
 
     latitude: float = Field(ge=-90, le=90)
     """Degrees north (WGS 84)."""
@@ -62,7 +62,7 @@ class Origin(Model):
 
 
 class Projection(StrEnum):
-    """How a map becomes flat."""
+    """The projection of a map from degrees to metres."""
 
     UTM = "Utm"
     LOCAL_CARTESIAN = "LocalCartesian"

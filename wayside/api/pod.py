@@ -25,7 +25,7 @@ from wayside.api.freedata import of_bounded_size
 _OWN_VOLUMES = "^(scratch|folder-[0-9]+|secret-[0-9]+)$"
 
 RESERVED_VARIABLES = frozenset({"POD_NAME", "POD_NAMESPACE", "POD_UID"})
-"""Environment variables by which the detector knows its pod."""
+"""Environment variables that identify the detector's pod."""
 
 
 class DetectorMode(StrEnum):
@@ -49,7 +49,7 @@ Amounts = Annotated[
     dict[Annotated[str, Field(max_length=253)], Quantity],
     Field(max_length=16),
 ]
-"""By the resource's name: cpu, memory, ephemeral-storage or one of the cluster's own."""
+"""Amounts by resource: cpu, memory, ephemeral-storage or an extended resource."""
 
 
 class DetectorVolume(Model):
@@ -108,7 +108,7 @@ class DetectorResources(Model):
 
     @model_validator(mode="after")
     def _fits(self) -> DetectorResources:
-        """Checks for which the API server would refuse the whole pod."""
+        """Refuse what the API server would refuse in the pod."""
         for field, amounts in (("requests", self.requests), ("limits", self.limits)):
             for name in amounts:
                 if name not in _RESOURCES and "/" not in name:
@@ -244,10 +244,10 @@ class DetectorToleration(Model):
 
 
 class DetectorPod(Model):
-    """The pod, or the container in others' pods.
+    """The pod of the detector, or its container in other pods.
 
-    A change of it, or of the paths of files and Secrets in the Detector, restarts a Standalone detector. Pods that have
-    the detector as a sidecar keep it as it is.
+    A change of the pod, or of the paths of files and Secrets in the Detector, restarts a Standalone detector. Existing
+    pods keep their sidecar unchanged.
     """
 
     constraints = (
@@ -304,7 +304,7 @@ class DetectorPod(Model):
 
     @property
     def on_its_own(self) -> list[str]:
-        """The given fields that only a pod of the detector's own can have."""
+        """The given fields that are valid only for the detector's own pod."""
         given = {name: getattr(self, to_snake(name)) for name in OF_ITS_OWN_POD}
         return [name for name, value in given.items() if value]
 

@@ -1,6 +1,6 @@
 """Generates CRDs from the models: pydantic's JSON schema made structural, with Kubernetes' extensions.
 
-And from the CRDs the schema for editors.
+The schema for editors is derived from the CRDs.
 """
 
 from __future__ import annotations
@@ -71,11 +71,11 @@ def field_names_at(kind: type[Kind], path: Sequence[str | int]) -> list[str]:
 class _Described(GenerateJsonSchema):
     """With the descriptions of fields, which are the docstrings below them, and the constraints of models.
 
-    The sources are read here alone: a program's start has no time for it.
+    Only this class reads the sources: at the start of a program, that would take too long.
     """
 
     def model_schema(self, schema: ModelSchema) -> JsonSchemaValue:
-        """As pydantic has it, with these."""
+        """pydantic's schema, with descriptions and constraints."""
         found = super().model_schema(schema)
         fields = schema["cls"].model_fields
         for name, text in _docstrings(schema["cls"]):
@@ -120,7 +120,7 @@ def _object_schema(kind: type[Kind], generator: type[GenerateJsonSchema] = _Desc
 
 
 def _structural(node: dict[str, Any], definitions: dict[str, Any]) -> dict[str, Any]:
-    """Inline references, turn optional into absent, and keep only what a structural schema knows."""
+    """Inline references, turn optional into absent, and keep only the keywords of a structural schema."""
     node = _resolved(node, definitions)
     if "x-wayside-schema" in node:
         return dict(node["x-wayside-schema"])  # structural already
@@ -145,7 +145,7 @@ def _structural(node: dict[str, Any], definitions: dict[str, Any]) -> dict[str, 
             if result.get("x-kubernetes-preserve-unknown-fields"):
                 result.pop("additionalProperties", None)
             if _is_free(result) or _is_free(result.get("additionalProperties", {})):
-                # Else, server-side apply notes an owner for each key of whatever is inside.
+                # Otherwise, server-side apply records an owner for each key inside.
                 result["x-kubernetes-map-type"] = "atomic"
     elif result.get("type") == "array":
         result["items"] = items = _structural(node.get("items", {}), definitions)
@@ -161,14 +161,14 @@ def _is_free(node: dict[str, Any]) -> bool:
 
 
 def _without_nulls(value: Any) -> Any:
-    """Absent and null are one to us; a structural schema's default must leave null out."""
+    """Absent and null mean the same here; a default in a structural schema must not contain null."""
     if isinstance(value, dict):
         return {key: _without_nulls(child) for key, child in value.items() if child is not None}
     return value
 
 
 def _resolved(node: dict[str, Any], definitions: dict[str, Any]) -> dict[str, Any]:
-    """Follow `$ref`, and `anyOf` of one type and null; what stands beside the reference wins."""
+    """Follow `$ref`, and `anyOf` of one type and null; keywords beside the reference take precedence."""
     beside = {key: value for key, value in node.items() if key not in ("$ref", "anyOf", "allOf")}
     if "type" in beside and "anyOf" in node:
         return beside  # the model defines the schema by hand
@@ -193,7 +193,7 @@ def editor_schema() -> dict[str, Any]:
         "required": ["apiVersion", "kind"],
         "properties": {
             "apiVersion": {"const": API_VERSION},
-            "kind": {"enum": sorted(KINDS), "description": "Which kind of object the document is."},
+            "kind": {"enum": sorted(KINDS), "description": "The kind of the object."},
         },
         "allOf": [
             {
@@ -217,7 +217,7 @@ def _for_editors(schema: dict[str, Any], kind: str) -> dict[str, Any]:
 
 
 def _plain(schema: dict[str, Any]) -> dict[str, Any]:
-    """The same without what only Kubernetes knows; a map with named fields has no others."""
+    """The schema without Kubernetes' extensions; an object with named fields allows no others."""
     found = {key: value for key, value in schema.items() if not key.startswith("x-kubernetes-") and key != "nullable"}
     if found.pop("exclusiveMinimum", False):
         found["exclusiveMinimum"] = found.pop("minimum")

@@ -77,7 +77,8 @@ class Role(Model):
 class PairsScope(Model):
     """The rule is evaluated once for each pair of clients.
 
-    Without roles, a is the one with the smaller name. With a role, each ordered pair of clients that fit is a subject.
+    Without roles, a is the client with the smaller name. With a role, each ordered pair of clients that match is a
+    subject.
     """
 
     position: Position

@@ -62,7 +62,7 @@ class LabelRequirement(Model):
                 return self.key not in labels
 
     def __str__(self) -> str:
-        """As kubectl's option --selector has it."""
+        """In the syntax of kubectl's option --selector."""
         match self.operator:
             case LabelOperator.EXISTS:
                 return self.key
@@ -89,6 +89,6 @@ class LabelSelector(Model):
         )
 
     def __str__(self) -> str:
-        """As kubectl's option --selector has it; empty if every object is selected."""
+        """In the syntax of kubectl's option --selector; empty if every object is selected."""
         labels = [f"{key}={value}" for key, value in sorted(self.match_labels.items())]
         return ", ".join([*labels, *map(str, self.match_expressions)])

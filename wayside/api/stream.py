@@ -125,7 +125,7 @@ class StreamPosition(Model):
 
     @property
     def geographic(self) -> bool:
-        """Whether it is on the Earth, else in metres."""
+        """Whether it is in degrees on the Earth; otherwise it is in metres."""
         return self.latitude is not None
 
 
@@ -305,7 +305,7 @@ class Stream(Model):
 
     @property
     def never_stale(self) -> bool:
-        """Whether the newest sample holds forever."""
+        """Whether the newest sample never becomes stale."""
         return self.stale_after == "Never" or (self.latched and self.stale_after is None)
 
     @property

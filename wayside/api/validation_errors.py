@@ -45,9 +45,9 @@ def messages(
     """The messages for pydantic's errors, each once, with the paths as the author wrote them.
 
     Args:
-        error: of the validation.
-        raw: what was validated.
-        fields: the names of the fields that an object at a path has.
+        error: the error of the validation.
+        raw: the object that was validated.
+        fields: returns the names of the fields of the object at a path.
     """
     seen = set()
     for item in error.errors(include_url=False):
@@ -62,7 +62,7 @@ def messages(
 
 
 def _unknown(name: str, fields: Collection[str]) -> str:
-    """The message for a field that does not exist: with the name of one that does, if one is similar."""
+    """The message for a field that does not exist. It names the most similar field, if there is one."""
     stem = name.lower().rstrip("s")
     similar = [*(each for each in fields if each.lower().startswith(stem)), *difflib.get_close_matches(name, fields, 1)]
     return (
@@ -97,7 +97,7 @@ def _message(item: ErrorDetails) -> str:
 
 
 def _written(location: tuple[int | str, ...], raw: Any) -> FieldPath:
-    """Drop the parts of a location that pydantic adds and that stand in no file (function and union tags)."""
+    """Drop the parts of a location that pydantic adds and that are not in the file (function and union tags)."""
     path: list[str | int] = []
     here = raw
     for index, part in enumerate(location):

@@ -1,4 +1,4 @@
-"""The detector's place in a Zenoh network."""
+"""The detector's Zenoh session: mode, endpoints, access and liveliness."""
 
 from __future__ import annotations
 

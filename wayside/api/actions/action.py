@@ -1,4 +1,4 @@
-"""An action of a rule: its name, and exactly one of the kinds that there are."""
+"""One action of a rule: its name, and exactly one kind of action."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class ActionSpec(Model):
 
     @property
     def window(self) -> Window | None:
-        """The samples that it gets of an episode; None: none."""
+        """The samples of an episode that the action receives; None: no samples."""
         chosen = getattr(self, self.field)
         if isinstance(chosen, Window):
             return chosen
@@ -66,10 +66,10 @@ class ActionSpec(Model):
 
     @property
     def templates(self) -> tuple[tuple[str, ...], Mapping[str, JsonValue]]:
-        """The path of the field with the values to render for each episode, and these values by name, with ${…}.
+        """The path of the field whose values are rendered for each episode, and these values by name.
 
-        A built-in action lists these fields in its attribute `templates`, and in `templates_in` the path where
-        they are not its own but those of a field.
+        A built-in action has these values in its attribute `templates`. If they are inside one of its fields,
+        `templates_in` is the path of that field.
         """
         if self.plugin is not None:
             return ("plugin", "values"), self.plugin.values

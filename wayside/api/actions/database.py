@@ -12,7 +12,7 @@ from wayside.api.base import JsonValue, Model, PositiveDuration, PositiveQuantit
 from wayside.api.freedata import NamedData
 
 DatabaseName = Annotated[str, Field(min_length=1, max_length=63, pattern=r"^[A-Za-z0-9_-]+$")]
-"""A name that MongoDB takes on every platform."""
+"""A name that MongoDB accepts on every platform."""
 
 
 class Attachments(Model):

@@ -1,4 +1,4 @@
-"""The deploy action: an application is demanded for as long as an episode lasts."""
+"""The deploy action: demands an application while an episode lasts."""
 
 from __future__ import annotations
 

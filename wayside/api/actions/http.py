@@ -1,7 +1,7 @@
-"""Access of actions to HTTP endpoints: headers, TLS and credentials. A rule never contains the secret ones.
+"""Access of actions to HTTP endpoints: headers, TLS and credentials. A rule never contains secrets.
 
-The authors of rules need not be those who run the detector: a rule can use Secrets that are mounted for it, and
-environment variables that are meant for rules, and no other files or variables.
+The people who write rules are often not those who run the detector. So a rule can use only mounted Secrets that the
+Detector does not keep for its own use, and environment variables whose names begin with WAYSIDE_.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from wayside.api.base import Model, ObjectName, PositiveDuration, map_list
 from wayside.api.constraints import Constraint, exactly_one, not_both
 
 _VARIABLE = r"^WAYSIDE_[A-Z0-9_]+$"
-_TOKEN = r"^[A-Za-z0-9!#$%&'*+.^_`|~-]+$"  # noqa: S105  RFC 9110, section 5.6.2: what a header's name is made of
+_TOKEN = r"^[A-Za-z0-9!#$%&'*+.^_`|~-]+$"  # noqa: S105  RFC 9110, section 5.6.2: the characters of a header's name
 _OURS = ("host", "content-length", "content-type", "transfer-encoding", "connection", "expect", "te", "upgrade")
 
 HttpUrl = Annotated[str, Field(max_length=2048, pattern=r"^https?://[^\s/?#@\\]+([/?][^\s#]*)?$")]
@@ -77,7 +77,7 @@ class HttpAccess(Model):
 
     @property
     def access(self) -> Access:
-        """The same as an `Access`, as used for all networks."""
+        """TLS and credentials as an `Access`, the common type for all networks."""
         return Access(
             tls=self.tls, tls_secret_name=self.tls_secret_name, credentials_secret_name=self.credentials_secret_name
         )

@@ -1,4 +1,4 @@
-"""The trigger action: another system records for as long as an episode lasts."""
+"""The trigger action: makes another system record while an episode lasts."""
 
 from __future__ import annotations
 
