@@ -10,7 +10,7 @@ from enum import StrEnum
 from wayside.inputerror import InputError
 
 IGNORE_ANNOTATION = "wayside.dev/ignore-findings"
-"""On an object: names of warnings about it that are not reported, separated by commas."""
+"""The annotation of an object with the names of the warnings about it that are not reported, separated by commas."""
 
 
 class Severity(StrEnum):
@@ -27,7 +27,7 @@ class Check:
     Attributes:
         name: words in lower case, joined by hyphens; it never changes.
         severity: errors fail the check; warnings fail `detector check --strict` only, and can be ignored.
-        meaning: when it is reported, as a clause without a full stop.
+        meaning: the condition under which it is reported, without a full stop.
     """
 
     name: str
@@ -37,12 +37,12 @@ class Check:
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """A finding that has no place in a file.
+    """A finding without a position in a file.
 
     Attributes:
         check: the name of its check.
-        text: what is wrong, where, and the remedy.
-        rule: the EventRule that it is about; empty where it is about the Detector alone.
+        text: the problem, its place and the remedy.
+        rule: the EventRule that it is about; empty if it is only about the Detector.
     """
 
     check: str
@@ -62,9 +62,9 @@ INVALID_DETECTOR = Check("invalid-detector", Severity.ERROR, "a field of a Detec
 
 
 def ignorable(names: Iterable[str], checks: Iterable[Check]) -> frozenset[str]:
-    """The names, all of which are those of warnings.
+    """The names, if all of them are names of warnings.
 
-    Raises InputError for a name that is none of the checks', and for an error's.
+    Raises InputError for a name that no check has, and for the name of an error.
     """
     known = {each.name: each.severity for each in checks}
     given = frozenset(names)

@@ -1,8 +1,9 @@
 """Stream keys in Zenoh's key-format notation: `vehicles/${client:*}/pose`.
 
-A key is a list of chunks between slashes. In a pattern, `*` stands for any one chunk, `**` for any number of them (also
-none), `$*` for any text inside a chunk; `${name:pattern}` captures what its pattern stands for. As in Zenoh, a capture
-covers whole chunks, wildcards match no chunk that begins with `@`, and where two `**` compete the first takes most.
+A key is a list of chunks between slashes. In a pattern, `*` stands for exactly one chunk, `**` for any number of chunks
+(also none), and `$*` for any text inside a chunk; `${name:pattern}` captures the text that its pattern matches. As in
+Zenoh, a capture covers whole chunks, wildcards match no chunk that begins with `@`, and the first of two `**` matches
+as many chunks as possible.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ class KeyPatternError(ValueError):
 
     def __init__(self, text: str, offset: int, problem: str) -> None:
         """`offset` counts from 0 within `text`."""
-        cut = 1 if not text or text.startswith("/") else 0  # the leading slash, which the author wrote as well
+        cut = 1 if not text or text.startswith("/") else 0  # the leading slash that was removed
         self.column = offset + 1 + (cut if text else 0)
         super().__init__(f"key {'/' * cut + text!r}, column {self.column}: {problem}")
 
@@ -32,12 +33,12 @@ class _Element:
 
     regex: str
     many: bool = False
-    """Whether it stands for any number of chunks, also none: then the slash beside it comes and goes with it."""
+    """Whether it stands for any number of chunks, also none: without chunks, the slash beside it is absent as well."""
 
 
 @dataclass(frozen=True, slots=True)
 class KeyPattern:
-    """Which keys belong to a stream, and what they capture."""
+    """A pattern for the keys of a stream, with its captures."""
 
     text: str
     expression: str
@@ -46,7 +47,7 @@ class KeyPattern:
     """The captured names, in order."""
     _regex: re.Pattern[str] = field(repr=False, compare=False)
     _captured: Mapping[str, re.Pattern[str]] = field(repr=False, compare=False)
-    """By the captured name, what its text must match."""
+    """The pattern that the text of each capture must match."""
 
     @classmethod
     def parse(cls, text: str) -> KeyPattern:
@@ -73,7 +74,7 @@ class KeyPattern:
         return cls(text, "/".join(expression), tuple(captures), re.compile(_joined(elements)), captures)
 
     def can_capture(self, name: str, text: str) -> bool:
-        """Whether some key gives this text to the capture of that name."""
+        """Whether the capture of that name can have this text."""
         return self._captured[name].fullmatch(text) is not None
 
     def match(self, key: str) -> dict[str, str] | None:
@@ -122,7 +123,7 @@ def _split(pattern: str) -> Iterator[tuple[int, str]]:
 
 
 def _capture(text: str, offset: int, part: str) -> tuple[str, int, str]:
-    """The name of the capture that the part is, the offset of its pattern in the text, and its pattern."""
+    """For a part that is a capture: its name, the offset of its pattern in the text, and its pattern."""
     if not part.startswith("${") or part.find("}") != len(part) - 1:
         raise KeyPatternError(text, offset, f"a capture must cover whole chunks: put slashes around ${{…}} in {part!r}")
     name, colon, pattern = part[2:-1].partition(":")
@@ -154,7 +155,7 @@ def _chunk(text: str, offset: int, chunk: str) -> _Element:
 
 
 def _joined(elements: list[_Element]) -> str:
-    """The elements with slashes between them; those that may stand for nothing take one of theirs along."""
+    """The elements with slashes between them; an element that may be empty includes the slash beside it."""
     fixed = next((index for index, element in enumerate(elements) if not element.many), 0)
     return "".join(
         f"(?:{element.regex}/)?"

@@ -1,4 +1,4 @@
-"""Objects as YAML text that every reader of Kubernetes' tools takes the same way."""
+"""Objects as YAML text that all Kubernetes tools read in the same way."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _READ_AS_BOOLEANS = re.compile(r"[yYnN]")
 
 
 class _Dumper(yaml.SafeDumper):
-    """Writes a lone y or n in quotes, and everything once: no anchors, which people do not expect."""
+    """Writes a lone y or n in quotes, and no anchors, which people do not expect."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True
@@ -28,7 +28,7 @@ _Dumper.add_representer(str, _text)
 
 
 def to_yaml(objects: Iterable[Any]) -> str:
-    """The objects as YAML documents, fields in their order; nothing for none."""
+    """The objects as YAML documents, with their fields in the given order; empty for no objects."""
     return "---\n".join(
         yaml.dump(each, Dumper=_Dumper, sort_keys=False, width=120, allow_unicode=True) for each in objects
     )

@@ -1,6 +1,6 @@
-"""Names inside keys and object names: percent-encoded, and joined so that no two subjects read the same.
+"""Names inside keys and object names: percent-encoded, and joined so that no two subjects have the same text.
 
-And what a misspelt name may stand for.
+The module also suggests the known name that is most similar to a misspelt one.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _all_inside = re.compile(r"[A-Za-z0-9_.-]*").fullmatch
 
 
 def encode(text: str) -> str:
-    """The text with every byte (UTF-8) outside `[A-Za-z0-9_.-]` as `%XX`: one chunk of a key, whatever it held."""
+    """The text as one chunk of a key: every byte (UTF-8) outside `[A-Za-z0-9_.-]` becomes `%XX`."""
     if _all_inside(text):  # most names are
         return text
     return _OUTSIDE.sub(lambda found: b"%%%02X" % found[0][0], text.encode()).decode("ascii")
@@ -30,7 +30,7 @@ def decode(text: str) -> str:
 
 
 def subject_text(clients: Sequence[str], element: str | None = None) -> str:
-    """A subject in one word: `car1`, `car1+car2`, `~fleet` for no client; an element of `each` follows after `~`.
+    """A subject as one word: `car1`, `car1+car2`, or `~fleet` for no client; an element of `each` follows after `~`.
 
     `+` and `~` never occur in an encoded name, so different subjects have different texts.
     """
@@ -39,10 +39,10 @@ def subject_text(clients: Sequence[str], element: str | None = None) -> str:
 
 
 def parse_subject(text: str) -> tuple[tuple[str, ...], str | None]:
-    """The clients and the element of a subject's text, as `subject_text` makes it.
+    """The clients and the element of a subject's text: the inverse of `subject_text`.
 
     Raises:
-        ValueError: no subject reads like this.
+        ValueError: the text is not that of a subject.
     """
     is_fleet = text == FLEET or text.startswith(f"{FLEET}~")
     head, mark, tail = text.removeprefix(FLEET).partition("~")
@@ -56,6 +56,6 @@ def parse_subject(text: str) -> tuple[tuple[str, ...], str | None]:
 
 
 def did_you_mean(name: str, known: Iterable[str], quote: str = "") -> str:
-    """The remedy for a name that is not known: a question with the most similar one; empty where none is similar."""
+    """The remedy for an unknown name: a question with the most similar known name; empty if none is similar."""
     close = difflib.get_close_matches(name, list(known), n=1)
     return f"did you mean {quote}{close[0]}{quote}?" if close else ""

@@ -22,7 +22,7 @@ def format_time(ns: int) -> str:
         ns: nanoseconds since the epoch; years 1 to 9999.
 
     Raises:
-        ValueError: outside those years.
+        ValueError: the time is outside these years.
     """
     seconds, fraction = divmod(ns, _SECOND)
     try:
@@ -41,7 +41,7 @@ def parse_time(text: str) -> int:
     """Nanoseconds since the epoch of an RFC 3339 time with up to nine digits after the second.
 
     Raises:
-        ValueError: it is none.
+        ValueError: the text is not such a time.
     """
     match = _PATTERN.fullmatch(text)
     if match is None:
@@ -57,14 +57,14 @@ def parse_time(text: str) -> int:
 
 
 def parse_seconds(text: str) -> float:
-    """Seconds since the epoch of an RFC 3339 time. Raises ValueError where it is none."""
+    """Seconds since the epoch of an RFC 3339 time. Raises ValueError if the text is not such a time."""
     return parse_time(text) / _SECOND
 
 
 def format_seconds(seconds: float) -> str:
-    """The time in UTC with milliseconds, as statuses have it: ``2026-05-04T10:20:30.500Z``.
+    """The time in UTC with milliseconds, as in statuses: ``2026-05-04T10:20:30.500Z``.
 
     Raises:
-        ValueError: outside the years 1 to 9999.
+        ValueError: the time is outside the years 1 to 9999.
     """
     return f"{format_time(round(seconds * 1000) * 1_000_000)[:-7]}Z"

@@ -1,1 +1,1 @@
-"""Positions on the earth and in local frames, and geometry over them. Pure."""
+"""Positions on the Earth and in local frames, and geometry over them. Pure."""

@@ -17,10 +17,10 @@ _CONVERGED = 1e-13
 
 
 def cartesian(latitude: float, longitude: float) -> tuple[float, float, float]:
-    """The place on the ellipsoid in metres from the Earth's centre (ECEF).
+    """A point on the ellipsoid in metres from the Earth's centre (ECEF).
 
-    The straight line between two such points is never longer than the way along the surface, there is no seam at the
-    antimeridian and nothing special about the poles: so a search within a reach of metres is done here.
+    The straight line between two such points is never longer than the distance along the surface, and neither the
+    antimeridian nor the poles are special cases. So neighbours within a distance are searched in these coordinates.
     """
     phi, lam = math.radians(latitude), math.radians(longitude)
     normal = SEMI_MAJOR / math.sqrt(1 - _ECCENTRICITY_2 * math.sin(phi) ** 2)
@@ -41,15 +41,15 @@ def degrees(latitude: float) -> tuple[float, float]:
 
 
 def surface_distance(latitude_1: float, longitude_1: float, latitude_2: float, longitude_2: float) -> float:
-    """The way along the surface between two places, in metres; of the heights nothing is known.
+    """The distance along the surface between two positions, in metres; heights are ignored.
 
     Vincenty's inverse formula ("Direct and inverse solutions of geodesics on the ellipsoid", Survey Review 176, 1975),
-    to less than a millimetre. Between places that lie almost opposite to each other on the globe it does not converge:
-    there, half the globe away, the distance on a sphere of the mean radius is given, which is up to 0.6 % off.
+    accurate to less than a millimetre. For nearly antipodal positions it does not converge; then the result is the
+    distance on a sphere of the mean radius, with an error of up to 0.6 %.
     """
     reduced_1, reduced_2 = _reduced(latitude_1), _reduced(latitude_2)
     sin_1, cos_1, sin_2, cos_2 = math.sin(reduced_1), math.cos(reduced_1), math.sin(reduced_2), math.cos(reduced_2)
-    # The shorter way around, and without the rounding of a difference of 360 degrees.
+    # The shorter way around the Earth, without the rounding error of a difference of 360 degrees.
     difference = math.radians(math.remainder(longitude_2 - longitude_1, 360.0))
     lam = difference
     for _ in range(_STEPS):

@@ -1,4 +1,4 @@
-"""Areas, lines and lanes, and exact tests of single points. `positions` computes over many points."""
+"""Areas, lines and lanes, and exact tests for single points. `positions` computes over many points."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from weakref import WeakValueDictionary
 Point = tuple[float, float]
 
 FARTHEST: Final = 1e12
-"""No frame reaches this far, in metres."""
+"""The largest valid coordinate, in metres."""
 DOUBT: Final = 4e-16
-"""Below this part of its terms, the sign of a difference of products is uncertain."""
+"""If a difference of products is smaller than this fraction of its terms, its sign is uncertain."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,13 +37,13 @@ class Shape:
 
     @cached_property
     def key(self) -> str:
-        """Name and content in short: equal shapes have equal keys."""
+        """The name with a digest of the content: equal shapes have equal keys."""
         content = json.dumps([self.name, self.geographic, self.rings, self.line, self.width])
         return f"{self.name}#{hashlib.sha256(content.encode()).hexdigest()[:16]}"
 
     @property
     def fields(self) -> tuple[str, ...]:
-        """What is known of a position with regard to it."""
+        """The fields of `at(position, place)` that exist for this shape."""
         bounded = ("inside",) if self.rings or self.width is not None else ()
         return (*bounded, "distance", *(("along", "across", "heading") if self.line else ()))
 
@@ -52,12 +52,12 @@ _SHAPES: WeakValueDictionary[str, Shape] = WeakValueDictionary()
 
 
 def interned(shape: Shape) -> Shape:
-    """The one shape of this key, by which `shape_of` finds it as long as somebody uses it."""
+    """The one shape of this key. `shape_of` finds it as long as it is referenced."""
     return _SHAPES.setdefault(shape.key, shape)
 
 
 def shape_of(key: str) -> Shape:
-    """The shape of a key. Raises ValueError where nobody uses it any more."""
+    """The shape of a key. Raises ValueError if the shape is no longer referenced."""
     try:
         return _SHAPES[key]
     except KeyError:
@@ -65,9 +65,10 @@ def shape_of(key: str) -> Shape:
 
 
 def contains(rings: Iterable[Sequence[Point]], point: Point) -> bool:
-    """Whether the point lies inside the outlines by the even-odd rule, or on an edge.
+    """Whether the point is inside the outlines by the even-odd rule, or on an edge.
 
-    A ray along the first axis crosses the edges an odd number of times. Exact, so that edges belong to it.
+    The point is inside if a ray along the first axis crosses the edges an odd number of times. The test is exact, so
+    that points on an edge are inside.
     """
     x, y = point
     odd = False
@@ -85,7 +86,8 @@ def contains(rings: Iterable[Sequence[Point]], point: Point) -> bool:
 
 
 def side(a: Point, b: Point, point: Point) -> float:
-    """Above 0 where the point lies left of the way from a to b, 0 on its line; exact by fractions in doubt."""
+    """Positive if the point is left of the line from a to b, 0 on the line, negative if it is right of it. If the sign
+    is uncertain, it is computed with exact fractions."""
     (ax, ay), (bx, by), (x, y) = a, b, point
     left, right = (bx - ax) * (y - ay), (by - ay) * (x - ax)
     value = left - right
@@ -98,7 +100,7 @@ def side(a: Point, b: Point, point: Point) -> float:
 
 
 def crossing(ring: Sequence[Point]) -> tuple[int, int] | None:
-    """Two edges of an outline that cross or touch, by their first corners; None where it is simple."""
+    """Two edges of an outline that cross or touch, by their first corners; None if there are none."""
     count = len(ring)
     edges = [*pairwise(ring), (ring[-1], ring[0])]
     for one, (a, b) in enumerate(edges):
@@ -119,6 +121,6 @@ def crossing(ring: Sequence[Point]) -> tuple[int, int] | None:
 
 
 def _fold(a: Point, b: Point, c: Point, d: Point) -> bool:
-    """Whether the second of two edges on one line runs back over the first."""
+    """Whether the second of two edges on one line goes back over the first."""
     (ax, ay), (bx, by), (cx, cy), (dx, dy) = a, b, c, d
     return (bx - ax) * (dx - cx) + (by - ay) * (dy - cy) < 0

@@ -1,6 +1,7 @@
-"""Positions with regard to areas, lines and lanes: for one position or many, with the same numbers.
+"""Positions relative to areas, lines and lanes. One position gives the same numbers as many at once.
 
-Everything is addition, multiplication, division and square roots, which give the same bits on every processor.
+All computations use only addition, multiplication, division and square roots, which give the same bits on every
+processor.
 """
 
 from __future__ import annotations
@@ -25,28 +26,28 @@ _AT_ONCE: Final = 1 << 20
 
 
 class Arc(NamedTuple):
-    """Positions with regard to a line; float64[n] each, metres."""
+    """Positions relative to a line; float64[n] each, in metres except for `direction`."""
 
     along: Doubles
-    """From the start of the line; before it negative, beyond the end greater than the length."""
+    """The distance along the line from its start: negative before the start, greater than the length beyond the end."""
     across: Doubles
-    """To the left of the line; to the right negative."""
+    """The distance to the left of the line; negative to the right."""
     distance: Doubles
-    """To the nearest point of the line."""
+    """The distance to the nearest point of the line."""
     direction: Doubles
-    """Of the line there, degrees counter-clockwise from the first axis, or from east."""
+    """The direction of the line there, in degrees counter-clockwise from the first axis, or from east."""
 
 
 class Positions:
-    """Positions with regard to one shape. Columns are float64[n]."""
+    """Computes positions relative to one shape. Columns are float64[n]."""
 
     def __init__(self, shape: Shape) -> None:
-        """It keeps what it needs of the shape, and not the shape."""
+        """It keeps the data of the shape, and no reference to the shape itself."""
         self._geographic, self._width = shape.geographic, shape.width
         self._rings, self._line = shape.rings, shape.line
 
     def allows(self, u: Doubles, v: Doubles, *headings: Doubles) -> Bools:
-        """Where (u, v) can be a position at all, and the heading is finite."""
+        """bool[n]: whether (u, v) is a valid position, and the headings are finite."""
         u_limit, v_limit = (90.0, 360.0) if self._geographic else (FARTHEST, FARTHEST)
         found: Bools = (np.abs(u) <= u_limit) & (np.abs(v) <= v_limit)
         for each in headings:
@@ -54,14 +55,15 @@ class Positions:
         return found
 
     def inside(self, u: Doubles, v: Doubles) -> Bools:
-        """Whether positions lie inside, or on the edge. An area decides exactly; else the width of the lane does."""
+        """bool[n]: whether positions are inside, or on the edge. The test is exact for an area; a lane has only its
+        width."""
         if self._rings:
             return self._in_rings(u, self._unrolled(v))
         found: Bools = self._beside(self.arc(u, v)) == 0
         return found
 
     def distance(self, u: Doubles, v: Doubles) -> Doubles:
-        """Metres to the area or the lane, 0 inside; to a line that has neither width nor area, metres to the line."""
+        """The distance to the area or lane in metres, 0 inside; without area and width, the distance to the line."""
         if self._rings:
             x, y = self._metres(u, v)
             nearest = np.sqrt(np.minimum.reduce([_nearest(x, y, each).squares for each in self._outlines]))
@@ -70,11 +72,11 @@ class Positions:
         return arc.distance if self._width is None else self._beside(arc)
 
     def arc(self, u: Doubles, v: Doubles) -> Arc:
-        """Positions with regard to the line."""
+        """The positions relative to the line."""
         return _arc(*self._metres(u, v), self._segments)
 
     def _beside(self, arc: Arc) -> Doubles:
-        """Metres to the lane of this width, 0 on it."""
+        """The distance to the lane of this width in metres, 0 inside."""
         aside = np.maximum(np.abs(arc.across) - (self._width or 0.0) / 2, 0.0)
         beyond = np.maximum(np.maximum(-arc.along, arc.along - self._segments.length), 0.0)
         found: Doubles = np.sqrt(aside * aside + beyond * beyond)
@@ -103,11 +105,11 @@ class Positions:
 
     @cached_property
     def _scale(self) -> Point:
-        """Metres a degree of latitude and of longitude at the origin, on the ellipsoid."""
+        """Metres per degree of latitude and of longitude at the origin, on the ellipsoid."""
         return geodesy.degrees(self._origin[0])
 
     def _unrolled(self, v: Doubles) -> Doubles:
-        """Longitudes as they follow on from the origin's."""
+        """Longitudes within half a turn of the origin's, so that the antimeridian is no seam."""
         if not self._geographic:
             return v
         away = v - self._origin[1]
@@ -155,7 +157,7 @@ _KNOWN: WeakKeyDictionary[Shape, Positions] = WeakKeyDictionary()
 
 
 def positions_at(shape: Shape) -> Positions:
-    """Positions with regard to the shape, prepared once."""
+    """The computation for a shape, prepared once."""
     found = _KNOWN.get(shape)
     if found is None:
         found = _KNOWN[shape] = Positions(shape)
@@ -163,7 +165,7 @@ def positions_at(shape: Shape) -> Positions:
 
 
 def turn(start: Doubles, end: Doubles) -> Doubles:
-    """The turn from one direction to another, degrees in (-180, 180], positive to the left."""
+    """The turn from one direction to another, in degrees in (-180, 180], positive to the left."""
     by = np.remainder(end - start, 360.0)
     return np.where(by > 180.0, by - 360.0, by)
 
@@ -175,11 +177,11 @@ AT: Final[Mapping[str, Callable[..., Doubles]]] = {
     "at_across": lambda at, u, v: at.arc(u, v).across,
     "at_heading": lambda at, u, v, heading: turn(at.arc(u, v).direction, heading),
 }
-"""The functions that the fields of `at(position, place)` become, by name, of `Positions` and columns."""
+"""The functions behind the fields of `at(position, place)`, by name. Their arguments are a `Positions` and columns."""
 
 
 def at_one(name: str, key: str, *numbers: float) -> float:
-    """The same for one position and the key of a shape. Raises ValueError where there is no answer."""
+    """The function's result for one position and the key of a shape. Raises ValueError for a position out of range."""
     shape = shape_of(key)
     at, columns = positions_at(shape), [np.array([number], np.float64) for number in numbers]
     if not at.allows(*columns)[0]:
@@ -197,7 +199,7 @@ class _Segments(NamedTuple):
     squares: Doubles
     lengths: Doubles
     begins: Doubles
-    """How far along the line each begins."""
+    """The distance along the line at which each segment begins."""
     directions: Doubles
     """Degrees counter-clockwise."""
     length: float
@@ -219,9 +221,9 @@ class _Nearest(NamedTuple):
 
     segment: NDArray[np.intp]
     part: Doubles
-    """How far along the segment, 0 to 1 on it."""
+    """The position along the segment: 0 at its start, 1 at its end."""
     squares: Doubles
-    """Of the distance."""
+    """The squares of the distances."""
 
 
 def _nearest(x: Doubles, y: Doubles, of: _Segments) -> _Nearest:
@@ -248,7 +250,7 @@ def _arc(x: Doubles, y: Doubles, of: _Segments) -> Arc:
     straight = (part == on) | ((segment == 0) & (part < 0)) | ((segment == last) & (part > 1))
     px, py = x - of.x[segment], y - of.y[segment]
     cross = of.dx[segment] * py - of.dy[segment] * px
-    # At a corner the side is that of the bisector: of either segment alone it would be wrong behind a sharp one.
+    # At a corner, the bisector decides about the side: behind a sharp corner, either segment alone would be wrong.
     ahead = part > 1
     other = np.minimum(np.maximum(np.where(ahead, segment + 1, segment - 1), 0), last)
     tx = of.dx[segment] / of.lengths[segment] + of.dx[other] / of.lengths[other]
