@@ -1,1 +1,1 @@
-"""The application manager: makes a cluster run what the live ApplicationTasks demand."""
+"""The application manager: runs the applications that live ApplicationTasks demand."""

@@ -1,9 +1,10 @@
-"""Reviews a template, rule or Detector before the API server stores it, and injects detectors into pods.
+"""Reviews templates, rules and Detectors before the API server stores them, and injects detectors into pods.
 
-The answers are the findings that also make the conditions. What a rule has only with others (its Detectors, the rules
-and templates that it names) is looked up again at the API server before it is reported: a Detector that was applied a
-moment before its rules may not have reached us yet. So is a pod's Detector, before the pod goes without. Whatever else
-goes wrong there is no answer, and the pod is made without its detector (failurePolicy Ignore).
+The responses contain the same findings as the conditions. If a finding of a rule depends on other objects (its
+Detectors, the rules and templates that it names), these objects are read from the API server again before it is
+reported: the watches may not have delivered a Detector that was applied just before its rules. A pod's Detector is also
+read again before the pod is created without it. On any other failure there is no response, and the pod is created
+without its detector (failurePolicy Ignore).
 """
 
 from __future__ import annotations
@@ -55,11 +56,11 @@ from wayside.kubernetes.resources import Object, Resource
 from wayside.rules import depends
 
 AT_ONCE = 8
-"""Questions about one namespace that are answered at the same time; those beyond get no answer."""
+"""The maximum number of concurrent reviews in one namespace; further ones are rejected."""
 
-LOOKING_UP = 3.0  # s for requests to the API server, which waits for us meanwhile
-LOOKING_AT_RULES = 1.0  # s for the rules of a Detector that changes
-_RULES_AT_ONCE = 20  # of these in one job, so that the limit of CPU time is each some rules'
+LOOKING_UP = 3.0  # s for requests to the API server, which waits for our response
+LOOKING_AT_RULES = 1.0  # s for the rules of a changed Detector
+_RULES_AT_ONCE = 20  # of these in one job: the limit of CPU time applies to each job
 
 _DEPLOYMENTS = Resource("apps/v1", "Deployment", "deployments")
 _FORBIDDEN = 403
@@ -69,9 +70,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Admission:
-    """Answers. `namespaces`: those that are managed, empty for all; `defaults`: None where the manager runs no
-    detectors.
-    """
+    """Responds to reviews. `namespaces`: the managed ones, empty for all; `defaults`: None if it runs no detectors."""
 
     cache: ClusterCache
     client: Client
@@ -83,7 +82,7 @@ class Admission:
     _under_way: Counter[str] = field(default_factory=Counter)
 
     async def review(self, review: Any) -> Object:
-        """The answer to an AdmissionReview. Raises ReviewError where it is none, and OverloadedError."""
+        """The response to an AdmissionReview. Raises ReviewError if it is not valid, and OverloadedError."""
         request = read(review)
         looked_after = not self.namespaces or request.namespace in self.namespaces
         findings = Findings()
@@ -100,7 +99,7 @@ class Admission:
         return response
 
     async def _in_turn(self, request: Request) -> Findings:
-        """The findings. Raises OverloadedError where the namespace has too many questions: others get their answers."""
+        """The findings. Raises OverloadedError if the namespace has too many reviews in progress."""
         if self._under_way[request.namespace] >= AT_ONCE:
             raise OverloadedError(f"{AT_ONCE} reviews of namespace {request.namespace} are in progress: try again")
         self._under_way[request.namespace] += 1
@@ -148,7 +147,7 @@ class Admission:
         return await self._run(rule.namespace, partial(rule_context(self.cache, rule).findings, rule))
 
     async def _run(self, namespace: str, job: Job[Findings]) -> Findings:
-        """What a worker process finds; that it takes too much is a problem as well."""
+        """The findings of a worker process; an exceeded limit of CPU time is a problem as well."""
         try:
             return await self.pool.run(namespace, job)
         except ExceededError as error:
@@ -159,7 +158,7 @@ class Admission:
             self.observe(raw)
 
     async def _of_detector(self, detector: Detector, old: Kind | None) -> Findings:
-        """What is wrong with the detector; that rules of it no longer compile is a remark, since they may follow."""
+        """The findings about the Detector. Rules that no longer compile are remarks: they may be changed next."""
         before = old if isinstance(old, Detector) else None
         findings = await self._run(detector.namespace, partial(judge_detector, detector))
         if not findings.problems and (problem := await self._pod_problem(detector, before)):
@@ -177,7 +176,7 @@ class Admission:
         return replace(findings, remarks=tuple(remarks))
 
     async def _pod_problem(self, detector: Detector, before: Detector | None) -> str:
-        """Why the API server would refuse the detector's Deployment; empty where it would not, or does not answer."""
+        """Why the API server would refuse the detector's Deployment; empty if it would not, or does not respond."""
         spec, old = detector.spec, before.spec if before is not None else None
         unchanged = old is not None and (old.mode, old.pod) == (spec.mode, spec.pod)
         if self.defaults is None or spec.mode is not DetectorMode.STANDALONE or spec.pod is None or unchanged:
@@ -196,7 +195,7 @@ class Admission:
         return problem
 
     async def inject(self, review: Any) -> Object:
-        """The answer to an AdmissionReview about a pod. Raises ReviewError where it is none."""
+        """The response to an AdmissionReview about a pod. Raises ReviewError if it is not valid."""
         request = read_pod(review)
         name = detector_of(request.pod.get("metadata"))
         if name is None:
@@ -215,12 +214,12 @@ class Admission:
     async def _injection(self, request: PodRequest, name: str) -> Injection:
         detector = self.cache.detector((request.namespace, name))
         metadata, spec = request.pod["metadata"], request.pod["spec"]
-        # Beside the event loop: whether the Detector is accepted is found by compiling its expressions.
+        # In a thread: it compiles the expressions to find out whether the Detector is accepted.
         return await asyncio.to_thread(injection, metadata, spec, request.namespace, detector, self.defaults)
 
 
 def _parsed(raw: Object | None) -> Kind | None:
-    """The object as its kind; None where it is none."""
+    """The object as its kind; None if it is not valid."""
     try:
         return parse_object(raw) if raw is not None else None
     except ValueError:

@@ -1,9 +1,9 @@
-"""The webhook's certificate, if the manager issues it: created, stored in a Secret, and renewed in time.
+"""Issues the webhook's certificate, if configured: creates it, stores it in a Secret, and renews it in time.
 
-All managers of a release share the Secret. A manager that finds its certificate missing or due writes a new one; the
-resourceVersion decides between two. The previous authority stays in `ca.crt` beside the new one, and the API server
-trusts both before any manager shows the new certificate, so no question fails while they change. A new
-authority signs one certificate and is forgotten: its key is kept nowhere, so nothing else can be signed with it.
+All managers of a release share the Secret. A manager that finds the certificate missing or due writes a new one; the
+resourceVersion decides between two writers. The previous CA stays in `ca.crt` beside the new one, and the API server
+trusts both before any manager uses the new certificate, so no review fails during the change. A new CA signs one
+certificate. Its key is stored nowhere, so nothing else can be signed with it.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ from wayside.kubernetes.resources import Object, Resource
 from wayside.kubernetes.retrying import repeatedly, until_answered
 from wayside.process.servingcertificate import CERTIFICATE, KEY
 
-EVERY = 10.0  # s between two looks at the Secret
-_RENEWED_AT = 1 / 3  # of its life that is left
+EVERY = 10.0  # s between two checks of the Secret
+_RENEWED_AT = 1 / 3  # of the lifetime that remains
 
 AUTHORITY = "ca.crt"
 VALID = datetime.timedelta(days=365)
-_CLOCKS = datetime.timedelta(hours=1)  # that the clocks of two machines may differ
+_CLOCKS = datetime.timedelta(hours=1)  # the tolerated difference between the clocks of two machines
 
 _SECRETS = Resource("v1", "Secret", "secrets")
 _GROUP = "admissionregistration.k8s.io/v1"
@@ -53,16 +53,16 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class CertificateIssuer:
-    """Keeps the certificate valid, the files in the folder as in the Secret, which exists, and the webhooks' authority.
+    """Keeps the certificate valid, the files in the folder equal to the Secret, and the CA in the webhooks.
 
-    `client` writes also while this manager is not the active one.
+    The Secret must exist. `client` also writes while this manager is not the active one.
     """
 
     client: Client
     serving: WebhookOptions
 
     async def look(self) -> None:
-        """Look once: make a certificate where one is due, give the API server its authority, and write the files."""
+        """Check once: create a certificate if it is due, write the CA into the webhooks, and write the files."""
         namespace, name = self.serving.secret
         secret = await self.client.get(_SECRETS, namespace, name)
         if secret is None:
@@ -77,7 +77,7 @@ class CertificateIssuer:
             try:
                 await self.client.replace(_SECRETS, secret | {"data": data})
             except ApiError as error:
-                if error.code == 409:  # another manager was faster
+                if error.code == 409:  # another manager was first
                     return await self.look()
                 raise
             log.info("created a certificate for the webhook, valid for %d days", VALID.days)
@@ -85,7 +85,7 @@ class CertificateIssuer:
         write_whole(self.serving.certificates, {each: files[each] for each in (AUTHORITY, CERTIFICATE, KEY)})
 
     async def _trust(self, bundle: str) -> None:
-        """Write the authority into those of the configurations that there are."""
+        """Write the CA into the existing webhook configurations."""
         for resource in _CONFIGURATIONS:
             found: Object | None = await self.client.get(resource, "", self.serving.webhooks)
             if found is None:
@@ -98,7 +98,7 @@ class CertificateIssuer:
 
 
 def _due(files: dict[str, bytes], now: datetime.datetime) -> bool:
-    """Whether there is no certificate, or too little of its life is left."""
+    """Whether there is no certificate, or too little of its lifetime remains."""
     if not all(files.get(each) for each in (AUTHORITY, CERTIFICATE, KEY)):
         return True
     try:
@@ -110,7 +110,7 @@ def _due(files: dict[str, bytes], now: datetime.datetime) -> bool:
 
 
 def _trusted(secret: Object, now: datetime.datetime) -> bytes:
-    """The authority of the certificate that is in use, if there is one that still holds."""
+    """The CA of the current certificate, if that is still valid."""
     bundle = base64.b64decode((secret.get("data") or {}).get(AUTHORITY, ""))
     try:
         newest = x509.load_pem_x509_certificates(bundle)[0]
@@ -121,10 +121,10 @@ def _trusted(secret: Object, now: datetime.datetime) -> bytes:
 
 @asynccontextmanager
 async def issuing(client: Client, serving: WebhookOptions | None) -> AsyncIterator[None]:
-    """Keep the webhook's certificate valid while the block runs, where the manager makes it.
+    """Keep the webhook's certificate valid while the block runs, if the manager issues it.
 
-    First it waits for a certificate, however long the API server takes to answer. Raises ConfigurationError where the
-    Secret does not exist, and ApiError where the API server refuses for good.
+    First it waits for a certificate, as long as the API server takes to respond. Raises ConfigurationError if the
+    Secret does not exist, and ApiError if the API server refuses permanently.
     """
     if serving is None or not serving.service:
         yield
@@ -141,9 +141,9 @@ async def issuing(client: Client, serving: WebhookOptions | None) -> AsyncIterat
 
 
 def make_certificates(folder: Path, hosts: Sequence[str]) -> bytes:
-    """Write ca.crt, tls.crt and tls.key for the hosts, names or addresses, into the folder; the first one's content.
+    """Write ca.crt, tls.crt and tls.key for the hosts (names or addresses) into the folder; returns ca.crt.
 
-    Raises ConfigurationError where the folder cannot be written to.
+    Raises ConfigurationError if the folder is not writable.
     """
     files = issued(hosts)
     write_whole(folder, files)
@@ -151,7 +151,7 @@ def make_certificates(folder: Path, hosts: Sequence[str]) -> bytes:
 
 
 def write_whole(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Write the files whole or not at all. Raises ConfigurationError where the folder cannot be written to."""
+    """Write the files atomically. Raises ConfigurationError if the folder is not writable."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name, content in files.items():
@@ -168,9 +168,9 @@ def write_whole(folder: Path, files: Mapping[str, bytes]) -> None:
 
 
 def issued(hosts: Sequence[str], valid: datetime.timedelta = VALID) -> dict[str, bytes]:
-    """A new authority's certificate, and one that it signed for the hosts, with its key: contents, by file name."""
+    """A new CA certificate, and a certificate with key that it signed for the hosts: contents, by file name."""
     authority, key = ec.generate_private_key(ec.SECP256R1()), ec.generate_private_key(ec.SECP256R1())
-    # Of two authorities with the same name, OpenSSL tries one alone.
+    # Of two CAs with the same name, OpenSSL tries only one.
     issuer = _named(f"wayside-admission-authority-{secrets.token_hex(4)}")
     root = (
         _begun(issuer, authority.public_key(), issuer, valid)

@@ -1,8 +1,8 @@
-"""The webhook: AdmissionReviews over HTTPS, in the manager's own event loop.
+"""The webhook: AdmissionReviews over HTTPS, in the manager's event loop.
 
-Whatever goes wrong here is an answer that the API server counts as none, and with failurePolicy Ignore the
-object is stored, and its condition reports later what the review could not. So nothing waits in a queue: where too many
-come at once, those beyond get 503 with Retry-After.
+If a review fails here, the API server gets an error. With failurePolicy Ignore it then stores the object, and the
+object's condition later reports the findings. So no request waits in a queue: requests beyond the maximum get 503 with
+Retry-After.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from wayside.kubernetes.connection import ConfigurationError
 from wayside.process.servingcertificate import ServingCertificate
 
 AT_ONCE = 32
-"""Questions of one kind that are answered at the same time; those beyond get 503 at once."""
+"""The maximum number of concurrent reviews of one kind; further ones get 503 immediately."""
 
 _RETRY_AFTER = "1"  # s; a review takes less
 
-LARGEST = 8 * 1024 * 1024  # bytes of a question: etcd takes 1.5 MiB an object, and an update brings two
+LARGEST = 8 * 1024 * 1024  # bytes of a request: etcd accepts 1.5 MiB per object, and an update contains two
 
 PORT_OPTION = "--admission-port"
 FOLDER_OPTION = "--admission-certificates"
@@ -41,9 +41,9 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class WebhookOptions:
-    """Where the webhook is served, and the folder with its certificate and key.
+    """The port of the webhook, and the folder with its certificate and key.
 
-    `service` and `webhooks`: where this manager makes the certificate itself, the Service for which it does, as
+    `service` and `webhooks`: if this manager issues the certificate itself, the Service to issue it for, as
     NAMESPACE/NAME, and the name of the webhook configurations.
     """
 
@@ -54,22 +54,22 @@ class WebhookOptions:
 
     @property
     def secret(self) -> tuple[str, str]:
-        """Namespace and name of the Secret with the certificate that this manager makes."""
+        """Namespace and name of the Secret with the certificate that this manager issues."""
         return certificate_secret(self.service)
 
 
 class ReviewHandler:
-    """Answers the AdmissionReviews of one webhook."""
+    """Responds to the AdmissionReviews of one webhook."""
 
     def __init__(self, review: Review, ready: Callable[[], bool], measures: Measures) -> None:
-        """`ready`: whether enough is known to answer."""
+        """`ready`: whether the caches are synced."""
         self._review = review
         self._ready = ready
         self._measures = measures
         self._in_progress = 0
 
     async def answer(self, request: web.Request) -> web.Response:
-        """The answer to one AdmissionReview; an HTTP error if there is none."""
+        """The response to one AdmissionReview; an HTTP error if the review failed."""
         if not self._ready():
             return self._none(503, "the caches are not synced yet")
         if self._in_progress >= AT_ONCE:
@@ -85,7 +85,7 @@ class ReviewHandler:
         except web.HTTPException:
             self._measures.reviewed("", "failed")
             raise
-        except Exception as error:  # a defect of ours keeps nobody from anything
+        except Exception as error:  # a defect of ours must not prevent any change
             log.exception("cannot review an object")
             return self._none(500, f"{type(error).__name__}: {error}")
         finally:
@@ -99,9 +99,9 @@ class ReviewHandler:
 
 @asynccontextmanager
 async def webhook(serving: WebhookOptions | None, handlers: Mapping[str, ReviewHandler]) -> AsyncIterator[None]:
-    """Serve the handlers, by their paths, on all addresses while the block runs; nothing where `serving` is None.
+    """Serve the handlers, by their paths, on all addresses while the block runs; nothing if `serving` is None.
 
-    Raises ConfigurationError where the port is taken, CertificateError where there is no valid certificate.
+    Raises ConfigurationError if the port is in use, CertificateError if there is no valid certificate.
     """
     if serving is None:
         yield

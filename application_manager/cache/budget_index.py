@@ -1,7 +1,8 @@
-"""Which tasks are within the budgets of their holder and namespace: an index, kept up to date task by task.
+"""Determines which tasks are within the budgets of their holder and namespace: an incremental index.
 
-The oldest tasks are within. So neither a restart nor the order of arrival changes which ones, and none that is served
-yields to a newer one. A task beyond its holder's budget takes nothing of its namespace's.
+The oldest tasks are within the budget. So neither a restart nor the order of arrival changes the result, and a served
+task never loses its place to a newer one. A task beyond its holder's budget does not count against its namespace's
+budget.
 """
 
 from __future__ import annotations
@@ -15,11 +16,11 @@ from application_manager.core.objects.policy import Name
 from wayside.api import ApplicationTask
 
 _Age = tuple[str, Name]
-"""When a task was created, and its name: the order."""
+"""The creation time and the name of a task: the sort key."""
 
 
 class _Budget:
-    """Tasks in their order, of which the first `limit` are within."""
+    """Tasks in their order; the first `limit` of them are within the budget."""
 
     def __init__(self, limit: int) -> None:
         self.limit = limit
@@ -29,21 +30,21 @@ class _Budget:
         return bisect_left(self.order, age) < self.limit
 
     def add(self, age: _Age) -> _Age | None:
-        """Add a task; the one that is not within any more, if any."""
+        """Add a task; returns the task that is beyond the budget now, if any."""
         insort(self.order, age)
         if len(self.order) <= self.limit or not self.within(age):
             return None
         return self.order[self.limit]
 
     def remove(self, age: _Age) -> _Age | None:
-        """Remove a task; the one that is within from now on, if any."""
+        """Remove a task; returns the task that is within the budget now, if any."""
         index = bisect_left(self.order, age)
         del self.order[index]
         return self.order[self.limit - 1] if index < self.limit <= len(self.order) else None
 
 
 class BudgetIndex:
-    """Budgets of all namespaces and holders; those without a limit cost nothing."""
+    """The budgets of all namespaces and holders; unlimited ones store nothing."""
 
     def __init__(self, policy: TaskPolicy) -> None:
         self._policy = policy
@@ -52,7 +53,7 @@ class BudgetIndex:
         self._known: dict[Name, tuple[_Age, str | None]] = {}
 
     def enter(self, task: ApplicationTask) -> set[Name]:
-        """Note an unfinished task; returns the other tasks that may be within or beyond a budget by that."""
+        """Note an unfinished task; returns the other tasks whose result may have changed."""
         name = (task.namespace, task.name)
         age, holder = (task.metadata.creation_timestamp, name), task.spec.requester.holder
         if self._known.get(name) == (age, holder):
@@ -68,7 +69,7 @@ class BudgetIndex:
         return moved - {name}
 
     def leave(self, name: Name) -> set[Name]:
-        """Note that a task has ended; returns the other tasks that may be within or beyond a budget by that."""
+        """Note that a task has ended; returns the other tasks whose result may have changed."""
         age, holder = self._known.pop(name, (None, None))
         if age is None:
             return set()
@@ -82,7 +83,7 @@ class BudgetIndex:
         return moved | ({follower[1]} | self._take(follower) if follower is not None else set())
 
     def verdict(self, name: Name) -> Verdict | None:
-        """Why the task waits; None where it is within its budgets."""
+        """Why the task waits; None if it is within its budgets."""
         age, holder = self._known.get(name, (None, None))
         if age is None:
             return None

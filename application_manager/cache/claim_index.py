@@ -1,6 +1,6 @@
-"""Which task claims which instance: an index, kept up to date task by task.
+"""Determines which task claims which instance: an incremental index.
 
-It saves determining every claim again whenever a task changes. What it holds follows from tasks and templates alone.
+Without it, every change of a task would compute all claims again. Its content follows from tasks and templates alone.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ from application_manager.core.objects.policy import Name
 from wayside.api import ApplicationTask
 
 Claims = Callable[[TemplateState, ApplicationTask], Claim | Verdict | None]
-"""What a task claims of a template, or its verdict; None while that is being computed."""
+"""The claim of a task on a template, or its verdict; None while that is being computed."""
 
 
 _ANY = TaskPolicy()
 
 
 class ClaimIndex:
-    """Claims of all tasks, and the verdicts of those that claim nothing.
+    """The claims of all tasks, and the verdicts of tasks that claim nothing.
 
-    A task whose claim is being computed keeps the one that it had, if any. Those that were there before this process
-    began to act may well have instances: until their claims are known, their templates are unsettled, and what runs of
-    them stays as it is.
+    While a claim is being computed, the previous one of the task is kept, if any. Tasks that existed before this
+    process became active may have instances: until their claims are known, their templates are unsettled, and the
+    instances of these templates are not changed.
 
     Attributes:
-        claim_of: what a task claims.
-        settled: called with a template that is unsettled no more.
-        moved: called with a task that is within its budgets, or beyond them, since another one came or ended.
+        claim_of: computes the claim of a task.
+        settled: called with a template that is no longer unsettled.
+        moved: called with a task whose budget result changed because another task was added or has ended.
     """
 
     def __init__(self, claim: Claims = claim_or_verdict, policy: TaskPolicy = _ANY) -> None:
@@ -45,7 +45,7 @@ class ClaimIndex:
         self._budgets = BudgetIndex(policy)
         self.settled: Callable[[Name], None] = lambda _: None
         self._pending: dict[Name, set[Name]] = {}  # template → tasks
-        self._unsettled: dict[Name, set[Name]] = {}  # of these, the tasks that were there at the beginning
+        self._unsettled: dict[Name, set[Name]] = {}  # of these, the tasks that existed at the start
         self._claims: dict[Name, Claim] = {}
         self._verdicts: dict[Name, Verdict] = {}
         self._by_instance: MembersByGroup[Name, Name, Claim] = MembersByGroup()
@@ -53,7 +53,7 @@ class ClaimIndex:
         self._templates: dict[Name, Name] = {}  # task → template
 
     def note(self, name: Name, entry: Entry, template: TemplateState) -> set[Name]:
-        """Note a task as it is now; returns the instances that it claimed or claims, none while that is computed."""
+        """Note the state of a task; returns the instances that it claimed or claims, none while that is computed."""
         task = entry.model
         if isinstance(task, ApplicationTask) and finished(task) is None and self._policy.refusal(task) is None:
             moved = self._budgets.enter(task)
@@ -81,7 +81,7 @@ class ClaimIndex:
         self._file(name, task)
         if isinstance(claimed, Verdict):
             served = before is not None and template_of_all(before.instance) is None
-            if claimed.kind is VerdictKind.FINISHED and before is not None and served:  # its status may not have it yet
+            if claimed.kind is VerdictKind.FINISHED and before is not None and served:  # not yet in its status
                 claimed = replace(claimed, instance=before.instance)
             self._verdicts[name] = claimed
             return touched
@@ -92,7 +92,7 @@ class ClaimIndex:
         return touched | {instance}
 
     def _beforehand(self, entry: Entry, task: ApplicationTask) -> Verdict | None:
-        """The verdict of a task that requests too much, whatever its template; None where there is none."""
+        """The verdict that does not depend on the template, of a task that has ended or is refused; else None."""
         over = finished(task)
         if over is not None:
             return over
@@ -101,7 +101,7 @@ class ClaimIndex:
         return self._policy.refusal(task) or self._budgets.verdict((task.namespace, task.name))
 
     def _wait(self, name: Name, task: ApplicationTask, before: Claim | None) -> set[Name]:
-        """Note that a task's claim is being computed: until then, a task that had one keeps it."""
+        """Note that a task's claim is being computed: until then, the previous claim is kept."""
         touched = set() if before is not None and before.task.metadata.uid == task.metadata.uid else self._drop(name)
         self._file(name, task)
         self._pending.setdefault((name[0], task.spec.template_name), set()).add(name)
@@ -113,7 +113,7 @@ class ClaimIndex:
         self._by_template.put(of, name, task)
 
     def _resolve(self, name: Name, found: Claim | Verdict | None) -> None:
-        """Note that a task's claim is known; one that takes too much to work out is as unknown as before."""
+        """Note the claim of a task; one that exceeds the limit of CPU time stays as unknown as before."""
         still = isinstance(found, Verdict) and found.reason == RefusalReason.EXPRESSION_LIMIT
         for waiting in (self._pending,) if still else (self._pending, self._unsettled):
             for template in [each for each, names in waiting.items() if name in names]:
@@ -128,11 +128,11 @@ class ClaimIndex:
         return template in self._pending
 
     def begin(self) -> None:
-        """Everything is listed: what is being computed now was there before."""
+        """Note that all objects are listed: the claims that are being computed are of tasks that existed before."""
         self._unsettled = {template: set(names) for template, names in self._pending.items()}
 
     def unsettled(self, template: Name) -> bool:
-        """Whether tasks that were there at the beginning may claim instances of the template that are not known yet."""
+        """Whether unknown claims of tasks that existed at the start may concern instances of the template."""
         return template in self._unsettled
 
     def forget(self, name: Name) -> set[Name]:
@@ -156,7 +156,7 @@ class ClaimIndex:
         return {instance}
 
     def verdict(self, name: Name) -> Verdict | None:
-        """The verdict of a task that claims nothing."""
+        """The verdict of a task without a claim."""
         return self._verdicts.get(name)
 
     def claim(self, name: Name) -> Claim | None:
@@ -164,14 +164,14 @@ class ClaimIndex:
         return self._claims.get(name)
 
     def claims(self, instance: Name, template: str | None = None) -> list[Claim]:
-        """All claims on an instance; with its template, also those on all instances of that."""
+        """All claims on an instance; with its template, also the claims on all instances of the template."""
         claimed = list(self._by_instance.get(instance, {}).values())
         if template is not None:
             claimed += self._by_instance.get((instance[0], all_instances(template)), {}).values()
         return claimed
 
     def claimed_of(self, template: Name) -> set[Name]:
-        """The instances of a template that tasks claim; a name that means all of them is left out."""
+        """The claimed instances of a template, without the name that means all instances."""
         found = {claimed.instance for name in self.tasks_of(template) if (claimed := self._claims.get(name))}
         return {(template[0], each) for each in found if template_of_all(each) is None}
 

@@ -59,19 +59,19 @@ INSTANCES: Final = Resource(*INSTANCE, ApplicationInstance.plural)
 EVENT_RULES: Final = Resource(*EVENT_RULE, EventRule.plural)
 DETECTORS: Final = Resource(*DETECTOR, Detector.plural)
 OWN: Final = {TEMPLATE: TEMPLATES, INSTANCE: INSTANCES, TASK: TASKS, DETECTOR: DETECTORS, EVENT_RULE: EVENT_RULES}
-"""Our own kinds and where they live, those that others depend on first."""
+"""Our own kinds and their resources, in the order of dependencies."""
 
 POD: Final[KindKey] = ("v1", "Pod")
 LEASE: Final[KindKey] = ("coordination.k8s.io/v1", "Lease")
 
 
 _Version = tuple[str, int, frozenset[str]]
-"""Of a template: its uid, its generation, and the warnings that its annotation ignores."""
+"""A template's uid, its generation, and the warnings that its annotation ignores."""
 
 
 @dataclass(frozen=True, slots=True)
 class LastDecision:
-    """What was last decided of an instance, and what it has given since."""
+    """The last decision about an instance, and the progress since."""
 
     decision: Decision
     service: InstanceProgress
@@ -79,14 +79,7 @@ class LastDecision:
 
 @dataclass(frozen=True, slots=True)
 class WorkRecord:
-    """How the last work on an instance went.
-
-    Attributes:
-        uid: the instance's; a record of a namesake is worth nothing.
-        generation: of the instance, that was worked on.
-        digest: of the rendering that was last applied in full.
-        since: when the instance was first worked on by this process, in seconds since 1970.
-    """
+    """The result of the last work on an instance."""
 
     uid: str
     generation: int

@@ -1,8 +1,7 @@
-"""Indexes of decisions: which instances may run in namespaces with limits, and which tasks use a fallback.
+"""Indexes of decisions: which instances have a place in namespaces with limits, and which tasks use a fallback.
 
-A place depends on what each instance requests, and on the order of all requests. So only the instances that changed
-since are decided again, and the order is determined again when any request differs. Namespaces without limits cost
-nothing.
+A place depends on the request of each instance, and on the order of all requests. So only the instances that changed
+are decided again, and the order is computed again when a request differs. Namespaces without limits cost nothing.
 """
 
 from __future__ import annotations
@@ -24,26 +23,26 @@ class PlaceIndex:
         self._touched: dict[str, set[str]] = {}
 
     def touch(self, name: Name) -> None:
-        """Note that an instance, or what demands it, changed."""
+        """Note that an instance, or its demand, changed."""
         if name[0] in self._placements:
             self._touched.setdefault(name[0], set()).add(name[1])
 
     def forget(self) -> None:
-        """Drop all placements: another manager has acted since."""
+        """Drop all placements: another manager has been active since."""
         self._placements.clear()
         self._touched.clear()
         self.being_made.clear()
 
     def placement(self, namespace: str) -> Placement | None:
-        """The placement noted last; None where there is none."""
+        """The last placement; None if there is none."""
         return self._placements.get(namespace)
 
     def stale(self, placement: Placement, namespace: str, now: float) -> set[str]:
-        """The instances whose request may differ from the one in the placement noted last."""
+        """The instances whose request may differ from the one in the last placement."""
         return placement.due(now) | self._touched.get(namespace, set())
 
     def note(self, namespace: str, placement: Placement | None) -> None:
-        """Note a placement that has all changes in it; None where the namespace has no limits."""
+        """Note a placement that contains all changes; None if the namespace has no limits."""
         self._touched.pop(namespace, None)
         if placement is None:
             self._placements.pop(namespace, None)
@@ -59,7 +58,7 @@ class FallbackIndex:
         self._turned: dict[Name, Fallback] = {}
 
     def note_template(self, template: Name, other: str | None) -> None:
-        """Note to which template of its namespace one falls back; None where it does not, or is gone."""
+        """Note the fallback template of a template; None if it has none, or was deleted."""
         self._templates.pop(template, None)
         if other is not None:
             self._templates[template] = other
@@ -80,12 +79,12 @@ class FallbackIndex:
         return (before.instances if before else set()) | (to.instances if to else set())
 
     def note(self, instance: Name, to: Fallback | None) -> None:
-        """Note what an instance's tasks turn to; None where they do not."""
+        """Note the fallback of an instance's tasks; None if there is none."""
         self._turned.pop(instance, None)
         if to is not None:
             self._turned[instance] = to
 
     def instances_of(self, template: Name) -> set[Name]:
-        """The instances of a template that tasks turned to."""
+        """The instances of a template whose tasks use their fallback."""
         turned = (each for of, each in self._turned.items() if (of[0], each.template) == template)
         return {(template[0], instance) for each in turned for instance in each.instances}

@@ -65,7 +65,7 @@ class DetectorIndex:
         self._troubles = {name: summary(troubles) for name, troubles in found.items()}
 
     def running(self, detector: Detector) -> ConditionState | None:
-        """The condition Running of this generation of the Detector; None where it was not processed yet."""
+        """The condition Running of this generation of the Detector; None if it was not processed yet."""
         known = self.processed.get((detector.namespace, detector.name))
         metadata = detector.metadata
         if known is None or (known.uid, known.generation) != (metadata.uid, metadata.generation):
@@ -82,7 +82,7 @@ class DetectorIndex:
 
 
 def _deployment_of(pod: Object) -> tuple[str, str] | None:
-    """The Deployment whose ReplicaSet controls the pod: that one's name is the Deployment's with the pod's hash."""
+    """The name of the Deployment whose ReplicaSet controls the pod: the ReplicaSet's name without the hash."""
     metadata, controller = pod["metadata"], controller_of(pod)
     ending = f"-{metadata['labels'].get('pod-template-hash', '')}"
     if controller.get("kind") != "ReplicaSet" or not str(controller["name"]).endswith(ending):

@@ -1,9 +1,9 @@
-"""Other managers of the same namespaces, by what they write into the statuses of templates.
+"""Detects other managers of the same namespaces by the statuses of templates.
 
-Managers with one Lease take turns by that. Two releases have a Lease each, and none may read the other's. So each
-writes its Lease, and when that was created, into the status of every template. Of two, the one with the older Lease
-acts in a namespace and the other one waits there. By an attempt, the younger one learns whether the older one is alive:
-it writes itself into one template, and the older one then writes itself back. docs/decisions/0028 has the reasons.
+Managers with the same Lease take turns. Two releases have a Lease each, and neither may read the other's. So each
+manager writes its Lease, and the Lease's creation time, into the status of every template. The one with the older Lease
+is active in the namespace, and the other one waits. The waiting manager regularly tests whether the other one is alive:
+it writes itself into one template, and a live manager overwrites that. docs/decisions/0028 has the reasons.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from application_manager.core.objects.policy import Name
 from wayside.api.applicationtemplate import TemplateManager
 
 ANSWER = 5.0
-"""Seconds in which a manager that is alive answers such an attempt."""
+"""Seconds in which a live manager responds to such a test."""
 
 log = logging.getLogger(__name__)
 
@@ -32,11 +32,12 @@ class NamespaceRole(Enum):
 
 @dataclass(slots=True)
 class _Yielded:
-    """A namespace in which the manager waits.
+    """A namespace in which this manager waits.
 
     Attributes:
-        template: by whose status it tries.
-        until: when it tries, or where it has tried, when no answer means that the other one is gone; since 1970.
+        template: the one whose status is used for the test.
+        until: the time of the next test or, during a test, the time at which the other manager counts as gone; in
+            seconds since 1970.
     """
 
     rival: TemplateManager
@@ -46,12 +47,12 @@ class _Yielded:
 
 
 class OverlapIndex:
-    """Namespaces that others manage as well.
+    """The namespaces that other managers manage as well.
 
     Attributes:
-        own: what this manager writes; None while its Lease is not known.
-        every: seconds between two attempts.
-        resumed: called with a namespace in which the manager acts again.
+        own: this manager, as it writes itself into statuses; None while its Lease is not known.
+        every: seconds between two tests.
+        resumed: called with a namespace in which this manager becomes active again.
     """
 
     def __init__(self) -> None:
@@ -60,19 +61,19 @@ class OverlapIndex:
         self.resumed: Callable[[str], None] = lambda _: None
         self._written: dict[Name, str] = {}  # the Lease in a template's status
         self._yielded: dict[str, _Yielded] = {}
-        self._younger: set[tuple[str, str]] = set()  # namespaces and Leases that were reported
+        self._younger: set[tuple[str, str]] = set()  # namespaces and Leases that were logged
 
     def yields(self, namespace: str) -> bool:
-        """Whether the manager does nothing in the namespace."""
+        """Whether this manager waits in the namespace."""
         return namespace in self._yielded
 
     @property
     def count(self) -> int:
-        """In how many namespaces it waits."""
+        """The number of namespaces in which it waits."""
         return len(self._yielded)
 
     def note(self, template: Name, written: TemplateManager | None, now: float) -> None:
-        """Note the manager in a template's status; `now` in seconds since 1970."""
+        """Note the manager in a template's status; `now` is in seconds since 1970."""
         own, namespace = self.own(), template[0]
         if own is None or written is None:
             return
@@ -82,13 +83,13 @@ class OverlapIndex:
             return
         if (own.since, own.lease) < (written.since, written.lease):
             self._report_younger(namespace, written)
-        elif before == own.lease:  # it has answered, or has come back
+        elif before == own.lease:  # it has responded, or is back
             self._yield(_Yielded(written, template, now + self.every))
         elif namespace not in self._yielded:  # it may be gone
             self._yield(_Yielded(written, template, now))
 
     def role(self, template: Name, now: float) -> tuple[NamespaceRole, float]:
-        """What may be done about a template as of `now`, and when that changes, both in seconds since 1970."""
+        """The role of this manager for a template at `now`, and when that changes, both in seconds since 1970."""
         state = self._yielded.get(template[0])
         if state is None:
             return NamespaceRole.ACT, now
@@ -105,7 +106,7 @@ class OverlapIndex:
             self._resume(namespace, f"the manager of the Lease {state.rival.lease} does not respond")
 
     def waits_for(self, namespace: str) -> str:
-        """The Lease of the manager for which this one waits in the namespace."""
+        """The Lease of the manager that is active in the namespace instead of this one; empty if none is."""
         state = self._yielded.get(namespace)
         return state.rival.lease if state is not None else ""
 

@@ -1,7 +1,7 @@
-"""An index of the pods with problems, by instance.
+"""The pods with problems, by instance.
 
-Pods are recognised by the instance's label, which the rendering puts into pod templates. Of those that run well, which
-are nearly all, nothing is kept here.
+A pod belongs to the instance in its label, which rendering adds to pod templates. Pods without problems, nearly all,
+are not stored.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from wayside.kubernetes.resources import Object
 
 
 class PodIndex:
-    """Troubles of pods."""
+    """The problems of pods."""
 
     def __init__(self) -> None:
         self._troubles: MembersByGroup[Name, Name, Trouble] = MembersByGroup()
 
     def note(self, pod: Object) -> bool:
-        """Note a pod as it is now; whether that changes the `troubles` of its instance."""
+        """Note the current state of a pod; returns whether the `troubles` of its instance changed."""
         instance = instance_of(pod)
         if instance is None:
             return False
@@ -33,7 +33,7 @@ class PodIndex:
         return before != self.troubles(instance)
 
     def forget(self, pod: Object) -> bool:
-        """Forget a pod that is deleted; whether that changes the `troubles` of its instance."""
+        """Forget a deleted pod; returns whether the `troubles` of its instance changed."""
         instance = instance_of(pod)
         if instance is None:
             return False
@@ -42,5 +42,5 @@ class PodIndex:
         return before != self.troubles(instance)
 
     def troubles(self, instance: Name) -> list[Trouble]:
-        """The different troubles of an instance's pods, the most important first."""
+        """The distinct problems of an instance's pods, the most important first."""
         return summary(self._troubles.get(instance, {}).values())

@@ -24,7 +24,7 @@ Group = TypeVar("Group")
 Member = TypeVar("Member")
 Value = TypeVar("Value")
 
-_TOMBSTONES = 10_000  # uids of deleted objects that are remembered; the oldest are forgotten
+_TOMBSTONES = 10_000  # uids of deleted objects to remember; the oldest are forgotten
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,19 +45,19 @@ class Entry:
 
     @property
     def version(self) -> int:
-        """The object's resourceVersion, which grows."""
+        """The object's resourceVersion, which increases."""
         return int(self.raw["metadata"]["resourceVersion"])
 
 
 class MembersByGroup(dict[Group, dict[Member, Value]]):
-    """Values of members, by group; there is no group without members."""
+    """The values of members, by group; groups without members do not exist."""
 
     def put(self, group: Group, member: Member, value: Value) -> None:
         """Note the value of a member."""
         self.setdefault(group, {})[member] = value
 
     def drop(self, group: Group, member: Member) -> None:
-        """Forget a member, if it is there."""
+        """Forget a member, if it exists."""
         members = self.get(group, {})
         members.pop(member, None)
         if not members:
@@ -87,7 +87,7 @@ class Store:
         yield from list(self._objects.get(kind, {}).items())
 
     def put(self, raw: Object) -> Entry | None:
-        """Note an object; the new entry, or None where this version is known."""
+        """Note an object; returns the new entry, or None if this version is already known."""
         kind, name = kind_of(raw), name_of(raw)
         uid = raw["metadata"]["uid"]
         known = self.get(kind, name)
@@ -104,7 +104,7 @@ class Store:
         return entry
 
     def remove(self, raw: Object) -> Entry | None:
-        """Note that an object was deleted; what was known of it, or None where that is known."""
+        """Note that an object was deleted; returns its entry, or None if the deletion is already known."""
         uid = raw["metadata"]["uid"]
         self._deleted[uid] = None
         if len(self._deleted) > _TOMBSTONES:
@@ -117,7 +117,7 @@ class Store:
         return self._objects[kind_of(raw)].pop(name_of(raw))
 
     def missing(self, kind: KindKey, present: Set[Name], version: str, scope: str | None) -> list[Entry]:
-        """The deleted entries: a list (of the namespace `scope`, None for all) has only those `present`."""
+        """Remove the entries that are missing in a list (of the namespace `scope`, None for all); returns them."""
         return [
             entry
             for name, entry in self.all(kind)
@@ -141,15 +141,15 @@ class Store:
 
 
 def _was_served(raw: Object) -> bool:
-    """Whether the task has, or had, an instance: without the task, that would be released."""
+    """Whether the task has, or had, an instance: without the task, the instance would be released."""
     return bool((raw.get("status") or {}).get("instanceName"))
 
 
 def kind_of(raw: Object) -> KindKey:
-    """The kind of an object as it was read."""
+    """The kind of a raw object."""
     return raw["apiVersion"], raw["kind"]
 
 
 def name_of(raw: Object) -> Name:
-    """The namespace and name of an object as it was read."""
+    """The namespace and name of a raw object."""
     return raw["metadata"]["namespace"], raw["metadata"]["name"]

@@ -24,9 +24,10 @@ KEPT = 64  # archives
 
 @dataclass(frozen=True, slots=True)
 class ChartCache:
-    """Gives charts as paths. `folder`: of the cache, made where it is missing.
+    """Provides charts as paths.
 
-    `local`: the folder with the charts of the image, in which all that templates name by a path must be.
+    `folder`: the cache, created if it is missing. `local`: the folder with the charts of the image; a template may only
+    name paths in it.
     """
 
     helm: HelmRunner
@@ -34,7 +35,7 @@ class ChartCache:
     local: Path
 
     async def path(self, source: ChartSource) -> Path:
-        """The chart, which is fetched where it is not here yet. Raises HelmError."""
+        """The path of the chart, which is fetched if it is not cached. Raises HelmError."""
         if source.chart.startswith("/"):
             return await asyncio.to_thread(self._local, source.chart)
         try:
@@ -98,7 +99,7 @@ class ChartCache:
 
 
 def default_folder() -> Path:
-    """Where charts are kept unless the command line names another folder."""
+    """The default folder of cached charts."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "wayside" / "charts"
 
 

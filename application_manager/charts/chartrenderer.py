@@ -1,8 +1,8 @@
 """Renders charts in the background, and caches the results.
 
-An instance whose chart is not rendered yet reports it, and is enqueued once it is: no worker ever waits for Helm.
-Charts do not affect each other: each source has few runs at a time, and a chart that cannot be fetched, or takes too
-long, is retried with backoff. So a wrong chart costs its own template, and no other.
+An instance whose chart is not rendered yet reports that, and is enqueued once the chart is rendered: no worker waits
+for Helm. Charts do not affect each other: the number of concurrent runs of each source is limited, and a chart that
+cannot be fetched, or takes too long, is retried with backoff.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from wayside.process.backoff import pause_after
 
 FIRST_PAUSE = 5.0  # s after a failure, doubled with each further one
 LONGEST_PAUSE = 300.0  # s
-KEPT = 2000  # renderings; those not requested for longest are forgotten, and done again when they are
-_RUNS = 6  # of helm, at a time
+KEPT = 2000  # renderings; the least recently requested are forgotten, and computed again on request
+_RUNS = 6  # concurrent runs of helm
 _RUNS_OF_ONE = 2  # of these for one source
 
 log = logging.getLogger(__name__)
@@ -41,7 +41,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(slots=True)
 class _Pause:
-    """How long something that failed is left alone; times by the monotonic clock."""
+    """The backoff of something that failed; times by the monotonic clock."""
 
     failures: int = 0
     until: float = 0.0
@@ -63,7 +63,7 @@ class _Pause:
 
 @dataclass(slots=True)
 class _Source:
-    """One chart: whether it can be had, and its runs."""
+    """One chart: whether it is available, and its runs."""
 
     pause: _Pause = field(default_factory=_Pause)
     runs: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(_RUNS_OF_ONE))
@@ -90,8 +90,9 @@ class ChartRenderer:
         self._runs = asyncio.Semaphore(_RUNS)
 
     def outcome(self, request: ChartRequest) -> ChartOutcome | None:
-        """The result of the request; None while it is rendered, after which the instance is enqueued. A failure stays
-        until a new attempt, after a pause, succeeds.
+        """The result of the request; None while it is being rendered, after which the instance is enqueued.
+
+        A failure is returned until a new attempt, after a pause, succeeds.
         """
         known = self._renderings.setdefault(request, _Rendering())
         self._renderings.move_to_end(request)
@@ -103,7 +104,7 @@ class ChartRenderer:
         return known.outcome
 
     async def close(self) -> None:
-        """End all runs."""
+        """Stop all runs."""
         tasks = [each.work for each in self._renderings.values() if each.work is not None]
         for task in tasks:
             task.cancel()
@@ -121,7 +122,7 @@ class ChartRenderer:
     async def _do(self, request: ChartRequest, known: _Rendering) -> None:
         try:
             outcome = await self._outcome(request)
-        except Exception as error:  # a defect must not leave the instance waiting for ever
+        except Exception as error:  # a defect must not leave the instance waiting forever
             log.exception("cannot render the chart of %s/%s", request.namespace, request.release)
             outcome = ApplyProblem(FAILED, f"spec.helm: chart {request.source}: {type(error).__name__}: {error}")
         finally:
@@ -135,7 +136,7 @@ class ChartRenderer:
     async def _outcome(self, request: ChartRequest) -> ChartOutcome:
         source = self._sources.setdefault(request.source, _Source())
         async with source.runs:
-            async with source.fetching:  # the first fetches, the others find it
+            async with source.fetching:  # the first request fetches, the others use the cache
                 if not source.pause.over and source.pause.failure is not None:
                     return source.pause.failure
                 try:
@@ -159,7 +160,7 @@ class ChartRenderer:
 async def rendered(helm: HelmRunner, request: ChartRequest, path: Path) -> ChartOutcome:
     """The objects of the chart at the path, or why they cannot be used. Raises HelmError.
 
-    It is rendered twice: what differs each time would be applied again and again.
+    The chart is rendered twice: an object that differs each time would be applied over and over.
     """
     text = await helm.template(request, path)
     if text != await helm.template(request, path):
@@ -173,7 +174,7 @@ async def rendered(helm: HelmRunner, request: ChartRequest, path: Path) -> Chart
 
 
 async def rendered_at_once(helm: HelmRunner, cache: ChartCache, request: ChartRequest) -> ChartOutcome:
-    """The same from the beginning, for who can wait: the chart is fetched where it is not here yet."""
+    """The result of the request, for callers that can wait: the chart is fetched if it is not cached."""
     try:
         path = await cache.path(request.source)
     except HelmError as error:
@@ -185,10 +186,10 @@ async def rendered_at_once(helm: HelmRunner, cache: ChartCache, request: ChartRe
 
 
 def unavailable(source: ChartSource, error: HelmError) -> ApplyProblem:
-    """The chart cannot be had."""
+    """The result for a chart that cannot be fetched."""
     return ApplyProblem(UNAVAILABLE, f"spec.helm: cannot fetch chart {source}: {error}")
 
 
 def failed(source: ChartSource, error: HelmError) -> ApplyProblem:
-    """The chart cannot be rendered."""
+    """The result for a chart that cannot be rendered."""
     return ApplyProblem(FAILED, f"spec.helm: chart {source}: {error}")

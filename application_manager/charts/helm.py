@@ -1,8 +1,8 @@
 """Runs the helm program, without access to the cluster, and without blocking the manager.
 
-Each run has a folder of its own as its home, an environment with nothing in it that leads to a cluster or to somebody's
-settings, and limits: time, memory, size of files, size of what it writes. `helm template` queries no cluster. Only a
-pull sees the proxies, certificates and registry logins that the manager's environment names.
+Each run has its own home folder, an environment without settings of a cluster or user, and limits: time, memory, file
+size and output size. `helm template` does not contact the cluster. Only a pull gets the proxies, certificates and
+registry logins of the manager's environment.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ PULL_TIME = 60.0  # s until a run is stopped
 TEMPLATE_TIME = 20.0  # s; a chart takes a tenth of one
 MEMORY = 1 << 30  # bytes of data
 FILE_SIZE = 64 << 20  # bytes
-OUTPUT = 8 << 20  # bytes, beyond what the API server would take in many objects
+OUTPUT = 8 << 20  # bytes, more than the API server would accept in many objects
 _ERRORS = 1 << 14  # bytes
 
 _OF_PULLS = (
@@ -37,7 +37,7 @@ _OF_PULLS = (
 
 
 class HelmError(Exception):
-    """Helm did not do it; the text gives the reason. `slow`: it was stopped at a limit of time."""
+    """Helm failed; the text gives the reason. `slow`: it exceeded a time limit."""
 
     def __init__(self, message: str, *, slow: bool = False) -> None:
         super().__init__(message)
@@ -50,7 +50,7 @@ class HelmRunner:
 
     Attributes:
         program: a path, or a name on PATH.
-        kube_version: of the cluster, as charts see it in `.Capabilities`; None: Helm's own idea.
+        kube_version: the cluster's version, as charts see it in `.Capabilities`; None: Helm's default.
     """
 
     program: str = "helm"
@@ -62,7 +62,7 @@ class HelmRunner:
         arguments += ["--version", source.version] if source.version else []
         arguments += ["--repo", source.repository] if source.repository else []
         if source.chart.startswith(OCI) and _is_loopback(source.chart):
-            arguments.append("--plain-http")  # as container tools do: nobody can listen in between
+            arguments.append("--plain-http")  # as container tools do: traffic to this machine cannot be intercepted
         environment = {name: os.environ[name] for name in _OF_PULLS if name in os.environ}
         await self._run(arguments, PULL_TIME, environment)
         archives = [folder / name for name in os.listdir(folder) if name.endswith(".tgz")]
@@ -99,7 +99,7 @@ class HelmRunner:
                 stderr=asyncio.subprocess.PIPE,
                 cwd=home,
                 env={**_environment(home), **more},
-                start_new_session=True,  # so that all it starts ends with it
+                start_new_session=True,  # so that all processes that it starts are stopped with it
             )
             _limit(process.pid, seconds)
             try:
@@ -147,7 +147,7 @@ def _limit(pid: int, seconds: float) -> None:
 
 
 async def _read(stream: asyncio.StreamReader | None) -> bytes:
-    """All of it. Raises HelmError where it is too long."""
+    """The whole output. Raises HelmError if it is too large."""
     found = bytearray()
     while stream is not None and (part := await stream.read(1 << 16)):
         found += part
@@ -169,7 +169,7 @@ def _kill(pid: int) -> None:
 
 
 def _cleaned(output: str) -> str:
-    """The output of Helm, on one line and without its own advice."""
+    """Helm's output on one line, without its own advice."""
     lines = [line.strip() for line in output.splitlines() if line.strip() and "--debug flag" not in line]
     return " ".join(line.removeprefix("Error: ") for line in lines if not line.startswith("level="))[-1500:]
 

@@ -1,4 +1,4 @@
-"""The client with which the manager reaches the API server."""
+"""The manager's client for the API server."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def manager_client(
     pacing: Pacing | None = None,
     timeout: float = 15.0,
 ) -> Client:
-    """A paced client that writes as the manager; `timeout`: seconds in which a request must be answered."""
+    """A client with a rate limit that writes as the manager; `timeout`: seconds for one request."""
     return Client(
         configuration,
         "wayside-application-manager",

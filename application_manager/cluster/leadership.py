@@ -1,7 +1,7 @@
 """Leader election: renews the Lease, or watches it until it can be acquired.
 
-It has a client of its own, so that no other request holds up a renewal. A time limits what may be done, never a
-flag: a process that was stopped finds its time over before anything had a chance to report it.
+It has its own client, so that other requests cannot delay a renewal. A deadline limits what the manager may do, not a
+flag: if the process was stopped for a while, the deadline has passed before any code could have cleared a flag.
 """
 
 from __future__ import annotations
@@ -25,32 +25,34 @@ from wayside.process.backoff import retry_async
 
 LEASE_NAME = "application-manager"
 DURATION = 12
-"""Seconds that a Lease must be observed unchanged before another manager takes it."""
+"""Seconds for which a Lease must be unchanged before another manager acquires it."""
 
 DEADLINE = 10.0
-"""Seconds after the sending of the last renewal in which its manager may act. What remains of the duration is for a
-connection to be opened, and for clocks that run at different speeds."""
+"""Seconds after the start of the last successful renewal during which this manager may act.
+
+The rest of the Lease's duration is a margin for opening a connection, and for clocks that run at different speeds.
+"""
 
 RENEW_EVERY = 2.0
 """Seconds between two renewals."""
 
 LOOK_EVERY = 1.0
-"""Seconds between two looks of a standby, or two attempts where one failed."""
+"""Seconds between two checks by a standby, or between two attempts after a failure."""
 
 RENEWAL_TIMEOUT = 3.0
-"""Seconds for one request about the Lease, so that a renewal that hangs leaves time for another."""
+"""Seconds for one request about the Lease, so that after a renewal that hangs there is time for another attempt."""
 
 log = logging.getLogger(__name__)
 
 
 def steady() -> float:
-    """Seconds of a clock that no one sets, and that runs while the machine sleeps, where there is such a clock."""
+    """Seconds of a clock that nobody can set, and that runs while the machine sleeps, if there is such a clock."""
     return time.clock_gettime(time.CLOCK_BOOTTIME) if hasattr(time, "CLOCK_BOOTTIME") else time.monotonic()
 
 
 @dataclass(frozen=True, slots=True)
 class LeaseKey:
-    """Where the Lease is that the managers of the same namespaces share."""
+    """The namespace and name of the Lease that the managers of the same namespaces share."""
 
     namespace: str
     name: str = LEASE_NAME
@@ -62,8 +64,8 @@ class LeaseKey:
 def lease_key(given: str | None, namespaces: tuple[str, ...]) -> LeaseKey:
     """The Lease of the option `--lease`, `NAME` or `NAMESPACE/NAME`.
 
-    The namespace is that of the pod, else the first that is managed, else `default`. Raises ValueError where the
-    name is that of a holder's Lease, or none.
+    The default namespace is that of the pod, else the first managed one, else `default`. Raises ValueError if the name
+    is not valid, or is reserved for holders' Leases.
     """
     namespace, _, name = (given or LEASE_NAME).rpartition("/")
     if not name or holder_of(name) is not None:
@@ -77,16 +79,16 @@ def lease_key(given: str | None, namespaces: tuple[str, ...]) -> LeaseKey:
 
 
 def own_identity() -> str:
-    """Who this manager is: its pod, so that a container that starts again need not wait for itself; else random."""
+    """The identity of this manager: its pod, so that a restarted container need not wait for itself; else random."""
     pod, uid = os.environ.get("POD_NAME"), os.environ.get("POD_UID")
     return f"{pod}_{uid}" if pod and uid else f"{socket.gethostname()}_{os.getpid()}_{secrets.token_hex(4)}"
 
 
 class Leadership:
-    """Seeks the Lease, holds it and gives it back."""
+    """Acquires the Lease, renews it and releases it."""
 
     def __init__(self, client: Client, key: LeaseKey, measures: Measures) -> None:
-        """`client`: for the Lease alone."""
+        """`client`: used for the Lease only."""
         self._client = client
         self._key = key
         self._measures = measures
@@ -96,10 +98,10 @@ class Leadership:
         self._was_active = False
         self._namespace_goes = False
         self._released = False
-        self._looking = asyncio.Lock()  # so that no renewal is under way when the Lease is released
+        self._looking = asyncio.Lock()  # so that no renewal is in progress when the Lease is released
 
     def remaining(self) -> float:
-        """For how many seconds this manager may act; none or less: it is not the active one."""
+        """The number of seconds for which this manager may act; 0 or less: it is not the active one."""
         return self._candidate.remaining(steady())
 
     @property
@@ -109,19 +111,19 @@ class Leadership:
 
     @property
     def lease(self) -> TemplateManager | None:
-        """The Lease, and when it was created, as statuses of templates have it; None while it was not seen."""
+        """The Lease and its creation time, as written into statuses of templates; None while the Lease was not read."""
         created = self._candidate.created
         return TemplateManager(lease=str(self._key), since=created) if created else None
 
     @property
     def role(self) -> str:
-        """What this manager is, in words; empty for the active one."""
+        """The role of this manager for /readyz and logs; empty for the active one."""
         if self.active:
             return ""
         return f"standby: {self._candidate.holder or 'nobody'} is active"
 
     async def look(self) -> None:
-        """Read the Lease and take or renew it if it is ours to have. Raises ApiError or Unreachable."""
+        """Read the Lease, and acquire or renew it if possible. Raises ApiError or Unreachable."""
         async with self._looking:
             if not self._released:
                 await self._look()
@@ -145,12 +147,12 @@ class Leadership:
                 return
             if error.code not in (404, 409):
                 raise
-            # Somebody else was first, or has removed it.
+            # Another manager was first, or the Lease was deleted.
             candidate.observe(await self._client.get(LEASES, self._key.namespace, self._key.name), steady())
         self._note_role()
 
     async def run(self) -> None:
-        """Look until cancelled."""
+        """Renew or check the Lease until cancelled."""
         while True:
             await retry_async(self.look, RequestError, self._failed)
             await asyncio.sleep(RENEW_EVERY if self.active else LOOK_EVERY)
@@ -162,13 +164,13 @@ class Leadership:
         return LOOK_EVERY
 
     async def wait_active(self) -> None:
-        """Wait until this manager is the active one."""
+        """Wait until this manager is active."""
         while not self.active:
             self._changed.clear()
             await self._changed.wait()
 
     async def wait_over(self) -> None:
-        """Wait until this manager is not the active one any more."""
+        """Wait until this manager is no longer active."""
         while (left := self.remaining()) > 0:
             self._changed.clear()
             try:
@@ -178,11 +180,11 @@ class Leadership:
         self._note_role()
 
     async def release(self) -> None:
-        """Give the Lease back, so that a standby takes it at once. Nothing may be written any more when this is called.
+        """Release the Lease, so that a standby acquires it immediately. Call it only after the last write.
 
-        Where that fails the standby waits until it has seen the Lease unchanged for its duration.
+        If this fails, the standby waits until the Lease was unchanged for its duration.
         """
-        self._released = True  # not to be taken again
+        self._released = True  # so that the renewal loop does not acquire it again
         try:
             async with asyncio.timeout(RENEWAL_TIMEOUT), self._looking:
                 draft = self._candidate.released(time.time()) if self.active else None
@@ -192,14 +194,14 @@ class Leadership:
                 await self._client.replace(LEASES, draft)
         except (ApiError, Unreachable, TimeoutError) as error:
             gone = isinstance(error, ApiError) and error.code in (404, 409)
-            level = logging.INFO if gone else logging.WARNING  # gone with its namespace, or taken
+            level = logging.INFO if gone else logging.WARNING  # deleted with its namespace, or acquired
             why = str(error) or "the API server does not respond"
             log.log(level, "cannot release the Lease %s; a standby takes over when it expires: %s", self._key, why)
         else:
             log.info("released the Lease %s", self._key)
 
     def _note_role(self) -> None:
-        """Log the role, once for each change."""
+        """Log the role when it changes."""
         active, was_active = self.active, self._was_active
         self._was_active = active
         self._measures.active(active)

@@ -1,8 +1,8 @@
-"""Which rights the manager's account has: each that it needs, at the start; to write in a namespace, when it is to.
+"""Checks the permissions of the manager's account: all at the start, and writing per namespace when it is needed.
 
-By its ClusterRole, the account of a manager of all namespaces may read everywhere. It writes where an administrator
-binds it to the role that allows writing (`application-manager rbac --grant`). What happens in other namespaces is seen
-and left alone: a request for each object there, refused each time, would be a load without an end.
+By its ClusterRole, the account of a manager of all namespaces may read everywhere. It may write where an administrator
+binds it to the role for writing (`application-manager rbac --grant`). The manager ignores the objects in other
+namespaces: otherwise it would send a request for each of them, over and over, and each would be refused.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from wayside.kubernetes.resources import Resource
 from wayside.kubernetes.retrying import repeatedly
 
 _REVIEWS = Resource("authorization.k8s.io/v1", "SelfSubjectAccessReview", "selfsubjectaccessreviews", namespaced=False)
-LOOK_EVERY = 5.0  # s between two questions about a namespace, while something is to be written there
-_SHOWN = 10  # of rights that lack, in one message
+LOOK_EVERY = 5.0  # s between two checks of a namespace in which something is to be written
+_SHOWN = 10  # missing permissions in one message
 
 log = logging.getLogger(__name__)
 
 Lack = tuple[PolicyRule, str, str | None]
-"""A right, the verb of it that is not allowed, and the namespace; None: all namespaces together."""
+"""A permission, the verb of it that is missing, and the namespace; None: all namespaces."""
 
 
 async def missing_rights(client: Client, needed: Iterable[PolicyRule], namespaces: Collection[str]) -> list[Lack]:
-    """What of the rights the account has not, in the namespaces; none given: in all of them together.
+    """The missing permissions in the namespaces; if none are given: cluster-wide.
 
-    Raises ApiError or Unreachable where the API server does not answer.
+    Raises ApiError or Unreachable if the API server does not respond.
     """
     verbs = [(right, verb, where) for where in namespaces or (None,) for right in needed for verb in right.verbs]
     allowed = await asyncio.gather(*(may(client, *each) for each in verbs))
@@ -38,9 +38,9 @@ async def missing_rights(client: Client, needed: Iterable[PolicyRule], namespace
 
 
 def report_missing(lacks: Collection[Lack]) -> None:
-    """Report the missing rights, each with what does not work without it and with the remedy.
+    """Report the missing permissions, each with the consequence and the remedy.
 
-    Raises ConfigurationError where nothing works without it.
+    Raises ConfigurationError if the manager cannot work without one of them.
     """
     if any(right.vital for right, _, _ in lacks):
         shown = [_text(each) for each in sorted(lacks, key=lambda each: not each[0].vital)[:_SHOWN]]
@@ -56,7 +56,7 @@ def _text(lack: Lack) -> str:
 
 
 async def may(client: Client, right: PolicyRule, verb: str, namespace: str | None) -> bool:
-    """Whether the account has this verb of the right; `namespace` None: in all namespaces together."""
+    """Whether the account has this verb of the permission; `namespace` None: in all namespaces."""
     resource, _, subresource = right.resource.partition("/")
     attributes = {
         "group": right.group,
@@ -78,10 +78,10 @@ async def may(client: Client, right: PolicyRule, verb: str, namespace: str | Non
 
 
 class NamespacePermissions:
-    """Queries the API server once for each namespace, and again while the answer is no."""
+    """Queries the API server once for each namespace, and again while the permission is missing."""
 
     def __init__(self, client: Client, changed: Callable[[], None]) -> None:
-        """`changed` is called when the account may write in a namespace in which it was not allowed to before."""
+        """`changed` is called when the account gets the permission to write in a namespace."""
         self._client = client
         self._changed = changed
         self._granted: set[str] = set()
@@ -89,7 +89,7 @@ class NamespacePermissions:
         self._querying = asyncio.Lock()
 
     async def may_write(self, namespace: str) -> bool:
-        """Whether the account may write in the namespace. Raises ApiError or Unreachable where nobody answers."""
+        """Whether the account may write in the namespace. Raises ApiError, or Unreachable if there is no response."""
         async with self._querying:
             if namespace not in self._granted | self._refused:
                 granted = await self._is_granted(namespace)
@@ -105,8 +105,8 @@ class NamespacePermissions:
         return namespace in self._granted
 
     async def run(self) -> None:
-        """Check the namespaces that are not granted again and again, until cancelled."""
-        await repeatedly(self._look, LOOK_EVERY, "")  # the look at its health reports that the API server is away
+        """Check the namespaces without permission periodically, until cancelled."""
+        await repeatedly(self._look, LOOK_EVERY, "")  # the health check reports that the API server does not respond
 
     async def _look(self) -> None:
         granted = [each for each in sorted(self._refused) if await self._is_granted(each)]

@@ -1,6 +1,6 @@
-"""Looks at objects that are not watched, where the account may list them.
+"""Lists objects that are not watched, if the account may list them.
 
-Nodes matter only while an application that is bound to some of them does not become ready, and show what the scheduler
+Nodes matter only while an application that requires certain nodes is not ready; they show a cause that the scheduler
 does not report. A cluster has many Events: those about a workload matter only while its pods cannot be created, and its
 own status does not give the reason.
 """
@@ -18,18 +18,18 @@ from wayside.kubernetes.errors import ApiError, Unreachable
 from wayside.kubernetes.resources import EVENTS, Object, Resource
 
 NODES = Resource("v1", "Node", "nodes", namespaced=False)
-FRESH = 2.0  # s for which an answer is used again
-FORBIDDEN_FOR = 60.0  # s until what may not be listed is listed again
-_NEWEST = 50  # Events of one workload that are read; their number is bounded by the API server keeping them for an hour
+FRESH = 2.0  # s for which a result is reused
+FORBIDDEN_FOR = 60.0  # s after which a list that was forbidden is tried again
+_NEWEST = 50  # Events of one workload to read; the API server keeps them for an hour, which bounds their number
 
 log = logging.getLogger(__name__)
 
 
 class _Look:
-    """Lists objects of a kind, and logs once that they cannot be listed."""
+    """Lists objects of a kind, and logs once if they cannot be listed."""
 
     def __init__(self, client: Client, resource: Resource, without: str) -> None:
-        """`without`: the log's message, with a place for the error, about what is missing without them."""
+        """`without`: the log message about the consequence, with a placeholder for the error."""
         self._client = client
         self._resource = resource
         self._without = without
@@ -37,7 +37,7 @@ class _Look:
         self._logged = False
 
     async def objects(self, namespace: str | None, fields: str = "", limit: int = 0) -> list[Object] | None:
-        """The objects; None where they may not be listed, or the API server does not answer."""
+        """The objects; None if they may not be listed, or the API server does not respond."""
         if time.monotonic() < self._forbidden_until:
             return None
         try:
@@ -65,21 +65,21 @@ class FailedPodsPoll:
         )
 
     async def events(self, namespace: str, uid: str) -> list[Object]:
-        """Those of the object with this uid; none where they may not be listed, or the API server does not answer."""
+        """The Events of the object with this uid; none if they may not be listed, or there is no response."""
         return await self._look.objects(namespace, f"regarding.uid={uid},reason={FAILED_CREATE}", _NEWEST) or []
 
 
 class NodePoll:
-    """The labels of all nodes, a few seconds old at most."""
+    """The labels of all nodes, at most a few seconds old."""
 
     def __init__(self, client: Client) -> None:
         self._look = _Look(client, NODES, "cannot list nodes (%s): only the scheduler reports why a pod fits no node")
         self._known: Nodes | None = None
-        self._until = 0.0  # monotonic time until which what is known is used
+        self._until = 0.0  # monotonic time until which the result is reused
         self._looking = asyncio.Lock()
 
     async def labels(self) -> Nodes | None:
-        """The labels of nodes by name; None where they may not be listed, or the API server does not answer."""
+        """The labels of nodes by name; None if they may not be listed, or the API server does not respond."""
         async with self._looking:
             if time.monotonic() >= self._until:
                 found = await self._look.objects(None)

@@ -25,7 +25,7 @@ _INVALID: Mapping[type[Kind], Check] = {
 
 @dataclass(slots=True)
 class Checked:
-    """What would be refused and what would be warned of, a line each, and the number of objects that were looked at."""
+    """The refusals and the warnings, one line each, and the number of checked objects."""
 
     problems: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
@@ -33,11 +33,10 @@ class Checked:
 
 
 def review_files(paths: Iterable[Path], policy: Policy, ignored: Set[str] = frozenset()) -> Checked:
-    """Look at the templates, rules and detectors in the files, each with all others of its namespace among them.
+    """Check the templates, rules and detectors in the files, each together with all others of its namespace.
 
-    Warnings whose names are in `ignored`, or in the annotation of their object, are left out.
-
-    Raises DocumentError for files that cannot be read as our kinds.
+    Warnings whose names are in `ignored`, or in the annotation of their object, are left out. Raises DocumentError for
+    files that cannot be read as our kinds.
     """
     documents = load_documents(paths)
     checked = Checked()
@@ -55,7 +54,7 @@ def review_files(paths: Iterable[Path], policy: Policy, ignored: Set[str] = froz
 
 
 def _findings(about: Kind, documents: Sequence[Document], policy: Policy) -> Findings | None:
-    """What is wrong with the object; None for a kind that is not looked at."""
+    """The findings about the object; None for a kind that is not checked."""
     match about:
         case ApplicationTemplate():
             return template_findings(about, policy)
@@ -67,7 +66,7 @@ def _findings(about: Kind, documents: Sequence[Document], policy: Policy) -> Fin
             rules = [each for each in here if isinstance(each, EventRule)]
             templates = [each for each in here if isinstance(each, ApplicationTemplate)]
             found = RuleContext(detectors, rules=rules, templates=templates).findings(about)
-            # Rules are often kept apart from all templates: without any there is nothing to check.
+            # Rules are often kept apart from templates: without any template, there is nothing to check.
             return found if templates else replace(found, remarks=())
     return None
 

@@ -70,7 +70,7 @@ def _main(debug: commandline.Debug = False) -> None:
     commandline.log_to_stderr("%(asctime)s %(levelname)-7s %(message)s", debug=debug)
     for noisy in ("asyncio", "aiohttp", "kopf"):
         logging.getLogger(noisy).setLevel(logging.WARNING)
-    if not debug:  # each watch logs each attempt to come back; we report once that the API server is away
+    if not debug:  # kopf logs each attempt of each watch to reconnect; we log once that the API server does not respond
         for handler in logging.getLogger().handlers:
             handler.addFilter(lambda record: not record.getMessage().startswith("Request attempt"))
 
@@ -328,7 +328,7 @@ def check(
 
 
 class Output(StrEnum):
-    """How an explanation is printed."""
+    """The output format of an explanation."""
 
     TEXT = "text"
     JSON = "json"

@@ -71,7 +71,7 @@ def _task(task: ExplainedTask) -> Iterator[str]:
         yield "  created by a person: it never expires"
     yield f"  {task.operation}, priority {task.priority}, created {task.created or 'just now'}"
     yield f"  {task.verdict}, {task.reason}: {task.message}"
-    shown = ("Accepted", "Finished") if task.verdict == "Finished" else ("Accepted",)  # by the line above
+    shown = ("Accepted", "Finished") if task.verdict == "Finished" else ("Accepted",)  # the line above shows it
     yield from _conditions(task.conditions, but=shown)
     if task.not_looked_at:
         yield (
@@ -100,7 +100,7 @@ def _conditions(conditions: list[dict[str, object]], but: tuple[str, ...] = ()) 
 
 def _tasks(explanation: Explanation, instance: ExplainedInstance) -> Iterator[str]:
     yield f"tasks of instance {instance.name}" + ("" if explanation.tasks else ": none")
-    # A finished task stays for an hour, and must not displace one that counts.
+    # A finished task exists for another hour, and must not displace one that counts.
     for task in sorted(explanation.tasks, key=lambda each: each.verdict == "Finished")[:_TASKS_SHOWN]:
         about = f"{task.rule} of {task.subject}" if task.rule else "by a person" if not task.holder else task.holder
         why = "" if task.verdict == "Counts" else f", {task.reason}: {task.message}"

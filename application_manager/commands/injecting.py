@@ -31,10 +31,10 @@ Manifest = dict[str, Any]
 
 
 def print_injected(files: Sequence[str], namespace: str, detector_image: str | None) -> None:
-    """Print the manifests with their detectors as YAML; exits with 1 where a pod cannot have its detector.
+    """Print the manifests with their detectors as YAML; exits with 1 if a pod cannot have its detector.
 
-    `files` of manifests and Detectors, `-` for stdin; `namespace` of manifests, and `detector_image` of Detectors, that
-    name none. Raises ConfigurationError where a file cannot be read, or a Detector not be looked up.
+    `files` contain manifests and Detectors, `-` is stdin; `namespace` is for manifests, and `detector_image` for
+    Detectors, that have none. Raises ConfigurationError if a file or a Detector cannot be read.
     """
     documents = [each for file in files for each in _read(file)]
     given = {each.name: each for each in map(_detector, documents) if each is not None}
@@ -50,7 +50,7 @@ def print_injected(files: Sequence[str], namespace: str, detector_image: str | N
 
 @dataclass(slots=True)
 class _Injector:
-    """Injects Detectors: those given by name, those of the cluster by namespace and name."""
+    """Injects Detectors: given ones by name, and those of the cluster by namespace and name."""
 
     given: dict[str, Detector]
     found: dict[tuple[str, str], Detector]
@@ -83,7 +83,7 @@ class _Injector:
 
 
 async def _looked_up(wanted: set[tuple[str, str]]) -> dict[tuple[str, str], Detector]:
-    """Look up in the cluster what the files do not have. Raises ConfigurationError."""
+    """Read the Detectors that the files do not contain from the cluster. Raises ConfigurationError."""
     listed = ", ".join(sorted(name for _, name in wanted))
     otherwise = "give its file with -f, or use the kubeconfig of a cluster that has it"
     try:
@@ -102,7 +102,7 @@ async def _looked_up(wanted: set[tuple[str, str]]) -> dict[tuple[str, str], Dete
 
 
 def _wanted(raw: Manifest, default: str) -> Iterator[tuple[str, str]]:
-    """The namespaces and names of the Detectors that the manifest requests and does not have."""
+    """The namespaces and names of the Detectors that the manifest requests and does not contain yet."""
     if raw.get("kind") == "List":
         for each in raw.get("items") or ():
             yield from _wanted(each, default)
@@ -122,7 +122,7 @@ def _is_detector(raw: Mapping[str, Any]) -> bool:
 
 
 def _detector(raw: Manifest) -> Detector | None:
-    """The Detector; None for another kind. Raises ConfigurationError where it is none that can be read."""
+    """The Detector; None for another kind. Raises ConfigurationError if it is not valid."""
     if not _is_detector(raw):
         return None
     try:

@@ -39,11 +39,10 @@ class InquiryError(InputError):
 
 
 async def inquire(subject: str, namespace: str | None) -> Explanation:
-    """The explanation of a task or an instance: of a name, or `task/<name>`, `instance/<name>` where there is one of
-    each.
+    """The explanation of a task or an instance, given its name, `task/<name>` or `instance/<name>`.
 
-    `namespace` None: the kubeconfig's, else `default`. Raises InquiryError where there is no such object, or the API
-    server refuses to return it, and ConfigurationError where there is no cluster.
+    `namespace` None: the kubeconfig's, else `default`. Raises InquiryError if there is no such object, or the API
+    server refuses to return it, and ConfigurationError if there is no cluster.
     """
     client = manager_client(await load_configuration())
     try:
@@ -99,7 +98,7 @@ async def _inquire(client: Client, subject: str, namespace: str) -> Explanation:
 
 
 async def _read(client: Client, resource: Resource, model: type[Model], namespace: str, name: str) -> Model | None:
-    """The object, or None where there is none."""
+    """The object, or None if there is none."""
     raw = await client.get(resource, namespace, name)
     if raw is None:
         return None
@@ -111,7 +110,7 @@ async def _read(client: Client, resource: Resource, model: type[Model], namespac
 
 
 async def _list(client: Client, resource: Resource, model: type[Model], namespace: str) -> Sequence[Model]:
-    """All of the namespace: places under a limit, and fallbacks, depend on the others too."""
+    """All objects of the namespace: places under a limit, and fallbacks, depend on the other objects too."""
     raws, _ = await client.list(resource, namespace)
     parsed = [_parsed(each) for each in raws]
     return [each for each in parsed if isinstance(each, model)]

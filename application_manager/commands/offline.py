@@ -1,4 +1,4 @@
-"""What would run, from files alone: the same pure functions as in the cluster."""
+"""Computes the demand from files alone, with the same pure functions as in the cluster."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from wayside.api import ApplicationTask, ApplicationTemplate, Kind
 
 @dataclass(frozen=True, slots=True)
 class OfflineResult:
-    """What would run.
+    """The result.
 
     Attributes:
         objects: the instances, each followed by its manifests.
-        refusals: what cannot be, one line each.
-        notes: what else is worth knowing: tasks that wait, sums that are held at a bound.
+        refusals: one line for each problem.
+        notes: further remarks: tasks that wait, sums that are capped.
     """
 
     objects: list[dict[str, Any]] = field(default_factory=list)
@@ -37,8 +37,9 @@ class OfflineResult:
 
 
 def charts_at_once(helm: HelmRunner, cache: Path | None, folder: Path) -> Charts:
-    """Renders charts while the caller waits. `cache` and `folder`: as the options have them; `cache` None: the default
-    one.
+    """Renders charts while the caller waits.
+
+    `cache` and `folder` are the values of the options; `cache` None: the default one.
     """
     kept = ChartCache(helm, cache or default_folder(), folder)
     return lambda request: asyncio.run(rendered_at_once(helm, kept, request))
@@ -47,9 +48,9 @@ def charts_at_once(helm: HelmRunner, cache: Path | None, folder: Path) -> Charts
 def render_objects(
     objects: Sequence[Kind], policy: Policy, now: float, limit: int | None = None, charts: Charts = no_charts
 ) -> OfflineResult:
-    """What the templates and tasks make run, namespace by namespace; objects of other kinds are passed over.
+    """The result of the templates and tasks, namespace by namespace; objects of other kinds are ignored.
 
-    `now` in seconds since 1970; `limit`: how many instances a namespace may have, None for any number.
+    `now` is in seconds since 1970; `limit`: the maximum number of instances in a namespace, None for no limit.
     """
     result = OfflineResult()
     for namespace in sorted({each.namespace for each in objects}):

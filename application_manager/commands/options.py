@@ -1,6 +1,6 @@
 """Parses and checks options; an error names its option (typer.BadParameter).
 
-What is read into is imported when it is read, as all that a command runs.
+The modules of the parsed values are imported on use, like all that a command runs.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class PullPolicy(StrEnum):
 
 @contextmanager
 def checking(option: str) -> Iterator[None]:
-    """Report a ValueError of the block as one of this option's value."""
+    """Report a ValueError of the block as an error of this option."""
     try:
         yield
     except ValueError as error:
@@ -57,7 +57,7 @@ def option_bytes(option: str, written: str) -> int:
 
 
 def policy_of(kinds: list[str] | None, accounts: list[str] | None, *, everywhere: bool = False) -> Policy:
-    """The policy; `everywhere`: of a manager of all namespaces."""
+    """The policy; `everywhere`: for a manager of all namespaces."""
     from application_manager.core.objects.policy import Policy
 
     with checking("--allowed-kinds"):
@@ -68,7 +68,7 @@ def policy_of(kinds: list[str] | None, accounts: list[str] | None, *, everywhere
 
 
 def tasks_of(most: int | None, holders: list[str] | None) -> TaskPolicy:
-    """The bounds of tasks: of `--max-tasks` and `--holder-policy`."""
+    """The limits of tasks: of `--max-tasks` and `--holder-policy`."""
     from application_manager.core.holders.policies import HolderPolicy, TaskPolicy
 
     with checking("--holder-policy"):
@@ -78,7 +78,7 @@ def tasks_of(most: int | None, holders: list[str] | None) -> TaskPolicy:
 def serving_of(
     port: int | None, certificates: Path | None, service: str | None, webhooks: str
 ) -> WebhookOptions | None:
-    """Where the webhook is served; None: nowhere."""
+    """The settings of the webhook; None: do not serve it."""
     if port is None and certificates is None and service is None:
         return None
     from application_manager.admission.webhook import FOLDER_OPTION, PORT_OPTION, WebhookOptions
@@ -109,7 +109,7 @@ def detectors_of(
     user: str | None,
     metrics_secret: str | None = None,
 ) -> PodDefaults | None:
-    """What holds for the pods of detectors; None: no detector is run."""
+    """The defaults for the pods of detectors; None: run no detectors."""
     from application_manager.core.objects.poddefaults import USER, PodDefaults, parse_environment, parse_user
 
     with checking("--detector-env"):

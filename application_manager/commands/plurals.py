@@ -1,4 +1,4 @@
-"""The plurals by which roles call kinds: those known without a cluster, else as the cluster has them."""
+"""The plurals of kinds for roles: a table for the known kinds, else from the cluster."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from wayside.kubernetes.errors import RequestError
 
 
 def plurals(policy: Policy) -> dict[KindKey, str]:
-    """What roles call the kinds of the policy. Raises ConfigurationError for one that nobody knows."""
+    """The plurals of the policy's kinds. Raises ConfigurationError for an unknown kind."""
     known = {kind: PLURALS[kind] for kind in policy.kinds if kind in PLURALS}
     others = sorted(policy.kinds - known.keys())
     return known | (asyncio.run(_looked_up(others)) if others else {})

@@ -1,6 +1,6 @@
-"""The commands that print manifests to be applied: `webhooks`, `rbac`, `detector-rbac` and `inject`.
+"""The commands that print manifests to apply: `webhooks`, `rbac`, `detector-rbac` and `inject`.
 
-Declared here; what a command runs is imported when it runs, so that `--help` need not.
+They are declared here; a command imports its implementation when it runs, so that `--help` stays fast.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def webhooks(
 
 
 def _authority(given: Path | None, folder: Path | None, hosts: Sequence[str]) -> bytes | None:
-    """The certificate of the CA, in the file or made in the folder. Raises ConfigurationError."""
+    """The certificate of the CA, from the file or created in the folder. Raises ConfigurationError."""
     if folder is not None:
         from application_manager.admission.issuer import make_certificates
 

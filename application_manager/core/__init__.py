@@ -1,1 +1,1 @@
-"""What should run, and the statuses that follow: pure functions of the live objects. No I/O, no clock."""
+"""The demand and the statuses: pure functions of the live objects. No I/O, no clock."""

@@ -1,8 +1,8 @@
 """Conditions that keep their time of transition, and the Kubernetes Events that follow from their changes. Pure.
 
-Two of them follow from the others: Ready and Stalled, by which kstatus, kubectl and GitOps tools judge. kstatus takes
-an object with Ready=True as current, with Ready=False as in progress, and with Stalled=True as failed. So Stalled is
-there only while waiting alone helps nothing.
+Two of them follow from the others: Ready and Stalled, which kstatus, kubectl and GitOps tools read. For kstatus, an
+object with Ready=True is current, with Ready=False in progress, and with Stalled=True failed. So Stalled is present
+only while waiting does not help.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ MAXIMUM_MESSAGE = 4096  # characters, as the CRDs allow
 
 @dataclass(frozen=True, slots=True)
 class ConditionState:
-    """What a condition should be now; `unknown`: whether it holds is not known yet."""
+    """The current state of a condition; `unknown`: its status is Unknown."""
 
     type: str
     holds: bool
@@ -43,7 +43,7 @@ def updated(
 ) -> list[Condition]:
     """The updated conditions; one keeps its time of transition while its status stays.
 
-    Conditions of other types are kept, but for those of the types `only_while`. `now` is in seconds since 1970.
+    Conditions of other types are kept, except for the types `only_while`. `now` is in seconds since 1970.
     """
     states = list(states)
     gone = set(only_while) - {each.type for each in states}
@@ -68,7 +68,7 @@ def find(conditions: Iterable[Condition], type_: str) -> Condition | None:
 
 
 def find_raw(status: Mapping[str, Any], type_: str) -> Mapping[str, Any]:
-    """The condition of the type in the status of an object as it was read; empty where there is none."""
+    """The condition of the type in a raw status; empty if there is none."""
     conditions = status.get("conditions") or ()
     return next((each for each in conditions if isinstance(each, Mapping) and each.get("type") == type_), {})
 
@@ -84,7 +84,7 @@ def from_first(
 ) -> Iterator[ConditionState]:
     """A condition that is absent until it is True for the first time, and False afterwards.
 
-    `now` and `otherwise`: its reason and message while it is True, None where it is not, and while it is False.
+    `now`: its reason and message while it is True, None if it is not; `otherwise`: those while it is False.
     """
     if now is not None:
         yield ConditionState(type_, True, *now)
@@ -93,13 +93,13 @@ def from_first(
 
 
 def changed(old: Iterable[Condition], new: Iterable[Condition]) -> list[Condition]:
-    """The conditions whose status or reason changed: what is worth a Kubernetes Event."""
+    """The conditions whose status or reason changed: each may need a Kubernetes Event."""
     before = {each.type: (each.status, each.reason) for each in old}
     return [each for each in new if before.get(each.type) != (each.status, each.reason)]
 
 
 def cut(message: str, longest: int = MAXIMUM_MESSAGE) -> str:
-    """The message, cut to this number of characters where it is longer."""
+    """The message, cut to this number of characters."""
     return message if len(message) <= longest else f"{message[: longest - 1]}…"
 
 
@@ -117,8 +117,8 @@ def concluded(
 ) -> list[Condition]:
     """The conditions updated with at least one state, and Ready and Stalled, which follow from them.
 
-    The object is ready if all states hold; otherwise Ready follows the first that does not.
-    `now` in seconds since 1970; `stalled`: the reasons that somebody has to correct the object for.
+    The object is ready if all states hold; otherwise Ready has the reason of the first that does not. `now` is in
+    seconds since 1970; `stalled`: the reasons that require a correction of the object.
     """
     failing = next((each for each in states if not each.holds), None)
     if failing is None:

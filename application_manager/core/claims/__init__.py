@@ -1,1 +1,1 @@
-"""What each task requests, and the merged result of the tasks of one instance."""
+"""The claims of tasks, and their merged result for one instance."""

@@ -1,6 +1,6 @@
-"""What one task requests: an instance and values for it, or the reason for its refusal.
+"""The claim of one task: an instance and values for it, or the reason for its refusal. Pure.
 
-Pure, and independent of all other tasks: it depends on the task's spec and on the template's parameters and key only.
+It does not depend on other tasks, only on the task's spec and on the template's parameters and key.
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ class Claim:
 
     Attributes:
         instance: its name, or what `all_instances` gives for the template.
-        parameters: those that the task itself gives; without the key's where it acts on what runs.
-        instead_of: the instance that is not ready, where this one is to serve the task instead.
-        fallback: then its template, which is not the task's.
+        parameters: the task's own parameters; of a Reconfigure or Suspend task without those of the key.
+        instead_of: the instance that is not ready, if this claim is for its fallback.
+        fallback: in this case, the fallback template.
     """
 
     task: ApplicationTask
@@ -75,18 +75,18 @@ class Claim:
 
 @dataclass(frozen=True, slots=True)
 class InvalidTemplate:
-    """A template that is there but cannot be used: it passed the API server, and yet does not make sense."""
+    """A template that cannot be used: the API server accepted it, but it is not valid."""
 
     name: str
     problem: str
 
 
 TemplateState = ApplicationTemplate | InvalidTemplate | None
-"""A template of a name: None where there is none."""
+"""Returns a template by name, or None."""
 
 
 def claim(template: TemplateState, task: ApplicationTask) -> Claim | Refusal:
-    """What the task requests of its template, None where there is no such template."""
+    """The claim of the task on its template; None if the template does not exist."""
     if isinstance(template, InvalidTemplate):
         message = f"spec.templateName: ApplicationTemplate {template.name} is not valid: {template.problem}"
         return Refusal(RefusalReason.TEMPLATE_INVALID, f"{message}; correct the template")
@@ -165,17 +165,17 @@ def _key_or_refusal(template: ApplicationTemplate, given: Mapping[str, Any]) -> 
 
 
 def all_instances(template: str) -> str:
-    """What means all instances of the template where an instance's name stands else; no instance has this name."""
+    """The name that stands for all instances of the template; no instance has this name."""
     return f"{template}/*"
 
 
 def template_of_all(instance: str) -> str | None:
-    """The template, where the name means all its instances; else None."""
+    """The template, if the name stands for all its instances; else None."""
     return instance.removesuffix("/*") if instance.endswith("/*") else None
 
 
 def instance_name(template: str, key: str | None) -> str:
-    """The instance's name: the template's, and with a key 10 characters that stand for it."""
+    """The instance's name: the template's name and, with a key, 10 characters that are computed from the key."""
     if key is None:
         return template
     digest = hashlib.sha256(key.encode()).digest()
@@ -185,7 +185,7 @@ def instance_name(template: str, key: str | None) -> str:
 def instance_key(template: ApplicationTemplate, complete: Mapping[str, Any]) -> str:
     """The key's value as text, from a task's parameters completed by the defaults.
 
-    Raises InterpolationError where the key does not compile, reads what is no parameter, or has no value.
+    Raises InterpolationError if the key does not compile, reads an unknown parameter, or has no value.
     """
     declared = tuple(sorted(template.spec.parameters))
     compiled = _compiled_key(template.spec.key or "", declared)
@@ -198,15 +198,15 @@ def instance_key(template: ApplicationTemplate, complete: Mapping[str, Any]) -> 
 
 
 def key_parameters(template: ApplicationTemplate) -> frozenset[str]:
-    """The parameters that the key is made from; none where there is no key.
+    """The parameters that the key reads; none if there is no key.
 
-    Raises InterpolationError where the key does not compile, or reads what is no parameter.
+    Raises InterpolationError if the key does not compile, or reads an unknown parameter.
     """
     if template.spec.key is None:
         return frozenset()
     declared = tuple(sorted(template.spec.parameters))
     paths = _compiled_key(template.spec.key, declared).paths
-    if any(len(path) == 1 for path in paths):  # it looks at the whole map
+    if any(len(path) == 1 for path in paths):  # it reads the whole map
         return frozenset(declared)
     return frozenset(str(path[1]) for path in paths)
 
@@ -218,7 +218,7 @@ def _compiled_key(source: str, declared: tuple[str, ...]) -> CompiledTemplate:
 
 
 def unknown_members(known: Mapping[str, tuple[str, ...]], each: Embedded) -> Iterator[InterpolationError]:
-    """What is wrong with a `${name.member}` that names a member that there is not; `known` has those of each name."""
+    """The problem of a `${name.member}` with an unknown member; `known` has the members of each name."""
     for path in sorted(each.expression.paths, key=str):
         members = known.get(str(path[0]))
         if members is None or len(path) < 2 or path[1] in members:

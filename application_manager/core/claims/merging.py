@@ -1,10 +1,10 @@
-"""Merges the values of several tasks, parameter by parameter, by the template's strategies.
+"""Merges the values of several tasks, parameter by parameter, by the template's strategies. Pure.
 
-Pure. The contributions come in their order of precedence, and nothing else about them matters: which of them arrived
-first, or how often, has no influence. A default counts only where nobody gives the parameter, so it is not added here.
+Only the order of precedence matters: the order of arrival, and duplicates, have no influence. A default counts only if
+no task gives the parameter, so defaults are not added here.
 
-Each task is within its own bound of size, but a Union of many is not. What is too large is not applied: the instance
-keeps the values that it has, and every other instance is served.
+The size of each task is limited, but the size of a Union of many tasks is not. A result that is too large is not
+applied: the instance keeps its values, and other instances are not affected.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Contribution:
 
 @dataclass(frozen=True, slots=True)
 class Conflict:
-    """A task that differs from an earlier one, or from the baseline, in a parameter on which all must agree."""
+    """A task that differs from an earlier one, or from the baseline, in a parameter with strategy Same."""
 
     parameter: str
     value: Any
@@ -52,7 +52,7 @@ class Conflict:
 
 @dataclass(frozen=True, slots=True)
 class Merged:
-    """One value for each parameter that somebody gives, without defaults, and what became of the tasks.
+    """One value for each parameter that a task or the baseline gives, without defaults.
 
     `conflicts`: the tasks that could not take part, by name; `capped`: a message about each sum that went beyond its
     parameter's bounds.
@@ -68,9 +68,9 @@ def merge(
     contributions: Sequence[Contribution],
     baseline: Mapping[str, Any] | None = None,
 ) -> Merged:
-    """Merge the tasks' values, which fit the template, in the order given: the first of them has precedence.
+    """Merge the tasks' values, which are valid for the template, in the given order: the first has precedence.
 
-    All must agree with the baseline where the strategy is Same; elsewhere it has the lowest priority.
+    With strategy Same, all must agree with the baseline; with others, it has the lowest priority.
     """
     agreeing, conflicts = _agreeing(declared, contributions, baseline or {})
     values_of = [each.parameters for each in agreeing] + ([baseline] if baseline is not None else [])
@@ -95,7 +95,7 @@ def merge(
 def _agreeing(
     declared: Mapping[str, Parameter], contributions: Sequence[Contribution], baseline: Mapping[str, Any]
 ) -> tuple[list[Contribution], dict[str, Conflict]]:
-    """Those that take part: greedily in their order, each that agrees with all before it where all must agree."""
+    """The tasks that take part: in their order, each that agrees with all earlier ones in the parameters with Same."""
     same = {name for name, each in declared.items() if each.merge is Merge.SAME}
     agreed: dict[str, tuple[Any, str | None]] = {name: (baseline[name], None) for name in same & baseline.keys()}
     agreeing: list[Contribution] = []
@@ -158,16 +158,16 @@ def _within(parameter: Parameter, total: Fraction) -> int | float:
 
 
 TOO_LARGE = "ParametersTooLarge"
-"""Reason of the condition Applied of an instance whose merged parameters are beyond the bounds."""
+"""Reason of the condition Applied of an instance whose merged parameters are too large."""
 
 MAXIMUM_MERGED_BYTES = 8 * freedata.MAXIMUM_BYTES
 """Bytes of all merged parameters together, as JSON: an object of the API server holds some 1.5 MB in all."""
 
-_SHOWN = 3  # tasks that are named
+_SHOWN = 3  # tasks to name
 
 
 def too_large(parameters: Mapping[str, Any], contributions: Sequence[Contribution]) -> str:
-    """Why the merged parameters are too large, naming the largest contributors; empty where they are not.
+    """Why the merged parameters are too large, with the largest contributors; empty if they are not.
 
     One parameter may take `freedata.MAXIMUM_BYTES`, all of them `MAXIMUM_MERGED_BYTES`.
     """

@@ -1,7 +1,7 @@
-"""The result of the live tasks of one instance: Deploy tasks merge, Reconfigure overrides, Suspend stops.
+"""The result of the live tasks of one instance: Deploy tasks merge, Reconfigure overrides, Suspend stops. Pure.
 
-Pure. `settle` looks at one instance; a task that means all instances of a template gets a verdict from each, and
-`gathered` makes one of them.
+`settle` decides one instance; a task for all instances of a template gets a verdict from each, and `gathered` combines
+these.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from wayside.api import ApplicationTemplate
 from wayside.api.operation import Operation
 
 ACCEPTED = "Accepted"
-"""Reason of the condition Accepted of a task that counts, without anything else to report."""
+"""Reason of the condition Accepted of a task that counts, if there is nothing else to report."""
 
 NOTHING_RUNS = "NothingRuns"
-"""Reason of the condition Accepted of a task that waits for something that it could change or stop."""
+"""Reason of the condition Accepted of a Reconfigure or Suspend task that waits for a Deploy task."""
 
 _SHOWN = 5  # names of instances in a message
 
 
 class VerdictKind(StrEnum):
-    """What a task is to the demand."""
+    """The state of a task in the demand."""
 
     COUNTS = "Counts"
     WAITING = "Waiting"
@@ -38,9 +38,10 @@ class VerdictKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What became of one task; reason and message are those of its condition Accepted, or Finished.
+    """The result for one task; reason and message are those of its condition Accepted or Finished.
 
-    `instance`: the one that serves it; `acts`: whether it acts on what runs, and does not deploy it.
+    `instance`: the one that serves it; `acts`: whether it reconfigures or suspends an instance, instead of deploying
+    it.
     """
 
     kind: VerdictKind
@@ -52,16 +53,16 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True)
 class Settled:
-    """What the tasks of one instance come to.
+    """The result of the tasks of one instance.
 
     Attributes:
         tasks: the names of those that deploy it and contribute, in their order.
-        baseline: whether the template demands it by itself.
-        parameters: the merged values with the defaults; None where nobody demands the instance.
+        baseline: whether the template itself demands it.
+        parameters: the merged values with the defaults; None if there is no demand for the instance.
         suspender: the first task that suspends it and is not outbid.
         verdicts: of all tasks, by name.
-        capped: a message about each sum that is held at a bound.
-        too_large: why the parameters are beyond their bounds; empty where they are not.
+        capped: a message about each capped sum.
+        too_large: why the parameters are too large; empty if they are not.
     """
 
     tasks: tuple[str, ...]
@@ -74,7 +75,7 @@ class Settled:
 
 
 def settle(name: str, template: ApplicationTemplate | None, claims: Sequence[Claim], exists: bool) -> Settled:
-    """What the live claims, in their order of precedence, come to; `exists`: whether there is the instance already."""
+    """The result of the live claims, in their order of precedence; `exists`: whether the instance exists already."""
     declared = template.spec.parameters if template else {}
     always = baseline(template) if template else None
     deploying, changing, stopping = (
@@ -114,12 +115,12 @@ def _contributions(claims: Sequence[Claim]) -> list[Contribution]:
 
 
 def _capped(base: Merged, layer: Merged) -> tuple[str, ...]:
-    """Of the layer all, of what is below it only what shows."""
+    """All values of the layer, and of the lower one those that it does not override."""
     return layer.capped + tuple(each for each in base.capped if each.partition(":")[0] not in layer.parameters)
 
 
 def _outbids(served: Sequence[Claim], suspend: Claim) -> Claim | None:
-    """The task that deploys the instance with a higher priority; the baseline never does."""
+    """The task that deploys the instance with a higher priority; the baseline never outbids."""
     first = served[0] if served else None
     return first if first is not None and first.task.spec.priority > suspend.task.spec.priority else None
 
@@ -161,7 +162,7 @@ def _waiting(name: str, each: Claim) -> Verdict:
 
 
 def waiting_for_any(claim: Claim) -> Verdict:
-    """The verdict of a task that means all instances of a template that has none."""
+    """The verdict of a task for all instances of a template that has none."""
     message = (
         f"no task deploys an instance of template {template_of_all(claim.instance)}: this {claim.operation} task "
         "waits until a Deploy task does"
@@ -170,11 +171,11 @@ def waiting_for_any(claim: Claim) -> Verdict:
 
 
 def gathered(claim: Claim, parts: Mapping[str, Verdict], otherwise: Verdict) -> Verdict:
-    """The one verdict of a task that means all instances of a template, of its verdicts by instance.
+    """The verdict of a task for all instances of a template, combined from its verdicts by instance.
 
-    `otherwise`: what holds where there is no instance that it could be about.
+    `otherwise`: the verdict if there is no instance for it.
     """
-    if otherwise.kind is not VerdictKind.WAITING:  # its holder is lost: that is so for all of them
+    if otherwise.kind is not VerdictKind.WAITING:  # its holder is lost, which applies to all of them
         return otherwise
     counting = sorted(name for name, each in parts.items() if each.kind is VerdictKind.COUNTS)
     others = [each for _, each in sorted(parts.items()) if each.kind not in (VerdictKind.COUNTS, VerdictKind.WAITING)]

@@ -1,8 +1,8 @@
-"""Checks the parameters of tasks against those that the template declares.
+"""Checks the parameters of tasks against those that the template declares. Pure.
 
-Pure. A task whose values do not fit is refused as a whole, and then contributes nothing to any parameter.
-Patterns are matched by CEL's regular expressions (RE2), whose time is linear in the text: Python's own would let a
-template's pattern and a task's text hold up the manager for as long as they like.
+A task with an invalid value is refused as a whole, and contributes nothing. Patterns are matched by CEL's regular
+expressions (RE2), whose time is linear in the text: with Python's own, a template's pattern and a task's text could
+block the manager.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ Parameters = Mapping[str, Any]
 
 
 def given(parameters: Parameters) -> dict[str, Any]:
-    """The parameters that are really given: null means absent."""
+    """The given parameters: null means absent."""
     return {name: values.normal(value) for name, value in parameters.items() if value is not None}
 
 
 def with_defaults(declared: Mapping[str, Parameter], parameters: Parameters) -> dict[str, Any]:
-    """The parameters, and the defaults of those that are not among them, in the order of their names."""
+    """The parameters, completed by the defaults of the absent ones, in the order of their names."""
     defaults = {name: values.normal(each.default) for name, each in declared.items() if each.default is not None}
     return dict(sorted((defaults | given(parameters)).items()))
 
 
 def size_problem(parameters: Parameters, where: str) -> str:
-    """Why the parameters of one task are too large; empty where they are not."""
+    """Why the parameters of one task are too large; empty if they are not."""
     size = freedata.size(parameters)
     if size <= freedata.MAXIMUM_BYTES:
         return ""
@@ -49,9 +49,9 @@ def size_problem(parameters: Parameters, where: str) -> str:
 def problems(
     declared: Mapping[str, Parameter], parameters: Parameters, template: str, where: str, *, whole: bool = True
 ) -> list[str]:
-    """Why the parameters do not fit the template; each text names the field under `where`, the value and the remedy.
+    """Why the parameters do not fit the template; each text has the field under `where`, the value and the remedy.
 
-    Required ones may be missing where the parameters are not meant to be the `whole`.
+    Unless the parameters are the `whole`, required ones may be missing.
     """
     too_large = size_problem(parameters, where)
     if too_large:
@@ -98,7 +98,7 @@ def _remedy(parameter: Parameter) -> str:
 
 
 def baseline(template: ApplicationTemplate) -> dict[str, Any] | None:
-    """The values of the template's baseline; None where it has none, or a wrong one, which its status reports."""
+    """The values of the template's baseline; None if there is none, or if it is invalid, which the status reports."""
     spec = template.spec
     if spec.baseline is None or _baseline_problems(template):
         return None
@@ -113,7 +113,7 @@ def _baseline_problems(template: ApplicationTemplate) -> list[str]:
 
 
 def template_problems(template: ApplicationTemplate) -> list[str]:
-    """What is wrong with the template's parameters and its baseline, beside what its model has checked."""
+    """The problems of the template's parameters and baseline that its model does not check."""
     declared, found = template.spec.parameters, _baseline_problems(template)
     for name, parameter in declared.items():
         if parameter.pattern is None:
@@ -130,7 +130,7 @@ _ENVIRONMENT = Environment({"text": CelType.STRING})
 
 
 def pattern_problem(pattern: str) -> str | None:
-    """Why the pattern is none, or None if it is."""
+    """Why the pattern is invalid; None if it is valid."""
     if (size := pattern_size(pattern)) > LARGEST_PATTERN:
         return (
             f"{values.shown(pattern)} takes {size} steps, more than {LARGEST_PATTERN}: use fewer repetitions, or "
@@ -144,14 +144,14 @@ def pattern_problem(pattern: str) -> str | None:
 
 
 def mismatch(pattern: str, value: Any) -> str | None:
-    """Why the text, or the array of texts, does not match the pattern; None if it does, or if the pattern is none."""
+    """Why the text, or the array of texts, does not match the pattern; None if it does, or the pattern is invalid."""
     if pattern_problem(pattern):
         return None  # the status of the template reports it, not that of the task
     for index, text in enumerate(value if isinstance(value, list) else [value]):
         which = f"item {index}, {values.shown(text)}," if isinstance(value, list) else values.shown(text)
         if (size := len(text.encode(errors="replace"))) > LONGEST_INPUT:
             return f"{which} has {size} bytes: a parameter with a pattern may have at most {LONGEST_INPUT}"
-        # CEL would see only what is before a NUL.
+        # CEL would read only the part before a NUL.
         if "\0" in text or not _matcher(pattern).evaluate({"text": text}):
             return f"{which} does not match the pattern {pattern}"
     return None

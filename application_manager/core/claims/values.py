@@ -28,12 +28,12 @@ def canonical(value: Any) -> str:
 
 
 def text(value: Any) -> str:
-    """The value as text, as `${…}` inside a text gives it: a text as it is, everything else as JSON."""
+    """The value as text, as `${…}` inside a text gives it: a text unchanged, any other value as JSON."""
     return value if isinstance(value, str) else canonical(value)
 
 
 def sort_key(value: Any) -> tuple[int, float, str]:
-    """An order over all JSON values: null, booleans, numbers by size, texts, then lists and maps by their JSON."""
+    """Sort key for all JSON values: null, booleans, numbers by size, texts, then lists and maps by their JSON."""
     match value:
         case None:
             return (0, 0.0, "")
@@ -47,6 +47,6 @@ def sort_key(value: Any) -> tuple[int, float, str]:
 
 
 def shown(value: Any, limit: int = 80) -> str:
-    """The value for a message, cut where it is long."""
+    """The value for a message, shortened if it is long."""
     whole = json.dumps(value, ensure_ascii=False)
     return whole if len(whole) <= limit else whole[: limit - 1] + "…"

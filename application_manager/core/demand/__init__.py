@@ -1,1 +1,1 @@
-"""Which instances should run, and which of them do if limits do not permit all."""
+"""The demanded instances, and which of them run if limits do not permit all."""

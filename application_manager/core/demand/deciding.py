@@ -1,9 +1,11 @@
-"""Decides what should become of one instance, from indexes of its namespace and the time. Pure.
+"""Decides about one instance, from indexes of its namespace and the time. Pure.
 
-`decide` is the one way to a decision: the operator calls it over the indexes of its cache, and `demand` over those of a
-snapshot. It changes nothing. Without limits, a decision follows from the tasks that claim the instance, its status and
-the Leases of their holders. Tasks of instances that are not ready claim it too, where their template falls back to its
-own. Limits are the last step: all instances of the namespace compete for places.
+`decide` is the only function that decides: the operator calls it with the indexes of its cache, and `demand` with those
+of a snapshot. It changes nothing.
+
+Without limits, a decision follows from the tasks that claim the instance, its status and the Leases of their holders.
+If the template of an instance that is not ready falls back to this template, its tasks claim this instance too. Limits
+are applied last: all instances of the namespace compete for places.
 """
 
 from __future__ import annotations
@@ -26,22 +28,22 @@ from wayside.api import ApplicationInstance, ApplicationTask, ApplicationTemplat
 
 
 class Indexes(Protocol):
-    """What decisions read of one namespace. Names are those of objects in it."""
+    """The data of one namespace for decisions. Names are those of its objects."""
 
     def template(self, name: str) -> TemplateState:
-        """The template, also where it is not valid."""
+        """The template, even if it is not valid."""
 
     def instance(self, name: str) -> ApplicationInstance | None:
         """The instance."""
 
     def claims(self, instance: str, template: str | None = None) -> list[Claim]:
-        """The claims of tasks on an instance; with its template, also those on all instances of that."""
+        """The claims of tasks on an instance; with its template, also the claims on all instances of the template."""
 
     def deadline(self, instance: ApplicationInstance) -> float | None:
-        """The release time decided before, in seconds since 1970; None where the instance was to stay."""
+        """The release time decided before, in seconds since 1970; None if the instance was to stay."""
 
     def leases(self, claims: Iterable[Claim]) -> Mapping[str, LeaseView]:
-        """The Leases of the holders of these claims, by holder; one that is missing is not lost."""
+        """The Leases of the holders of these claims, by holder; a missing one does not count as lost."""
 
     def fallback_templates(self) -> Iterable[str]:
         """The templates to which others fall back."""
@@ -50,18 +52,18 @@ class Indexes(Protocol):
         """`fallback_claims` of each instance whose template falls back to this one."""
 
     def placement(self, name: str, unlimited: Decision | None, now: float) -> Placement | None:
-        """Who has a place, given the decision about this instance without limits; None where there are no limits."""
+        """The placement, given the decision about this instance without limits; None if there are no limits."""
 
 
 @dataclass(frozen=True, slots=True)
 class Decided:
-    """What `decide` returns.
+    """The result of `decide`.
 
     Attributes:
-        decision: what should become of the instance; None: it does not exist, and nothing demands it.
-        unlimited: the same without limits.
-        placement: who has a place in the namespace now; None where there are no limits.
-        enqueue: the names of other instances to decide again, since this decision changes theirs.
+        decision: the decision; None if the instance neither exists nor is demanded.
+        unlimited: the decision without limits.
+        placement: the placement of the namespace; None if there are no limits.
+        enqueue: the names of other instances to decide again, because this decision affects theirs.
     """
 
     decision: Decision | None
@@ -71,7 +73,7 @@ class Decided:
 
 
 def decide(name: str, indexes: Indexes, now: float) -> Decided:
-    """What should become of an instance, or of tasks for all instances of a template by the name that means these.
+    """The decision about an instance or, with the name that stands for all instances of a template, about their tasks.
 
     `now` is in seconds since 1970.
     """
@@ -86,7 +88,7 @@ def decide(name: str, indexes: Indexes, now: float) -> Decided:
 
 
 def decide_without_limits(name: str, indexes: Indexes, now: float) -> Decision | None:
-    """What should become of an instance if there were no limits; None: it does not exist, and nothing demands it."""
+    """The decision without limits; None if the instance neither exists nor is demanded."""
     instance, named = indexes.instance(name), indexes.claims(name)
     template = _template_of(name, instance, named, indexes, now)
     borrowed = _borrowed(name, template, indexes, now)
@@ -94,13 +96,13 @@ def decide_without_limits(name: str, indexes: Indexes, now: float) -> Decision |
         return None
     own = indexes.claims(name, template)
     decision = _decide_one(name, template, [*own, *borrowed], indexes, now)
-    if borrowed and decision.overdue:  # what it serves for others it does not hand on
+    if borrowed and decision.overdue:  # a fallback instance has no fallback of its own for these tasks
         return replace(decision, fallback=_decide_one(name, template, own, indexes, now).fallback)
     return decision
 
 
 def request(name: str, unlimited: Decision | None, indexes: Indexes, *, being_made: bool = False) -> PlaceRequest:
-    """What an instance requests of the limits; `being_made`: the API server may have it already."""
+    """The instance's request for a place; `being_made`: it may have been created at the API server already."""
     if unlimited is None:
         return PlaceRequest(None, None)
     template = indexes.template(unlimited.template)
@@ -109,7 +111,7 @@ def request(name: str, unlimited: Decision | None, indexes: Indexes, *, being_ma
 
 
 def fallback_claims(instance: ApplicationInstance, indexes: Indexes, now: float) -> Fallback | None:
-    """What the tasks of an instance turn to while it is not ready in time; None where they do not."""
+    """The fallback of an instance's tasks while it is overdue; None if there is none."""
     of = instance.spec.template_name
     if not overdue(instance, indexes.template(of), now)[0]:
         return None
@@ -117,7 +119,7 @@ def fallback_claims(instance: ApplicationInstance, indexes: Indexes, now: float)
 
 
 def has_baseline(template: TemplateState) -> bool:
-    """Whether the template demands its instance, which has its name, by itself."""
+    """Whether the template itself demands the instance with its name."""
     return isinstance(template, ApplicationTemplate) and baseline(template) is not None
 
 
@@ -133,18 +135,18 @@ def _template_of(
 
 
 def _borrowed(name: str, template: str, indexes: Indexes, now: float) -> list[Claim]:
-    """The claims on an instance by tasks of others that are not ready."""
+    """The claims on an instance by tasks whose own instance is not ready."""
     return [each for turned in indexes.fallbacks(template, now) for each in turned.claims if each.instance == name]
 
 
 def _decide_one(name: str, template_name: str, claims: Iterable[Claim], indexes: Indexes, now: float) -> Decision:
-    """What should become of an instance, given the tasks that claim it."""
+    """The decision about an instance, given the tasks that claim it."""
     ordered = sorted(claims, key=lambda each: precedence(each.task))
     template, instance = indexes.template(template_name), indexes.instance(name)
     paused = instance is not None and is_paused(instance)
     if instance is not None and not is_managed(instance):
         return _left_alone(instance, ordered)
-    if isinstance(template, InvalidTemplate):  # its tasks are refused, and what runs stays until it is corrected
+    if isinstance(template, InvalidTemplate):  # its tasks are refused; the objects stay as they are
         key = instance.spec.key if instance else None
         return Decision(name, template_name, key, paused=paused)
     live, verdicts, changes = live_claims(ordered, template, indexes.leases(ordered), now)
@@ -155,8 +157,8 @@ def _decide_one(name: str, template_name: str, claims: Iterable[Claim], indexes:
     suspended: bool | None = settled.suspender is not None
     release_time = None
     if not wanted and instance is not None and not paused and not is_held(instance):
-        linger = linger_of(instance, template).seconds  # from when we see that no demand is left
-        deadline = indexes.deadline(instance)  # of a linger that continues; it restarts after a demand
+        linger = linger_of(instance, template).seconds  # from the time at which we see that no demand is left
+        deadline = indexes.deadline(instance)  # of the current linger; it restarts after a demand
         release_time = max(now + linger if deadline is None else deadline, protected_until(instance, template))
         changes.append(release_time)
     other = indexes.template(fallback_of(template) or "")
@@ -164,7 +166,7 @@ def _decide_one(name: str, template_name: str, claims: Iterable[Claim], indexes:
     changes += [change] if change is not None else []
     served = [each for each in live if each.task.name in settled.tasks]
     if paused or template is None or (release_time is not None and instance is not None and instance.spec.suspended):
-        suspended = None  # what lingers is not started again
+        suspended = None  # a lingering instance is not started again
     demanded = (settled.parameters, settled.suspender is not None)
     withheld = (
         paused and wanted and instance is not None and (instance.spec.parameters, instance.spec.suspended) != demanded
@@ -196,7 +198,7 @@ def _decide_one(name: str, template_name: str, claims: Iterable[Claim], indexes:
 
 
 def _was_served(task: ApplicationTask) -> bool:
-    """Whether the task's status shows that its instance ran, or gave way to another."""
+    """Whether the task's status shows that its instance ran, or was preempted."""
     conditions = task.status.conditions if task.status else ()
     accepted = find(conditions, "Accepted")
     applied = task.status is not None and task.status.applied_time is not None
@@ -204,9 +206,9 @@ def _was_served(task: ApplicationTask) -> bool:
 
 
 def _decide_for_all(name: str, indexes: Indexes, now: float) -> Decision | None:
-    """The verdicts of tasks that mean all instances of a template, as far as these do not matter (see `gathered`).
+    """The verdicts of tasks for all instances of a template, for the case that it has none (see `gathered`).
 
-    It makes nothing run; `name` is what `all_instances` gives. None where there are no such tasks.
+    It demands no instance; `name` is the result of `all_instances`. None if there are no such tasks.
     """
     template = indexes.template(template_of_all(name) or "")
     ordered = sorted(indexes.claims(name), key=lambda each: precedence(each.task))
@@ -225,7 +227,7 @@ def _generations(claims: Iterable[Claim]) -> dict[str, int]:
 
 
 def precedence(task: ApplicationTask) -> tuple[int, str, str]:
-    """The order of tasks: priority descending, then creation, then name; never times that the sender claims."""
+    """The order of tasks: priority descending, then creation time, then name; never times that the sender claims."""
     return (-task.spec.priority, task.metadata.creation_timestamp, task.name)
 
 

@@ -13,29 +13,29 @@ from wayside.api.base import MANAGED_BY, MANAGED_BY_LABEL
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """What should become of one instance.
+    """The decision about one instance.
 
     Attributes:
-        parameters: the merged values; None where they stay as they are.
+        parameters: the merged values; None if they stay unchanged.
         tasks: the tasks that contribute, in their order.
         verdicts: of all tasks that claim the instance, by task name.
-        generations: of these tasks, that the decision is about.
-        release_time: when it goes, in seconds since 1970; None: it stays.
-        next_change: when this decision changes by itself, in seconds since 1970; None: not at all.
-        paused: whether a person wants the instance and its objects left as they are.
-        withheld: whether the pause keeps merged values from the instance.
-        capped: a message about each merged sum that is held at its parameter's bound.
-        too_large: why the merged values are too large and it keeps those that it has; empty where they are not.
-        baseline: whether the template demands it by itself.
-        suspended: whether it is to be at zero; None where that stays as it is.
+        generations: the generations of these tasks that the decision is based on.
+        release_time: when it is released, in seconds since 1970; None: it stays.
+        next_change: when this decision changes by itself, in seconds since 1970; None: never.
+        paused: whether a person paused the instance and its objects.
+        withheld: whether the pause keeps new merged values from the instance.
+        capped: a message about each merged sum that is capped at its parameter's bound.
+        too_large: why the merged values are too large, so that it keeps its previous ones; empty if they are not.
+        baseline: whether the template itself demands it.
+        suspended: whether it is to be suspended; None if that stays unchanged.
         suspender: the task that suspends it.
-        rank: of the demand, which determines who has a place where there is a limit; None where nobody demands it.
+        rank: the rank of the demand, which determines who has a place under a limit; None without demand.
         ran: whether a task that demands it was served before.
-        yields: why it goes though its time has not come: another has its place.
-        overdue: the readyTimeout that it is beyond; empty where it is not.
-        fallback: what its tasks turn to meanwhile, if its template has a fallback.
+        yields: why it is released early: another instance has its place.
+        overdue: the readyTimeout that it exceeded; empty if it did not.
+        fallback: the fallback of its tasks, if it is overdue and its template has one.
         stands_in_for: the instances that are not ready, and whose tasks it serves.
-        borrowed: these tasks, of which it has not the last word.
+        borrowed: these tasks; their own instances decide about them.
     """
 
     name: str
@@ -64,10 +64,10 @@ class Decision:
 
     @property
     def wanted(self) -> bool:
-        """Whether any task demands it, or its template by itself."""
+        """Whether a task, or the template itself, demands it."""
         return bool(self.tasks) or self.baseline
 
 
 def is_managed(instance: ApplicationInstance) -> bool:
-    """Whether the manager made the instance; a person's is never changed or released."""
+    """Whether the manager created the instance; a person's instance is never changed or released."""
     return instance.metadata.labels.get(MANAGED_BY_LABEL) == MANAGED_BY

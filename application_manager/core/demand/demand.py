@@ -1,9 +1,9 @@
-"""Demand: what should run, as a pure function of what is live.
+"""The demand as a pure function of the live objects.
 
-`demand` looks at one namespace: its templates, tasks, instances with their status, the Leases of its holders and the
-time. The result does not depend on the order in which anything arrived. It falls into independent parts: each task
-claims an instance by itself (`claims`), and `decide` (`deciding`) determines what becomes of one instance. The operator
-calls `decide` for what changed, over the indexes of its cache. `demand` calls it for all, over those of a snapshot.
+`demand` computes one namespace from its templates, tasks, instances with their status, the Leases of its holders and
+the time. The result does not depend on the order of arrival. It consists of independent parts: each task claims an
+instance by itself (`claims`), and `decide` (`deciding`) decides about one instance. The operator calls `decide` for
+changed instances, with the indexes of its cache. `demand` calls it for all, with those of a snapshot.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ from wayside.api import ApplicationInstance, ApplicationTask, ApplicationTemplat
 
 @dataclass(frozen=True, slots=True)
 class NamespaceOutcome:
-    """What should become of a whole namespace, by name.
+    """The result for a whole namespace, by name.
 
-    `instances`: those that exist or should; `waiting`: those that do neither, though there are tasks for them.
+    `instances`: those that exist or are to exist; `waiting`: those that do neither, although tasks demand them.
     """
 
     instances: dict[str, Decision]
@@ -58,10 +58,10 @@ def demand(
     now: float,
     limit: int | None = None,
 ) -> NamespaceOutcome:
-    """What should run in one namespace, given all of its templates, tasks, instances and Leases (by holder).
+    """The demand of one namespace, given all of its templates, tasks, instances and Leases (by holder).
 
-    A holder without a Lease is not lost. `now` in seconds since 1970; `limit`: how many instances the namespace may
-    have, None for any number.
+    A holder without a Lease does not count as lost. `now` is in seconds since 1970; `limit`: the maximum number of
+    instances in the namespace, None for no limit.
     """
     verdicts: dict[str, Verdict] = {}
     claims: list[Claim] = []
@@ -94,7 +94,7 @@ def demand(
 
 
 class _Snapshot:
-    """The indexes of one namespace, of all its objects at one time."""
+    """The indexes of one namespace, from a snapshot of its objects."""
 
     def __init__(
         self,
@@ -161,9 +161,9 @@ class _Snapshot:
 
 @dataclass(frozen=True, slots=True)
 class TaskVerdict:
-    """The verdict of a task that claims something, and the names of the instances that serve it.
+    """The verdict of a task that has a claim, and the names of the instances that serve it.
 
-    `generation`: of the task, that the verdict is about.
+    `generation`: the generation of the task that the verdict is based on.
     """
 
     verdict: Verdict
@@ -172,10 +172,10 @@ class TaskVerdict:
 
 
 def verdict_of(claimed: Claim, decided: Mapping[str, Decision], meant: Iterable[str]) -> TaskVerdict | None:
-    """What became of the task of a claim; None where its instance was not decided yet.
+    """The result for the task of a claim; None if its instance was not decided yet.
 
-    `decided`: by instance, and by the names that mean all instances of a template; `meant`: the instances of the
-    template, where the task means them all.
+    `decided`: decisions by instance, and by the names that stand for all instances of a template; `meant`: the
+    instances of the template, if the task is for all of them.
     """
     task, own = claimed.task.name, decided.get(claimed.instance)
     if own is None or task not in own.verdicts:
@@ -195,7 +195,7 @@ def verdict_of(claimed: Claim, decided: Mapping[str, Decision], meant: Iterable[
 
 
 def claim_or_verdict(template: TemplateState, task: ApplicationTask) -> Claim | Verdict:
-    """What the task claims, or its verdict where it claims nothing, because it has ended or is refused."""
+    """The claim of the task, or its verdict if it has ended or is refused."""
     over = finished(task)
     if over is not None:
         return over
@@ -204,7 +204,7 @@ def claim_or_verdict(template: TemplateState, task: ApplicationTask) -> Claim | 
 
 
 def finished(task: ApplicationTask) -> Verdict | None:
-    """The verdict of a task that has ended; None where it has not."""
+    """The verdict of a task that has ended; None if it has not."""
     if task.spec.end_time is not None:
         return Verdict(VerdictKind.FINISHED, "Ended", f"the demand ended at {task.spec.end_time}")
     if task.metadata.deletion_timestamp is not None:
@@ -213,5 +213,5 @@ def finished(task: ApplicationTask) -> Verdict | None:
 
 
 def refused(refusal: Refusal) -> Verdict:
-    """The verdict of a task that is refused."""
+    """The verdict of a refused task."""
     return Verdict(VerdictKind.REFUSED, refusal.reason, refusal.message)

@@ -16,7 +16,7 @@ from wayside.api.base import MANAGED_BY, MANAGED_BY_LABEL, Metadata
 
 
 def draft(name: Name, decision: Decision, existing: ApplicationInstance | None) -> ApplicationInstance:
-    """The instance as it should be; without a uid where it does not exist yet."""
+    """The instance as it should be; without a uid if it does not exist yet."""
     suspended = bool(existing and existing.spec.suspended) if decision.suspended is None else decision.suspended
     if existing is not None and decision.parameters is None:
         if suspended == existing.spec.suspended:
@@ -37,7 +37,7 @@ def draft(name: Name, decision: Decision, existing: ApplicationInstance | None) 
 def manifest(
     wanted: ApplicationInstance, existing: ApplicationInstance | None, template: TemplateState
 ) -> dict[str, Any] | None:
-    """What to apply so that the instance becomes as wanted; None if it is so already, or is a person's."""
+    """The manifest to apply so that the instance becomes as wanted; None if it is already, or is a person's."""
     usable = template if isinstance(template, ApplicationTemplate) else None
     if existing is None:
         return created(wanted, usable)
@@ -50,7 +50,7 @@ def manifest(
 
 
 def created(wanted: ApplicationInstance, template: ApplicationTemplate | None) -> dict[str, Any]:
-    """The manifest by which the instance comes to be."""
+    """The manifest to create the instance with."""
     return {
         "apiVersion": API_VERSION,
         "kind": wanted.kind,
@@ -69,11 +69,11 @@ CHART_PENDING = "ChartPending"
 
 
 EXPRESSION_LIMIT = "ExpressionLimit"
-"""The reason of the condition Applied where the expressions of the template take more than they may."""
+"""The reason of the condition Applied if the expressions of the template exceed their limits."""
 
 
 def without_template(wanted: ApplicationInstance, template: TemplateState) -> ConditionState | None:
-    """Why the instance has no objects, where that is for want of a template, as the condition Applied has it."""
+    """The condition Applied of an instance without objects, if its template is missing or invalid."""
     of = wanted.spec.template_name
     if template is None:
         message = (
@@ -87,10 +87,10 @@ def without_template(wanted: ApplicationInstance, template: TemplateState) -> Co
 
 
 def problem(template: ApplicationTemplate, reason: str, message: str) -> ConditionState:
-    """Why the instance cannot be rendered, as the condition Applied gives it."""
+    """The condition Applied of an instance that cannot be rendered."""
     return ConditionState("Applied", False, reason, f"ApplicationTemplate {template.name}: {message}")
 
 
 def chart_pending(template: ApplicationTemplate, request: ChartRequest) -> ConditionState:
-    """That the instance's chart is being rendered, as the condition Applied gives it."""
+    """The condition Applied while the instance's chart is being rendered."""
     return problem(template, CHART_PENDING, f"chart {request.source} is being rendered")

@@ -1,10 +1,11 @@
 """Fallbacks of instances that do not become ready: `lifecycle.readyTimeout` and `fallback`. Pure.
 
-An instance is overdue once it has not been ready for `readyTimeout` in one go, and no longer so once it has been ready
-for as long in one go: both are shown by conditions of its status with their times of transition, so a restart of the
-manager changes nothing, and what is ready for a moment now and then does not flap. While it is overdue, its tasks also
-claim an instance of the fallback template, with those of their parameters that it knows; the overdue one stays, and
-tries on. A fallback has no fallback of its own for what it took over.
+An instance is overdue once it has not been ready for `readyTimeout` without interruption, and until it has been ready
+for as long without interruption. Conditions of its status show both with their times of transition, so a restart of the
+manager changes nothing, and an instance that is ready only now and then does not flap.
+
+While it is overdue, its tasks also claim an instance of the fallback template, with those of their parameters that it
+declares. The overdue instance stays, and retries. A fallback instance has no further fallback for these tasks.
 """
 
 from __future__ import annotations
@@ -21,24 +22,23 @@ from wayside.api.operation import Operation
 from wayside.times import parse_seconds
 
 TIMED_OUT = "TimedOut"
-"""The condition of an instance that is overdue."""
+"""The condition of an overdue instance."""
 
 READY_TIMEOUT = "ReadyTimeout"
-"""Reason of the conditions Ready and TimedOut of such an instance."""
+"""Reason of the conditions Ready and TimedOut of an overdue instance."""
 
 FALLEN_BACK = "FallenBack"
 """Reason of the condition Accepted of a task that the fallback serves."""
 
 FALLBACK_FAILED = "FallbackFailed"
-"""The same where the fallback cannot, for the reason in the message."""
+"""Reason of the condition Accepted of a task that the fallback cannot serve; the message has the cause."""
 
 
 @dataclass(frozen=True, slots=True)
 class Fallback:
-    """What the tasks of an overdue instance claim besides: one claim for each task that the fallback template can take
-    over.
+    """The additional claims of an overdue instance's tasks: one for each task that the fallback template can serve.
 
-    `refused`: by task, why it cannot.
+    `refused`: by task, why the template cannot serve it.
     """
 
     template: str
@@ -46,24 +46,24 @@ class Fallback:
     refused: Mapping[str, str] = field(default_factory=dict)
 
     def instance_of(self, task: str) -> str | None:
-        """The instance that is to serve the task instead; None where none can."""
+        """The fallback instance for the task; None if there is none."""
         return next((each.instance for each in self.claims if each.task.name == task), None)
 
     @property
     def instances(self) -> set[str]:
-        """The instances that are to serve instead."""
+        """The fallback instances."""
         return {each.instance for each in self.claims}
 
 
 def fallback_of(template: TemplateState) -> str | None:
-    """The template that this one falls back to, if it does."""
+    """The fallback of this template, if it has one."""
     if not isinstance(template, ApplicationTemplate) or template.spec.lifecycle.fallback is None:
         return None
     return template.spec.lifecycle.fallback.template_name
 
 
 def overdue(instance: ApplicationInstance, template: TemplateState, now: float) -> tuple[str, float | None]:
-    """The readyTimeout that the instance is beyond, empty where it is not; and when that changes by itself."""
+    """The readyTimeout that the instance exceeded, empty if it did not; and when that changes by itself."""
     if not isinstance(template, ApplicationTemplate) or template.spec.lifecycle.ready_timeout is None:
         return "", None
     timeout = template.spec.lifecycle.ready_timeout
@@ -72,7 +72,7 @@ def overdue(instance: ApplicationInstance, template: TemplateState, now: float) 
     is_ready = ready is not None and ready.status == "True"
     since = ready.last_transition_time if ready is not None else instance.metadata.creation_timestamp
     applied = find(conditions, "Applied")
-    # What was applied in full before an update was refused is left as it is: it may well be ready.
+    # The objects of the last successful apply stay when an update is refused: they may well be ready.
     refused = applied is not None and applied.status == "False" and bool(instance.status and instance.status.spec_hash)
     if instance.spec.suspended or is_ready != was or not since or refused:
         return str(timeout) if was else "", None
@@ -86,9 +86,10 @@ def overdue(instance: ApplicationInstance, template: TemplateState, now: float) 
 
 
 def fallback(instance: str, template: TemplateState, other: TemplateState, claims: Iterable[Claim]) -> Fallback | None:
-    """What the claims on an overdue instance become; None where its template has no fallback.
+    """The fallback claims of an overdue instance; None if its template has no fallback.
 
-    `other`: the fallback template, None where there is none of that name; `claims`: those that deploy it and count.
+    `other`: the fallback template, None if there is none of that name; `claims`: those that deploy the instance and
+    count.
     """
     name = fallback_of(template)
     if name is None:
@@ -118,9 +119,9 @@ def _claim(other: ApplicationTemplate | InvalidTemplate, each: Claim) -> Claim |
 
 
 def turned(verdict: Verdict, task: str, to: Fallback | None, others: Mapping[str, Verdict]) -> Verdict:
-    """The task's verdict, with what became of it at the fallback.
+    """The task's verdict, with the result at the fallback.
 
-    `verdict`: that of its own instance; `others`: the verdicts of the fallback's, empty where that was not looked at
+    `verdict`: that of its own instance; `others`: the verdicts of the fallback instance, empty if it was not decided
     yet.
     """
     if to is None or verdict.kind is not VerdictKind.COUNTS or verdict.acts:
@@ -143,10 +144,10 @@ def turned(verdict: Verdict, task: str, to: Fallback | None, others: Mapping[str
 def fallback_conditions(
     known: Iterable[Condition], late: str, turns: Fallback | None, stands_in_for: Iterable[str]
 ) -> Iterator[ConditionState]:
-    """The conditions TimedOut and StandsIn of an instance, each from when it was True for the first time.
+    """The conditions TimedOut and StandsIn of an instance; each is absent until it is True for the first time.
 
-    `late`: the readyTimeout that it is beyond, empty where it is not; `turns`: what its tasks turn to meanwhile;
-    `stands_in_for`: the instances whose tasks it serves.
+    `late`: the readyTimeout that it exceeded, empty if it did not; `turns`: the fallback of its tasks; `stands_in_for`:
+    the instances whose tasks it serves.
     """
     conditions, others, timed_out = list(known), ", ".join(stands_in_for), None
     if late:

@@ -1,7 +1,8 @@
-"""How long an instance stays: its linger, once nobody demands it, its minimumUptime, and what people want. Pure.
+"""How long an instance exists: its linger, its minimumUptime, and the annotations of people. Pure.
 
-An annotation of a person counts by being there, whatever its value, which may name who wants it and why; only `false`
-is as if it were absent. Both are conditions of the instance's status while they hold, and are False once it is gone.
+An annotation counts if it is present, whatever its value, which may name its author and the reason; only the value
+`false` counts as absent. Both annotations have a condition in the instance's status, which is False after the
+annotation was removed.
 """
 
 from __future__ import annotations
@@ -16,14 +17,14 @@ from wayside.api.base import Duration
 from wayside.times import parse_seconds
 
 LINGER_ANNOTATION = "wayside.dev/linger"
-"""On an instance: its template's linger, for when the template is gone."""
+"""On an instance: its template's linger, for the case that the template is deleted."""
 
 
 PAUSE_ANNOTATION = "wayside.dev/pause"
-"""On an instance: neither it nor its objects are changed, pruned or released."""
+"""On an instance: the manager does not change, prune or release it or its objects."""
 
 HOLD_ANNOTATION = "wayside.dev/hold"
-"""On an instance: it is not released though nobody demands it. Demands that come are served as ever."""
+"""On an instance: it is not released without demand. Demands are still served."""
 
 _CONDITIONS = (
     ("Paused", PAUSE_ANNOTATION, "the instance and its objects are not changed"),
@@ -33,24 +34,24 @@ _BARE = frozenset({"", "true"})  # values without a reason
 
 
 def written_deadline(instance: ApplicationInstance) -> float | None:
-    """The release time that the status holds, in seconds since 1970: what survives our own restart."""
+    """The release time in the status, in seconds since 1970: it survives our own restart."""
     written = instance.status.release_time if instance.status else None
     return None if written is None else parse_seconds(written)
 
 
 def linger_of(instance: ApplicationInstance, template: ApplicationTemplate | None) -> Duration:
-    """How long the instance lingers: by its template, or by what that had while there was one."""
+    """How long the instance lingers: by its template or, if that is deleted, by the annotation."""
     if template is not None:
         return template.spec.lifecycle.linger
     noted = instance.metadata.annotations.get(LINGER_ANNOTATION)
     try:
         return Duration.parse(noted) if noted else Lifecycle().linger
     except ValueError:
-        return Lifecycle().linger  # somebody wrote something else into the annotation
+        return Lifecycle().linger  # a person wrote another value into the annotation
 
 
 def protected_until(instance: ApplicationInstance, template: TemplateState) -> float:
-    """When the instance has been there for its template's minimumUptime, in seconds since 1970; 0 where it has none."""
+    """The end of the instance's minimumUptime, in seconds since 1970; 0 if its template has none."""
     if not isinstance(template, ApplicationTemplate) or not instance.metadata.creation_timestamp:
         return 0.0
     uptime = template.spec.lifecycle.minimum_uptime.seconds
@@ -58,17 +59,17 @@ def protected_until(instance: ApplicationInstance, template: TemplateState) -> f
 
 
 def is_paused(instance: ApplicationInstance) -> bool:
-    """Whether the instance is to be left as it is."""
+    """Whether a person paused the instance."""
     return _reason(instance, PAUSE_ANNOTATION) is not None
 
 
 def is_held(instance: ApplicationInstance) -> bool:
-    """Whether the instance is to be kept though nobody demands it."""
+    """Whether a person holds the instance."""
     return _reason(instance, HOLD_ANNOTATION) is not None
 
 
 def manual_conditions(instance: ApplicationInstance) -> Iterator[ConditionState]:
-    """The conditions Paused and Held: True while the annotation is there, False once it is gone, absent before."""
+    """The conditions Paused and Held: True with the annotation, False after it was removed, absent before."""
     known = instance.status.conditions if instance.status else ()
     for type_, annotation, meaning in _CONDITIONS:
         reason = _reason(instance, annotation)

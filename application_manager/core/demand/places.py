@@ -1,11 +1,13 @@
-"""Which instances run within a limit, of all that are demanded or exist. Pure.
+"""Decides which of the demanded or existing instances run within limits. Pure.
 
-Two limits may hold at once: a template's `maxInstances`, and one for the namespace. The order is: what may not be
-stopped (held or paused by a person, or younger than its `minimumUptime`); then what is demanded, by the priority of its
-first task, of equal priority what runs already, then the older demand; last what lingers, the latest deadline first. So
-a higher priority preempts, an equal one never does, and what lingers yields first.
+Two limits may apply at once: a template's `maxInstances`, and the namespace's limit. The order is: first, instances
+that may not be stopped (held or paused by a person, or younger than their `minimumUptime`); then the demanded ones, by
+the priority of their first task, with equal priority those that run already, then the older demand; last, the lingering
+ones, the latest deadline first. So a higher priority preempts, an equal one never does, and lingering instances yield
+first.
 
-An instance is counted until it is gone. So what gets the place of another waits for that, and no limit is exceeded.
+An instance counts until it is deleted. So an instance that gets the place of another waits for the deletion, and no
+limit is exceeded.
 """
 
 from __future__ import annotations
@@ -16,20 +18,20 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 Rank = tuple[int, str, str]
-"""Of a demand's first task: its priority negated, its creation, its name."""
+"""The priority (negated), creation time and name of a demand's first task."""
 
 BASELINE_RANK: Rank = (1_000_001, "", "")
-"""A template's own demand, below all tasks."""
+"""The rank of a template's own demand, below all tasks."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlaceCandidate:
-    """An instance that is demanded, or there.
+    """An instance that is demanded, or exists.
 
     Attributes:
-        rank: of its demand; None where nobody demands it.
-        exists: whether it is there, or being made.
-        leaving: whether it is being deleted: it is there, and is no reason to keep it.
+        rank: of its demand; None without demand.
+        exists: whether it exists, or is being created.
+        leaving: whether it is being deleted: it still counts, but not as running already.
         kept: whether it stays whatever the limit: a person holds or pauses it, or it waits for its template.
         protected_until: the end of its minimumUptime, in seconds since 1970.
         deadline: the end of its linger, in seconds since 1970.
@@ -48,7 +50,7 @@ class PlaceCandidate:
 
     @property
     def priority(self) -> int:
-        """That of its first task; where nobody demands it, below all others."""
+        """The priority of its first task; without demand, below all others."""
         return -(self.rank or BASELINE_RANK)[0]
 
     @property
@@ -60,7 +62,7 @@ class PlaceCandidate:
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """How many instances there may be: of each template with a limit, and in the namespace."""
+    """The maximum number of instances: of each template with a limit, and of the namespace."""
 
     templates: Mapping[str, int] = field(default_factory=dict)
     namespace: int | None = None
@@ -71,15 +73,15 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class GrantedPlace:
-    """What an instance gets.
+    """The result for an instance.
 
     Attributes:
-        given: whether it runs, or stays; otherwise it does not start, and goes if it is there.
-        preempts: the one whose place it has, in words; empty where there is none.
-        awaits: of one that is to run: the instances that must be gone first, in words; empty where it may start.
-        limit: of one that is not to run: the limit that it is beyond, in words.
-        yields_to: of one that is not to run and did before: who has its place, in words.
-        outbid_from: of one that is not to run: the priority that would have a place; None where none would.
+        given: whether it has a place; otherwise it does not start, and is released if it exists.
+        preempts: the instance whose place it has, as text; empty if there is none.
+        awaits: the instances that must be deleted before it may start, as text; empty if it may start.
+        limit: without a place: the limit, as text.
+        yields_to: without a place, if it ran before: the instance that has its place, as text.
+        outbid_from: without a place: the priority that would get one; None if there is none.
         next_change: when this changes by itself, in seconds since 1970.
     """
 
@@ -99,9 +101,9 @@ class GrantedPlace:
 
 @dataclass(frozen=True, slots=True)
 class PlaceRequest:
-    """What an instance requests of the limits; `candidate` None where it takes no place.
+    """The request of an instance for a place; `candidate` None if it needs no place.
 
-    `next_change`: when that changes by itself, in seconds since 1970; None: not at all.
+    `next_change`: when that changes by itself, in seconds since 1970; None: never.
     """
 
     candidate: PlaceCandidate | None
@@ -113,9 +115,9 @@ _NOTHING = PlaceRequest(None, None)
 
 @dataclass(frozen=True, slots=True)
 class Placement:
-    """Who has a place in one namespace, and the requests that this follows from, by name of the instance.
+    """The places of one namespace, and the requests on which they are based, by name of the instance.
 
-    `until`: when places change by themselves, in seconds since 1970.
+    `until`: when the places change by themselves, in seconds since 1970.
     """
 
     limits: Limits
@@ -124,12 +126,12 @@ class Placement:
     until: float = -math.inf
 
     def due(self, now: float) -> set[str]:
-        """The instances whose request has changed by itself; `now` in seconds since 1970."""
+        """The instances whose requests have changed by themselves; `now` is in seconds since 1970."""
         times = ((name, each.next_change) for name, each in self.requests.items())
         return {name for name, when in times if when is not None and when <= now}
 
     def updated(self, requests: Mapping[str, PlaceRequest], limits: Limits, now: float) -> Placement:
-        """The placement with these requests in place of the instances' former ones."""
+        """The placement after these requests replace the previous ones of their instances."""
         changed = {name: each for name, each in requests.items() if self.requests.get(name, _NOTHING) != each}
         stale = now >= self.until or limits != self.limits
         if not changed and not stale:
@@ -144,7 +146,7 @@ class Placement:
         return Placement(limits, merged, places(candidates, limits, now), min(ends, default=math.inf))
 
     def moved(self, before: Placement | None) -> set[str]:
-        """The instances whose place is another than before."""
+        """The instances whose result differs from the previous placement."""
         then: Mapping[str, GrantedPlace] = before.given if before is not None else {}
         if then is self.given:
             return set()
@@ -152,7 +154,7 @@ class Placement:
 
 
 def places(candidates: Iterable[PlaceCandidate], limits: Limits, now: float) -> dict[str, GrantedPlace]:
-    """What each candidate of one namespace gets, by name; `now` in seconds since 1970."""
+    """The result for each candidate of one namespace, by name; `now` is in seconds since 1970."""
     everybody = sorted(candidates, key=lambda each: each.name)
     fixed = [each for each in everybody if _is_fixed(each, now)]
     free = sorted((each for each in everybody if not _is_fixed(each, now)), key=_order)
@@ -196,7 +198,7 @@ def _order(each: PlaceCandidate) -> tuple[object, ...]:
 
 
 class _Room:
-    """How much of the limits is taken."""
+    """The number of places taken, by limit."""
 
     def __init__(self, limits: Limits) -> None:
         self._limits = limits
@@ -208,7 +210,7 @@ class _Room:
         self._total += 1
 
     def lacks(self, each: PlaceCandidate) -> str:
-        """The limit that leaves no room for it, in words; empty where there is room."""
+        """The limit that leaves no place for it, as text; empty if there is a place."""
         own, all_ = self._limits.templates.get(each.template), self._limits.namespace
         if own is not None and self._taken[each.template] >= own:
             return f"template {each.template} is at its limit of {_instances(own)} (spec.maxInstances)"
@@ -222,7 +224,7 @@ def _instances(count: int) -> str:
 
 
 def _rivals(each: PlaceCandidate, others: Iterable[PlaceCandidate], limits: Limits) -> Iterator[PlaceCandidate]:
-    """Those that take places from the same limit."""
+    """The candidates that compete for the same limit."""
     for other in others:
         if other.name != each.name and (limits.namespace is not None or other.template == each.template):
             yield other
@@ -231,9 +233,9 @@ def _rivals(each: PlaceCandidate, others: Iterable[PlaceCandidate], limits: Limi
 def _preemptions(
     chosen: list[PlaceCandidate], losers: list[PlaceCandidate], limits: Limits
 ) -> dict[str, tuple[PlaceCandidate, PlaceCandidate]]:
-    """By the name of each that ran and has no place any more, itself and who has its place.
+    """The preemptions: by the name of each instance that lost its place, itself and the one that has its place.
 
-    The last in order gives way to the first of those that came after it with a higher priority.
+    The last in order is preempted by the first of those behind it with a higher priority.
     """
     found: dict[str, tuple[PlaceCandidate, PlaceCandidate]] = {}
     left = sorted((each for each in chosen if each.rank is not None), key=_order)
@@ -249,9 +251,9 @@ def _preemptions(
 
 
 def _bars(chosen: Iterable[PlaceCandidate], limits: Limits, now: float) -> dict[str, GrantedPlace]:
-    """What it takes to get a place among those that have one, and when the first of them may be stopped.
+    """The priority that would get a place, and when the first of the placed instances may be stopped.
 
-    By template; by an empty name that of all together, where the namespace has a limit.
+    By template; by an empty name that of all instances, if the namespace has a limit.
     """
     groups: dict[str, list[PlaceCandidate]] = {}
     for each in chosen:
@@ -269,7 +271,7 @@ def _bars(chosen: Iterable[PlaceCandidate], limits: Limits, now: float) -> dict[
 def _waiting(
     everybody: list[PlaceCandidate], chosen: list[PlaceCandidate], so_far: Mapping[str, GrantedPlace], limits: Limits
 ) -> dict[str, GrantedPlace]:
-    """The places of those that are to run, and wait until others are gone."""
+    """The results of the instances that have a place, and wait until others are deleted."""
     room = _Room(limits)
     for each in everybody:
         if each.exists:

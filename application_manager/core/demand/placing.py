@@ -1,4 +1,4 @@
-"""Applies limits: what a decision requests, and its result once places are assigned. Pure."""
+"""Applies limits: the request of a decision, and its result once places are assigned. Pure."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ LIMIT_REACHED = "LimitReached"
 """Reason of the condition Accepted of a task whose instance waits for a place."""
 
 PREEMPTED = "Preempted"
-"""The same, where the instance ran and one of higher priority has its place."""
+"""Reason of the condition Accepted of a task whose instance ran, until one of higher priority got its place."""
 
 
 def limits(templates: Iterable[ApplicationTemplate | InvalidTemplate], namespace: int | None) -> Limits:
-    """The limits of one namespace; `namespace` is that of all its instances."""
+    """The limits of one namespace; `namespace` is the limit of all its instances."""
     own = {
         each.name: each.spec.max_instances
         for each in templates
@@ -37,7 +37,7 @@ def candidate(
     *,
     being_made: bool = False,
 ) -> PlaceCandidate | None:
-    """What the decision requests; None where that is nothing, or the instance is a person's, beyond all limits."""
+    """The candidate of the decision; None if it needs no place, or the instance is a person's."""
     if instance is not None and not is_managed(instance):
         return None
     if instance is None and decision.rank is None:
@@ -59,7 +59,7 @@ def candidate(
 
 
 def placed(decision: Decision, place: GrantedPlace | None, *, exists: bool, now: float) -> Decision:
-    """What becomes of the decision with the place that its instance got; None: no limit concerns it."""
+    """The decision, given the place of its instance; None: no limit applies."""
     if place is None:
         return decision
     if place.starts:

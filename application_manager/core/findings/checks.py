@@ -37,4 +37,4 @@ CHECKS = (
     FAILING_EXAMPLE,
     BROKEN_RULE,
 )
-"""All of them."""
+"""All findings."""

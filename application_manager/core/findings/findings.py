@@ -18,11 +18,11 @@ class Findings:
     """Findings whose texts each name the field, the value and the remedy.
 
     Attributes:
-        problems: what is wrong with the object itself, given what is there.
-        doubts: why it cannot be used as it is, though another object may put it right: no Detector selects the rule
-            yet, or a rule that a signal names is still to come.
-        remarks: what may go wrong with an object that is in order: with certain values of tasks, or since a template
-            that a rule names is not there.
+        problems: errors of the object itself.
+        doubts: why it cannot be used now, although another object may correct that: no Detector selects the rule yet,
+            or a rule that a signal names does not exist yet.
+        remarks: what may fail although the object is valid: with certain values of tasks, or because a template that a
+            rule names does not exist.
     """
 
     problems: tuple[str, ...] = ()
@@ -31,17 +31,17 @@ class Findings:
 
     @property
     def faults(self) -> tuple[str, ...]:
-        """All that keeps the object from being used, each once."""
+        """All findings that prevent the use of the object, each once."""
         return _texts(*self.problems, *self.doubts)
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """All that is no reason to refuse it, each once."""
+        """All findings that are no reason to refuse the object, each once."""
         return _texts(*self.doubts, *self.remarks)
 
     @property
     def all(self) -> tuple[str, ...]:
-        """Everything, each once."""
+        """All findings, each once."""
         return _texts(*self.problems, *self.doubts, *self.remarks)
 
 
@@ -50,6 +50,6 @@ def _texts(*findings: str | Finding) -> tuple[str, ...]:
 
 
 def field_of(finding: str) -> str:
-    """The field that a finding names first, e.g. spec.when; empty where it names none."""
+    """The field that a finding names first, e.g. spec.when; empty if it names none."""
     found = _FIELD.match(finding)
     return found[1] if found else ""

@@ -1,7 +1,7 @@
 """Decides whether a pod gets the detector that its label names, and builds the AdmissionReview. Pure.
 
-A pod is never refused. Where it cannot have its detector it is made without, a warning gives the reason to who made it,
-and later an Event of the pod gives it to everybody.
+A pod is never refused. If it cannot have its detector, it is created without it; a warning gives the reason to its
+creator, and later an Event of the pod gives it to everybody.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _NO_IMAGE = (
 
 @dataclass(frozen=True, slots=True)
 class PodRequest:
-    """A question about a pod that is to be made; `pod` is empty where nothing is to be done."""
+    """A review of a pod that is to be created; `pod` is empty if there is nothing to do."""
 
     uid: str
     namespace: str
@@ -37,9 +37,9 @@ class PodRequest:
 
 @dataclass(frozen=True, slots=True)
 class Injection:
-    """What becomes of a pod: what it gets, or why it gets nothing.
+    """The result for a pod: the addition, or the reason why there is none.
 
-    Both are None where it has its detector already, or requests none.
+    Both are None if it has its detector already, or requests none.
     """
 
     addition: Addition | None = None
@@ -47,7 +47,7 @@ class Injection:
 
 
 def detector_of(metadata: Mapping[str, Any] | None) -> str | None:
-    """The Detector that a pod, or the template of pods, with this metadata requests; None: none."""
+    """The Detector that a pod, or a pod template, with this metadata requests; None: none."""
     name = ((metadata or {}).get("labels") or {}).get(SIDECAR_LABEL)
     return None if name is None else str(name)
 
@@ -59,10 +59,10 @@ def injection(
     detector: Detector | None,
     defaults: PodDefaults | None,
 ) -> Injection:
-    """What becomes of a pod with this metadata and spec, which may be those of a template of pods.
+    """The result for a pod, or a pod template, with this metadata and spec.
 
-    `detector`: the one of the namespace that it requests, None where there is none that can be read; `defaults`: None
-    where the manager runs no detectors.
+    `detector`: the requested one of the namespace, None if there is no valid one; `defaults`: None if the manager runs
+    no detectors.
     """
     name = detector_of(metadata)
     if name is None:
@@ -98,7 +98,7 @@ def _why_not(name: str, metadata: Mapping[str, Any], spec: Mapping[str, Any], de
 
 
 def read_pod(review: Any) -> PodRequest:
-    """The question in an AdmissionReview about a pod. Raises ReviewError."""
+    """The review request about a pod. Raises ReviewError."""
     raw = request_in(review)
     pod, kind = raw.get("object"), raw.get("kind")
     made = raw.get("operation") == "CREATE" and not raw.get("subResource")
@@ -109,7 +109,7 @@ def read_pod(review: Any) -> PodRequest:
 
 
 def answer_pod(request: PodRequest, found: Injection) -> Json:
-    """The AdmissionReview that goes back: always allowed."""
+    """The response: always allowed."""
     response: Json = {"uid": request.uid, "allowed": True}
     if found.addition is not None:
         operations = json.dumps(patch(request.pod["spec"], found.addition)).encode()

@@ -1,7 +1,8 @@
 """AdmissionReviews: the requests of the API server before it stores an object, and the responses. Pure.
 
-Only a new spec can be refused. Whatever leaves the spec as it is passes, also of an object that was wrong all along:
-else nobody could label it, and a finalizer could never be removed. Deleting passes, and so does what is going anyway.
+Only a new spec can be refused. A change that leaves the spec unchanged passes, even if the object is invalid: otherwise
+nobody could label it, and a finalizer could never be removed. A deletion passes, and so does a change of an object that
+is being deleted.
 """
 
 from __future__ import annotations
@@ -17,17 +18,19 @@ from wayside.api.base import API_VERSION, GROUP
 
 REVIEW_VERSION = "admission.k8s.io/v1"
 REVIEWED = {"ApplicationTemplate": "applicationtemplates", "Detector": "detectors", "EventRule": "eventrules"}
-"""The kinds that are looked at, and their resources. Never tasks and instances: an outage of ours, or a fault, must not
-keep a demand from ending."""
+"""The kinds that are reviewed, and their resources.
 
-MOST_REPORTED = 16  # problems, and warnings, of one answer; an HTTP header holds each warning
+Never tasks and instances: an outage or a defect of the manager must not prevent the end of a demand.
+"""
+
+MOST_REPORTED = 16  # problems, and warnings, of one response; each warning is an HTTP header
 LONGEST = 1024  # characters of each
 
 Json = dict[str, Any]
 
 
 class ReviewError(ValueError):
-    """What came is no AdmissionReview."""
+    """The request is not a valid AdmissionReview."""
 
 
 class OverloadedError(Exception):
@@ -35,7 +38,7 @@ class OverloadedError(Exception):
 
 
 class Weight(Enum):
-    """What findings come to."""
+    """The effect of findings on a review."""
 
     NONE = "not checked"
     WARNED = "warned of"
@@ -44,13 +47,13 @@ class Weight(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """A question of the API server.
+    """A review request of the API server.
 
     Attributes:
-        kind: of the object; empty where it is none of those that are looked at.
-        object: as it would be stored; empty where it goes.
+        kind: of the object; empty if that is not reviewed.
+        object: as it would be stored; empty for a deletion.
         old: as it is stored; None for a new one.
-        weight: what problems come to.
+        weight: the effect of problems.
     """
 
     uid: str
@@ -62,7 +65,7 @@ class Request:
 
 
 def request_in(review: Any) -> Json:
-    """The `request` of an AdmissionReview, which has a uid. Raises ReviewError."""
+    """The `request` of an AdmissionReview, with its uid. Raises ReviewError."""
     if not isinstance(review, dict) or review.get("apiVersion") != REVIEW_VERSION:
         raise ReviewError(f"is not an AdmissionReview of {REVIEW_VERSION}: only the API server may call this path")
     raw = review.get("request")
@@ -72,7 +75,7 @@ def request_in(review: Any) -> Json:
 
 
 def read(review: Any) -> Request:
-    """The question in an AdmissionReview. Raises ReviewError."""
+    """The review request in an AdmissionReview. Raises ReviewError."""
     raw = request_in(review)
     kind, new, old = (raw.get(name) for name in ("kind", "object", "oldObject"))
     kind = kind if isinstance(kind, dict) else {}
@@ -101,7 +104,7 @@ def _weight(raw: Mapping[str, Any], new: Json, old: Json | None) -> Weight:
 
 
 def answer(request: Request, findings: Findings) -> Json:
-    """The AdmissionReview that goes back."""
+    """The AdmissionReview of the response."""
     if request.weight is Weight.NONE:
         findings = Findings()
     refused = request.weight is Weight.REFUSED and bool(findings.problems)
@@ -133,7 +136,7 @@ def _cause(problem: str) -> Json:
 
 
 def shortened(texts: tuple[str, ...]) -> list[str]:
-    """The texts as headers can hold them, the first of them where there are many."""
+    """The texts in a form that HTTP headers can contain; of many, the first ones."""
     lines = [_line(each) for each in texts[:MOST_REPORTED]]
     left = len(texts) - len(lines)
     return [*lines, f"and {left} more: correct these first"] if left else lines

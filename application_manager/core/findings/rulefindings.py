@@ -1,10 +1,11 @@
 """Finds errors in EventRules and Detectors, as far as possible without the message types. Pure.
 
-The same compiler that the detector runs checks here. A rule is checked with all Detectors that select it. What the rule
-alone has, or has with every one of them, is its own fault; what only some have, what stands in a field of theirs, and
-what is merely not there yet is a doubt. What its deploy actions require of templates is only a remark: the rule is in
-order all the same, and a template may yet come or change. What `${…}` will be nobody knows before the episode, so of
-these parameters only the names are looked at.
+The compiler of the detector checks them here too. A rule is checked with all Detectors that select it. A problem of the
+rule alone, or with every one of them, is an error of the rule. A problem with only some of them, a problem in a field
+of a Detector, and a reference to a rule that does not exist yet are doubts.
+
+If a template would refuse its deploy actions, that is only a remark: the rule is valid, and the template may still
+change. Values of `${…}` are unknown before the episode, so only the names of these parameters are checked.
 """
 
 from __future__ import annotations
@@ -40,21 +41,21 @@ from wayside.rules import (
 
 
 def selects(detector: Detector, rule: EventRule) -> bool:
-    """Whether the detector evaluates the rule, which is in its namespace."""
+    """Whether the Detector, in the namespace of the rule, selects the rule."""
     return detector.spec.rule_selector.matches(rule.metadata.labels)
 
 
 def selecting(rule: EventRule, detectors: Sequence[Detector]) -> list[Detector]:
-    """Those of the detectors, which are in the rule's namespace, that evaluate it, by name."""
+    """The Detectors, in the namespace of the rule, that select the rule, by name."""
     return sorted((each for each in detectors if selects(each, rule)), key=lambda each: each.name)
 
 
 def rule_findings(
     rule: EventRule, detectors: Sequence[Detector], invalid: Sequence[str] = (), others: Sequence[EventRule] = ()
 ) -> Findings:
-    """What is wrong with the rule, given the valid detectors and the other rules of its namespace.
+    """The findings about the rule, given the valid Detectors and the other rules of its namespace.
 
-    `invalid`: the names of its namespace's other detectors.
+    `invalid`: the names of the namespace's other Detectors.
     """
     judges = selecting(rule, detectors)
     if not judges:
@@ -69,7 +70,7 @@ def rule_findings(
         for problem in dict.fromkeys(_compiled(rule, detector, known)):
             having.setdefault(problem, []).append(detector.name)
     own = {each for each in having if each.detector is None and each not in passing}
-    # A rule that one detector can evaluate is a good one.
+    # One Detector that can evaluate the rule is enough.
     refused = {name for each in own for name in having[each]} == {each.name for each in judges}
     problems: list[str] = []
     doubts: list[Finding] = []
@@ -99,7 +100,7 @@ class RuleContext:
 
 
 def detector_findings(detector: Detector) -> Findings:
-    """What is wrong with the detector."""
+    """The findings about the Detector."""
     problems = [
         str(problem) for index, stream in enumerate(detector.spec.streams) for problem in stream_problems(stream, index)
     ]
@@ -107,9 +108,10 @@ def detector_findings(detector: Detector) -> Findings:
 
 
 def newly_wrong(rule: EventRule, new: Detector, old: Detector | None) -> tuple[Finding, ...]:
-    """What is wrong with a rule, which is in order as far as others are concerned, since its detector is as `new`.
+    """The new problem of a rule, otherwise valid, with the changed Detector `new`.
 
-    Nothing where the detector does not select it, or where all was wrong with the `old` one as well, None if it is new.
+    None if the Detector does not select it, or if the rule had problems with `old` as well, which is None for a new
+    Detector.
     """
     if not selects(new, rule):
         return ()
@@ -129,7 +131,7 @@ def _compiled(rule: EventRule, detector: Detector, known: Sequence[RuleProblem])
 
 
 def _names_what_is_not_there(problem: RuleProblem, rule: EventRule, beside: Sequence[EventRule]) -> bool:
-    """Whether it is about a signal whose rule is not there; else it is about a circle."""
+    """Whether the problem is a signal whose rule does not exist; otherwise it is a cycle."""
     match problem.path:
         case ("spec", "signals", int(index), "ruleName"):
             return rule.spec.signals[index].rule_name not in {rule.name, *(each.name for each in beside)}
@@ -153,9 +155,9 @@ def _remedies(detectors: Sequence[Detector], invalid: Sequence[str]) -> Iterator
 def deploy_remarks(
     rule: EventRule, templates: Iterable[ApplicationTemplate], invalid: Iterable[str] = ()
 ) -> list[Finding]:
-    """What the tasks of the rule would be refused for, without what its annotation ignores.
+    """Why the tasks of the rule would be refused, without the findings that its annotation ignores.
 
-    `templates`: those of its namespace that are valid; `invalid`: the names of the others.
+    `templates`: the valid ones of its namespace; `invalid`: the names of the others.
     """
     known, others = {each.name: each for each in templates}, set(invalid)
     found: list[Finding] = []

@@ -1,9 +1,9 @@
 """Finds errors in an ApplicationTemplate before any task names it. Pure.
 
-It is compiled, its expressions are checked for the types of the parameters they read, and it is rendered on examples.
-What fails on an example counts against the template only if no value of a task could change it; else it is a remark,
-and where the example proves nothing, it is nothing. A default, a member of an enum and both booleans are values that
-will come; all others are made up.
+It is compiled, the types of the parameters in its expressions are checked, and it is rendered with examples. A failure
+with an example is an error of the template only if no value of a task could avoid it; otherwise it is a remark or, if
+the example proves nothing, it is ignored. A default, a member of an enum and both booleans are real values; all others
+are made up.
 """
 
 from __future__ import annotations
@@ -40,15 +40,14 @@ _NAMES = "metadata.name"
 _ITEMS: Mapping[str, Any] = {"string": "example", "number": 1, "integer": 1, "boolean": True}
 
 Reads = Iterable[tuple[str, frozenset[Path]]]
-"""Fields, each with what an expression in it reads."""
+"""Fields, each with the parameters that its expressions read."""
 
 
 @dataclass(frozen=True, slots=True)
 class Example:
-    """Parameters of one instance, as tasks give them; defaults come in besides.
+    """Parameters of one instance, as tasks give them; the defaults are added.
 
-    `made_up`: the names of those whose value is no task's, nor the template's; `phrase`: when it is so, to end a
-    sentence.
+    `made_up`: the parameters with made-up values; `phrase`: when this occurs, for the end of a sentence.
     """
 
     given: Mapping[str, Any]
@@ -57,7 +56,7 @@ class Example:
 
 
 def template_findings(template: ApplicationTemplate, policy: Policy) -> Findings:
-    """What is wrong with the template."""
+    """The findings about the template."""
     problems: list[str] = []
     try:
         Renderer(template, policy)
@@ -75,7 +74,7 @@ def template_findings(template: ApplicationTemplate, policy: Policy) -> Findings
 
 
 def _mistyped(template: ApplicationTemplate) -> Iterator[str]:
-    """Expressions that use a parameter as another type than it has; one that may be null is of any."""
+    """Expressions that use a parameter as another type; a parameter that may be null has any type."""
     declared = template.spec.parameters
     kinds = {
         f"parameters.{name}": _KINDS[each.type]
@@ -124,7 +123,7 @@ def _on_examples(template: ApplicationTemplate, policy: Policy) -> Findings:
 
 
 def _without_patterns(template: ApplicationTemplate) -> ApplicationTemplate:
-    """The template, for examples, which match no pattern."""
+    """The template for examples: without patterns, which the examples do not match."""
     loose: dict[str, Parameter] = {
         name: each.model_copy(update={"pattern": None}) for name, each in template.spec.parameters.items()
     }
@@ -132,7 +131,7 @@ def _without_patterns(template: ApplicationTemplate) -> ApplicationTemplate:
 
 
 def _rendered(template: ApplicationTemplate, renderer: Renderer, example: Example) -> tuple[str, ...]:
-    """What goes wrong when the example's instance is rendered."""
+    """The problems when the example's instance is rendered."""
     complete = parameters.with_defaults(template.spec.parameters, example.given)
     key = None
     if template.spec.key is not None:
@@ -155,16 +154,16 @@ def _rendered(template: ApplicationTemplate, renderer: Renderer, example: Exampl
 
 
 def _no_objects(_: ChartRequest) -> ChartOutcome:
-    """Of a chart, the values alone can be looked at without fetching it."""
+    """# Of a chart, only the values can be checked without fetching it."""
     return ChartObjects(())
 
 
 def _read(problem: str, template: ApplicationTemplate, reads: Reads) -> frozenset[str]:
-    """The parameters that a problem may depend on."""
+    """The parameters on which a problem may depend."""
     field = field_of(problem)
     if field == "spec.key":
         return claims.key_parameters(template)
-    if field == "spec.manifests":  # two objects of one name
+    if field == "spec.manifests":  # two objects with the same name
         touched = [paths for path, paths in reads if path.endswith(_NAMES)]
     else:
         touched = [paths for path, paths in reads if _within(path, field) or _within(field, path)]
@@ -174,18 +173,18 @@ def _read(problem: str, template: ApplicationTemplate, reads: Reads) -> frozense
 
 def _parameters(every: frozenset[str], paths: frozenset[Path]) -> frozenset[str]:
     of_parameters = [path for path in paths if path[0] == "parameters"]
-    if any(len(path) == 1 for path in of_parameters):  # it looks at the whole map
+    if any(len(path) == 1 for path in of_parameters):  # it reads the whole map
         return every
     return frozenset(str(path[1]) for path in of_parameters)
 
 
 def _within(field: str, other: str) -> bool:
-    """Whether the field is the other, or a part of it."""
+    """Whether the field is the other one, or a part of it."""
     return field == other or (field.startswith(other) and field[len(other)] in ".[")
 
 
 def examples(template: ApplicationTemplate) -> tuple[Example, ...]:
-    """The baseline where there is one, the least that a task may give, and all that it can."""
+    """The examples: the baseline if there is one, the minimum that a task may give, and all parameters."""
     baseline = template.spec.baseline
     if baseline is None:
         return _of_tasks(template.spec.parameters)
@@ -207,7 +206,7 @@ def _of_tasks(declared: Mapping[str, Parameter]) -> tuple[Example, ...]:
 
 
 def example_of(parameter: Parameter) -> Any:
-    """A value within the parameter's bounds; of a pattern it knows nothing."""
+    """A value within the parameter's bounds; patterns are ignored."""
     if parameter.default is not None:
         return parameter.default
     if parameter.enum:
@@ -227,7 +226,7 @@ def example_of(parameter: Parameter) -> Any:
 
 
 def is_open(parameter: Parameter) -> bool:
-    """Whether values may be of a shape that cannot be guessed, so that an example that fails proves nothing."""
+    """Whether the parameter's values may have any shape, so that a failure with an example proves nothing."""
     shapeless = parameter.type in (ParameterType.OBJECT, ParameterType.ARRAY) or parameter.pattern is not None
     return shapeless and not _is_real(parameter)
 

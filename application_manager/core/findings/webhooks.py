@@ -2,7 +2,7 @@
 
 A ValidatingWebhookConfiguration for templates, rules and detectors, and a MutatingWebhookConfiguration for pods that
 request a detector. This module makes them safe: failurePolicy Ignore and a short timeout, so that a manager that is
-unavailable or hangs delays a change and never prevents it; only new specs of three kinds, and only new pods with the
+unavailable or hangs delays a change but never prevents it; only new specs of three kinds, and only new pods with the
 label; and no side effects, so that a dry run is reviewed as well.
 """
 
@@ -20,17 +20,17 @@ from wayside.api.base import GROUP, VERSION
 
 PATH = "/admission"
 INJECTION_PATH = "/injection"
-TIMEOUT = 5  # s that a change waits for a manager that hangs
+TIMEOUT = 5  # s by which a manager that hangs delays a change
 _SERVICE = re.compile(r"(?P<namespace>[a-z0-9-]+)/(?P<name>[a-z0-9-]+)(?::(?P<port>[0-9]{1,5}))?")
 _URL = re.compile(r"https://(\[[0-9a-fA-F:]+\]|[^/:?#@\s]+)(:[0-9]{1,5})?")
 
 
 @dataclass(frozen=True, slots=True)
 class WebhookClientConfig:
-    """Where the API server finds the manager: a Service, or a URL.
+    """The address of the manager for the API server: a Service, or a URL.
 
-    `client`: the `clientConfig`, without the path and the authority's certificate; `hosts`: the names that the
-    manager's certificate must be for.
+    `client`: the `clientConfig`, without the path and the CA; `hosts`: the names that the manager's certificate must
+    have.
     """
 
     client: dict[str, Any]
@@ -65,9 +65,9 @@ class WebhookClientConfig:
 
 
 def certificate_secret(service: str) -> tuple[str, str]:
-    """Namespace and name of the Secret with the certificate that the manager makes for a Service NAMESPACE/NAME.
+    """Namespace and name of the Secret with the certificate that the manager issues for a Service NAMESPACE/NAME.
 
-    Raises ValueError where that is none.
+    Raises ValueError if `service` is not valid.
     """
     if _SERVICE.fullmatch(service) is None or ":" in service:
         raise ValueError(f"must be NAMESPACE/NAME of a Service; got {service!r}")
@@ -80,8 +80,8 @@ def webhook_configuration(
 ) -> dict[str, Any]:
     """The webhook configuration for templates, rules and detectors; `namespaces` empty: all.
 
-    `authority`: the certificate (PEM) of the authority that signed the manager's; None where somebody else writes it
-    in, as cert-manager does.
+    `authority`: the certificate (PEM) of the CA that signed the manager's; None if another program adds it, such as
+    cert-manager.
     """
     rules = _rules(GROUP, VERSION, ["CREATE", "UPDATE"], sorted(REVIEWED.values()))
     webhook = {"name": f"admission.{GROUP}", "clientConfig": place.at(PATH, authority), "rules": rules}

@@ -1,7 +1,7 @@
 """Whether any node fits the pods of an object; the message names the field and the value. Pure.
 
-What is looked at is what a template renders from parameters: `nodeName`, `nodeSelector`, and the node affinity that is
-required. Taints, room and all else are the scheduler's to report, on the pod.
+It reads the fields that a template may render from parameters: `nodeName`, `nodeSelector`, and the required node
+affinity. The scheduler itself reports taints, resources and all other causes on the pod.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ Labels = Mapping[str, str]
 Nodes = Mapping[str, Labels]
 """The labels of nodes, by name."""
 
-_SEVERAL = "-"  # in place of a label's key, where there are several
-_SHOWN = 5  # values that there are, in a message
+_SEVERAL = "-"  # replaces a label's key if there are several
+_SHOWN = 5  # existing values in a message
 
 
 @dataclass(frozen=True, slots=True)
 class _Required:
-    """A requirement: the message if no node meets it, its field and value, and the terms of which a node meets one."""
+    """A requirement: the message if no node meets it, its field and value, and its terms, of which one must be met."""
 
     words: str
     wanted: str
@@ -40,7 +40,7 @@ def is_placed(live: Mapping[str, Any]) -> bool:
 
 
 def misplaced(live: Mapping[str, Any], nodes: Nodes) -> Trouble | None:
-    """Why no node is as the object's pods require; None where one is."""
+    """Why no node meets the requirements of the object's pods; None if one does."""
     required = list(_required(pod_spec(live)))
     if not required:
         return None
@@ -75,7 +75,7 @@ def _required(spec: Mapping[str, Any]) -> Iterator[_Required]:
 
 
 def _expressions(term: Mapping[str, Any]) -> list[tuple[str, str, list[str]]]:
-    """Key, operator and values of a term's requirements; the key of a node's name is empty."""
+    """Key, operator and values of a term's requirements; the key is empty for the name of a node."""
     fields = [{**each, "key": ""} for each in term.get("matchFields") or ()]
     found = [*fields, *(term.get("matchExpressions") or ())]
     return [(str(each.get("key")), str(each.get("operator")), each.get("values") or []) for each in found]
@@ -98,7 +98,7 @@ def _in_words(key: str, operator: str, values: Iterable[str]) -> str:
 
 
 def _meets(term: Mapping[str, Any], name: str, labels: Labels) -> bool:
-    """Whether a node meets a term, as the scheduler has it (`component-helpers/scheduling/corev1/nodeaffinity`)."""
+    """Whether a node meets a term, like in the scheduler (`component-helpers/scheduling/corev1/nodeaffinity`)."""
     return all(
         _holds(operator, name if not key else labels.get(key), list(map(str, values)))
         for key, operator, values in _expressions(term)
@@ -121,11 +121,11 @@ def _holds(operator: str, value: str | None, values: list[str]) -> bool:
             except (ValueError, IndexError):
                 return False
             return have > limit if operator == "Gt" else have < limit
-    return True  # an operator of the future: the scheduler will report it
+    return True  # an operator of the future: the scheduler reports it
 
 
 def _instead(key: str, nodes: Nodes) -> str:
-    """What there is in place of what is required."""
+    """The existing alternatives to the required value."""
     if not nodes:
         return " (there are no nodes)"
     if key == _SEVERAL:

@@ -1,7 +1,7 @@
-"""Why a pod does not run, from its status, in plain words. Pure.
+"""Why a pod does not run, from its status. Pure.
 
-The same trouble gives the same words, whatever the kubelet is at just now: an image is being pulled once more, a
-container that crashes runs for a moment. So a status that repeats them is not rewritten with each attempt.
+The same trouble gives the same text, whatever the kubelet's current attempt is: pulling an image again, or running a
+crashing container for a moment. So a status with this text is not rewritten at each attempt.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 
 from application_manager.core.conditions import cut, find_raw
 
-_LONGEST = 600  # characters of a message of a kubelet or a scheduler
+_LONGEST = 600  # characters of a kubelet's or scheduler's message
 
 _IMAGE = frozenset(
     {
@@ -27,7 +27,7 @@ _IMAGE = frozenset(
         "SignatureValidationFailed",
     }
 )
-"""A container's waiting reasons that mean its image, from the kubelet's `pkg/kubelet/images/types.go`."""
+"""Waiting reasons of a container that concern its image, from the kubelet's `pkg/kubelet/images/types.go`."""
 
 _CREATION = frozenset(
     {
@@ -41,7 +41,7 @@ _CREATION = frozenset(
 
 
 class TroubleReason(StrEnum):
-    """One word for each trouble: reasons of the condition Ready, the most telling first."""
+    """The kind of a trouble: reasons of the condition Ready, the most specific first."""
 
     IMAGE_PULL_FAILED = "ImagePullFailed"
     CONTAINER_FAILED = "ContainerFailed"
@@ -57,7 +57,7 @@ class Trouble:
     """Why a pod does not run.
 
     Attributes:
-        message: names the image or container, and the cause; the same for all pods that have the same trouble.
+        message: names the image or container, and the cause; equal for all pods with the same trouble.
         hint: where to look further, which names the pod; empty where the message is complete.
     """
 
@@ -72,7 +72,7 @@ class Trouble:
 
 
 def trouble(pod: Mapping[str, Any]) -> Trouble | None:
-    """What keeps the pod from running; None where nothing does, or nothing is known yet, or it is being deleted."""
+    """Why the pod does not run; None if it runs, or the cause is not known yet, or it is being deleted."""
     status = pod.get("status") or {}
     if pod["metadata"].get("deletionTimestamp") or status.get("phase") == "Succeeded":
         return None
@@ -95,7 +95,7 @@ def trouble(pod: Mapping[str, Any]) -> Trouble | None:
 
 
 def summary(troubles: Iterable[Trouble]) -> list[Trouble]:
-    """Each different trouble once, the most telling first."""
+    """Each distinct trouble once, the most specific first."""
     order = list(TroubleReason)
     different: dict[tuple[TroubleReason, str], Trouble] = {}
     for each in sorted(troubles, key=lambda each: (order.index(each.reason), each.message, each.hint)):
@@ -141,11 +141,11 @@ def _ending(ended: Mapping[str, Any]) -> str:
 
 
 def _pull_cause(message: str) -> str:
-    """The cause of a failed pull, without the words about the next attempt."""
+    """The cause of a failed pull, without the part about the next attempt."""
     return _plain(re.sub(r'^Back-off pulling image "[^"]*"(: )?', "", message).removeprefix("ErrImagePull: "))
 
 
 def _plain(message: str) -> str:
-    """One line, without the wrapping of gRPC, and not too long."""
+    """One line, without the wrapping of gRPC, and shortened."""
     line = " ".join(re.sub(r"rpc error: code = \w+ desc = ", "", str(message)).split())
     return cut(line, _LONGEST)

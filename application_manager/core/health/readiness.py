@@ -1,7 +1,7 @@
 """Whether an object is ready, by its status. Pure.
 
-The rules are those of `kubectl rollout status` for workloads and of the conditions Ready and Available for all else. A
-kind without either is ready by being there.
+The rules are those of `kubectl rollout status` for workloads, and the conditions Ready and Available for all other
+kinds. An object without either is ready once it exists.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ _LOAD_BALANCER = "LoadBalancer"
 
 
 def not_ready(live: Mapping[str, Any]) -> str | None:
-    """Why the object is not ready, in words that follow its name; None if it is.
+    """Why the object is not ready, as words that follow its name; None if it is ready.
 
-    Workloads are ready when their controller has seen their present spec and all their pods are available and of that
+    A workload is ready when its controller has processed its current spec, and all its pods are available and of that
     spec. A Job is ready once it runs or has completed, a PersistentVolumeClaim once it is bound, a Service of type
     LoadBalancer once it has an address.
     """
@@ -45,7 +45,7 @@ def not_ready(live: Mapping[str, Any]) -> str | None:
 
 
 def is_unseen(live: Mapping[str, Any]) -> bool:
-    """Whether the object is a workload whose controller has not looked at its present spec yet."""
+    """Whether the object is a workload whose controller has not processed its current spec yet."""
     status = live.get("status") or {}
     return live.get("kind") in _OBSERVED and _stale(live, status) is not None
 
@@ -113,7 +113,7 @@ def _claim(status: Mapping[str, Any]) -> str | None:
 
 
 def _by_conditions(live: Mapping[str, Any], status: Mapping[str, Any]) -> str | None:
-    """Why an object of any other kind is not ready, as its condition Ready, else Available, has it."""
+    """Why an object of any other kind is not ready, by its condition Ready, else Available."""
     if not isinstance(status, Mapping) or not isinstance(status.get("conditions", []), list):
         return None  # a kind with a status of another shape
     for type_ in ("Ready", "Available"):

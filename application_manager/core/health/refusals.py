@@ -14,7 +14,7 @@ QUOTA_EXCEEDED = TroubleReason.QUOTA_EXCEEDED.value
 ADMISSION_REFUSED = TroubleReason.ADMISSION_REFUSED.value
 APPLY_REFUSED = "ApplyRefused"
 FAILED_CREATE = "FailedCreate"
-"""The reason of the Events of Kubernetes' controllers for pods that they cannot make."""
+"""The reason of the Events of Kubernetes' controllers for pods that they cannot create."""
 
 _RETRIED = 20 * 60.0  # s
 _POD = re.compile(r'^.*?\bpods "[^"]*" is ', re.DOTALL)
@@ -23,14 +23,14 @@ _REMEDIES = {
     QUOTA_EXCEEDED: "raise the ResourceQuota, or wait until other pods or objects end; the manager retries",
     ADMISSION_REFUSED: "change the template or the admission policy; the manager retries",
 }
-_NO_RIGHT = re.compile(r"cannot \w+ resource")  # the manager's account lacks a right: nothing that is admitted or not
+_NO_RIGHT = re.compile(r"cannot \w+ resource")  # a missing permission of the manager's account
 
 
 def reason_of(code: int, message: str) -> str:
-    """The reason of a refusal: by a ResourceQuota, by other admission (LimitRange, policies, webhooks), or else.
+    """The reason of a refusal: by a ResourceQuota, by other admission (LimitRange, policies, webhooks), or any other.
 
-    `code` is the HTTP status. A quota answers 403 with "exceeded quota" (`plugin/pkg/admission/resourcequota`), a
-    LimitRange and PodSecurity 403, a webhook or a policy with "denied", whatever the code.
+    `code` is the HTTP status. A quota responds with 403 and "exceeded quota" (`plugin/pkg/admission/resourcequota`), a
+    LimitRange and PodSecurity with 403, a webhook or a policy with "denied", whatever the code.
     """
     if "exceeded quota" in message:
         return QUOTA_EXCEEDED
@@ -42,12 +42,12 @@ def reason_of(code: int, message: str) -> str:
 
 
 def with_remedy(reason: str, message: str) -> str:
-    """The message, with what helps."""
+    """The message, with the remedy."""
     return f"{message}: {_REMEDIES[reason]}" if reason in _REMEDIES else message
 
 
 def refused_pods(live: Mapping[str, Any]) -> Trouble | None:
-    """Why the pods of a Deployment or ReplicaSet are refused, if they are; of the others only Events report it."""
+    """Why the pods of a Deployment or ReplicaSet are refused, if they are; for other kinds only Events report it."""
     if live.get("kind") not in ("Deployment", "ReplicaSet"):
         return None
     failure = find_raw(live.get("status") or {}, "ReplicaFailure")
@@ -55,7 +55,7 @@ def refused_pods(live: Mapping[str, Any]) -> Trouble | None:
 
 
 def lacks_pods(live: Mapping[str, Any]) -> bool:
-    """Whether a StatefulSet, DaemonSet or Job lacks pods that its controller makes; only Events give the reason."""
+    """Whether a StatefulSet, DaemonSet or Job has too few pods; only Events give the reason."""
     spec, status = live.get("spec") or {}, live.get("status") or {}
     match live.get("kind"):
         case "StatefulSet":
@@ -69,9 +69,9 @@ def lacks_pods(live: Mapping[str, Any]) -> bool:
 
 
 def refused_by_events(events: Iterable[Mapping[str, Any]], now: float) -> Trouble | None:
-    """Why pods are refused, by the last of the Events FailedCreate of a workload that lacks pods; None if none is new.
+    """Why pods are refused, by the last Event FailedCreate of a workload that has too few; None without a recent one.
 
-    `now` is in seconds since 1970. The controllers try again after 17 minutes at the latest.
+    `now` is in seconds since 1970. The controllers retry after 17 minutes at the latest.
     """
     notes = [(_last(each), str(each.get("note", ""))) for each in events if each.get("reason") == FAILED_CREATE]
     at, note = max(notes, default=(0.0, ""))
@@ -79,7 +79,7 @@ def refused_by_events(events: Iterable[Mapping[str, Any]], now: float) -> Troubl
 
 
 def without_names(message: str) -> str:
-    """The message without the name of the pod that was tried, which is another one each time."""
+    """The message without the name of the pod, which differs at each attempt."""
     return _POD.sub("", message)
 
 
@@ -90,12 +90,12 @@ def _trouble(message: str) -> Trouble:
 
 
 def _of_pods(message: str) -> str:
-    """Quota or admission: the right to make pods belongs to Kubernetes' own controllers, and is not in question."""
+    """Quota or admission: Kubernetes' own controllers have the permission to create pods."""
     return QUOTA_EXCEEDED if reason_of(403, message) == QUOTA_EXCEEDED else ADMISSION_REFUSED
 
 
 def _last(event: Mapping[str, Any]) -> float:
-    """When it was last seen, in seconds since 1970, by whichever field its sender fills."""
+    """The time of the last occurrence, in seconds since 1970, from any of the fields that its sender may fill."""
     series = event.get("series") or {}
     stamps = (series.get("lastObservedTime"), event.get("deprecatedLastTimestamp"), event.get("eventTime"))
     return max((parse_time(str(each)) / 1e9 for each in stamps if each), default=0.0)

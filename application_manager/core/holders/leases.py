@@ -1,8 +1,8 @@
-"""Whether the holders of demands are alive, by their Leases and the manager's own clock alone.
+"""Whether the holders of demands are alive, by their Leases and the manager's own clock.
 
-A Lease lapses when it has been *observed unchanged* for long enough, on a clock of ours that runs only while we reach
-the API server: the holder's clock may be wrong, and an outage stops its renewals as well as our looking. Pure: fed with
-what was seen and when.
+A Lease lapses when it was *observed unchanged* for long enough, on a clock of ours that runs only while the API server
+responds: the holder's clock may be wrong, and an outage stops both its renewals and our observation. Pure: the caller
+passes the observations and their times.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from wayside.api.applicationtemplate import Lifecycle, LossPolicy
 from wayside.kubernetes.leases import DEFAULT_DURATION, lease_name
 from wayside.times import parse_seconds
 
-RAREST_LOOK = 5.0  # s between two looks at a Lease that is long overdue; a renewal also comes by watching
-_RARER = 0.25  # of the time that a Lease is overdue: what a lapse may be noticed late by, in proportion
+RAREST_LOOK = 5.0  # s between two reads of a long overdue Lease; the watch also reports a renewal
+_RARER = 0.25  # of the overdue time: the maximum delay of a noticed lapse, in proportion
 
 HOLDER_LOST = "HolderLost"
-FINISH_LOST_AFTER = 3600.0  # s that a holder may be lost before its tasks are finished
+FINISH_LOST_AFTER = 3600.0  # s for which a holder may be lost before its tasks are finished
 
 HolderKey = tuple[str, str]
 """Namespace and holder."""
@@ -31,12 +31,12 @@ HolderKey = tuple[str, str]
 
 @dataclass(frozen=True, slots=True)
 class LeaseView:
-    """A holder's Lease as of now.
+    """The current state of a holder's Lease.
 
     Attributes:
-        unchanged: for how many seconds it was observed unchanged, up to the last look at it.
+        unchanged: for how many seconds it was observed unchanged, up to the last observation.
         duration: the Lease's own duration in seconds.
-        renewed: whether it was seen to change since we began to look.
+        renewed: whether a change was observed since the start.
     """
 
     unchanged: float
@@ -45,10 +45,10 @@ class LeaseView:
 
 
 class HealthyTime:
-    """Seconds during which we reached the API server.
+    """Seconds during which the API server responded.
 
-    The time between two looks counts when both succeeded and were at most `longest` seconds apart; a longer gap means
-    that this process itself was stopped, and then nothing is known about others.
+    The time between two checks counts if both succeeded and were at most `longest` seconds apart; a longer gap means
+    that this process itself was stopped, so that nothing is known about others.
     """
 
     def __init__(self, longest: float = 5.0) -> None:
@@ -58,11 +58,11 @@ class HealthyTime:
 
     @property
     def reached(self) -> bool:
-        """Whether the last look succeeded."""
+        """Whether the last check succeeded."""
         return self._last is not None
 
     def look(self, now: float, *, succeeded: bool) -> None:
-        """Note a look at the API server at `now`, in seconds of a monotonic clock."""
+        """Note a check of the API server at `now`, in seconds of a monotonic clock."""
         if not succeeded:
             self._last = None
             return
@@ -74,21 +74,21 @@ class HealthyTime:
 @dataclass(slots=True)
 class _Observation:
     identity: str
-    since: float  # healthy seconds at which it was new
-    looked: float  # healthy seconds at which it was seen last
+    since: float  # healthy seconds at which it last changed
+    looked: float  # healthy seconds at which it was last observed
     duration: float = DEFAULT_DURATION
     renewed: bool = False
-    seen: bool = True  # else it was only expected: what is seen first is neither old nor a renewal
+    seen: bool = True  # otherwise only expected: the first observation is neither old nor a renewal
 
 
 @dataclass(slots=True)
 class LeaseIndex:
-    """What was observed of all Leases; times are healthy seconds (see `HealthyTime.elapsed`)."""
+    """The observations of all Leases; times are healthy seconds (see `HealthyTime.elapsed`)."""
 
     _observed: dict[HolderKey, _Observation] = field(default_factory=dict)
 
     def observe(self, key: HolderKey, lease: Mapping[str, Any] | None, at: float) -> bool:
-        """Note the holder's Lease as it is, None where there is none. Returns whether it changed, i.e. was renewed."""
+        """Note the current state of the holder's Lease, None if there is none; returns whether it was renewed."""
         identity = _identity(lease)
         known = self._observed.get(key)
         if known is None or (not known.seen and lease is not None):
@@ -97,7 +97,7 @@ class LeaseIndex:
         known.looked, known.seen = at, True
         if identity == known.identity:
             return False
-        # A Lease that disappears is no sign of life; one that appears or changes is.
+        # The deletion of a Lease is no sign of life; its creation or a change is.
         if lease is not None:
             known.since, known.renewed = at, True
             known.duration = _duration(lease)
@@ -109,17 +109,17 @@ class LeaseIndex:
         self._observed.setdefault(key, _Observation(_identity(None), at, at, seen=False))
 
     def view(self, key: HolderKey) -> LeaseView:
-        """The holder's Lease, as it was when it was looked at last."""
+        """The state of the holder's Lease at its last observation."""
         known = self._observed.get(key)
         if known is None:
             return LeaseView(0.0, renewed=False)
         return LeaseView(known.looked - known.since, known.duration, known.renewed)
 
     def due(self, key: HolderKey, at: float) -> bool:
-        """Whether the Lease should be read: it is unchanged for longer than its duration, as far as we know.
+        """Whether to read the Lease: it was unchanged for longer than its duration, as far as we know.
 
-        A watch that broke unnoticed looks just like a holder that is lost, so only a look can distinguish them. The
-        longer a Lease was seen to be overdue, the rarer the looks, so that many lost holders cost little.
+        A watch that broke unnoticed looks the same as a lost holder; only a read distinguishes them. The longer a Lease
+        is overdue, the less often it is read, so that many lost holders cost little.
         """
         known = self._observed.get(key)
         if known is None or not known.seen:
@@ -128,19 +128,19 @@ class LeaseIndex:
         return at - known.since >= known.duration and at - known.looked >= min(RAREST_LOOK, overdue * _RARER)
 
     def seen(self, key: HolderKey) -> bool:
-        """Whether the holder's Lease was ever looked at, be it there or not."""
+        """Whether the holder's Lease, or its absence, was ever observed."""
         known = self._observed.get(key)
         return known is not None and known.seen
 
     def forget_except(self, keys: Iterable[HolderKey]) -> None:
-        """Drop what concerns no holder of interest any more."""
+        """Remove the observations of holders that no longer matter."""
         kept = set(keys)
         for key in [key for key in self._observed if key not in kept]:
             del self._observed[key]
 
 
 def _identity(lease: Mapping[str, Any] | None) -> str:
-    """What a renewal changes: the Lease's spec and its uid, not its labels or managed fields."""
+    """The content that a renewal changes: the Lease's spec and uid, not its labels or managed fields."""
     if lease is None:
         return ""
     uid = lease.get("metadata", {}).get("uid", "")
@@ -157,7 +157,7 @@ def live_claims(
 ) -> tuple[list[Claim], dict[str, Verdict], list[float]]:
     """The claims whose holders are not lost, the verdicts of the others, and when any of this changes by itself.
 
-    `leases` by holder, one that is missing is not lost; `now` and what is returned in seconds since 1970.
+    `leases` is by holder; a missing one does not count as lost. `now` and the returned times are in seconds since 1970.
     """
     lifecycle = template.spec.lifecycle if template else Lifecycle()
     live: list[Claim] = []
@@ -177,10 +177,10 @@ def live_claims(
 def _lapse(
     task: ApplicationTask, lifecycle: Lifecycle, leases: Mapping[str, LeaseView], now: float
 ) -> tuple[Verdict | None, float | None]:
-    """The task's verdict where its holder is lost, None where it counts; and when that changes by itself.
+    """The task's verdict if its holder is lost, None if it counts; and when that changes by itself.
 
-    The loss in the status survives our own restart: the holder counts as lost until its Lease is seen to be
-    renewed, since a new manager has not observed anything yet.
+    The status records the loss, which survives our own restart: the holder counts as lost until its Lease is observed
+    to be renewed, because a new manager has not observed anything yet.
     """
     holder = task.spec.requester.holder
     view = leases.get(holder) if holder else None

@@ -1,7 +1,7 @@
-"""What tasks may request: the administrator's limits on their number, and on what holders may do. Pure.
+"""The administrator's limits on the number of tasks, and on the tasks of holders. Pure.
 
-Who a holder is, the chart's admission policy makes sure of; what it may request is decided here. People's tasks have no
-holder, and are limited by their roles.
+The chart's admission policy verifies who a holder is; this module limits its requests. Tasks of people have no holder;
+roles limit them.
 """
 
 from __future__ import annotations
@@ -24,9 +24,10 @@ _FORM = (
 
 @dataclass(frozen=True, slots=True)
 class HolderPolicy:
-    """What holders may do whose namespace and name match these patterns, with `*` and `?`.
+    """The limits of holders whose namespace and name match these patterns, with `*` and `?`.
 
-    `max_tasks`: how many unfinished tasks each may have, `max_priority`: the highest of its tasks; None: any.
+    `max_tasks`: the maximum number of unfinished tasks of each, `max_priority`: the maximum priority of its tasks;
+    None: no limit.
     """
 
     namespace: str
@@ -37,7 +38,7 @@ class HolderPolicy:
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """A policy as the option `--holder-policy` has it. Raises ValueError, which names the part and the form."""
+        """Parse a value of the option `--holder-policy`. Raises ValueError, which names the part and the form."""
         who, colon, rest = text.partition(":")
         namespace, slash, holder = who.partition("/")
         if not (colon and slash and namespace and holder):
@@ -57,25 +58,25 @@ class HolderPolicy:
         return cls(namespace, holder, numbers["max-tasks"], numbers["max-priority"], operations)
 
     def matches(self, namespace: str, holder: str) -> bool:
-        """Whether it is about this holder."""
+        """Whether it applies to this holder."""
         return fnmatchcase(namespace, self.namespace) and fnmatchcase(holder, self.holder)
 
 
 @dataclass(frozen=True, slots=True)
 class TaskPolicy:
-    """The limits of tasks: of those of a namespace, None for any number, and of holders, by the first that matches."""
+    """The limits of tasks: the maximum per namespace, None for no limit, and those of holders, by the first match."""
 
     max_tasks: int | None = None
     holders: Sequence[HolderPolicy] = field(default=())
 
     def of(self, namespace: str, holder: str | None) -> HolderPolicy | None:
-        """What holds for a holder; None for people, and where nothing does."""
+        """The policy of a holder; None for people, and if no policy matches."""
         if holder is None:
             return None
         return next((each for each in self.holders if each.matches(namespace, holder)), None)
 
     def refusal(self, task: ApplicationTask) -> Verdict | None:
-        """Why the task's holder may not request that, whatever others do; None if it may."""
+        """Why the policy of the task's holder forbids the task, regardless of other tasks; None if it does not."""
         holder = task.spec.requester.holder
         policy = self.of(task.namespace, holder)
         if policy is None:

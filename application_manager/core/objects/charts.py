@@ -1,8 +1,8 @@
 """Helm charts as applications: requests to Helm, and the objects in its output. Pure.
 
-The program itself runs elsewhere. Here a template and an instance become a request, the text that `helm template` gave
-for it becomes objects, and everything that is not applied like a manifest is refused: hooks, which would run at moments
-that there are not here, and CRDs, which are the cluster's and not a namespace's.
+Other modules run the program. This one turns a template and an instance into a request, and the output of `helm
+template` into objects. It refuses everything that cannot be applied like a manifest: hooks, because there is no install
+or upgrade at which they would run, and CRDs, because they are cluster-wide.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from application_manager.core.objects.ownership import ApplyProblem
 from wayside.api.applicationtemplate import Helm
 
 UNAVAILABLE = "ChartUnavailable"
-"""The reason where the chart cannot be had."""
+"""The reason if the chart cannot be fetched."""
 FAILED = "RenderFailed"
-"""The reason where it cannot be rendered, as for manifests."""
+"""The reason if the chart cannot be rendered, as for manifests."""
 
 MAXIMUM_OBJECTS = 256
-"""In one chart: an instance's status names them all."""
+"""In one chart: an instance's status lists them all."""
 
 _DOCUMENT = re.compile(r"^---[ \t]*$", re.MULTILINE)
 _SOURCE = re.compile(r"^# Source: (?:[^/\n]*/)?(.+)$", re.MULTILINE)
@@ -32,7 +32,7 @@ _HOOK = "helm.sh/hook"
 
 @dataclass(frozen=True, slots=True)
 class ChartSource:
-    """Where a chart is, by the template."""
+    """The source of a chart, from the template."""
 
     chart: str
     version: str | None = None
@@ -40,7 +40,7 @@ class ChartSource:
 
     @classmethod
     def of(cls, helm: Helm) -> ChartSource:
-        """The source that a template names."""
+        """The source in a template."""
         return cls(helm.chart, helm.version, helm.repository)
 
     def __str__(self) -> str:
@@ -60,7 +60,7 @@ class ChartRequest:
 
 @dataclass(frozen=True, slots=True)
 class ChartObject:
-    """One object of a chart, and the file in the chart that it comes from."""
+    """One object of a chart, and the file in the chart that contains it."""
 
     file: str
     manifest: dict[str, Any]
@@ -68,7 +68,7 @@ class ChartObject:
 
 @dataclass(frozen=True, slots=True)
 class ChartObjects:
-    """What a chart was rendered to, in Helm's order."""
+    """The rendered chart, in Helm's order."""
 
     objects: tuple[ChartObject, ...]
 
@@ -76,16 +76,16 @@ class ChartObjects:
 ChartOutcome = ChartObjects | ApplyProblem
 
 Charts = Callable[[ChartRequest], ChartOutcome | None]
-"""What came of a request; None where it is still to come."""
+"""Returns the result of a request; None while it is pending."""
 
 
 def no_charts(request: ChartRequest) -> ChartOutcome:
-    """For where there is no Helm."""
+    """The result without Helm."""
     return ApplyProblem(UNAVAILABLE, f"spec.helm: cannot render chart {request.source} here: helm is not available")
 
 
 def parse_chart(source: ChartSource, text: str) -> ChartOutcome:
-    """The objects in what `helm template --include-crds` wrote, or why they cannot be used."""
+    """The objects in the output of `helm template --include-crds`, or why they cannot be used."""
     objects: list[ChartObject] = []
     problems: list[str] = []
     for part in _DOCUMENT.split(text):

@@ -1,12 +1,12 @@
 """Live configuration: the files of a template become the texts of one ConfigMap of the instance. Pure.
 
-A ConfigMap of its own, so that a change reaches the running application and never the pod template, which would
-replace the pods. A text stays as it is; a map, a list, a number or a boolean is written in the format that the file's
-extension determines.
+It is a separate ConfigMap, so that a change reaches the running application without a change of the pod template, which
+would replace the pods. A text stays unchanged; a map, a list, a number or a boolean is written in the format of the
+file's extension.
 
-The kubelet writes a changed ConfigMap into a pod at its next sync of that pod, which may be more than a minute away. It
-syncs at once when the pod itself changes, and an annotation is enough: a hash of the content, so that the same content
-is never announced twice.
+The kubelet writes a changed ConfigMap into a pod at its next sync of that pod, which may be more than a minute later.
+It syncs immediately when the pod itself changes, and an annotation is enough: a hash of the content, so that the same
+content is never announced twice.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ CONFIG_MAP = ("v1", "ConfigMap")
 MAXIMUM_BYTES = 1_000_000  # of all files; the API server takes 1 MiB a ConfigMap, and etcd 1.5 MiB with all around it
 
 ANNOTATION = "wayside.dev/configuration"
-"""On a pod: `fingerprint` of the configuration that was announced to it last."""
+"""On a pod: the `fingerprint` of the configuration that was last announced to it."""
 
 Object = Mapping[str, Any]
 
@@ -36,12 +36,12 @@ Check = Callable[[Embedded], Iterable[InterpolationError]]
 
 
 def config_map_name(instance: str) -> str:
-    """The name of an instance's ConfigMap: what `${instance.configMap}` stands for."""
+    """The name of an instance's ConfigMap, for `${instance.configMap}`."""
     return f"{instance}-configuration"
 
 
 def config_map_key(instance: str) -> ObjectKey:
-    """What identifies it."""
+    """The key of the ConfigMap."""
     return (*CONFIG_MAP, config_map_name(instance))
 
 
@@ -56,7 +56,7 @@ def config_map(instance: str, files: Mapping[str, str]) -> dict[str, Any]:
 
 
 class Configuration:
-    """The files of a template, compiled. Raises InterpolationError, with all further ones in its `others`."""
+    """The files of a template, compiled. Raises InterpolationError, with all further errors in its `others`."""
 
     def __init__(self, files: Mapping[str, Any], environment: Environment, check: Check) -> None:
         self._files: dict[str, CompiledTemplate] = {}
@@ -76,7 +76,7 @@ class Configuration:
         return tuple(each for compiled in self._files.values() for each in compiled.embedded)
 
     def render(self, variables: Mapping[str, Any]) -> tuple[dict[str, str], list[str]]:
-        """The text of each file, and what is wrong, each problem with its field. A file that is null is left out."""
+        """The text of each file, and the problems, each with its field. A file that is null is left out."""
         files: dict[str, str] = {}
         problems: list[str] = []
         for name, compiled in self._files.items():
@@ -110,7 +110,7 @@ def _path(name: str) -> str:
 
 
 def _text(name: str, value: Any) -> str | None:
-    """The file's text, None where its name does not determine how to write the value."""
+    """The file's text; None if its name does not determine a format."""
     if isinstance(value, str):
         return value
     plain = values.normal(value)
@@ -128,13 +128,13 @@ def fingerprint(files: Mapping[str, str]) -> str:
 
 
 def selectors(objects: Iterable[Object]) -> tuple[str, ...]:
-    """Label selectors that together cover the pods of these workloads; one that is empty covers all."""
+    """Label selectors that together select the pods of these workloads; an empty one selects all."""
     found = {_selector(each) for each in objects if pod_template(each)}
     return ("",) if "" in found else tuple(sorted(found))
 
 
 def behind(pods: Iterable[Object], instance: str, content: str) -> Iterator[tuple[str, str]]:
-    """Name and uid of the pods that mount the instance's configuration and do not have this content announced."""
+    """Name and uid of the pods that mount the instance's configuration, and to which this content was not announced."""
     for pod in pods:
         metadata = pod["metadata"]
         going = "deletionTimestamp" in metadata or (pod.get("status") or {}).get("phase") in _OVER
@@ -153,7 +153,7 @@ def _mounts(pod: Object, config_map: str) -> bool:
 
 
 def _selector(workload: Object) -> str:
-    # What selects the pods, since that never changes; the template's labels may, and older pods keep theirs.
+    # The selector never changes. The template's labels may, and older pods keep the old ones.
     labels = (workload["spec"].get("selector") or {}).get("matchLabels")
     labels = labels or (pod_template(workload).get("metadata") or {}).get("labels") or {}
     return ",".join(f"{key}={value}" for key, value in sorted(labels.items()))

@@ -1,9 +1,8 @@
-"""The objects of a detector that the manager runs: an account, its rights, and the Deployment. Pure.
+"""The objects of a detector that the manager runs: a service account, its permissions, and the Deployment. Pure.
 
-Of one in others' pods (mode Sidecar, see `sidecars`) these are its rights alone, for the accounts of those pods.
-
-Only what is part of the pod stands in the Deployment: the image, resources, volumes and Secrets. All else of the
-Detector, and its rules, the detector follows itself, so a change of these restarts nothing.
+For a detector in other pods (mode Sidecar, see `sidecars`), these are only the permissions, for the service accounts of
+those pods. The Deployment contains only the parts of the Detector that concern the pod: the image, resources, volumes
+and Secrets. The detector itself watches the rest of the Detector, and its rules, so a change of these restarts nothing.
 """
 
 from __future__ import annotations
@@ -32,10 +31,10 @@ KINDS = (
     ("rbac.authorization.k8s.io/v1", "RoleBinding", "rolebindings"),
     ("apps/v1", "Deployment", "deployments"),
 )
-"""apiVersion, kind and plural of a detector's objects, those first that the others need."""
+"""apiVersion, kind and plural of a detector's objects, in the order of dependencies."""
 
 METRICS, METRICS_PORT = "metrics", 9100
-_SECRETS_FOLDER = "/etc/wayside/secrets"  # where the detector looks for them
+_SECRETS_FOLDER = "/etc/wayside/secrets"  # where the detector expects them
 _METRICS_FOLDER = "/etc/wayside/metrics-certificates"  # not among the Secrets that rules may use
 _SECRET_FIELDS = frozenset({"tlsSecretName", "credentialsSecretName", "uriSecretName"})
 _AS_GIVEN = frozenset(OF_ITS_OWN_POD) - {"securityContext"}
@@ -43,12 +42,12 @@ _SCRATCH_SIZE = "256Mi"
 
 
 def object_name(detector: str) -> str:
-    """What all objects of the Detector are called."""
+    """The name of all objects of the Detector."""
     return f"detector-{detector}"
 
 
 def detector_roles(namespace: str, detector: str) -> list[Manifest]:
-    """The account, the Role and the RoleBinding with what the detector needs, and no more."""
+    """The service account, the Role and the RoleBinding with exactly the permissions that the detector needs."""
     name = object_name(detector)
     account = {
         "apiVersion": "v1",
@@ -60,13 +59,13 @@ def detector_roles(namespace: str, detector: str) -> list[Manifest]:
 
 
 def sidecar_roles(namespace: str, detector: str, accounts: Iterable[str]) -> list[Manifest]:
-    """The Role and the RoleBinding with what the detector needs in others' pods, for their accounts and no others."""
+    """The Role and the RoleBinding with the permissions that the detector needs in other pods, for their accounts."""
     whose = [(namespace, each) for each in sorted(set(accounts))]
     return list(bound(object_name(detector), namespace, merged_rules(sidecar_rights(detector)), *whose))
 
 
 def detector_objects(detector: Detector, defaults: PodDefaults) -> list[Manifest]:
-    """All objects of the Detector, as they are to be applied: labelled, and owned by it."""
+    """All objects of the Detector, as they are to be applied: with labels and owner."""
     if detector.spec.mode is DetectorMode.SIDECAR:
         made = sidecar_roles(detector.namespace, detector.name, detector.spec.service_account_names or ())
     else:
@@ -77,14 +76,14 @@ def detector_objects(detector: Detector, defaults: PodDefaults) -> list[Manifest
 
 
 def deployment_to_try(detector: Detector, defaults: PodDefaults) -> Manifest:
-    """The Deployment of a detector of its own, for a dry run: by a name that none has, and owned by nothing."""
+    """The Deployment of a Standalone detector for a dry run: with an unused name, and without owner."""
     made = _deployment(detector, defaults)
     made["metadata"]["name"] += ".dry-run"
     return made
 
 
 def secrets_of(detector: Detector) -> list[str]:
-    """The Secrets that its pod mounts: those that the Detector names, and those that its rules may use."""
+    """The Secrets that its pod mounts: those in the Detector, and those that its rules may use."""
     pod = detector.spec.pod or DetectorPod()
     return sorted({*_named(detector.spec.to_json()), *pod.secret_names})
 
@@ -129,7 +128,7 @@ def _deployment(detector: Detector, defaults: PodDefaults) -> Manifest:
         "metadata": {"name": name, "namespace": detector.namespace},
         "spec": {
             "replicas": 1,
-            "strategy": {"type": "Recreate"},  # two of a name would wait for each other's Lease
+            "strategy": {"type": "Recreate"},  # two pods of one name would wait for each other's Lease
             "selector": {"matchLabels": {MANAGED_BY: MANAGER, DETECTOR_LABEL: detector.name}},
             "template": {"metadata": {"labels": _labels(detector.name)}, "spec": _pod(detector, defaults)},
         },
@@ -153,7 +152,7 @@ def _pod(detector: Detector, defaults: PodDefaults) -> Manifest:
         "securityContext": {
             "runAsNonRoot": True,
             **run_as(defaults),
-            **({} if defaults.user is None else {"fsGroup": defaults.user}),  # volumes are writable to it
+            **({} if defaults.user is None else {"fsGroup": defaults.user}),  # makes volumes writable for it
             "fsGroupChangePolicy": "OnRootMismatch",
             "seccompProfile": {"type": "RuntimeDefault"},
             **(pod.security_context or {}),
@@ -176,8 +175,8 @@ def container(
 ) -> Manifest:
     """The container that runs the Detector, without probes.
 
-    `mounts` as `volumes_of` has them; `port`: where metrics and health are served, None for nowhere; `port_name`: how
-    scrapers find it.
+    `mounts`: as returned by `volumes_of`; `port`: of metrics and health, None: do not serve them; `port_name`: for
+    scrapers.
     """
     pod = detector.spec.pod or DetectorPod()
     metrics = {} if port is None else {"ports": [{"name": port_name, "containerPort": port, "protocol": "TCP"}]}
@@ -205,18 +204,18 @@ def container(
 
 
 def pull_secrets(detector: Detector, defaults: PodDefaults) -> list[Manifest]:
-    """The Secrets to pull the image with: those of all detectors, then its own."""
+    """The Secrets for pulling the image: those of all detectors, then its own."""
     own = [each.name for each in detector.spec.pod.image_pull_secrets] if detector.spec.pod is not None else []
     return [{"name": each} for each in dict.fromkeys((*defaults.pull_secrets, *own))]
 
 
 def run_as(defaults: PodDefaults) -> Manifest:
-    """The user of a detector, as a security context has it."""
+    """The user of a detector in a security context."""
     return {} if defaults.user is None else {"runAsUser": defaults.user, "runAsGroup": defaults.user}
 
 
 def field_variable(variable: str, path: str) -> Manifest:
-    """An environment variable that has a field of the pod, by the downward API."""
+    """An environment variable with a field of the pod, by the downward API."""
     return {"name": variable, "valueFrom": {"fieldRef": {"fieldPath": path}}}
 
 
@@ -227,7 +226,7 @@ def probe(defaults: PodDefaults, path: str, period: int, failures: int, port_nam
 
 
 def _environment(pod: DetectorPod, defaults: PodDefaults) -> list[Manifest]:
-    """Who the pod is, then what holds for all detectors, unless the Detector gives its own, then what it gives."""
+    """The pod's identity, then the variables of all detectors, unless the Detector overrides them, then its own."""
 
     given: dict[str, Manifest] = {name: {"value": value} for name, value in sorted(defaults.environment.items())}
     for each in pod.env:
@@ -239,9 +238,9 @@ def _environment(pod: DetectorPod, defaults: PodDefaults) -> list[Manifest]:
 
 
 def volumes_of(detector: Detector, defaults: PodDefaults, prefix: str = "") -> tuple[list[Manifest], list[Manifest]]:
-    """The volumes, and where they are mounted. A Secret that is not there yet keeps nothing from starting.
+    """The volumes, and their mounts. A missing Secret does not prevent the start.
 
-    `prefix`: what the volumes' names begin with.
+    `prefix`: the start of the volumes' names.
     """
     pod = detector.spec.pod or DetectorPod()
     scratch = f"{prefix}scratch"
@@ -265,7 +264,7 @@ def volumes_of(detector: Detector, defaults: PodDefaults, prefix: str = "") -> t
 
 
 def _without_volume(detector: Detector, pod: DetectorPod) -> list[str]:
-    """The folders that are in no volume, those within another one left out."""
+    """The folders that are in no volume, without those inside another one."""
     found: list[PurePosixPath] = []
     there = [PurePosixPath(each.mount_path) for each in pod.volume_mounts] + [PurePosixPath("/tmp")]  # noqa: S108  see above
     for path in sorted(map(PurePosixPath, detector.spec.folders.values())):

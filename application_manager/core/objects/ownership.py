@@ -1,6 +1,6 @@
-"""The objects of an owner, distinguished from those of others by their controller and uid, and their labels. Pure.
+"""The objects of an owner, distinguished from others by their controller, uid and labels. Pure.
 
-Pods have the instance's label alone: it never changes while the instance lives, so it never makes a workload roll out.
+Pods have only the instance's label: it never changes during the life of the instance, so it never causes a rollout.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ Manifest = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class LastApplied:
-    """What was applied before: the digest of the rendering that was last applied in full, and the uids of the objects.
+    """The last apply: the digest of the last completely applied rendering, and the uids of the objects.
 
-    A uid is None where the object may not have been applied.
+    A uid is None if the object may not have been applied.
     """
 
     digest: str | None = None
@@ -42,16 +42,16 @@ class LastApplied:
 
     @classmethod
     def read(cls, digest: str | None, references: Iterable[ObjectReference]) -> LastApplied:
-        """The content of references, as `references` makes them."""
+        """The keys in references that `references` returned."""
         return cls(digest, {reference_key(each): each.uid for each in references})
 
 
 @dataclass(frozen=True, slots=True)
 class ApplyResult:
-    """What came of it: the condition Applied, and what belongs to the instance now.
+    """The result of an apply: the condition Applied, and the objects of the instance.
 
-    `complete`: whether everything is as rendered; `took`: when applying began and ended, in nanoseconds since the
-    epoch, None where nothing was applied.
+    `complete`: whether everything is as rendered; `took`: the start and the end of the apply, in nanoseconds since the
+    epoch, None if nothing was applied.
     """
 
     state: ConditionState
@@ -62,7 +62,7 @@ class ApplyResult:
 
 @dataclass(frozen=True, slots=True)
 class ApplyProblem:
-    """What keeps objects from being applied: the reason of the condition Applied, and the problem with its remedy."""
+    """Why objects are not applied: the reason of the condition Applied, and the problem with its remedy."""
 
     reason: str
     message: str
@@ -74,20 +74,20 @@ def controller_uid(live: Mapping[str, Any]) -> str | None:
 
 
 def controller_of(live: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The reference to the object's controller; empty where it has none."""
+    """The owner reference to the object's controller; empty if it has none."""
     owners: list[Mapping[str, Any]] = live["metadata"].get("ownerReferences") or []
     return next((each for each in owners if each.get("controller")), {})
 
 
 def instance_of(live: Mapping[str, Any]) -> tuple[str, str] | None:
-    """Namespace and name of the instance whose label the object has."""
+    """Namespace and name of the instance in the object's label."""
     metadata = live["metadata"]
     name = (metadata.get("labels") or {}).get(INSTANCE_LABEL)
     return (metadata["namespace"], name) if name else None
 
 
 def foreign(live: Mapping[str, Any], owner: Kind, what: str, recorded: str | None = None) -> ApplyProblem | None:
-    """Why the object may not be applied over, or None if it is the owner's, an instance's or Detector's.
+    """Why the object may not be applied over, or None if it belongs to the owner.
 
     `what`: the object's kind and name; `recorded`: its uid, if the owner's status lists it.
     """
@@ -109,19 +109,19 @@ def foreign(live: Mapping[str, Any], owner: Kind, what: str, recorded: str | Non
 
 
 def reference_key(of: ObjectReference | SuspendedReplicas) -> ObjectKey:
-    """What identifies the object of a reference in a status."""
+    """The key of the object of a reference in a status."""
     return of.api_version, of.kind, of.name
 
 
 def references(uids: Mapping[ObjectKey, str | None]) -> tuple[ObjectReference, ...]:
-    """The objects as a status lists them, in one order."""
+    """The objects for a status, in a fixed order."""
     return tuple(
         ObjectReference(api_version=key[0], kind=key[1], name=key[2], uid=uid) for key, uid in sorted(uids.items())
     )
 
 
 def owned(manifest: Manifest, instance: ApplicationInstance) -> Manifest:
-    """The manifest with the instance, which has a uid by now, as its owner and controller."""
+    """The manifest with the owner, which has a uid by now, as its controller."""
     owner = {
         "apiVersion": API_VERSION,
         "kind": instance.kind,
@@ -133,12 +133,12 @@ def owned(manifest: Manifest, instance: ApplicationInstance) -> Manifest:
 
 
 def object_key(manifest: Mapping[str, Any]) -> ObjectKey:
-    """What identifies the objects of one instance: apiVersion, kind and name."""
+    """The keys of the objects of one instance: apiVersion, kind and name."""
     return manifest["apiVersion"], manifest["kind"], manifest["metadata"]["name"]
 
 
 def our_fields(raw: Mapping[str, Any]) -> str:
-    """The fields that are ours; an update by somebody else takes those that it changes."""
+    """The fields that this manager owns; another client that updates them takes them over."""
     for each in raw["metadata"].get("managedFields") or []:
         if each.get("manager") == FIELD_MANAGER and each.get("operation") == "Apply" and not each.get("subresource"):
             return json.dumps(each.get("fieldsV1"), sort_keys=True)
@@ -146,7 +146,7 @@ def our_fields(raw: Mapping[str, Any]) -> str:
 
 
 def labelled(manifest: Manifest, instance: ApplicationInstance) -> Manifest:
-    """The manifest in the instance's namespace and with its labels, and its pod template with the instance's."""
+    """The manifest in the instance's namespace and with its labels, and its pod template with the instance's label."""
     metadata = manifest["metadata"]
     own = {
         MANAGED_BY_LABEL: MANAGED_BY,
@@ -163,7 +163,7 @@ def labelled(manifest: Manifest, instance: ApplicationInstance) -> Manifest:
 
 
 def _labelled_pods(instance: str, template: Manifest) -> Manifest:
-    """The pod template with the instance's label; one of a wrong shape is unchanged, and the API server rejects it."""
+    """The pod template with the instance's label; an invalid one is unchanged, and the API server rejects it."""
     metadata = template.get("metadata") or {}
     labels = (metadata.get("labels") or {}) if isinstance(metadata, dict) else None
     if not isinstance(labels, dict):

@@ -16,17 +16,16 @@ USER = 65532  # of our image
 
 @dataclass(frozen=True, slots=True)
 class PodDefaults:
-    """From the manager's options.
+    """The defaults in the manager's options.
 
     Attributes:
-        image: of Detectors that name none.
+        image: of Detectors without an image.
         pull_policy: of all images; None: Kubernetes' default, by the image's tag.
-        pull_secrets: by which nodes pull the images; each namespace with detectors has Secrets of these names.
-        environment: of the containers, e.g. where traces go; what a Detector gives itself wins.
-        metrics_secret: the Secret with tls.crt and tls.key by which they serve metrics and health, in each namespace
-            with detectors; None: without TLS.
-        user: the user that they run as, and the group of their volumes; None: the cluster chooses, as
-            OpenShift does.
+        pull_secrets: for pulling the images; each namespace with detectors has Secrets of these names.
+        environment: of the containers, e.g. the endpoint of traces; a Detector's own variables override it.
+        metrics_secret: the Secret in each namespace with detectors with the tls.crt and tls.key for metrics and health;
+            None: without TLS.
+        user: the user of the processes, and the group of their volumes; None: the cluster chooses, as OpenShift does.
     """
 
     image: str
@@ -38,7 +37,7 @@ class PodDefaults:
 
 
 def parse_user(given: str) -> int | None:
-    """Read a user's number, or `cluster` for None. Raises ValueError for what is neither, and for root."""
+    """Parse a user ID, or `cluster` as None. Raises ValueError for anything else, and for root."""
     if given == "cluster":
         return None
     if not given.isdigit() or int(given) == 0:
@@ -47,7 +46,7 @@ def parse_user(given: str) -> int | None:
 
 
 def parse_environment(given: Iterable[str]) -> dict[str, str]:
-    """Read NAME=VALUE each. Raises ValueError for what is none."""
+    """Parse a list of NAME=VALUE. Raises ValueError."""
     found = {}
     for each in given:
         name, equals, value = each.partition("=")

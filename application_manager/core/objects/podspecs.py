@@ -1,7 +1,7 @@
 """Finds the pod specs and the service accounts in a manifest of any kind, by their shape. Pure.
 
-Kinds that an administrator allows may make pods in ways that nobody foresaw here (ReplicaSet, Rollout, Knative
-Service), so what has `containers` is a pod's spec wherever it stands.
+Kinds that an administrator allows may create pods in ways that the manager does not know (ReplicaSet, Rollout, Knative
+Service), so any map with `containers` is treated as a pod spec.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ POD_TEMPLATES: Mapping[str, tuple[str, ...]] = {
     **dict.fromkeys(("Deployment", "StatefulSet", "DaemonSet", "ReplicaSet", "ReplicationController", "Job"), _USUAL),
     "CronJob": ("spec", "jobTemplate", "spec", "template"),
 }
-"""Where the pod, or the template of pods, is in a manifest of the kind."""
+"""The path of the pod, or the pod template, in a manifest of the kind."""
 
 _CONTAINERS = ("containers", "initContainers")
 _ACCOUNTS = ("serviceAccountName", "serviceAccount")
@@ -26,24 +26,24 @@ _TEXTS = {"ConfigMap": ("data", "binaryData"), "Secret": ("data", "stringData")}
 
 
 def at(value: Any, path: Iterable[str]) -> Mapping[str, Any]:
-    """The map at the path in another one; empty where there is none."""
+    """The map at the path in another one; empty if there is none."""
     for each in path:
         value = value.get(each) if isinstance(value, Mapping) else None
     return value if isinstance(value, Mapping) else {}
 
 
 def pod_template(manifest: Mapping[str, Any]) -> Mapping[str, Any]:
-    """What the pods of a manifest are made of, in an unknown kind at `spec.template`; empty where there is none."""
+    """The pod template of a manifest, in an unknown kind at `spec.template`; empty if there is none."""
     return at(manifest, POD_TEMPLATES.get(str(manifest.get("kind")), _USUAL))
 
 
 def pod_spec(manifest: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The spec of a manifest's pods; empty where there is none."""
+    """The pod spec of a manifest; empty if there is none."""
     return at(pod_template(manifest), ("spec",))
 
 
 def with_pod_template(manifest: dict[str, Any], change: Callable[[dict[str, Any]], dict[str, Any]]) -> dict[str, Any]:
-    """The manifest with its pod template changed; as it is where it has none, or is of an unknown kind."""
+    """The manifest with its pod template changed; unchanged if it has none, or is of an unknown kind."""
     path = POD_TEMPLATES.get(str(manifest.get("kind")))
     return manifest if path is None else _changed(manifest, path, change)
 
@@ -57,7 +57,7 @@ def _changed(value: dict[str, Any], path: tuple[str, ...], change: Callable[[dic
 
 @dataclass(frozen=True, slots=True)
 class PodSpec:
-    """A pod spec, as it is in its manifest, and its field."""
+    """A pod spec in its manifest, and its field."""
 
     where: str
     spec: dict[str, Any]
@@ -65,14 +65,14 @@ class PodSpec:
 
 @dataclass(frozen=True, slots=True)
 class NamedAccount:
-    """A service account that a field outside of pod specs names."""
+    """A service account in a field outside of pod specs."""
 
     where: str
     account: str
 
 
 def pods_and_accounts(manifest: dict[str, Any]) -> Iterator[PodSpec | NamedAccount]:
-    """All of them, each with its field; what is metadata, or the text of a ConfigMap or Secret, is neither."""
+    """All of them, each with its field; metadata, and the texts of ConfigMaps and Secrets, are ignored."""
     kind = str(manifest.get("kind"))
     path = POD_TEMPLATES.get(kind)
     known = "" if path is None else ".".join((*path, "spec"))

@@ -1,7 +1,7 @@
-"""What a template may create: the administrator's limits on kinds, namespaces and service accounts.
+"""The administrator's limits on kinds, namespaces and service accounts of a template's objects.
 
-The namespace is the wall: a template's objects stay in its own namespace, are of the allowed kinds and run with the
-listed service accounts. The account `default` is there for everyone, so its token is never mounted.
+The namespace is the boundary: a template's objects are in its own namespace, are of the allowed kinds and use the
+allowed service accounts. Any pod may use the service account `default`, so its token is never mounted.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ PLURALS: Mapping[KindKey, str] = {
     SECRET: "secrets",
     ("v1", "Service"): "services",
 }
-"""The kinds that are known without a cluster, and what paths and roles call them."""
+"""The kinds that are known without a cluster, with their plurals."""
 
 DEFAULT_KINDS: frozenset[KindKey] = frozenset(PLURALS) - {SECRET}
-"""The kinds that are allowed where the administrator names none."""
+"""The kinds that are allowed by default."""
 
 _NEVER_KINDS = frozenset({"Role", "RoleBinding", "ClusterRole", "ClusterRoleBinding", "ServiceAccount", "Namespace"})
 _NEVER_GROUPS = frozenset(
@@ -56,16 +56,13 @@ _TOKEN_SECRET = "kubernetes.io/service-account-token"  # noqa: S105  a type of S
 
 
 def kind_text(key: KindKey) -> str:
-    """A kind as options and messages write it, e.g. apps/v1/Deployment."""
+    """A kind in options and messages, e.g. apps/v1/Deployment."""
     return "/".join(key)
 
 
 @dataclass(frozen=True, slots=True)
 class Policy:
-    """The kinds and service accounts that templates may use.
-
-    Raises ValueError for a kind that no administrator can allow.
-    """
+    """The kinds and service accounts that templates may use. Raises ValueError for a kind that can never be allowed."""
 
     kinds: frozenset[KindKey] = DEFAULT_KINDS
     service_accounts: frozenset[str] = frozenset({"default"})
@@ -80,15 +77,15 @@ class Policy:
 
     @classmethod
     def parse(cls, kinds: list[str] | None, service_accounts: list[str] | None) -> Self:
-        """The policy of the options `--allowed-kinds` and `--service-accounts`, None or empty where not given.
+        """The policy of the options `--allowed-kinds` and `--service-accounts`, None or empty if not given.
 
-        Raises ValueError for what is no kind, or one that can never be allowed.
+        Raises ValueError for an invalid kind, or one that can never be allowed.
         """
         parsed = frozenset(_parse_kind(each) for each in kinds) if kinds else DEFAULT_KINDS
         return cls(parsed, frozenset(service_accounts or ["default"]))
 
     def check_everywhere(self) -> None:
-        """Raise ValueError for a kind that no manager of all namespaces may look at."""
+        """Raise ValueError if a manager of all namespaces may not use one of the kinds."""
         if SECRET in self.kinds:
             raise ValueError(
                 "v1/Secret needs --namespace, since a manager of all namespaces would read every Secret of the "
@@ -96,7 +93,7 @@ class Policy:
             )
 
     def kind_problem(self, api_version: str, kind: str) -> str | None:
-        """Why the kind may not be used, or None if it may."""
+        """Why the kind is not allowed, or None if it is."""
         if (api_version, kind) in self.kinds:
             return None
         same = sorted(kind_text(key) for key in self.kinds if key[1] == kind)
@@ -108,7 +105,7 @@ class Policy:
         return f"{kind_text((api_version, kind))} is not a kind that the administrator allows: {choice}"
 
     def pod_problems(self, manifest: dict[str, Any]) -> Iterator[tuple[str, str]]:
-        """Field and problem of each thing in the manifest's pods that is not allowed."""
+        """Field and problem of each part of the manifest's pods that is not allowed."""
         if manifest.get("kind") == "Secret" and manifest.get("type") == _TOKEN_SECRET:
             yield "type", f"{_TOKEN_SECRET} would contain a service account's token: remove it"
         for found in pods_and_accounts(manifest):
@@ -131,7 +128,7 @@ class Policy:
             )
 
     def completed(self, manifest: dict[str, Any]) -> dict[str, Any]:
-        """The manifest, in place, with the token of the account `default` kept out of its pods."""
+        """The manifest, changed in place so that its pods do not mount the token of the service account `default`."""
         for found in pods_and_accounts(manifest):
             if isinstance(found, PodSpec) and found.spec.get("serviceAccountName", "default") == "default":
                 found.spec.setdefault("automountServiceAccountToken", False)

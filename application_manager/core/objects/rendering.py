@@ -1,7 +1,7 @@
-"""Rendering: a template and an instance give manifests, and the same two give the same bytes.
+"""Rendering: a template and an instance give manifests; equal input gives equal bytes. Pure.
 
-Pure. A `Renderer` holds a template compiled once; `render` fills in an instance. What the template may not do is
-reported with the field, the value and the remedy; then nothing is rendered at all.
+A `Renderer` contains a template that is compiled once; `render` evaluates it for an instance. Anything that the
+template may not do is reported with the field, the value and the remedy; then nothing is rendered at all.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ _NAME = re.compile(
 _LONGEST_NAME = 253  # characters
 
 MOST_EXPRESSIONS = 1000
-"""In one template: each takes about a millisecond to compile, and no template is to hold up the manager."""
+"""In one template: each takes about a millisecond to compile, and no template may block the manager."""
 
 
 class RenderError(Exception):
-    """A template that cannot be rendered; `problems` holds all that is wrong, each with field, value and remedy."""
+    """A template that cannot be rendered; `problems` has all errors, each with field, value and remedy."""
 
     def __init__(self, problems: list[str], reason: str = "RenderFailed") -> None:
         super().__init__("; ".join(problems))
@@ -61,7 +61,7 @@ class ChartPending(Exception):  # noqa: N818  no error: the answer is still to c
 class Rendering:
     """The objects of an instance: manifests without owner, which `owned` adds, and a digest of them all.
 
-    `replicas`: of each workload that can be scaled, what the template states; None where it leaves that to others.
+    `replicas`: of each workload with replicas, the number in the template; None if the template does not set it.
     """
 
     manifests: tuple[Manifest, ...]
@@ -69,14 +69,14 @@ class Rendering:
     replicas: Mapping[ObjectKey, int | None] = field(default_factory=dict)
 
     def keys(self) -> set[ObjectKey]:
-        """What identifies the objects: apiVersion, kind and name of each."""
+        """The keys of the objects: apiVersion, kind and name of each."""
         return {object_key(each) for each in self.manifests}
 
 
 class Renderer:
     """A template, compiled.
 
-    Raises RenderError for expressions that do not compile or name what there is not, and for kinds not allowed.
+    Raises RenderError for expressions that do not compile or read unknown names, and for kinds that are not allowed.
     """
 
     def __init__(self, template: ApplicationTemplate, policy: Policy) -> None:
@@ -123,16 +123,16 @@ class Renderer:
 
     @property
     def embedded(self) -> tuple[Embedded, ...]:
-        """All expressions of the template but the key, with their fields."""
+        """All expressions of the template except the key, with their fields."""
         compiled = [*self._manifests, *([self._values] if self._values is not None else [])]
         of_files = self._configuration.embedded if self._configuration is not None else ()
         return (*of_files, *(each for one in compiled for each in one.embedded))
 
     def render(self, instance: ApplicationInstance, charts: Charts = no_charts) -> Rendering:
-        """The instance's objects; `charts` knows what became of a chart.
+        """The instance's objects; `charts` returns the results of charts.
 
-        Raises RenderError where an expression fails on the instance's values, or a manifest may not be as it is, and
-        ChartPending where the chart's rendering is still to come.
+        Raises RenderError if an expression fails with the instance's values, or a manifest is not allowed, and
+        ChartPending while the chart is being rendered.
         """
         spec = self.template.spec
         problems = parameters.problems(spec.parameters, instance.spec.parameters, self.template.name, "spec.parameters")
@@ -150,7 +150,7 @@ class Renderer:
         for index, compiled in enumerate(self._manifests):
             path = f"spec.manifests[{index}]"
             try:
-                # Copied, since a template without ${…} somewhere gives out its own parts.
+                # Copied, because rendering returns parts of the template that contain no ${…} themselves.
                 manifest = cast("Manifest", copy.deepcopy(compiled.render(variables, integers=True)))
             except InterpolationError as error:
                 problems.append(str(error))
@@ -184,7 +184,7 @@ class Renderer:
         variables: Mapping[str, Any],
         charts: Charts,
     ) -> Iterator[tuple[str, Manifest]]:
-        """The chart's objects, each with where it stands."""
+        """The chart's objects, each with its place."""
         try:
             given = compiled.render(variables, integers=True)
         except InterpolationError as error:
@@ -196,7 +196,7 @@ class Renderer:
         if isinstance(outcome, ApplyProblem):
             raise RenderError([outcome.message], outcome.reason)
         for each in outcome.objects:
-            # Copied and in one form, since what comes from the chart is kept for the next time.
+            # Copied and normalised, because the chart's objects stay in the cache.
             yield f"spec.helm: {each.file} of chart {helm.chart}", cast("Manifest", values.normal(each.manifest))
 
     def _problems(self, manifest: Manifest, instance: ApplicationInstance) -> Iterator[tuple[str, str]]:
@@ -237,17 +237,17 @@ class Renderer:
 
 
 def error_texts(error: InterpolationError) -> list[str]:
-    """The error and all further ones that came with it."""
+    """The error, and all further ones in it."""
     return [str(each) for each in (error, *error.others)]
 
 
 def digest(manifests: list[Manifest]) -> str:
-    """A digest of manifests: equal exactly if their canonical bytes are."""
+    """A digest of manifests: equal if and only if their canonical bytes are equal."""
     return hashlib.sha256(values.canonical(manifests).encode()).hexdigest()
 
 
 def _expressions(template: ApplicationTemplate) -> int:
-    """How many `${` there are to be compiled."""
+    """The number of `${` to compile."""
     spec = template.spec
     text = json.dumps([spec.configuration, spec.manifests, spec.helm.values if spec.helm is not None else None])
     return text.count("${") - text.count("$${")

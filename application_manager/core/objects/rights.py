@@ -1,7 +1,7 @@
-"""The rights that the manager's account needs, from the kinds that templates may create. Pure.
+"""The permissions that the manager's account needs, from the kinds that templates may create. Pure.
 
-One table, read three times: `application-manager rbac` prints it as roles, a manager that starts queries the API server
-for each of its entries, and the tests hold it against what a manager does. A verb that nothing needs is not in it.
+One table for three uses: `application-manager rbac` prints it as roles, a starting manager queries the API server for
+each of its entries, and the tests compare it with the manager's requests. It contains no verb that is not needed.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class PolicyRule:
     Attributes:
         group: the API group, empty for the core group.
         resource: the plural, with `/<subresource>` where it is one.
-        purpose: what does not work without it; `vital`: nothing does.
+        purpose: the consequence if it is missing; `vital`: the manager, or the detector, cannot work without it.
         name: the one object that it is limited to; empty: all.
     """
 
@@ -43,12 +43,12 @@ class PolicyRule:
     name: str = ""
 
     def rule(self) -> dict[str, Any]:
-        """As a role has it."""
+        """The rule for a role."""
         names = {"resourceNames": [self.name]} if self.name else {}
         return {"apiGroups": [self.group], "resources": [self.resource], "verbs": list(self.verbs)} | names
 
     def lack(self, verb: str, where: str) -> str:
-        """The message where the verb is not allowed; `where` is "in namespace x" or "in all namespaces"."""
+        """The message if the verb is missing; `where` is "in namespace x" or "in all namespaces"."""
         of = f" of {self.group}" if self.group else ""
         name = f" {self.name}" if self.name else ""
         return f"its service account cannot {verb} {self.resource}{name}{of} {where}, so {self.purpose}"
@@ -58,22 +58,22 @@ REMEDY = "apply the output of `application-manager rbac`"
 
 
 def rights(plurals: Mapping[KindKey, str], *, detectors: bool = False) -> list[PolicyRule]:
-    """The rights that are needed in each managed namespace; `detectors`: whether the manager runs detectors too."""
+    """The permissions in each managed namespace; `detectors`: whether the manager runs detectors."""
     return [*_own(), *_children(plurals), *(_running_detectors() if detectors else ())]
 
 
 def read_only(needed: Iterable[PolicyRule]) -> list[PolicyRule]:
-    """What of the rights changes nothing: all that a manager of all namespaces has in each of them."""
+    """The read permissions, which a manager of all namespaces has in each of them."""
     return _narrowed(needed, lambda verb: verb in _READING)
 
 
 def writing(needed: Iterable[PolicyRule]) -> list[PolicyRule]:
-    """What of the rights changes something, or may be handed on to detectors: it is granted by namespace."""
+    """The permissions to write, or to pass on to detectors: they are granted by namespace."""
     return _narrowed(needed, lambda verb: verb not in _READING)
 
 
 def granting() -> PolicyRule:
-    """The right that a manager of all namespaces queries to learn whether it may write in one."""
+    """The permission that a manager of all namespaces queries to learn whether it may write in a namespace."""
     return PolicyRule(_GROUP, "applicationtasks/status", ("patch",), "their statuses are not written")
 
 
@@ -83,7 +83,7 @@ def _narrowed(needed: Iterable[PolicyRule], wanted: Callable[[str], bool]) -> li
 
 
 def detector_rights(name: str) -> list[PolicyRule]:
-    """What the Detector of that name must be allowed to do in its namespace, where it runs by itself."""
+    """The permissions of a Standalone detector in its namespace."""
     return [
         *_detecting(name, "hold"),
         PolicyRule(_LEASES, "leases", ("get", "update"), "it counts as lost", vital=True, name=lease_name(name)),
@@ -92,10 +92,10 @@ def detector_rights(name: str) -> list[PolicyRule]:
 
 
 def sidecar_rights(name: str) -> list[PolicyRule]:
-    """What the Detector of that name must be allowed to do in its namespace, where it runs in others' pods.
+    """The permissions of a Sidecar detector in its namespace.
 
-    Each pod has a Lease of its own, whose name no role knows: that the others' are left alone, the chart's policy sees
-    to, by the verb `hold-as-pod`.
+    Each pod has its own Lease, whose name no role can know: with the verb `hold-as-pod`, the chart's policy makes sure
+    that a pod changes no other Lease.
     """
     return [
         *_detecting(name, "hold-as-pod"),
@@ -112,18 +112,18 @@ def _detecting(name: str, hold: str) -> Iterator[PolicyRule]:
 
 
 def lease_rights(name: str) -> list[PolicyRule]:
-    """What is needed in the namespace of the managers' own Lease."""
+    """The permissions in the namespace of the managers' own Lease."""
     purpose = "no manager becomes active"
     return [
         PolicyRule(_LEASES, "leases", ("get", "update"), purpose, vital=True, name=name),
         PolicyRule(
             _LEASES, "leases", ("create",), purpose, vital=True
-        ),  # of what is not there yet, no role knows the name
+        ),  # no role can know the name of an object that does not exist yet
     ]
 
 
 def certificate_rights(secret: str, webhooks: str) -> tuple[list[PolicyRule], list[PolicyRule]]:
-    """What a manager needs that makes its webhook's certificate: in the Secret's namespace, and in the cluster."""
+    """The permissions to issue the webhook's certificate: in the Secret's namespace, and in the cluster."""
     purpose = "the webhook has no certificate that the API server trusts"
     group = "admissionregistration.k8s.io"
     plurals = ("validatingwebhookconfigurations", "mutatingwebhookconfigurations")
@@ -134,7 +134,7 @@ def certificate_rights(secret: str, webhooks: str) -> tuple[list[PolicyRule], li
 
 
 def node_rights() -> list[PolicyRule]:
-    """What is of use for the whole cluster, and can be done without: nodes belong to no namespace."""
+    """The optional cluster-wide permissions: nodes belong to no namespace."""
     return [PolicyRule("", "nodes", ("list",), "only the scheduler reports that no node fits a template")]
 
 
@@ -155,7 +155,7 @@ def _own() -> Iterator[PolicyRule]:
 
 
 def _running_detectors() -> Iterator[PolicyRule]:
-    """To make a detector's objects; what it hands on by their Roles, the manager must have itself (no `escalate`)."""
+    """To create a detector's objects; the manager must have the permissions in their Roles itself (no `escalate`)."""
     no_detector = "no detector runs"
     for group, resource in (
         ("", "serviceaccounts"),
@@ -203,18 +203,18 @@ def roles(
 ) -> list[dict[str, Any]]:
     """The roles and their bindings, as manifests.
 
-    A manager of named namespaces has a Role in each. One of all namespaces has a ClusterRole that reads, and another
-    one that writes, which only RoleBindings lead to.
+    A manager of named namespaces has a Role in each. A manager of all namespaces has a ClusterRole for reading, and
+    another one for writing, which only RoleBindings refer to.
 
     Args:
-        plurals: of the kinds that are allowed.
-        namespaces: those that are managed; empty: all.
+        plurals: of the allowed kinds.
+        namespaces: the managed ones; empty: all.
         lease, account: namespace and name.
-        name: of all roles and bindings; those of the Lease end with `-lease`, of the webhook's certificate
-            with `-certificates`, the ClusterRole that writes with `-writer`.
-        granted: without `namespaces`: those in which the manager may write.
-        certificates: namespace and name of the Secret, and the name of the webhook configurations, where the manager
-            makes its webhook's certificate.
+        name: of all roles and bindings; those of the Lease end with `-lease`, of the webhook's certificate with
+            `-certificates`, the ClusterRole for writing with `-writer`.
+        granted: without `namespaces`: the namespaces in which the manager may write.
+        certificates: namespace and name of the Secret, and the name of the webhook configurations, if the manager
+            issues its webhook's certificate.
     """
     where = list(dict.fromkeys(namespaces))
     needed = rights(plurals, detectors=detectors)
@@ -234,7 +234,7 @@ def roles(
 
 
 def merged_rules(needed: Iterable[PolicyRule]) -> list[dict[str, Any]]:
-    """As few rules as possible: resources of a group with the same verbs are one."""
+    """The minimum number of rules: resources of a group with the same verbs are combined."""
     verbs: dict[tuple[str, str, str], dict[str, None]] = {}
     for each in needed:
         verbs.setdefault((each.group, each.name, each.resource), {}).update(dict.fromkeys(each.verbs))
@@ -250,9 +250,9 @@ def merged_rules(needed: Iterable[PolicyRule]) -> list[dict[str, Any]]:
 def bound(
     name: str, namespace: str | None, rules: list[dict[str, Any]], *accounts: tuple[str, str]
 ) -> Iterator[dict[str, Any]]:
-    """A role with these rules and the binding of the accounts, each namespace and name, to it.
+    """A role with these rules, and its binding for the accounts, each a namespace and a name.
 
-    Both are for the namespace, or without one for the cluster.
+    Both are for the namespace or, without one, for the cluster.
     """
     role = _role(name, namespace, rules)
     yield role

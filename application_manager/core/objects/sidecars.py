@@ -3,10 +3,10 @@
 The webhook adds it to pods, and `application-manager inject` to manifests. It is a native sidecar, an init container
 that is always restarted: it starts before the pod's own containers, ends after them, and keeps no Job from completing.
 
-The pod shall not suffer from it. So nothing of it is waited for: no startup probe holds back the other containers, and
-no readiness probe takes the pod out of its Services. It comes after all other init containers, for which it would be
-too late anyway; its names are its own; and its token is a volume of its own, whatever the pod or its account have for
-mounting one.
+The pod must not suffer from it. So nothing waits for the sidecar: no startup probe delays the other containers, and no
+readiness probe removes the pod from its Services. It comes after all other init containers, which need no detector; its
+names do not collide with those of the pod; and its token is a separate volume, whatever the pod or its service account
+configure for mounting one.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from wayside.api import Detector
 SIDECAR_LABEL = "wayside.dev/detector"
 """On pods: the Detector that they request."""
 CONTAINER = "wayside-detector"
-"""The name of the container. A pod that has one of this name has its detector."""
+"""The name of the container. A pod with a container of this name already has its detector."""
 
 _PREFIX = "wayside-"
 _TOKEN = f"{_PREFIX}token"
@@ -38,24 +38,24 @@ _TOKEN_FOLDER = "/var/run/secrets/kubernetes.io/serviceaccount"  # noqa: S105  a
 _TOKEN_SECONDS = 3607  # the kubelet renews it in time; the value that Kubernetes itself uses
 _METRICS = "wayside-metrics"  # scrapers find ports by their names, over all containers of a pod
 _FIRST_PORT = 9464  # not 9100, which many pods have themselves
-_STARTING = 120  # s that a detector may take until its health counts
+_STARTING = 120  # s until a missing health response counts
 
 
 @dataclass(frozen=True, slots=True)
 class Addition:
-    """What is added to the lists of a pod's spec, by their fields."""
+    """The additions to the lists of a pod's spec, by their fields."""
 
     items: dict[str, list[Manifest]]
 
 
 class SidecarError(ValueError):
-    """With the sidecar the pod would not be valid, and would not be made at all."""
+    """With the sidecar, the pod would not be valid, and could not be created."""
 
 
 def addition(spec: Mapping[str, Any], detector: Detector, defaults: PodDefaults) -> Addition | None:
-    """The fields that the spec of a pod needs for the Detector's sidecar; None if it has the sidecar.
+    """The fields to add to the spec of a pod for the Detector's sidecar; None if it has the sidecar already.
 
-    Raises SidecarError where they do not go together.
+    Raises SidecarError if the two are not compatible.
     """
     if has_sidecar(spec):
         return None
@@ -82,12 +82,12 @@ def addition(spec: Mapping[str, Any], detector: Detector, defaults: PodDefaults)
 
 
 def has_sidecar(spec: Mapping[str, Any]) -> bool:
-    """Whether the spec of a pod has the detector's container, be it ours or one that its author wrote."""
+    """Whether the spec of a pod has the detector's container, even if its author wrote it."""
     return any(each.get("name") == CONTAINER for each in _all_containers(spec))
 
 
 def sidecar_pods(pods: Iterable[Mapping[str, Any]]) -> Iterator[Mapping[str, Any]]:
-    """Of each pod that has the sidecar, what concerns it alone, as if there were nothing else in the pod."""
+    """The sidecars of pods, each as if its pod had no other containers."""
     for pod in pods:
         spec, status = pod.get("spec") or {}, pod.get("status") or {}
         if has_sidecar(spec):
@@ -112,7 +112,7 @@ def added(spec: Mapping[str, Any], given: Addition) -> Manifest:
 
 
 def patch(spec: Mapping[str, Any], given: Addition) -> list[dict[str, Any]]:
-    """The same as a JSON patch of the pod (RFC 6902), which touches nothing else."""
+    """The addition as a JSON patch of the pod (RFC 6902), which changes nothing else."""
     operations: list[dict[str, Any]] = []
     for field, items in given.items.items():
         if _list(spec, field):
@@ -126,11 +126,11 @@ def _sidecar(detector: Detector, defaults: PodDefaults, mounts: list[Manifest], 
     made = container(detector, defaults, mounts, name=CONTAINER, port=port, port_name=_METRICS)
     made["command"] += ["--as-pod", "--namespace=$(POD_NAMESPACE)"]
     made["env"].append(field_variable("POD_NAMESPACE", "metadata.namespace"))
-    for each in made["env"]:  # a Secret that is not there would keep the whole pod from starting
+    for each in made["env"]:  # a missing Secret would prevent the start of the whole pod
         for reference in ("secretKeyRef", "configMapKeyRef"):
             if reference in each.get("valueFrom", {}):
                 each["valueFrom"][reference] |= {"optional": True}
-    # The pod's own securityContext is its author's, so all that the restricted standard requires is here.
+    # The pod's own securityContext belongs to its author: the sidecar sets all that the restricted standard requires.
     made["securityContext"] |= {
         "runAsNonRoot": True,
         **run_as(defaults),
@@ -147,7 +147,7 @@ def _sidecar(detector: Detector, defaults: PodDefaults, mounts: list[Manifest], 
 def _port(spec: Mapping[str, Any]) -> int | None:
     """A port for metrics and health that no other container of the pod declares.
 
-    None in a pod of the node's network: there it could be another pod's, and would keep a second pod from the node.
+    None in a pod with hostNetwork: another pod on the node could use the port, which would keep this pod off the node.
     """
     if spec.get("hostNetwork"):
         return None
@@ -156,7 +156,7 @@ def _port(spec: Mapping[str, Any]) -> int | None:
 
 
 def _token() -> Manifest:
-    """The account's token, bound to the pod: what the ServiceAccount admission mounts where it may."""
+    """The service account's token, bound to the pod: the same volume that the ServiceAccount admission mounts."""
     sources = [
         {"serviceAccountToken": {"path": "token", "expirationSeconds": _TOKEN_SECONDS}},
         {"configMap": {"name": "kube-root-ca.crt", "items": [{"key": "ca.crt", "path": "ca.crt"}]}},

@@ -17,7 +17,7 @@ from application_manager.core.objects.ownership import ObjectKey, object_key
 Json = dict[str, Any]
 
 SCALED = frozenset({("apps/v1", "Deployment"), ("apps/v1", "StatefulSet")})
-"""The kinds, among those that can be allowed, whose `scale` subresource has the number of replicas."""
+"""The allowable kinds with a `scale` subresource for their replicas."""
 
 _SUSPENDABLE = frozenset({"Job", "CronJob"})
 _REMOVED = frozenset({"DaemonSet", "Pod"})
@@ -30,7 +30,7 @@ def is_scaled(manifest: Mapping[str, Any]) -> bool:
 
 
 def yielded(manifests: Iterable[Json]) -> list[Json]:
-    """The manifests, where an autoscaler among them determines the replicas of a workload: without `replicas` there."""
+    """The manifests; if one of them is an autoscaler for a workload, that workload has no `replicas`."""
     everything = list(manifests)
     autoscaled = {(each["kind"], each["name"]) for each in _targets(everything)}
     return [
@@ -55,7 +55,7 @@ def stopped(manifests: Iterable[Json]) -> list[Json]:
 
 
 def stated_replicas(manifests: Iterable[Json]) -> dict[ObjectKey, int | None]:
-    """By workload that can be scaled, the replicas that its manifest states; None where it leaves them to others."""
+    """By workload with replicas, the number in its manifest; None if the manifest does not set it."""
     found: dict[ObjectKey, int | None] = {}
     for each in manifests:
         if is_scaled(each):
@@ -72,7 +72,7 @@ def autoscalers(manifests: Iterable[Mapping[str, Any]]) -> list[str]:
 
 
 def pods_left(live: Mapping[str, Any]) -> int:
-    """How many pods of a workload that is to be at zero there still are, as far as its status shows."""
+    """The number of pods of a suspended workload that still exist, as far as its status shows."""
     status, spec = live.get("status") or {}, live.get("spec") or {}
     if (live.get("apiVersion"), live.get("kind")) in SCALED:
         return int(max(status.get("replicas") or 0, spec.get("replicas", 1)))
@@ -91,6 +91,6 @@ def _with_spec(manifest: Json, **changes: Any) -> Json:
     """A copy with other members of the spec; None removes one."""
     spec = manifest.get("spec")
     if not isinstance(spec, dict):
-        return manifest  # the API server will report what is wrong with it
+        return manifest  # the API server reports the error
     changed = {key: value for key, value in copy.deepcopy(spec).items() if key not in changes}
     return {**manifest, "spec": changed | {key: value for key, value in changes.items() if value is not None}}

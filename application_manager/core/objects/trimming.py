@@ -1,7 +1,7 @@
 """Trims objects for the cache to the fields that decisions read. Pure.
 
-An object may have 1.5 MB, and Python needs several times that. So neither the texts of ConfigMaps and Secrets are kept
-nor containers, managed fields of others, foreign annotations and the values of a task's event.
+An object may have 1.5 MB, and Python needs several times that. So the cache does not contain the texts of ConfigMaps
+and Secrets, containers, managed fields of others, foreign annotations and the values of a task's event.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _OF_TASKS = ("templateName",)  # fields of a task's spec that are read in additi
 
 
 def own(raw: Object) -> Object:
-    """An object of our kinds without what nobody reads, for its model to be made of."""
+    """An object of our kinds, reduced to the fields that its model needs."""
     lean = {**raw, "metadata": _metadata(raw, managers=())}
     spec = raw.get("spec")
     if raw.get("kind") == "ApplicationTask" and isinstance(spec, dict) and isinstance(spec.get("event"), dict):
@@ -32,7 +32,7 @@ def own(raw: Object) -> Object:
 
 
 def beside_model(lean: Object) -> Object:
-    """What is kept of an object of our kinds whose model is kept as well; tasks and instances are many."""
+    """The raw fields to keep for an object of our kinds, beside its model; there are many tasks and instances."""
     if lean["kind"] not in ("ApplicationTask", "ApplicationInstance"):
         return lean
     spec, status = lean.get("spec") or {}, lean.get("status") or {}
@@ -48,7 +48,7 @@ def beside_model(lean: Object) -> Object:
 
 
 def others(raw: Object, manager: str) -> Object:
-    """What is kept of an object of another kind; of its managed fields those of `manager`, by which it drifts."""
+    """The fields to keep for an object of another kind; of its managed fields, those of `manager`, to detect drift."""
     kept = {key: value for key, value in raw.items() if key not in _CONTENT and key != "spec"}
     kept["metadata"] = _metadata(raw, managers=(manager,))
     if raw["kind"] in _SPEC_IS_READ and "spec" in raw:
@@ -59,7 +59,7 @@ def others(raw: Object, manager: str) -> Object:
 
 
 def without_objects(template: ApplicationTemplate) -> ApplicationTemplate:
-    """The template without its objects and status, which may be large, and play no part in claims."""
+    """The template without its objects and status, which may be large and do not affect claims."""
     less: dict[str, Any] = {"manifests": [], "configuration": {}, "helm": None}
     return template.model_copy(update={"spec": template.spec.model_copy(update=less), "status": None})
 
@@ -81,7 +81,7 @@ def _metadata(raw: Object, managers: tuple[str, ...]) -> Object:
 
 
 def _without_containers(spec: Any) -> Any:
-    """The spec without what its pods are made of; where they may run stays."""
+    """The spec without the pod's content; the fields for scheduling stay."""
     if not isinstance(spec, Mapping):
         return spec
     kept = {key: value for key, value in spec.items() if key not in _CONTAINERS}
