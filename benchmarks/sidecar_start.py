@@ -25,10 +25,11 @@ from tests.cluster.expected_objects import condition
 from tests.cluster.namespaces import fresh_namespace
 from tests.e2e.images import WAYSIDE_IMAGE, wayside_archive
 from tests.e2e.node import Node
-from tests.e2e.released import MANAGER, PATIENCE, RELEASE, available, image_values
+from tests.e2e.released import MANAGER, RELEASE, available, image_values
 from tests.e2e.test_sidecar import DETECTOR, pod_spec, resources, sidecar_of
 from tests.helm import ensure_tools
 from tests.helm.wayside_chart import CHART, Helm
+from tests.patience import NODE_PATIENCE
 
 LOOK = 0.02  # s between two looks
 PROGRAM = """
@@ -69,14 +70,14 @@ def measure(api: Api, helm: Helm, rounds: int) -> tuple[Seconds, Seconds, Second
     given = {"image": image_values(WAYSIDE_IMAGE), "crds": {"install": False}}
     given["manager"] = {"namespaces": [api.namespace]}
     helm("install", RELEASE, str(CHART), "--namespace", api.namespace, values=given)
-    api.wait_for("Deployment", MANAGER, available, timeout=PATIENCE, what="the manager is available")
+    api.wait_for("Deployment", MANAGER, available, timeout=NODE_PATIENCE, what="the manager is available")
     for each in resources(WAYSIDE_IMAGE):
         api.apply(each)
     api.wait_for(
         "Detector",
         DETECTOR,
         lambda raw: condition(raw, "Running").get("reason") == "InPods",
-        timeout=PATIENCE,
+        timeout=NODE_PATIENCE,
         what="the accounts have their rights",
     )
     taken: list[Seconds] = [{kind: [] for kind in KINDS} for _ in range(3)]
@@ -109,7 +110,9 @@ def one(api: Api, name: str, kind: str) -> tuple[float, float, float]:
     if kind == DETECTED:
         if not sidecar_of(api.get("Pod", name)):
             sys.exit(f"pod {name} has no detector")
-        api.wait_for("Lease", f"wayside-{DETECTOR}.{name}", lambda _: True, timeout=PATIENCE, what="its detector works")
+        api.wait_for(
+            "Lease", f"wayside-{DETECTOR}.{name}", lambda _: True, timeout=NODE_PATIENCE, what="its detector works"
+        )
     began = time.monotonic()
     api.delete("Pod", name)
     return stored, started, until(lambda: api.find("Pod", name) is None) - began
@@ -122,10 +125,10 @@ def runs(pod: Object) -> bool:
 
 def until(holds: Callable[[], bool]) -> float:
     """When it holds at last, on the monotonic clock."""
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + NODE_PATIENCE
     while not holds():
         if time.monotonic() > deadline:
-            sys.exit(f"not within {PATIENCE:g} s")
+            sys.exit(f"not within {NODE_PATIENCE:g} s")
         time.sleep(LOOK)
     return time.monotonic()
 

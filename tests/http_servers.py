@@ -11,8 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-WAIT = 60.0
-"""Seconds after which a test gives up on the endpoint."""
+from tests.patience import PATIENCE
 
 
 @dataclass(frozen=True)
@@ -54,7 +53,7 @@ def hangs(after: bytes = b"") -> Behaviour:
 
     def hang(endpoint: Endpoint, connection: socket.socket, _: Received) -> None:
         connection.sendall(after)
-        endpoint.ended.wait(WAIT)
+        endpoint.ended.wait(PATIENCE)
 
     return hang
 
@@ -72,7 +71,7 @@ def holds(until: threading.Event, then: Behaviour) -> Behaviour:
     """Nothing until the event is set, then that."""
 
     def hold(endpoint: Endpoint, connection: socket.socket, request: Received) -> None:
-        assert until.wait(WAIT)
+        assert until.wait(PATIENCE)
         then(endpoint, connection, request)
 
     return hold
@@ -119,7 +118,7 @@ class Endpoint:
     def received(self, count: int) -> list[Received]:
         """The requests, once there is this number of them."""
         with self._arrived:
-            assert self._arrived.wait_for(lambda: len(self.requests) >= count, WAIT), self.requests
+            assert self._arrived.wait_for(lambda: len(self.requests) >= count, PATIENCE), self.requests
             return list(self.requests)
 
     def close(self) -> None:

@@ -15,10 +15,8 @@ import zenoh
 
 from detector.streams.zenoh import Put
 from tests.certificates import Authority
+from tests.patience import PATIENCE
 from wayside.api.stream import Encoding, Stream
-
-PATIENCE = 60.0
-"""Seconds for conditions whose speed a test does not check: a test that passes does not wait for them."""
 
 
 class Arrivals:

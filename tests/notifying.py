@@ -15,10 +15,9 @@ from detector.actions import ActionContext, Completion, DetectorConfiguration, E
 from detector.actions.notify import Notify
 from detector.streams.codecs.ros import standard
 from tests.driving import SECOND, START, a_detector, a_rule
+from tests.patience import PATIENCE
 from wayside.api.actions.notify import NotifyAction as Parameters
 from wayside.times import format_time
-
-WAIT = 60.0
 
 
 class NoMessenger:
@@ -48,7 +47,7 @@ class Harness:
 
     def until(self, get: Callable[[], Any]) -> Any:
         with self.changed:
-            assert self.changed.wait_for(get, WAIT), (self.outcomes, self.lost, self.reasons)
+            assert self.changed.wait_for(get, PATIENCE), (self.outcomes, self.lost, self.reasons)
             return get()
 
     def run(self, *episodes: Episode) -> None:

@@ -19,6 +19,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Literal
 
+from tests.patience import PATIENCE
+
 Name = Literal["detector", "application-manager"]
 PROGRAMS: Mapping[str, str] = {
     "detector": "detector.commands.program",
@@ -26,7 +28,6 @@ PROGRAMS: Mapping[str, str] = {
 }
 """The module of each program; its `main` reads `sys.argv`."""
 BIN = Path(sys.executable).parent
-PATIENCE = 120.0  # s for a command that ends by itself
 
 _servers = multiprocessing.get_context("forkserver")
 _servers.set_forkserver_preload(["tests.preloaded"])

@@ -36,7 +36,8 @@ from tests.cluster.controlplane import ControlPlane  # noqa: E402
 from tests.cluster.crds import CRDS  # noqa: E402
 from tests.cluster.pods import mark_pods_ready  # noqa: E402
 from tests.cluster.processes import Processes  # noqa: E402
-from tests.cluster.waiting import PATIENCE, wait_until  # noqa: E402
+from tests.cluster.waiting import wait_until  # noqa: E402
+from tests.patience import PATIENCE  # noqa: E402
 from tests.ports import free_endpoint  # noqa: E402
 
 GUIDE = ROOT / "docs" / "tutorial.md"

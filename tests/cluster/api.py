@@ -19,12 +19,12 @@ import urllib3
 from kubernetes.client import ApiClient, Configuration
 from kubernetes.config import load_kube_config
 
-from tests.cluster.waiting import INTERVAL, PATIENCE, wait_until
+from tests.cluster.waiting import INTERVAL, wait_until
+from tests.patience import PATIENCE
 
 Object = dict[str, Any]  # a Kubernetes object, as JSON
 Objects = list[Object]
 FIELD_MANAGER = "test"
-REQUEST_TIMEOUT = 60.0  # s
 
 COME_BACK = frozenset({429, 503})
 """Nothing was done, and may be soon: a fresh API server answers so while it reads what its storage has of a kind."""
@@ -273,7 +273,7 @@ class Api:
         url = self._client.configuration.host + path
         try:
             response = self._client.rest_client.request(  # type: ignore[no-untyped-call]
-                method, url, headers, sent, _request_timeout=REQUEST_TIMEOUT
+                method, url, headers, sent, _request_timeout=PATIENCE
             )
             text = response.read().decode()
         except urllib3.exceptions.HTTPError as error:

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
-from tests.cluster.waiting import PATIENCE
+from tests.patience import PATIENCE
 from wayside.kubernetes.client import Client
 from wayside.kubernetes.connection import connect
 

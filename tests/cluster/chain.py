@@ -18,7 +18,8 @@ from detector.streams.zenoh import open_session
 from tests.cluster.api import Api, Object
 from tests.cluster.expected_objects import condition, start_manager, wait_settled
 from tests.cluster.processes import Process, Processes
-from tests.cluster.waiting import PATIENCE, wait_until
+from tests.cluster.waiting import wait_until
+from tests.patience import PATIENCE
 from tests.ports import free_endpoint
 from tests.ros_messages import cdr, pose_stamped
 from wayside.api.zenoh import Zenoh, ZenohMode

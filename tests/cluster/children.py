@@ -17,6 +17,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import IO
 
+from tests.patience import PATIENCE
 from tests.programs import PROGRAMS, Program
 
 _register_lock = threading.Lock()
@@ -80,7 +81,7 @@ class Child:
         self._kill_group()
         return code
 
-    def terminate(self, patience: float = 60) -> int:
+    def terminate(self, patience: float = PATIENCE) -> int:
         """Send SIGTERM and wait for the end; return the exit code.
 
         Raises:

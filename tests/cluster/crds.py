@@ -10,7 +10,8 @@ from pathlib import Path
 import yaml
 
 from tests.cluster.api import Api, ApiError, Object, Unreachable
-from tests.cluster.waiting import PATIENCE, wait_until
+from tests.cluster.waiting import wait_until
+from tests.patience import PATIENCE
 
 CRDS = Path(__file__).parents[2] / "crds"
 CRD_NAMES = frozenset(

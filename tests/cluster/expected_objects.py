@@ -25,7 +25,8 @@ from application_manager.core.objects.rendering import Renderer, RenderError
 from application_manager.core.statuses.status import task_status
 from tests.cluster.api import Api, Object
 from tests.cluster.processes import Process, Processes
-from tests.cluster.waiting import PATIENCE, wait_until
+from tests.cluster.waiting import wait_until
+from tests.patience import PATIENCE
 from wayside.api import ApplicationInstance, ApplicationTask, ApplicationTemplate
 
 KINDS = ("Deployment", "ConfigMap", "Service", "HorizontalPodAutoscaler")  # those that the tests' templates make

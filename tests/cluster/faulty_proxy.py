@@ -19,7 +19,7 @@ import aiohttp
 import yaml
 from aiohttp import web
 
-from tests.cluster.waiting import PATIENCE
+from tests.patience import PATIENCE
 
 _HOP = frozenset({"connection", "content-length", "content-encoding", "host", "keep-alive", "transfer-encoding"})
 

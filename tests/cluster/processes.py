@@ -8,7 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from tests.cluster.children import Child
-from tests.cluster.waiting import PATIENCE, wait_until
+from tests.cluster.waiting import wait_until
+from tests.patience import PATIENCE
 from tests.programs import BIN, PROGRAMS
 
 SCHEDULING = Path(__file__).with_name("scheduling")
@@ -58,7 +59,7 @@ class Process:
         """The memory that the present run holds now; 0 where the system does not report it."""
         return self._child.resident_bytes()
 
-    def terminate(self, patience: float = 60) -> int:
+    def terminate(self, patience: float = PATIENCE) -> int:
         """Send SIGTERM, wait for the end, return the exit code; TimeoutError (and SIGKILL) after `patience` seconds."""
         return self._child.terminate(patience)
 

@@ -13,6 +13,7 @@ from rich.console import Console
 
 from tests.cluster.binaries import PACKAGES, BinariesUnavailableError, cache_folder, ensure_binaries
 from tests.cluster.toolchain import version_of
+from tests.patience import PATIENCE
 
 
 def program(path: Path, text: str = "#!/bin/sh\n") -> Path:
@@ -88,7 +89,7 @@ done
     command = [sys.executable, "-m", "tests.cluster.binaries"]
     runs = [subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL) for _ in range(2)]
 
-    assert [run.wait(60) for run in runs] == [0, 0]
+    assert [run.wait(PATIENCE) for run in runs] == [0, 0]
     assert sorted(record.read_text().split()) == sorted(["built"] * len(PACKAGES) + [*PACKAGES.values()])
 
 

@@ -17,7 +17,8 @@ from detector.actions.deploy.lease import HolderLease, ProcessIdentity
 from tests.cluster.api import Api, Object
 from tests.cluster.background import Background, background
 from tests.cluster.controlplane import ControlPlane
-from tests.cluster.waiting import PATIENCE, wait_until
+from tests.cluster.waiting import wait_until
+from tests.patience import PATIENCE
 from wayside.kubernetes.leases import HOLDER_LEASE_LABEL
 
 NAME = "wayside-intersection-a"

@@ -12,7 +12,8 @@ from detector.resources.selection import RuleSet
 from tests.cluster.api import Api, Object
 from tests.cluster.background import Background, background
 from tests.cluster.controlplane import ControlPlane
-from tests.cluster.waiting import PATIENCE, wait_until
+from tests.cluster.waiting import wait_until
+from tests.patience import PATIENCE
 
 API_VERSION = "wayside.dev/v1alpha1"
 SITE = {"site": "a"}

@@ -19,7 +19,8 @@ from detector.engine.episodes.record import EpisodeRecord
 from tests.cluster.api import Api, Object, Objects
 from tests.cluster.background import Background, background
 from tests.cluster.controlplane import ControlPlane
-from tests.cluster.waiting import PATIENCE, wait_until
+from tests.cluster.waiting import wait_until
+from tests.patience import PATIENCE
 
 SECOND = 10**9
 START = 1_767_225_600 * SECOND + 123_456_789

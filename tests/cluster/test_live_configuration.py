@@ -21,6 +21,7 @@ from tests.cluster.processes import Process, Processes
 from tests.cluster.repeating import repeated
 from tests.cluster.waiting import wait_until
 from tests.networks import router
+from tests.patience import PATIENCE
 from tests.ports import free_endpoint
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "live-configuration"
@@ -100,7 +101,7 @@ class SourcesSubscriber:
 
     def wait_for(self, expected: list[str] | None) -> None:
         with self._changed:
-            assert self._changed.wait_for(lambda: self.contents[-1:] == [expected], 120), self.contents
+            assert self._changed.wait_for(lambda: self.contents[-1:] == [expected], PATIENCE), self.contents
 
 
 def _sources_of(sample: zenoh.Sample) -> list[str]:

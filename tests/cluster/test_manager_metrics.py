@@ -16,12 +16,13 @@ from tests.cluster.expected_objects import start_manager, task, template
 from tests.cluster.pods import mark_pods_ready
 from tests.cluster.processes import Processes
 from tests.cluster.waiting import wait_until
+from tests.patience import PATIENCE
 from tests.ports import free_port
 
 
 def get(port: int, path: str) -> tuple[int, str]:
     try:
-        with urllib.request.urlopen(f"http://127.0.0.1:{port}{path}", timeout=60) as answer:
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}{path}", timeout=PATIENCE) as answer:
             return answer.status, answer.read().decode()
     except urllib.error.HTTPError as error:
         return error.code, error.read().decode()

@@ -203,7 +203,7 @@ def test_work_in_progress_at_shutdown_is_finished_or_repaired(api: Api, pair: Pa
     def terminated(pair: Pair) -> None:
         nonlocal began
         began = time.monotonic()
-        assert pair.active.terminate(patience=60) == 0
+        assert pair.active.terminate() == 0
 
     interrupted(api, pair, terminated)
     taken, last = pair.new.lease_writes()[0].at, pair.old.lease_writes()[-1].at

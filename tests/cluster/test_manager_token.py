@@ -14,7 +14,7 @@ from kubernetes.aio.client import Configuration
 from application_manager.cluster.client import manager_client
 from tests.cluster.api import Api
 from tests.cluster.controlplane import ControlPlane
-from tests.cluster.waiting import PATIENCE
+from tests.patience import PATIENCE
 from wayside.kubernetes.connection import use_pod_account
 from wayside.kubernetes.errors import ApiError
 from wayside.kubernetes.resources import LEASES

@@ -64,7 +64,7 @@ def test_starting_a_running_program_is_refused(processes: Processes) -> None:
 def test_a_program_that_ends_while_its_output_is_awaited_is_reported_at_once_with_its_log(processes: Processes) -> None:
     program = start(processes, "raise SystemExit('no such template')")
     with pytest.raises(ChildProcessError, match=r"(?s)ended without writing 'ready'.*no such template"):
-        program.wait_for_output("ready", timeout=60)
+        program.wait_for_output("ready")
 
 
 def test_child_processes_are_killed_with_their_program(processes: Processes) -> None:

@@ -16,11 +16,12 @@ from tests import programs
 from tests.cluster.api import Api, Object
 from tests.cluster.expected_objects import start_manager, wait_settled
 from tests.cluster.processes import Processes
-from tests.cluster.waiting import PATIENCE, wait_until
+from tests.cluster.waiting import wait_until
 from tests.guides import guide, yaml_blocks
 from tests.helm import ensure_tools
 from tests.helm.wayside_chart import Helm, HelmError
 from tests.networks import router, session
+from tests.patience import PATIENCE
 from tests.ports import free_endpoint
 from wayside.api import ApplicationTemplate
 

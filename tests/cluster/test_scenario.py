@@ -22,7 +22,8 @@ import yaml
 from tests.cluster.api import Api
 from tests.cluster.processes import Processes
 from tests.cluster.repeating import repeated
-from tests.cluster.waiting import PATIENCE, wait_until
+from tests.cluster.waiting import wait_until
+from tests.patience import PATIENCE
 from tests.ports import free_endpoint
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "cooperative-recording"

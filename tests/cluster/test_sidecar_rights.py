@@ -22,6 +22,7 @@ from tests.cluster.test_manager_detectors import close_vehicles, detector, live
 from tests.cluster.test_manager_rbac import ALLOWED, granted, may, printed, put, used, wait_in_force
 from tests.cluster.waiting import wait_until
 from tests.cluster.webhook import Webhook
+from tests.patience import PATIENCE
 from tests.ports import free_endpoint
 
 NAME = object_name(HOLDER)
@@ -167,5 +168,5 @@ def status_of(folder: Path, endpoint: str) -> list[str]:
     (file := folder / "detector.yaml").write_text(
         yaml.safe_dump(sidecar_detector("vehicle", zenoh={"mode": "peer", "listen": [endpoint]}))
     )
-    done = programs.run("detector", "status", "--detector", file, "--json", "--timeout", "30", check=True)
+    done = programs.run("detector", "status", "--detector", file, "--json", "--timeout", str(PATIENCE), check=True)
     return [json.loads(line)["holder"] for line in done.stdout.splitlines()]

@@ -32,6 +32,7 @@ from tests.cluster.sidecars import (
 )
 from tests.cluster.waiting import wait_until
 from tests.cluster.webhook import Webhook
+from tests.patience import PATIENCE
 from tests.ports import free_port
 
 
@@ -136,7 +137,7 @@ def test_a_second_webhook_call_for_the_same_pod_adds_nothing(
 
 def reviews_of_pods(port: int) -> int:
     """How many questions about pods the manager has answered."""
-    with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=30) as response:
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=PATIENCE) as response:
         lines = response.read().decode().splitlines()
     name = 'wayside_manager_reviews_total{answer="'
     return sum(int(float(each.split()[-1])) for each in lines if each.startswith(name) and 'kind="Pod"' in each)

@@ -16,6 +16,7 @@ from tests.cluster.expected_objects import end, start_manager
 from tests.cluster.processes import Processes
 from tests.cluster.waiting import wait_until
 from tests.otlp import Received, Receiver
+from tests.patience import PATIENCE
 from tests.ports import free_ports
 from wayside.times import parse_time
 
@@ -167,7 +168,7 @@ def test_a_rejection_and_an_instance_that_never_became_ready_are_failures_in_the
 
 def counted(port: int, name: str, cause: str) -> float:
     """The counter `name` for the cause in /metrics."""
-    with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=60) as answer:
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=PATIENCE) as answer:
         families = text_string_to_metric_families(answer.read().decode())
     samples = [sample for family in families for sample in family.samples if sample.name == name]
     return sum(each.value for each in samples if each.labels["cause"] == cause)

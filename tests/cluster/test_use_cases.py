@@ -24,8 +24,9 @@ from tests.cluster.api import Api
 from tests.cluster.expected_objects import condition, start_manager, wait_settled
 from tests.cluster.processes import Processes
 from tests.cluster.repeating import repeated
-from tests.cluster.waiting import INTERVAL, PATIENCE, wait_until
+from tests.cluster.waiting import INTERVAL, wait_until
 from tests.networks import session
+from tests.patience import PATIENCE
 from tests.ports import free_endpoint
 
 PACE = 2.5  # times as fast as it happens

@@ -7,11 +7,9 @@ import time
 from collections.abc import Callable
 from typing import TypeVar
 
-State = TypeVar("State")
+from tests.patience import PATIENCE
 
-PATIENCE = 120.0
-"""Seconds for conditions whose speed a test does not check. A test that passes does not wait for them, and
-a machine that is many times slower than usual still passes."""
+State = TypeVar("State")
 
 INTERVAL = 0.05  # s between two looks: short beside what is waited for, long beside one request
 

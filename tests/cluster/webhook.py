@@ -24,7 +24,8 @@ from tests.cluster.api import Api, ApiError, Object
 from tests.cluster.controlplane import ControlPlane
 from tests.cluster.expected_objects import config, start_manager, template
 from tests.cluster.processes import Process, Processes
-from tests.cluster.waiting import PATIENCE, wait_until
+from tests.cluster.waiting import wait_until
+from tests.patience import PATIENCE
 from tests.ports import free_port
 
 

@@ -16,9 +16,9 @@ from tests.cluster.waiting import wait_until
 from tests.e2e.node import Node
 from tests.e2e.wayside_in_cluster import METRICS_PORT, ZENOH_PORT, apply_manager, expose_detector
 from tests.e2e.workloads import wait_available
+from tests.patience import NODE_PATIENCE
 from wayside.api.zenoh import Zenoh, ZenohMode
 
-PATIENCE = 300.0
 MANAGER = "app=application-manager"
 DETECTOR = f"wayside.dev/runs={HOLDER}"
 IDLE = ["python3", "-c", "import time; time.sleep(10**6)"]
@@ -32,7 +32,7 @@ class PairsOnNode(PairsNamespace):
     """
 
     def __init__(self, node: Node, api: Api, image: str) -> None:
-        super().__init__(api, PATIENCE)
+        super().__init__(api, NODE_PATIENCE)
         self.node = node
         self.image = image
         self.endpoint = ""
@@ -72,12 +72,14 @@ class PairsOnNode(PairsNamespace):
         def holds(pods: Objects) -> bool:
             return len(pods) == 1 and is_ready(pods[0]) and restarts_of(pods[0]) == restarts
 
-        return wait_until(lambda: self.pods(pair), holds, timeout=PATIENCE, what=what, diagnose=self.reported)[0]
+        return wait_until(lambda: self.pods(pair), holds, timeout=NODE_PATIENCE, what=what, diagnose=self.reported)[0]
 
     def wait_no_pods(self, pair: Pair) -> None:
         """Wait until no pod of the pair's application is left."""
         what = f"no pod of {pair} is left"
-        wait_until(lambda: self.pods(pair), lambda pods: not pods, timeout=PATIENCE, what=what, diagnose=self.reported)
+        wait_until(
+            lambda: self.pods(pair), lambda pods: not pods, timeout=NODE_PATIENCE, what=what, diagnose=self.reported
+        )
 
     def programs(self) -> Objects:
         """The pods of the manager and the detector, also those that are ending."""
@@ -90,7 +92,7 @@ class PairsOnNode(PairsNamespace):
             return len(pods) == 2 and all(is_ready(pod) and restarts_of(pod) == restarts for pod in pods)
 
         what = f"both programs are ready after {restarts} restarts"
-        wait_until(self.programs, holds, timeout=PATIENCE, what=what, diagnose=self.reported)
+        wait_until(self.programs, holds, timeout=NODE_PATIENCE, what=what, diagnose=self.reported)
 
     def metrics(self, labels: str = DETECTOR) -> Mapping[str, float]:
         """What the program in the pod with these labels measures, by name with labels, as it stands in `/metrics`."""
@@ -104,7 +106,7 @@ class PairsOnNode(PairsNamespace):
     ) -> Mapping[str, float]:
         """Wait until the metrics are so."""
         transient = (ApiError, Unreachable, ValueError)  # the pod may be on its way
-        return wait_until(lambda: self.metrics(labels), holds, timeout=PATIENCE, what=what, transient=transient)
+        return wait_until(lambda: self.metrics(labels), holds, timeout=NODE_PATIENCE, what=what, transient=transient)
 
     def vehicles(self) -> Vehicles:
         """Vehicles outside the cluster."""
@@ -137,11 +139,11 @@ class PublishedEvents:
     def wait(self, pair: Pair, *kinds: str) -> None:
         """Wait until the pair's events are these."""
         what = f"the events of {pair} are {kinds}"
-        wait_until(lambda: self.kinds(pair), lambda found: found == list(kinds), timeout=PATIENCE, what=what)
+        wait_until(lambda: self.kinds(pair), lambda found: found == list(kinds), timeout=NODE_PATIENCE, what=what)
 
     def __enter__(self) -> PublishedEvents:
         # It connects in the background, and what is published before, nobody hears.
-        wait_until(self._session.info.peers_zid, bool, timeout=PATIENCE, what="the detector is connected")
+        wait_until(self._session.info.peers_zid, bool, timeout=NODE_PATIENCE, what="the detector is connected")
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -13,10 +13,10 @@ import zenoh
 from tests.certificates import Authority
 from tests.cluster.api import Api
 from tests.e2e.node import Node
+from tests.patience import NODE_PATIENCE
 
 RELEASE = "wayside"
 MANAGER, ROUTER, DETECTOR = f"{RELEASE}-manager", f"{RELEASE}-router", "detector-town"
-PATIENCE = 300.0
 ROUTERS_PROGRAM = """
 import sys, threading, zenoh
 zenoh.init_log_from_env_or("error")
@@ -66,7 +66,7 @@ def apply_certificates(api: Api, authority: Authority) -> None:
 def wait_installed(api: Api) -> None:
     """Wait until the manager, the router and the detector are available."""
     for name in (MANAGER, ROUTER, DETECTOR):
-        api.wait_for("Deployment", name, available, timeout=PATIENCE, what=f"{name} is available")
+        api.wait_for("Deployment", name, available, timeout=NODE_PATIENCE, what=f"{name} is available")
 
 
 def available(found: dict[str, Any]) -> bool:
@@ -83,7 +83,7 @@ def outside(node: Node, api: Api) -> str:
 
 
 def vehicle(
-    endpoint: str, authority: Path, certificate: tuple[Path, Path] | None, *, patience: float = PATIENCE
+    endpoint: str, authority: Path, certificate: tuple[Path, Path] | None, *, patience: float = NODE_PATIENCE
 ) -> zenoh.Session:
     """A session from outside. Raises zenoh.ZError where it is not let in within `patience` seconds."""
     tls: dict[str, Any] = {"root_ca_certificate": str(authority), "verify_name_on_connect": False}

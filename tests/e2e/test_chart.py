@@ -19,7 +19,6 @@ from tests.e2e.node import Node
 from tests.e2e.released import (
     DETECTOR,
     MANAGER,
-    PATIENCE,
     RELEASE,
     ROUTER,
     apply_certificates,
@@ -32,6 +31,7 @@ from tests.e2e.released import (
 from tests.e2e.test_cooperative_recording import REPORT, applications, ready, wait_pods
 from tests.e2e.wayside_in_cluster import EXAMPLE, example_documents
 from tests.helm.wayside_chart import CHART, Helm
+from tests.patience import NODE_PATIENCE
 
 sys.path.insert(0, str(EXAMPLE))
 
@@ -119,7 +119,7 @@ def test_the_example_from_nothing_by_mutual_tls_through_an_upgrade_until_nothing
             "Deployment",
             MANAGER,
             lambda found: available(found) and found["status"].get("readyReplicas") == 2,
-            timeout=PATIENCE,
+            timeout=NODE_PATIENCE,
             what="two managers of the new version are ready",
         )
         assert lives([*applications(api, "scene-recorder"), *applications(api, "scene-fusion")]) == running
@@ -128,14 +128,14 @@ def test_the_example_from_nothing_by_mutual_tls_through_an_upgrade_until_nothing
         other.put(second, 1000)  # which the new manager acts on
         wait_pods(api, "scene-recorder", lambda pods: not pods, "the recorder is gone")
         wait_pods(api, "scene-fusion", lambda pods: not pods, "the fusion is gone")
-    api.wait_list("ApplicationTask", lambda found: not found, timeout=PATIENCE, what="the tasks are over and gone")
+    api.wait_list("ApplicationTask", lambda found: not found, timeout=NODE_PATIENCE, what="the tasks are over and gone")
 
     for document in example:
         api.delete(document["kind"], document["metadata"]["name"])
     for name in ("router-tls", "town-tls"):
         api.delete("Secret", name)
     helm("uninstall", RELEASE, *where)
-    left = wait_left(node, before, {"CustomResourceDefinition"}, PATIENCE)
+    left = wait_left(node, before, {"CustomResourceDefinition"}, NODE_PATIENCE)
     assert {name for _, _, name in left} == CRD_NAMES, "the CRDs are kept"
 
 
@@ -160,4 +160,4 @@ def test_a_release_that_was_never_upgraded_leaves_no_detector_behind(
         bare.delete("Secret", name)
     for name in () if keep else CRD_NAMES:
         wait_crd_gone(bare, name)
-    wait_left(node, before, {"CustomResourceDefinition"} if keep else set(), PATIENCE)
+    wait_left(node, before, {"CustomResourceDefinition"} if keep else set(), NODE_PATIENCE)

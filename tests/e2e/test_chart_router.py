@@ -12,9 +12,10 @@ from tests.certificates import Authority
 from tests.cluster.api import Api
 from tests.cluster.waiting import wait_until
 from tests.e2e.node import Node
-from tests.e2e.released import PATIENCE, RELEASE, ROUTER, apply_certificates, outside, values, vehicle, wait_installed
+from tests.e2e.released import RELEASE, ROUTER, apply_certificates, outside, values, vehicle, wait_installed
 from tests.e2e.workloads import deployment
 from tests.helm.wayside_chart import CHART, Helm
+from tests.patience import NODE_PATIENCE
 
 RULE = {
     "signals": [{"name": "speed", "stream": "speed", "value": "msg.value"}],
@@ -51,7 +52,7 @@ def test_a_vehicle_with_a_certificate_has_an_application_run_and_others_do_not_g
             car.put("vehicles/car1/speed", b'{"value": 40}')
             return any(task.get("status", {}).get("phase") == "Ready" for task in api.list("ApplicationTask"))
 
-        wait_until(is_ready, bool, timeout=PATIENCE, what="the application demanded by the vehicle's speed is ready")
+        wait_until(is_ready, bool, timeout=NODE_PATIENCE, what="the application that the speed demands is ready")
         assert api.find("Deployment", "watch") is not None
         requested = [task["spec"]["requester"]["subjects"] for task in api.list("ApplicationTask")]
         assert {name for subjects in requested for name in subjects} == {"car1"}
@@ -60,7 +61,7 @@ def test_a_vehicle_with_a_certificate_has_an_application_run_and_others_do_not_g
             car.put("vehicles/car1/speed", b'{"value": 10}')
             return api.find("Deployment", "watch") is None
 
-        wait_until(is_gone, bool, timeout=PATIENCE, what="the application is gone")
+        wait_until(is_gone, bool, timeout=NODE_PATIENCE, what="the application is gone")
 
     mixed = authority.sign("car1")[0], authority.sign("car2")[1]
     for certificate in (None, foreign.sign("car1"), mixed):

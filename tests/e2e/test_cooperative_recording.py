@@ -11,13 +11,13 @@ from tests.cluster.api import Api, Objects
 from tests.cluster.waiting import wait_until
 from tests.e2e.node import Node
 from tests.e2e.wayside_in_cluster import EXAMPLE, apply_example, run_town
+from tests.patience import NODE_PATIENCE
 
 sys.path.insert(0, str(EXAMPLE))
 
 from cooperative_recording.parked import ParkedVehicles
 from cooperative_recording.vehicles import LIDAR_VEHICLES
 
-PATIENCE = 300.0
 REPORT = """
 import pathlib, sys, time
 print("#", *sys.argv[1:], flush=True)
@@ -43,7 +43,7 @@ def ready(pods: Objects) -> bool:
 
 
 def wait_pods(api: Api, name: str, holds: Callable[[Objects], bool], what: str) -> Objects:
-    return wait_until(lambda: applications(api, name), holds, timeout=PATIENCE, what=what)
+    return wait_until(lambda: applications(api, name), holds, timeout=NODE_PATIENCE, what=what)
 
 
 def test_applications_really_run_while_vehicles_are_close_follow_who_joins_and_are_gone_after(
@@ -52,7 +52,7 @@ def test_applications_really_run_while_vehicles_are_close_follow_who_joins_and_a
     first, second, third = (vehicle.name for vehicle in LIDAR_VEHICLES[:3])
     apply_example(api, image, ["python3", "-c", REPORT])
     port = run_town(api, image)
-    with ParkedVehicles([f"tcp/{node.address}:{port}"], wait_s=PATIENCE) as vehicles:
+    with ParkedVehicles([f"tcp/{node.address}:{port}"], wait_s=NODE_PATIENCE) as vehicles:
         vehicles.put(first, 0)
         vehicles.put(second, 100)
 
@@ -74,7 +74,7 @@ def test_applications_really_run_while_vehicles_are_close_follow_who_joins_and_a
         written = wait_until(
             configurations,
             bool,
-            timeout=PATIENCE,
+            timeout=NODE_PATIENCE,
             what="the fusion receives them",
             transient=(yaml.YAMLError, TypeError, KeyError),
         )
@@ -92,7 +92,7 @@ def test_applications_really_run_while_vehicles_are_close_follow_who_joins_and_a
         wait_until(
             configurations,
             lambda found: found[-1] == everybody,
-            timeout=PATIENCE,
+            timeout=NODE_PATIENCE,
             what="the fusion receives all",
             transient=(yaml.YAMLError, TypeError, KeyError),
         )

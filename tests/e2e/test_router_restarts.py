@@ -15,9 +15,10 @@ from tests.cluster.api import Api
 from tests.cluster.chain import BETWEEN, CARS, NEAR, PERIOD, VANS, untouched
 from tests.cluster.waiting import wait_until
 from tests.e2e.node import Node
-from tests.e2e.pairs_on_node import PATIENCE, PairsOnNode, restarts_of
+from tests.e2e.pairs_on_node import PairsOnNode, restarts_of
 from tests.e2e.wayside_in_cluster import ZENOH_PORT
 from tests.e2e.workloads import deployment, running_pods, service, wait_available
+from tests.patience import NODE_PATIENCE
 from tests.process.test_rmw_zenoh import Node as RosNode
 from wayside.api.zenoh import Zenoh, ZenohMode
 
@@ -72,7 +73,7 @@ class NumberingVehicle:
         wait_until(
             lambda: [each.matching_status.matching for each in self._seen],
             all,
-            timeout=PATIENCE,
+            timeout=NODE_PATIENCE,
             what="the detector is subscribed",
         )
         self._thread.start()
@@ -80,7 +81,7 @@ class NumberingVehicle:
     def wait_sent(self, more: int) -> None:
         """Wait until this number more were sent of each stream."""
         goal = self.sent + more
-        wait_until(lambda: self.sent, lambda sent: sent >= goal, timeout=PATIENCE, what=f"{goal} were sent")
+        wait_until(lambda: self.sent, lambda sent: sent >= goal, timeout=NODE_PATIENCE, what=f"{goal} were sent")
 
     def stop(self) -> int:
         """Publish no more; returns how many were sent of each stream."""

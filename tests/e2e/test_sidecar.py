@@ -10,10 +10,11 @@ from application_manager.core.objects.sidecars import CONTAINER
 from tests.cluster.api import Api, Object
 from tests.cluster.expected_objects import condition
 from tests.cluster.waiting import wait_until
-from tests.e2e.released import MANAGER, PATIENCE, RELEASE, available, image_values
+from tests.e2e.released import MANAGER, RELEASE, available, image_values
 from tests.e2e.wayside_in_cluster import RESTRICTED, ZENOH_PORT
 from tests.e2e.workloads import deployment, wait_available
 from tests.helm.wayside_chart import CHART, Helm
+from tests.patience import NODE_PATIENCE
 from wayside.process.startup import ENDED
 
 DETECTOR = "on-board"
@@ -90,7 +91,7 @@ def asking(api: Api, image: str, helm: Helm) -> None:
     """The chart is installed as it comes, with webhooks and policy, and everything is there but pods."""
     given = {"image": image_values(image), "crds": {"install": False}, "manager": {"namespaces": [api.namespace]}}
     helm("install", RELEASE, str(CHART), "--namespace", api.namespace, values=given)
-    api.wait_for("Deployment", MANAGER, available, timeout=PATIENCE, what="the manager is available")
+    api.wait_for("Deployment", MANAGER, available, timeout=NODE_PATIENCE, what="the manager is available")
     for each in resources(image):
         api.apply(each)
     restricted = {"pod-security.kubernetes.io/enforce": "restricted"}
@@ -99,14 +100,14 @@ def asking(api: Api, image: str, helm: Helm) -> None:
         "Detector",
         DETECTOR,
         lambda raw: condition(raw, "Running").get("reason") == "InPods",
-        timeout=PATIENCE,
+        timeout=NODE_PATIENCE,
         what="the accounts have their rights",
     )
     probe = {"apiVersion": "v1", "kind": "Pod", "metadata": {"name": "probe", "labels": RETRIES}}
     wait_until(
         lambda: api.apply(probe | {"spec": pod_spec(image, WAIT)}, dry_run=True)["spec"].get("initContainers"),
         bool,
-        timeout=PATIENCE,
+        timeout=NODE_PATIENCE,
         what="the API server calls the webhook for pods, and reaches it",
     )
 
@@ -120,7 +121,7 @@ def test_a_pods_detector_sees_its_data_and_what_it_demands_goes_with_the_pod(
     (task,) = api.wait_list(
         "ApplicationTask",
         lambda found: len(found) == 1 and found[0].get("status", {}).get("phase") == "Ready",
-        timeout=PATIENCE,
+        timeout=NODE_PATIENCE,
         what="its task is Ready",
     )
     holder = f"{DETECTOR}.car"
@@ -133,11 +134,11 @@ def test_a_pods_detector_sees_its_data_and_what_it_demands_goes_with_the_pod(
     api.wait_for("Detector", DETECTOR, lambda raw: condition(raw, "Running")["message"] == logged, what=logged)
 
     api.delete("Pod", "car")
-    api.wait_gone("Pod", "car", timeout=PATIENCE)
-    api.wait_gone("Lease", f"wayside-{holder}", timeout=PATIENCE)
-    api.wait_gone("Deployment", application, timeout=PATIENCE)
+    api.wait_gone("Pod", "car", timeout=NODE_PATIENCE)
+    api.wait_gone("Lease", f"wayside-{holder}", timeout=NODE_PATIENCE)
+    api.wait_gone("Deployment", application, timeout=NODE_PATIENCE)
     api.wait_list(
-        "Pod", lambda found: not found, labels=f"app={application}", timeout=PATIENCE, what="its pods are gone"
+        "Pod", lambda found: not found, labels=f"app={application}", timeout=NODE_PATIENCE, what="its pods are gone"
     )
 
 
@@ -147,7 +148,11 @@ def test_a_job_with_a_detector_completes(api: Api, image: str, asking: None) -> 
     job = {"apiVersion": "batch/v1", "kind": "Job", "metadata": {"name": "nightly"}}
     api.create(job | {"spec": {"template": template}})
     api.wait_for(
-        "Job", "nightly", lambda raw: condition(raw, "Complete").get("status") == "True", timeout=PATIENCE, what="it is"
+        "Job",
+        "nightly",
+        lambda raw: condition(raw, "Complete").get("status") == "True",
+        timeout=NODE_PATIENCE,
+        what="it is",
     )
     (pod,) = api.list("Pod", labels="job-name=nightly")
     assert pod["status"]["phase"] == "Succeeded"

@@ -13,10 +13,10 @@ import yaml
 from tests.cluster.api import Api, Object
 from tests.cluster.expected_objects import condition
 from tests.e2e.workloads import deployment, service, wait_available
+from tests.patience import NODE_PATIENCE
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "cooperative-recording"
 ZENOH_PORT, METRICS_PORT = 7447, 9100
-PATIENCE = 300.0
 RESTRICTED = {  # the Pod Security Standard of this name
     "allowPrivilegeEscalation": False,
     "capabilities": {"drop": ["ALL"]},
@@ -55,7 +55,7 @@ def run_town(api: Api, image: str) -> int:
         "Detector",
         "town",
         lambda raw: condition(raw, "Running").get("status") == "True",
-        timeout=PATIENCE,
+        timeout=NODE_PATIENCE,
         what="the manager runs the detector",
     )
     return port

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from tests.cluster.api import Api, Object, Objects
+from tests.patience import NODE_PATIENCE
 
 
 def deployment(
@@ -48,7 +49,7 @@ def service(name: str, port: int, target: int = 0, **spec: Any) -> Object:
     }
 
 
-def wait_available(api: Api, name: str, timeout: float = 300) -> Object:
+def wait_available(api: Api, name: str, timeout: float = NODE_PATIENCE) -> Object:
     """Wait until all pods of a Deployment are ready, of its present spec; return one of them."""
 
     def holds(found: Object) -> bool:

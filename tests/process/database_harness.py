@@ -23,6 +23,7 @@ from detector.actions import (
 from detector.actions.database import Database
 from detector.assembly import stream_readers
 from tests.driving import START, a_detector, a_rule, a_stream, at
+from tests.patience import PATIENCE
 from wayside.api.actions.database import DatabaseAction
 
 SPEEDS = "json/speed"
@@ -107,7 +108,7 @@ class Harness:
         with self._changed:
             return self.outcomes[name][-1] if name in self.outcomes else None
 
-    def outcome(self, name: str = "e1", within: float = 60) -> Outcome:
+    def outcome(self, name: str = "e1", within: float = PATIENCE) -> Outcome:
         """What became of the episode in the end."""
 
         def final() -> bool:
@@ -150,7 +151,7 @@ def speeds(count: int, client: str = "car1", first: int = 0, pad: int = 0) -> li
     ]
 
 
-def wait_until(condition: Callable[[], bool], within: float = 60, pause: float = 0.02) -> None:
+def wait_until(condition: Callable[[], bool], within: float = PATIENCE, pause: float = 0.02) -> None:
     deadline = time.monotonic() + within
     while not condition():
         assert time.monotonic() < deadline, "it did not happen"

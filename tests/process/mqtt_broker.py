@@ -17,6 +17,8 @@ from amqtt.session import Session
 from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion
 
+from tests.patience import PATIENCE
+
 PASSWORD = "open sesame"
 
 
@@ -59,7 +61,7 @@ def publisher(port: int, tls: str | None = None) -> Iterator[Client]:
         client.tls_set(tls)
     client.connect("localhost", port)
     client.loop_start()
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + PATIENCE
     while not client.is_connected():
         assert time.monotonic() < deadline
         time.sleep(0.01)

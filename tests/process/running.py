@@ -18,12 +18,10 @@ from detector.streams.query_handler import NoAnswerError, query_detectors
 from tests import programs
 from tests.driving import a_detector
 from tests.networks import session
+from tests.patience import PATIENCE
 from tests.ports import free_port
 from wayside.api import Kind
 from wayside.api.zenoh import Zenoh, ZenohMode
-
-PATIENCE = 60.0
-"""Seconds: a loaded machine takes long to start a process."""
 
 
 class Process:

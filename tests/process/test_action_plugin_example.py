@@ -12,8 +12,9 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from tests.patience import PATIENCE
 from tests.process.installing import installed
-from tests.process.running import PATIENCE, Process
+from tests.process.running import Process
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "action-plugin"
 

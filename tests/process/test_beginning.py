@@ -4,18 +4,27 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Mapping
 
 import pytest
 
+from tests.patience import PATIENCE
+from tests.programs import PROGRAMS, Name
 from wayside.process.startup import ENDED
+
+CLIS: Mapping[Name, str] = {
+    "detector": "detector.commands.cli",
+    "application-manager": "application_manager.commands.cli",
+}
+"""The modules whose imports are slow."""
 
 WHILE_IT_IMPORTS = """
 import os, signal, sys, threading
-import {package}.program as program
+import {program} as program
 
 class Cli:
     def find_spec(self, name, path=None, target=None):
-        if name == "{package}.cli":
+        if name == "{cli}":
             print(sorted(set(sys.modules) & {{"typer", "pydantic", "kubernetes", "zenoh", "kopf"}}), flush=True)
             os.kill(os.getpid(), signal.SIGTERM)
             threading.Event().wait()
@@ -27,8 +36,8 @@ program.main()
 container, or else end it by the signal itself."""
 
 
-@pytest.mark.parametrize("package", ["detector.commands", "application_manager"])
-def test_a_program_stopped_during_its_imports_ends(package: str) -> None:
-    code = WHILE_IT_IMPORTS.format(package=package)
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_a_program_stopped_during_its_imports_ends(name: Name) -> None:
+    code = WHILE_IT_IMPORTS.format(program=PROGRAMS[name], cli=CLIS[name])
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE, check=False)
     assert (done.returncode, done.stdout) == (ENDED, "[]\n")

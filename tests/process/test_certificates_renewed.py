@@ -17,7 +17,8 @@ from detector.engine.samples.liveliness import LIVELINESS, TokenState
 from detector.streams.session import open_session
 from detector.streams.zenoh import Network
 from tests.certificates import Authority
-from tests.networks import PATIENCE, Arrivals, guarded_router, stream, wait_for
+from tests.networks import Arrivals, guarded_router, stream, wait_for
+from tests.patience import PATIENCE
 from tests.ports import free_endpoint
 from wayside.api.zenoh import Zenoh
 

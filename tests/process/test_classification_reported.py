@@ -12,8 +12,9 @@ import yaml
 
 from tests.driving import a_deploy, a_rule, a_stream
 from tests.mongodb.proxy import ServerProxy
+from tests.patience import PATIENCE
 from tests.process.database_harness import wait_until
-from tests.process.running import PATIENCE, Process
+from tests.process.running import Process
 from tests.recording_bench import mcap_files, metadata_of
 
 GIVEN = {"overarchingPurpose": ["Safety"], "incidence": ["Rare"], "typeOfAction": ["DataCollection", "Deployment"]}

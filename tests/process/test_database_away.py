@@ -14,8 +14,9 @@ import pytest
 from tests.driving import a_rule, a_stream
 from tests.mongodb import MongoServer
 from tests.mongodb.proxy import ServerProxy
+from tests.patience import PATIENCE
 from tests.process.database_harness import wait_until
-from tests.process.running import PATIENCE, Process
+from tests.process.running import Process
 from tests.recording_bench import mcap_files, read_with_mcap
 
 AWAY = 60.0

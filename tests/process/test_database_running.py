@@ -15,8 +15,9 @@ from detector.status.model import RuleStatus
 from detector.streams.codecs.cdr import CdrDecoder
 from tests.driving import a_rule, a_stream
 from tests.mongodb.proxy import ServerProxy
+from tests.patience import PATIENCE
 from tests.process.database_harness import spooled, wait_until
-from tests.process.running import PATIENCE, Process
+from tests.process.running import Process
 from tests.recording_bench import mcap_files, read_with_mcap
 from tests.ros_messages import cdr, point_cloud
 

@@ -13,8 +13,9 @@ import pytest
 
 from tests.driving import a_rule, a_stream
 from tests.networks import router_process, wait_for
+from tests.patience import PATIENCE
 from tests.ports import free_endpoint
-from tests.process.running import PATIENCE, Process
+from tests.process.running import Process
 
 ALWAYS = a_rule("r", signals=[{"name": "v", "stream": "speed", "value": "msg.v"}], when="v > 10")
 

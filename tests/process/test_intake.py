@@ -8,6 +8,7 @@ import time
 
 from detector.engine.samples.intake import Intake
 from detector.engine.samples.sample import SAMPLE_OVERHEAD, Arrival
+from tests.patience import PATIENCE
 
 
 class Clock:
@@ -147,9 +148,9 @@ def test_a_lossless_put_waits_for_room_up_to_a_timeout() -> None:
     put([("k", b"first")])
     put([("k", b"given up")])
     assert intake.dropped == 1
-    patient = intake.patient_putter("tokens", patience=60)
+    patient = intake.patient_putter("tokens", patience=PATIENCE)
     waiting = threading.Thread(target=patient, args=([("k", b"second")],))
     waiting.start()
     assert [arrival.payload for arrival in intake.drain(2)] == [b"first"]
-    waiting.join(60)
+    waiting.join(PATIENCE)
     assert [arrival.payload for arrival in intake.drain(3)] == [b"second"]

@@ -11,7 +11,8 @@ from detector.assembly import DetectorError, stream_readers
 from detector.streams.loss_counter import Cause, LossCounter
 from detector.streams.zenoh import Network
 from tests.driving import a_detector, a_stream
-from tests.networks import PATIENCE, Arrivals, router, session, stream, wait_for
+from tests.networks import Arrivals, router, session, stream, wait_for
+from tests.patience import PATIENCE
 from wayside.api.base import PositiveDuration
 from wayside.api.stream import History, Stream
 from wayside.api.zenoh import Zenoh, ZenohMode

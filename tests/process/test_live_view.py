@@ -16,8 +16,9 @@ from websockets.sync.client import ClientConnection, connect
 
 from tests import programs
 from tests.driving import a_rule, a_stream
+from tests.patience import PATIENCE
 from tests.ports import free_port
-from tests.process.running import PATIENCE, Process
+from tests.process.running import Process
 
 PROTOCOL: Any = "foxglove.sdk.v1"
 FAST = a_rule(

@@ -14,7 +14,8 @@ from detector.sources.mqtt import topic_filter
 from detector.sources.supervision import SourceState, SourceThread
 from detector.streams.loss_counter import Cause, LossCounter
 from tests.certificates import Authority
-from tests.networks import PATIENCE, Arrivals, stream, wait_for
+from tests.networks import Arrivals, stream, wait_for
+from tests.patience import PATIENCE
 from tests.ports import free_port
 from tests.process.mqtt_broker import PASSWORD, broker, publisher
 from wayside.api.plugin import DataSource

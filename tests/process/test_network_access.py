@@ -23,7 +23,8 @@ from detector.streams.session import NetworkError, open_session
 from detector.streams.zenoh import Network
 from tests.certificates import Authority
 from tests.driving import a_detector
-from tests.networks import PATIENCE, Arrivals, router, router_process, stream, wait_for
+from tests.networks import Arrivals, router, router_process, stream, wait_for
+from tests.patience import PATIENCE
 from tests.ports import free_endpoint
 from wayside.api.access import Access
 from wayside.api.zenoh import Zenoh, ZenohMode

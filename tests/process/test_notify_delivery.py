@@ -26,6 +26,7 @@ from tests.http_servers import (
 )
 from tests.networks import session
 from tests.notifying import a_harness, an_episode
+from tests.patience import PATIENCE
 
 LOST = "events not delivered to any target"
 
@@ -244,7 +245,7 @@ def test_at_shutdown_undelivered_messages_without_a_journal_become_dead_letters(
         harness.run(an_episode("e1"), an_episode("e2"))
         harness.end()
     assert harness.lost[LOST] == 2
-    assert "before it was delivered" in harness.outcome("e1", OutcomeState.FAILED).message
+    assert "before the event was delivered" in harness.outcome("e1", OutcomeState.FAILED).message
 
 
 def test_journalled_messages_undelivered_at_shutdown_are_delivered_after_a_restart(
@@ -355,7 +356,7 @@ def test_a_zenoh_key_gets_the_event() -> None:
         subscriber = alone.declare_subscriber("city/alerts", take)
         harness = a_harness({"zenoh": {"key": "city/alerts"}, "title": "t"}, messenger=Session(alone))
         harness.run(an_episode(rendered={"title": "braking"}))
-        assert changed.wait(60), arrived
+        assert changed.wait(PATIENCE), arrived
         harness.outcome("e1")
         harness.end()
         subscriber.undeclare()

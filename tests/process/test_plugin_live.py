@@ -27,6 +27,7 @@ from detector.replay.intake_writer import IntakeWriter
 from detector.replay.replaying import replay_intake
 from detector.resources.selection import RuleSet
 from tests.driving import a_detector
+from tests.patience import PATIENCE
 from tests.plugins.rules import plugin_rule, plugins
 from wayside.api import EventRule
 
@@ -60,7 +61,7 @@ class CollectingSink:
 
 
 def wait_until(condition: Callable[[], bool], feed: Callable[[], None]) -> None:
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + PATIENCE
     while not condition():
         feed()
         assert time.monotonic() < deadline
@@ -73,7 +74,7 @@ def test_killed_and_started_again_the_replay_gives_the_same_events(tmp_path: Pat
     failures: list[BaseException] = []
     kept, intake = CollectingSink(), Intake(time.time_ns)
     writer = IntakeWriter(tmp_path / "intake.mcap", detector.spec.streams)
-    with closing(ProcessHost(patience=60)) as host:
+    with closing(ProcessHost(patience=PATIENCE)) as host:
         engine = make_engine(detector, stream_readers(detector), holder="h", start=time.time_ns(), plugins=host)
         evaluator = Evaluator(
             engine,
@@ -104,6 +105,6 @@ def test_killed_and_started_again_the_replay_gives_the_same_events(tmp_path: Pat
     assert not failures
     assert len([*recorded_outages(tmp_path / "intake.mcap")]) >= 4
     with closing(ProcessHost(Outages(lambda: recorded_outages(tmp_path / "intake.mcap")), wait=True)) as again:
-        again._patience = 60
+        again._patience = PATIENCE
         outcome = replay_intake(read_intake(tmp_path / "intake.mcap"), None, None, again)
     assert [event.to_json() for event in outcome.events] == [event.to_json() for event in kept.all]

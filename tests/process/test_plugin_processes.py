@@ -19,14 +19,12 @@ from detector.plugins.instances import LocalHost
 from detector.plugins.outages import Outages
 from detector.plugins.processes import ProcessHost
 from tests.driving import a_detector, arrival
+from tests.patience import PATIENCE
 from tests.plugins.rules import PluginDrive, plugin_rule, plugins
 
 __all__ = ["plugins"]  # a fixture
 
 pytestmark = pytest.mark.usefixtures("plugins")
-
-PATIENT = 60.0
-"""Seconds: no plugin of a test is as slow as that, however busy the machine."""
 
 
 class Clock:
@@ -40,7 +38,7 @@ class Clock:
 
 @pytest.fixture
 def host() -> Iterator[ProcessHost]:
-    with closing(ProcessHost(wait=True, patience=PATIENT)) as made:
+    with closing(ProcessHost(wait=True, patience=PATIENCE)) as made:
         yield made
 
 
@@ -84,13 +82,13 @@ def test_a_plugin_that_exits_is_reported_and_the_others_continue(host: ProcessHo
 
 
 def test_a_hanging_plugin_is_stopped_and_reported(caplog: pytest.LogCaptureFixture) -> None:
-    with closing(ProcessHost(wait=True, patience=PATIENT)) as host:
+    with closing(ProcessHost(wait=True, patience=PATIENCE)) as host:
         drive = PluginDrive(a_detector(), plugin_rule("r", parameters={"hangAt": 7}), plugin_rule("z"), host=host)
         drive.take(arrival(0.5, "a", {"v": 1}), until=1)
         process = host._signals["r", "p"]._process
         host._patience = 5.0  # the other one, too, must answer within it
         assert drive.take(arrival(1.5, "a", {"v": 7}), until=2) == []
-        host._patience = PATIENT
+        host._patience = PATIENCE
         assert drive.take(until=4) == ["z a started 3"]
         assert process is not None
         assert process.returncode is not None
@@ -100,7 +98,7 @@ def test_a_hanging_plugin_is_stopped_and_reported(caplog: pytest.LogCaptureFixtu
 
 def test_a_live_plugin_is_restarted_up_to_three_times_with_a_pause() -> None:
     clock = Clock()
-    with closing(ProcessHost(patience=PATIENT, monotonic=clock)) as host:
+    with closing(ProcessHost(patience=PATIENCE, monotonic=clock)) as host:
         drive = PluginDrive(a_detector(), plugin_rule(parameters={"exitAt": 7}), host=host)
         for start, pause in enumerate((1, 10, 60, 1000)):
             wait_for_it(host, drive, start * 100)
@@ -115,14 +113,14 @@ def test_a_live_plugin_is_restarted_up_to_three_times_with_a_pause() -> None:
 def wait_for_it(host: ProcessHost, drive: PluginDrive, seconds: int) -> None:
     """Evaluate until the plugin gives values; the process starts while we do."""
     drive.take(arrival(seconds + 0.5, "a", {"v": 1}), until=seconds + 1)
-    assert host._signals["r", "p"].is_ready(PATIENT, again=False)
+    assert host._signals["r", "p"].is_ready(PATIENCE, again=False)
 
 
 def test_a_replay_with_the_recorded_plugin_outages_gives_the_same_events() -> None:
     """Live, the plugin starts, gives values, ends, and is started again; a replay with the same outages agrees."""
     clock = Clock()
     rule = plugin_rule(when="p.count >= 2", until="p.count >= 4", parameters={"exitAt": 6})
-    with closing(ProcessHost(patience=PATIENT, monotonic=clock)) as host:
+    with closing(ProcessHost(patience=PATIENCE, monotonic=clock)) as host:
         live = PluginDrive(a_detector(), rule, host=host)
         wait_for_it(host, live, 0)
         live.take(*some_arrivals(), until=6)
@@ -134,7 +132,7 @@ def test_a_replay_with_the_recorded_plugin_outages_gives_the_same_events() -> No
     assert [(each["call"], each["running"]) for each in reported][:2] == [(1, False), (2, True)]
     assert len(reported) == 4
     again = [arrival(0.5, "a", {"v": 1}), *some_arrivals(), arrival(7.5, "a", {"v": 1})]
-    with closing(ProcessHost(Outages(lambda: reported), wait=True, patience=PATIENT)) as host:
+    with closing(ProcessHost(Outages(lambda: reported), wait=True, patience=PATIENCE)) as host:
         replayed = PluginDrive(a_detector(), rule, host=host)
         for each, until in ((again[:1], 1), (again[1:-1], 7), (again[-1:], 14)):
             replayed.take(*each, until=until)

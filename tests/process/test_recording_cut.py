@@ -32,6 +32,7 @@ from detector.engine.episodes.events import Event
 from detector.engine.episodes.record import EpisodeRecord
 from detector.engine.episodes.rendering import Rendered
 from tests.driving import at
+from tests.patience import PATIENCE
 from tests.recording_bench import (
     Bench,
     a_sample,
@@ -76,7 +77,7 @@ def recovered(path: Path) -> Bench:
     bench.action.wake()
     for thread in threading.enumerate():
         if thread.name == "recordings-recovery":
-            thread.join(60)
+            thread.join(PATIENCE)
             assert not thread.is_alive()
     return bench
 
@@ -259,7 +260,7 @@ def test_a_sample_is_written_within_a_second(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     bench.action.started(an_episode())
     bench.action.samples(an_episode(), SAMPLES[:5])
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + PATIENCE
     while bench.action._open["episode1"].series.waiting and time.monotonic() < deadline:
         assert bench.action.wake() is not None
     assert not bench.action._open["episode1"].series.waiting
@@ -272,7 +273,7 @@ def test_a_slow_disk_drops_and_counts_samples_and_delays_nothing(
     proceed, write = threading.Event(), os.pwritev
 
     def slowly(*arguments: Any) -> int:
-        proceed.wait(60)
+        proceed.wait(PATIENCE)
         return write(*arguments)
 
     monkeypatch.setattr("os.pwritev", slowly)
@@ -291,10 +292,10 @@ def test_a_slow_disk_drops_and_counts_samples_and_delays_nothing(
     for sample in points:
         worker.enqueue(RunSamples(run, [sample]))
     worker.enqueue(RunCompleted(run))
-    assert time.monotonic() - begin < 30  # the disk stands still for twice as long
+    assert time.monotonic() - begin < PATIENCE / 2  # the disk stands still for twice as long
     proceed.set()
     worker.request_close()
-    assert worker.join(60)
+    assert worker.join(PATIENCE)
     loss_counter = outcomes.counts_by_action()[which]
     assert (loss_counter.failed, loss_counter.samples, loss_counter.missing) == (1, 5, 3)
     (folder,) = (tmp_path / "r").iterdir()

@@ -15,7 +15,8 @@ import yaml
 from detector.assembly.checking import findings
 from detector.status.model import read_status
 from detector.streams.query_handler import query_detectors
-from tests.process.running import PATIENCE, Process
+from tests.patience import PATIENCE
+from tests.process.running import Process
 from tests.recording_bench import mcap_files, metadata_of, read_with_mcap
 from wayside.api import EventRule
 from wayside.api.documents import load_documents

@@ -20,8 +20,9 @@ from detector.streams.codecs.cdr import CdrDecoder
 from tests import programs
 from tests.driving import a_rule, a_stream
 from tests.mongodb.proxy import ServerProxy
+from tests.patience import PATIENCE
 from tests.process.database_harness import wait_until
-from tests.process.running import PATIENCE, Process
+from tests.process.running import Process
 from tests.recording_bench import Recorded, mcap_files, read_with_mcap, read_with_rosbags, seconds
 from tests.ros_messages import cdr, point_cloud
 from wayside.api import EventRule

@@ -15,7 +15,8 @@ import zenoh
 
 from detector.streams.session import NetworkError, open_session
 from tests.certificates import Authority
-from tests.networks import PATIENCE, wait_for
+from tests.networks import wait_for
+from tests.patience import PATIENCE
 from tests.ports import free_endpoint
 from wayside.api.zenoh import Zenoh
 

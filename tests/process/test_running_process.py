@@ -20,7 +20,8 @@ from tests import programs
 from tests.certificates import Authority
 from tests.driving import a_deploy, a_rule, a_stream
 from tests.networks import wait_for
-from tests.process.running import PATIENCE, Process
+from tests.patience import PATIENCE
+from tests.process.running import Process
 
 SPEED = {"name": "v", "stream": "speed", "value": "msg.v", "aggregate": "Max", "over": "5m"}
 FAST = a_rule("fast", signals=[SPEED], when="v > 10", evaluation={"every": "100ms"})

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.networks import PATIENCE, wait_for
+from tests.networks import wait_for
+from tests.patience import PATIENCE
 from tests.ports import free_port
 from tests.process.installing import installed
 

@@ -24,7 +24,8 @@ from detector.sources.registry import OFFERS, source_plugin_problems
 from detector.sources.supervision import Sources, SourceState, SourceThread
 from detector.streams.loss_counter import Cause, LossCounter
 from tests.driving import a_detector, a_stream
-from tests.networks import PATIENCE, Arrivals, stream, wait_for
+from tests.networks import Arrivals, stream, wait_for
+from tests.patience import PATIENCE
 from wayside.api import Detector
 from wayside.api.plugin import DataSource
 

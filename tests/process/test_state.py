@@ -27,11 +27,11 @@ from detector.live.state import StateFile, state_file, what_was_open
 from detector.streams.zenoh import open_session
 from tests import programs
 from tests.driving import Drive, a_deploy, a_detector, a_rule, arrival, at
+from tests.patience import PATIENCE
 from tests.ports import free_endpoint
 from wayside.api.zenoh import Zenoh, ZenohMode
 
 SPEED = {"name": "speed", "stream": "speed", "value": "msg.v"}
-PATIENCE = 60.0  # s
 
 
 def speeding(**spec: Any) -> Any:

@@ -9,7 +9,8 @@ import pytest
 import zenoh
 
 from detector.streams.zenoh import EVENT_ENCODING, Network, NetworkError
-from tests.networks import PATIENCE, Arrivals, router, session, stream, wait_for
+from tests.networks import Arrivals, router, session, stream, wait_for
+from tests.patience import PATIENCE
 from wayside.api.zenoh import Zenoh, ZenohMode
 
 

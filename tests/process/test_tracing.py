@@ -16,6 +16,7 @@ from detector.engine.episodes.events import Event
 from detector.engine.episodes.record import EpisodeRecord
 from detector.engine.episodes.rendering import Rendered
 from tests.otlp import Receiver
+from tests.patience import PATIENCE
 from tests.ports import free_ports
 from wayside.process.tracecontext import Span, TraceContext, episode_context, parse_traceparent
 from wayside.process.tracing import tracing
@@ -26,7 +27,7 @@ CONTEXTS = st.builds(TraceContext, st.integers(1, 2**128 - 1), st.integers(1, 2*
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """No variable of the machine counts, spans are handed over soon, and the end waits until they are."""
-    monkeypatch.setattr("wayside.process.spans._PATIENCE", 60.0)
+    monkeypatch.setattr("wayside.process.spans._PATIENCE", PATIENCE)
     for name in ("ENDPOINT", "TRACES_ENDPOINT", "PROTOCOL", "TRACES_PROTOCOL"):
         monkeypatch.delenv(f"OTEL_EXPORTER_OTLP_{name}", raising=False)
     monkeypatch.delenv("OTEL_SDK_DISABLED", raising=False)
@@ -71,7 +72,7 @@ def test_without_an_endpoint_there_are_no_traces_and_nothing_is_imported() -> No
         "assert tracing('x') is None\n"
         "assert not [name for name in sys.modules if name.startswith('opentelemetry')]\n"
     )
-    subprocess.run([sys.executable, "-c", script], check=True, cwd=Path(__file__).parents[2], timeout=60)
+    subprocess.run([sys.executable, "-c", script], check=True, cwd=Path(__file__).parents[2], timeout=PATIENCE)
 
 
 @pytest.mark.parametrize(("name", "value"), [("OTEL_SDK_DISABLED", "true"), ("OTEL_TRACES_EXPORTER", "none")])
@@ -132,7 +133,7 @@ def test_spans_beyond_the_queue_are_dropped_and_counted_and_the_rest_arrives(mon
         reported = tracing("x")
         assert reported is not None
         reported.emit(Span("first", 1, 2))
-        assert receiver.requested.wait(60)
+        assert receiver.requested.wait(PATIENCE)
         for number in range(50):
             reported.emit(Span(f"later {number}", 3, 4))
         assert reported.dropped == 50 - 8

@@ -27,8 +27,9 @@ from detector.streams.query_handler import status_key
 from detector.streams.session import open_session
 from tests.driving import a_rule
 from tests.networks import router_process, wait_for
+from tests.patience import PATIENCE
 from tests.ports import free_endpoint
-from tests.process.running import PATIENCE, Process
+from tests.process.running import Process
 from wayside.api import EventRule
 from wayside.api.base import Duration, PositiveDuration
 from wayside.api.zenoh import Zenoh, ZenohMode

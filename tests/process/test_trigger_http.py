@@ -24,9 +24,8 @@ from detector.actions.trigger.action import Trigger
 from detector.assembly import stream_readers
 from tests.driving import a_detector, a_rule
 from tests.http_servers import answers, endpoint, hangs
+from tests.patience import PATIENCE
 from wayside.api.actions import trigger as api
-
-PATIENCE = 60.0
 
 
 class NoMessenger:

@@ -29,10 +29,9 @@ from tests.cluster.controlplane import commands
 from tests.cluster.controlplane.kubeconfig import new_token, write_kubeconfig
 from tests.cluster.controlplane.site import LOOPBACK, Site
 from tests.cluster.crds import apply_crds
-from tests.cluster.waiting import PATIENCE, wait_until
+from tests.cluster.waiting import wait_until
+from tests.patience import PATIENCE
 from tests.ports import free_ports
-
-READY_TIMEOUT = PATIENCE  # for each program; a loaded machine takes ten times the usual 2 s
 
 _CONTROLLERS_RIGHTS = {
     "apiVersion": "rbac.authorization.k8s.io/v1",
@@ -260,7 +259,7 @@ class ControlPlane:
                 raise RuntimeError(f"{child.name} ended instead of: {what}\n{self.tails()}")
             return ready()
 
-        wait_until(look, bool, timeout=READY_TIMEOUT, what=what, transient=(Unreachable, ApiError), diagnose=self.tails)
+        wait_until(look, bool, timeout=PATIENCE, what=what, transient=(Unreachable, ApiError), diagnose=self.tails)
 
     def __enter__(self) -> ControlPlane:
         self.start()

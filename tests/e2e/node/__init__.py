@@ -26,9 +26,9 @@ from tests.e2e.images import pause_archive
 from tests.e2e.node import configurations
 from tests.e2e.node.enclosure import Enclosure
 from tests.e2e.programs import Programs, ensure_programs
+from tests.patience import NODE_PATIENCE
 
 NAME = "node"
-READY_TIMEOUT = 300.0  # for each program, on a machine many times slower than usual
 USERS = {  # the names that Kubernetes' own roles are bound to
     "kubelet": (f"system:node:{NAME}", "system:nodes"),
     "kube-proxy": ("system:kube-proxy", ""),
@@ -129,7 +129,7 @@ class Node:
 
         error = (_CommandError,)
         what = "containerd answers"
-        wait_until(answers, bool, timeout=READY_TIMEOUT, what=what, transient=error, diagnose=child.tail)
+        wait_until(answers, bool, timeout=NODE_PATIENCE, what=what, transient=error, diagnose=child.tail)
 
     def start_kubelet(self) -> None:
         """Start kubelet; it does not wait for the node to be ready."""
@@ -161,7 +161,7 @@ class Node:
         wait_until(
             ready,
             bool,
-            timeout=READY_TIMEOUT,
+            timeout=NODE_PATIENCE,
             what="the node is ready",
             transient=(Unreachable, ApiError),
             diagnose=self._children["kubelet"].tail,

@@ -23,6 +23,7 @@ from pathlib import Path
 
 from tests.cluster.children import Child
 from tests.cluster.waiting import wait_until
+from tests.patience import NODE_PATIENCE
 
 CGROUPS = Path("/sys/fs/cgroup")
 CGROUP_PREFIX = "wayside-e2e-"
@@ -79,7 +80,7 @@ class Enclosure:
         self._target = int(found[0])
         self._join()
 
-    def run(self, *command: str, path: str, timeout: float = 300) -> str:
+    def run(self, *command: str, path: str, timeout: float = NODE_PATIENCE) -> str:
         """Run a command inside to its end and return its stdout; RuntimeError with its stderr if it fails."""
         done = subprocess.run(
             [*self.enter, *command],

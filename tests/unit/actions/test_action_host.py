@@ -28,6 +28,7 @@ from detector.actions.worker import SILENT
 from detector.assembly import stream_readers
 from detector.engine.engine import Engine
 from tests.driving import a_detector, a_rule, a_stream, an_engine, arrival, at, compiled
+from tests.patience import PATIENCE
 from wayside.api import EventRule
 
 DETECTOR = a_detector(a_stream("speed"), clientTimeout="60s")
@@ -84,7 +85,7 @@ class Hangs(Recorded):
     """Waits for ever, or until it is let go."""
 
     def started(self, episode: Episode) -> None:
-        SLOW.wait(120)
+        SLOW.wait(PATIENCE)
         super().started(episode)
 
 
@@ -127,7 +128,9 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     yield
     SLOW.set()
     for thread in set(threading.enumerate()).difference(before):
-        thread.join(60)  # what was let go just now is still to note its words, and not among those of the next test
+        thread.join(
+            PATIENCE
+        )  # what was let go just now is still to note its words, and not among those of the next test
 
 
 class HostHarness:
@@ -160,7 +163,7 @@ class HostHarness:
         return self.host.outcomes.counts_by_action()[ActionKey("fast", action)]
 
     def when(self, true: Callable[[], bool]) -> None:
-        end = time.monotonic() + 60
+        end = time.monotonic() + PATIENCE
         while not true():
             assert time.monotonic() < end, (
                 Recorded.reported,

@@ -19,6 +19,7 @@ from detector.actions.deploy.file_store import FileTaskStore, write_tasks_yaml
 from detector.actions.deploy.reconciler import DemandReconciler, DeployCounts
 from detector.actions.deploy.stores import restore, task_manifest
 from detector.engine.episodes.demands import Demand, to_task
+from tests.patience import PATIENCE
 from tests.unit.actions.test_demands import DEMAND, changed
 from wayside.api.documents import load_documents
 from wayside.times import format_time
@@ -49,7 +50,7 @@ async def reconciling(folder: Path, interval: float = 0.02, **options: Any) -> A
 
 async def eventually(holds: Callable[[], bool], what: str) -> None:
     try:
-        async with asyncio.timeout(60):
+        async with asyncio.timeout(PATIENCE):
             while not holds():  # noqa: ASYNC110  files do not notify of changes
                 await asyncio.sleep(0.005)
     except TimeoutError:

@@ -18,6 +18,7 @@ from application_manager.commands.cli import EXPECTED, app
 from application_manager.core.findings.reviews import OverloadedError, ReviewError
 from application_manager.core.findings.webhooks import PATH
 from application_manager.measures import Measures
+from tests.patience import PATIENCE
 from tests.ports import free_port
 from tests.unit.manager_objects import DEPLOYMENT
 from wayside.kubernetes.connection import ConfigurationError
@@ -50,7 +51,7 @@ def served(
                     headers.append(response.headers)
                 return response.status, await response.text()
 
-        async with asyncio.timeout(120), webhook(WebhookOptions(port, folder), {PATH: handler}):
+        async with asyncio.timeout(PATIENCE), webhook(WebhookOptions(port, folder), {PATH: handler}):
             await scenario(ask)
 
     asyncio.run(run())

@@ -9,6 +9,7 @@ import sys
 import pytest
 
 from tests.guides import ROOT
+from tests.patience import PATIENCE
 from wayside.process.startup import importing
 
 EXAMPLE = ROOT / "examples" / "cooperative-recording"
@@ -48,7 +49,9 @@ def test_no_garbage_is_looked_for_while_importing_nor_in_what_was_imported() -> 
 
 def loaded(code: str, *words: str) -> set[str]:
     """The packages that a program has loaded at its end."""
-    done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, timeout=120, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code, *words], capture_output=True, text=True, timeout=PATIENCE, check=True
+    )
     return {name.partition(".")[0] for name in done.stdout.splitlines()[-1].split()}
 
 

@@ -33,6 +33,7 @@ from tests.driving import (
     speed,
 )
 from tests.networks import wait_for
+from tests.patience import PATIENCE
 from tests.unit.engine.live import Live
 
 
@@ -233,8 +234,8 @@ def test_the_replay_of_pauses_questions_and_left_out_evaluations_gives_the_same_
         payload = b'{"v": %d}' % (20 if (n // 3) % 2 else 5)
         live.put([(f"vehicles/{client}/speed", payload) for client in ("a", "b")])
         if n in (10, 20):
-            live.evaluator.pause_rule("p", n == 10).result(10)
-        assert [each.subject for each in live.evaluator.ask("q").result(10)] == ["a", "b"]
+            live.evaluator.pause_rule("p", n == 10).result(PATIENCE)
+        assert [each.subject for each in live.evaluator.ask("q").result(PATIENCE)] == ["a", "b"]
     recording = live.stop()
     assert {event.episode.rule for event in recording.logged} == {"r", "q", "p"}
     levels = [

@@ -33,6 +33,7 @@ from tests.driving import (
     lines,
     reported,
 )
+from tests.patience import PATIENCE
 from tests.unit.engine.live import Live, Recording
 from wayside.api import Detector
 
@@ -182,8 +183,8 @@ def received(detector: Detector, rules: Sequence[Any], sent: Sequence[tuple[int,
     for step, value in sent:
         live.now = START + step * STEP
         payload = json.dumps({"t": (START + step * STEP) / SECOND, "v": value}).encode()
-        live.evaluator.call(lambda payload=payload: live.put([("vehicles/car/speed", payload)])).result(10)
-        live.evaluator.call(lambda: None).result(10)
+        live.evaluator.call(lambda payload=payload: live.put([("vehicles/car/speed", payload)])).result(PATIENCE)
+        live.evaluator.call(lambda: None).result(PATIENCE)
     return live.stop()
 
 

@@ -23,7 +23,8 @@ from rosbags.highlevel import AnyReader
 from application_manager.core.objects.policy import Policy
 from application_manager.core.objects.rendering import Renderer
 from tests.guides import ROOT
-from tests.networks import PATIENCE, session
+from tests.networks import session
+from tests.patience import PATIENCE
 from tests.ports import free_endpoint
 from tests.unit.manager_objects import instance
 from wayside.api import ApplicationTemplate, Detector, EventRule, Kind

@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from tests.patience import PATIENCE
+
 WORKER = """
 import sys
 from contextlib import contextmanager
@@ -43,7 +45,7 @@ def test_it_is_started_once_stopped_after_the_last_and_started_again_for_one_tha
     first.stdin.flush()
     assert log.read_text() == "started\n"
     second.communicate("\n")
-    assert first.wait(60) == 0
+    assert first.wait(PATIENCE) == 0
     assert log.read_text() == "started\nstopped\n"
     worker(tmp_path).communicate("\n")
     assert log.read_text() == "started\nstopped\n" * 2
@@ -53,5 +55,5 @@ def test_a_worker_that_is_killed_holds_up_no_other(tmp_path: Path) -> None:
     first, second = worker(tmp_path), worker(tmp_path)
     second.kill()
     second.communicate()
-    first.communicate("\n", timeout=60)
+    first.communicate("\n", timeout=PATIENCE)
     assert (tmp_path / "log").read_text() == "started\nstopped\n"

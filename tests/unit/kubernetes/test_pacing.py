@@ -7,6 +7,7 @@ from contextlib import suppress
 
 import pytest
 
+from tests.patience import PATIENCE
 from wayside.kubernetes.pacing import CongestionWindow, Pacing
 
 QUICK = 0.004  # s that a write takes at an idle API server
@@ -89,7 +90,7 @@ def test_one_that_is_cancelled_leaves_its_place_to_the_next(waits: bool) -> None
             each.cancel()
             with suppress(asyncio.CancelledError):
                 await each
-        async with asyncio.timeout(5), pacing.turn("a"):
+        async with asyncio.timeout(PATIENCE), pacing.turn("a"):
             pass
 
     asyncio.run(scenario())

@@ -9,6 +9,7 @@ from contextlib import asynccontextmanager
 
 import pytest
 
+from tests.patience import PATIENCE
 from wayside.kubernetes import workqueue
 from wayside.kubernetes.errors import ApiError, Unreachable
 from wayside.kubernetes.workqueue import WorkQueue
@@ -18,7 +19,7 @@ from wayside.kubernetes.workqueue import WorkQueue
 async def running(*queues: WorkQueue[str]) -> AsyncIterator[None]:
     tasks = [asyncio.create_task(queue.run()) for queue in queues]
     try:
-        async with asyncio.timeout(60):
+        async with asyncio.timeout(PATIENCE):
             yield
     finally:
         for task in tasks:
@@ -208,7 +209,7 @@ async def test_a_worker_whose_cancellation_is_lost_to_an_error_ends_all_the_same
     running = asyncio.create_task(queue.run())
     await begun.wait()
     running.cancel()
-    await asyncio.wait({running}, timeout=60)
+    await asyncio.wait({running}, timeout=PATIENCE)
     assert running.cancelled()
     assert times == 1
 
@@ -287,7 +288,7 @@ async def test_a_queue_yields_to_the_one_before_it_in_the_same_namespace_alone()
     queue.add(("loud", "a"))
     queue.add(("quiet", "b"))
     working = asyncio.create_task(queue.run())
-    async with asyncio.timeout(60):
+    async with asyncio.timeout(PATIENCE):
         await both.wait()
     working.cancel()
     assert done == [("quiet", "b"), ("loud", "a")]

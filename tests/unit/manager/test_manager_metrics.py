@@ -21,6 +21,7 @@ from application_manager.watching.watch_health import WatchHealth
 from application_manager.work.recorder import BURST, REFILL, EventReason, TokenBuckets
 from application_manager.work.tracing import LostSpans
 from tests.guides import guide
+from tests.patience import PATIENCE
 from tests.unit.manager_objects import instance, task, template
 from wayside.kubernetes.connection import ConfigurationError
 from wayside.kubernetes.errors import ApiError
@@ -99,7 +100,7 @@ def test_a_queue_reports_how_long_its_work_took_and_what_failed() -> None:
         queue = WorkQueue("task", work, 1, measure=measures.reconciled)
         queue.add("a")
         running = asyncio.create_task(queue.run())
-        async with asyncio.timeout(60):
+        async with asyncio.timeout(PATIENCE):
             await finished.wait()
         running.cancel()
         await asyncio.gather(running, return_exceptions=True)

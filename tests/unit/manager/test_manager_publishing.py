@@ -16,7 +16,8 @@ import pytest
 import zenoh
 
 from application_manager.work.publishing import Publisher, key_of, settings
-from tests.networks import PATIENCE, router, wait_for
+from tests.networks import router, wait_for
+from tests.patience import PATIENCE
 from tests.ports import free_endpoint, free_port
 from wayside.kubernetes.connection import ConfigurationError
 

@@ -10,6 +10,7 @@ import pytest
 
 from application_manager.work import recorder
 from application_manager.work.recorder import EventReason, Recorder
+from tests.patience import PATIENCE
 from tests.unit.manager_objects import NOW, task
 from wayside.kubernetes.client import Client
 from wayside.kubernetes.errors import ApiError
@@ -90,7 +91,7 @@ def test_what_is_dropped_later_is_reported_when_its_time_has_come_though_no_furt
     async def trickle() -> None:
         running = asyncio.create_task(events.run())
         report(events, 0, 5)
-        async with asyncio.timeout(30):
+        async with asyncio.timeout(PATIENCE):
             while len(lines(caplog)) < 2:  # noqa: ASYNC110  a log has no event to wait for
                 await asyncio.sleep(0.01)
         running.cancel()

@@ -13,6 +13,7 @@ from application_manager.measures import Measures
 from application_manager.observability.pages import stalled
 from application_manager.running import watchdog
 from application_manager.running.watchdog import STALLED
+from tests.patience import PATIENCE
 from wayside.kubernetes.workqueue import WorkQueue
 
 
@@ -28,8 +29,8 @@ def ended_by(stall: watchdog.Stall, *, hangs: bool = False, silent: float = 3600
     async def scenario() -> None:
         async with watchdog.watchdog(stall, silent, step=0.02, end=end):
             if hangs:
-                called.wait(60)
-            await asyncio.to_thread(called.wait, 60 if hangs or stall() else 0.3)
+                called.wait(PATIENCE)
+            await asyncio.to_thread(called.wait, PATIENCE if hangs or stall() else 0.3)
 
     asyncio.run(scenario())
     return logged[0] if logged else None
@@ -59,7 +60,9 @@ async def main():
         hanging()
 asyncio.run(main())
 """
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=PATIENCE, check=False
+    )
     assert done.returncode == STALLED
     assert "CRITICAL watchdog: the event loop has not run for" in done.stderr
     assert "in hanging" in done.stderr

@@ -16,7 +16,8 @@ from detector.sources.supervision import SourceState, SourceThread
 from detector.streams.codecs import CdrDecoder
 from detector.streams.loss_counter import LossCounter
 from tests.driving import a_detector
-from tests.networks import PATIENCE, Arrivals, stream, wait_for
+from tests.networks import Arrivals, stream, wait_for
+from tests.patience import PATIENCE
 from tests.recorded import messages_in
 from wayside.api.plugin import DataSource
 from wayside.api.stream import Encoding, Stream

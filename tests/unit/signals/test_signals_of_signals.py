@@ -12,6 +12,7 @@ from pydantic import ValidationError
 from detector.engine.episodes.open_episodes import from_document
 from detector.replay.replaying import replay_intake
 from tests.driving import POSITION, START, Drive, a_deploy, a_detector, a_rule, at, lines, place, speed
+from tests.patience import PATIENCE
 from tests.unit.engine.live import Live
 
 SPEED = {"name": "v", "stream": "speed", "value": "msg.v"}
@@ -118,7 +119,7 @@ def test_the_replay_of_lags_and_statistics_gives_the_same_events() -> None:
     for n, value in zip(range(120), itertools.cycle([9, 9, 8, 3, 3, 3, 3, 7]), strict=False):
         live.now = START + n * 400_000_000
         live.put([(f"vehicles/{client}/speed", b'{"v": %d}' % value) for client in ("a", "b")])
-        live.evaluator.call(lambda: None).result(10)
+        live.evaluator.call(lambda: None).result(PATIENCE)
     recording = live.stop()
     assert {(event.episode.rule, event.started) for event in recording.logged} == set(
         itertools.product("rs", (True, False))

@@ -23,6 +23,7 @@ from detector.status.updating import StatusUpdater
 from detector.streams.query_handler import NoAnswerError, QueryHandler, query_detectors
 from detector.streams.zenoh import Network
 from tests.driving import POSITION, Drive, a_detector, a_rule, a_stream, arrival, at
+from tests.patience import PATIENCE
 from tests.ports import free_endpoint
 from wayside.api.zenoh import Zenoh, ZenohMode
 from wayside.rules import RuleProblem
@@ -159,10 +160,10 @@ def test_what_is_requested_from_the_evaluation_is_done_on_its_thread_and_errors_
     )
     early = evaluator.call(lambda: drive.engine.now)
     evaluator._thread.start()
-    assert early.result(60) == drive.engine.now
+    assert early.result(PATIENCE) == drive.engine.now
     with pytest.raises(ZeroDivisionError):
-        evaluator.call(lambda: 1 // 0).result(60)
-    assert evaluator.call(lambda: "continues").result(60) == "continues"
+        evaluator.call(lambda: 1 // 0).result(PATIENCE)
+    assert evaluator.call(lambda: "continues").result(PATIENCE) == "continues"
     evaluator.stop()
     assert evaluator.call(lambda: "too late").cancelled()
     assert failures == []

@@ -20,6 +20,7 @@ from detector.streams.codecs.etsi import EtsiDecoder, OwnDefinitions
 from detector.streams.codecs.ros import types_with
 from tests.driving import Drive, a_detector, a_rule, a_stream, at, lines
 from tests.guides import guide, yaml_blocks
+from tests.patience import PATIENCE
 from tests.unit.encodings.test_etsi_asn1 import DICTIONARY, PERCEPTION, perception
 from tests.unit.engine.live import Live
 from wayside.api import Detector, EventRule
@@ -169,7 +170,7 @@ def test_live_and_replay_give_the_same_events() -> None:
         items = [item(1, n % 7, n % 13), item(2, 3, n % 11), *([item(3, 9, 12)] if n % 40 < 5 else [])]
         put([("stations/n/list", sent(0, *items).payload)])
         if n % 7 == 0:
-            live.evaluator.ask("ask").result(10)
+            live.evaluator.ask("ask").result(PATIENCE)
     recording = live.stop()
     assert {event.episode.subject for event in recording.logged} >= {"1", "2", "3", "1+2"}
     assert {str(event.reason) for event in recording.logged} >= {"ClientLost", "Until"}
