@@ -109,7 +109,7 @@ messages = st.lists(
     cuts=[],
     on_data=True,
 )
-def test_each_sample_of_a_window_is_passed_on_once_and_no_other(
+def test_exactly_the_samples_of_a_window_are_delivered_once_each(
     drawn: list[tuple[int, str, str, float, int]], cuts: list[int], on_data: bool
 ) -> None:
     arrivals = [
@@ -175,7 +175,7 @@ def test_a_run_is_passed_on_in_order_and_completed_once_time_has_passed_its_wind
     assert all(lane.came is None for lane in engine.buffer), "nobody keeps what comes any more"
 
 
-def test_what_was_latched_comes_with_the_window_however_old_it_is() -> None:
+def test_latched_samples_are_delivered_with_the_window_whatever_their_age() -> None:
     engine = an_engine(PLAIN, fast(an_action(streams=["speed"], before="500ms")))
     first = [arrival(0.5, "car1", {"m": 1}, "map"), arrival(0.6, "car2", {"m": 2}, "map")]
     reported = run(engine, [first, *speeds((9.05, 1.0))], 9.2)
@@ -183,7 +183,7 @@ def test_what_was_latched_comes_with_the_window_however_old_it_is() -> None:
     assert [(sample.stream, sample.client) for sample in sampled.samples] == [("map", "car1"), ("speed", "car1")]
 
 
-def test_what_a_cap_pushes_out_in_between_is_reported_all_the_same() -> None:
+def test_samples_evicted_by_a_cap_are_still_reported_as_missing() -> None:
     tight = a_detector(a_stream("speed", buffer={"count": 1}), clientTimeout="60s")
     engine = an_engine(tight, fast(an_action()))
     engine.advance([arrival(0.05, "car1", {"v": 1})], at(0.2))
@@ -192,12 +192,12 @@ def test_what_a_cap_pushes_out_in_between_is_reported_all_the_same() -> None:
     assert sum(len(each.samples) for each in reported if isinstance(each, RunSamples)) == 49
 
 
-def test_a_dry_run_notifies_nobody() -> None:
+def test_a_dry_run_runs_no_action() -> None:
     engine = an_engine(PLAIN, fast(an_action(), dryRun=True))
     assert run(engine, speeds((0.05, 1.0), (1.05, 0.0)), 3.0) == []
 
 
-def test_the_end_of_the_detector_cuts_what_is_open() -> None:
+def test_at_shutdown_open_windows_are_truncated() -> None:
     engine = an_engine(PLAIN, fast(an_action()))
     run(engine, speeds((0.05, 1.0)), 1.0)
     reported = engine.consequences.cut(engine.now, "it stops")
@@ -205,7 +205,7 @@ def test_the_end_of_the_detector_cuts_what_is_open() -> None:
     assert reported[-1].cut == "it stops"
 
 
-def test_open_episodes_go_over_to_actions_that_change() -> None:
+def test_open_episodes_are_handed_over_to_changed_actions() -> None:
     engine = an_engine(PLAIN, fast(an_action("a"), an_action("b")))
     run(engine, speeds((0.05, 1.0)), 1.0)
     engine.set_rules(compiled(PLAIN, fast(an_action("b"), an_action("c"))))
@@ -214,7 +214,7 @@ def test_open_episodes_go_over_to_actions_that_change() -> None:
     assert [(each.run.action, each.resumed) for each in reported if isinstance(each, RunStarted)] == [("c", True)]
 
 
-def test_an_action_that_is_the_same_with_other_parameters_is_another() -> None:
+def test_an_action_with_other_parameters_is_another_action() -> None:
     other = {"name": "keep", "plugin": {"name": "keeper", "parameters": {"folder": "b"}}}
     engine = an_engine(PLAIN, fast({"name": "keep", "plugin": {"name": "keeper"}}))
     run(engine, speeds((0.05, 1.0)), 1.0)
@@ -231,7 +231,7 @@ def test_a_changed_rule_ends_its_episodes_and_their_windows_continue() -> None:
     assert [len(each.samples) for each in reported if isinstance(each, RunSamples)] == [1]
 
 
-def test_what_comes_when_its_window_is_complete_is_counted() -> None:
+def test_samples_after_the_completion_of_their_window_are_counted() -> None:
     engine = an_engine(DATA, fast(an_action(streams=["speed"], before="1s")))
     reported = run(
         engine,
@@ -249,7 +249,7 @@ def test_what_comes_when_its_window_is_complete_is_counted() -> None:
     assert all(lane.came is None for lane in engine.buffer), "nobody waits for late ones any more"
 
 
-def test_what_is_rendered_for_an_action_is_of_the_start_and_each_by_itself() -> None:
+def test_parameters_of_actions_are_rendered_at_the_start_independently_of_each_other() -> None:
     values = {"text": "${client} at ${v}", "missing": "${labels.plate}"}
     engine = an_engine(PLAIN, fast({"name": "n", "plugin": {"name": "teller", "values": values}}))
     [begun, *_] = run(engine, speeds((0.05, 1.0)), 1.0)

@@ -205,7 +205,7 @@ def test_an_action_receives_an_episode_in_order_and_closed_at_last() -> None:
     assert site.counts("a").done == 1
 
 
-def test_what_one_raises_fails_that_episode_and_no_other() -> None:
+def test_an_exception_in_an_action_fails_only_its_episode() -> None:
     site = HostHarness(fast(a="raises", b="recorded"))
     one_episode(site)
     one_episode(site, "car2", begin=2.0)
@@ -221,7 +221,7 @@ def test_what_one_raises_fails_that_episode_and_no_other() -> None:
     assert [text for text in Recorded.reported if text.startswith("a") and "car1" in text] == ["a started car1"]
 
 
-def test_one_that_cannot_be_made_fails_its_episodes_with_the_reason() -> None:
+def test_an_action_that_cannot_be_created_fails_its_episodes_with_the_reason() -> None:
     site = HostHarness(fast(a="impossible", b="recorded"))
     one_episode(site)
     site.host.close()
@@ -229,7 +229,7 @@ def test_one_that_cannot_be_made_fails_its_episodes_with_the_reason() -> None:
     assert site.counts("b").done == 1
 
 
-def test_one_that_hangs_holds_up_nobody_and_what_finds_its_queue_full_is_counted() -> None:
+def test_a_hanging_action_delays_no_other_and_drops_beyond_its_queue_are_counted() -> None:
     site = HostHarness(fast(a="hangs", b="recorded"), maximum_bytes=1000)
     site.take((0.05, "car1", 1.0), until=0.5)
     for step in range(40):
@@ -245,7 +245,7 @@ def test_one_that_hangs_holds_up_nobody_and_what_finds_its_queue_full_is_counted
     site.host.close()
 
 
-def test_one_that_hangs_at_the_end_is_left_behind() -> None:
+def test_an_action_that_hangs_at_shutdown_is_abandoned() -> None:
     site = HostHarness(fast(a="hangs"))
     one_episode(site)
     site.host.close(grace=0.05)
@@ -254,7 +254,7 @@ def test_one_that_hangs_at_the_end_is_left_behind() -> None:
     ]
 
 
-def test_one_that_is_replaced_completes_what_it_has_and_the_new_one_continues() -> None:
+def test_a_replaced_action_completes_its_episodes_and_the_new_one_takes_later_ones() -> None:
     site = HostHarness(fast(a="recorded"))
     site.take((0.05, "car1", 1.0), until=0.5)
     site.when(lambda: "a 1 samples car1" in Recorded.reported)
@@ -264,7 +264,7 @@ def test_one_that_is_replaced_completes_what_it_has_and_the_new_one_continues() 
     site.host.close()
 
 
-def test_one_is_woken_when_it_wishes_and_what_it_raises_then_is_counted() -> None:
+def test_an_action_is_woken_on_request_and_its_exceptions_are_counted() -> None:
     Wakes.calls = 0
     site = HostHarness(fast(a="wakes"))
     site.when(lambda: Wakes.calls > 5)
@@ -272,7 +272,7 @@ def test_one_is_woken_when_it_wishes_and_what_it_raises_then_is_counted() -> Non
     site.host.close()
 
 
-def test_one_that_reports_nothing_has_failed_at_the_end() -> None:
+def test_an_action_without_outcomes_counts_as_failed_at_shutdown() -> None:
     site = HostHarness(fast(a="silent"))
     one_episode(site)
     site.host.close()
@@ -292,7 +292,7 @@ def test_each_outcome_is_reported_once() -> None:
     assert any(b'"type":"dev.wayside.action.failed"' in payload for _, payload in site.published)
 
 
-def test_a_plugin_that_is_not_there_is_reported_with_its_place() -> None:
+def test_a_missing_action_plugin_is_reported_by_field() -> None:
     rule = fast(a="recordet")
     [problem] = registry.action_problems(rule, DETECTOR)
     assert str(problem).startswith("spec.actions[0].plugin.name: ")

@@ -66,20 +66,20 @@ def test_the_deadline_holds_whatever_the_endpoint_does(behaviour: Behaviour) -> 
     ],
     ids=["no body", "a body without end", "chunks without end", "less than announced"],
 )
-def test_where_no_body_is_wanted_a_success_is_one_at_once(behaviour: Behaviour) -> None:
+def test_without_a_wanted_body_a_success_counts_at_once(behaviour: Behaviour) -> None:
     with endpoint(behaviour) as there:
         begun = time.monotonic()
         assert send(client("20s"), there.url).status == 200
         assert time.monotonic() - begun < 10
 
 
-def test_no_more_of_a_body_is_read_than_is_wanted() -> None:
+def test_a_body_is_read_only_up_to_the_wanted_size() -> None:
     with endpoint(drips(OK + b"\r\n", b"x" * 10_000, 0.0001)) as there:
         answer = send(client(), there.url, want=30_000)
     assert (len(answer.body), answer.whole) == (30_000, False)
 
 
-def test_a_body_shorter_than_announced_is_not_whole() -> None:
+def test_a_body_shorter_than_announced_is_incomplete() -> None:
     with endpoint(sends(OK + b"Content-Length: 1000\r\n\r\nshort")) as there:
         answer = send(client(), there.url, want=2000)
     assert (answer.body, answer.whole) == (b"short", False)
@@ -109,12 +109,12 @@ def test_redirects_are_not_followed() -> None:
         (sends(b"HTTP/1.1 200 OK\r\nX: " + b"a" * 100_000 + b"\r\n\r\n"), "is not HTTP"),
     ],
 )
-def test_what_is_no_answer_is_reported(behaviour: Behaviour, reported: str) -> None:
+def test_a_response_that_is_not_http_is_reported(behaviour: Behaviour, reported: str) -> None:
     with endpoint(behaviour) as there, pytest.raises(HttpError, match=reported):
         send(client(), there.url)
 
 
-def test_nobody_there_and_no_such_name_are_reported_without_the_path() -> None:
+def test_refused_connections_and_unknown_hosts_are_reported_without_the_path() -> None:
     with nobody() as there, pytest.raises(HttpError, match=rf"^{there}: cannot connect: "):
         send(client(), f"{there}/secret-path")
     with pytest.raises(HttpError, match=r"^http://nobody\.invalid:80: ") as caught:
@@ -122,7 +122,7 @@ def test_nobody_there_and_no_such_name_are_reported_without_the_path() -> None:
     assert "secret" not in str(caught.value)
 
 
-def test_who_gives_up_waits_no_longer() -> None:
+def test_a_cancelled_request_returns_at_once() -> None:
     closing = threading.Event()
     with endpoint(hangs()) as there:
         threading.Thread(target=lambda: (there.received(1), closing.set())).start()
@@ -143,7 +143,7 @@ def test_certificates_are_checked(tmp_path: Path) -> None:
         assert len(there.requests) == 1
 
 
-def test_the_certificate_must_be_for_the_name_unless_that_is_waived(tmp_path: Path) -> None:
+def test_the_certificate_must_match_the_host_name_unless_disabled(tmp_path: Path) -> None:
     authority = Authority(tmp_path)
     with endpoint(certificate=authority.sign("server", "elsewhere")) as there:
         with pytest.raises(HttpError, match=r"certificate is not trusted: .*'localhost'"):
@@ -151,7 +151,7 @@ def test_the_certificate_must_be_for_the_name_unless_that_is_waived(tmp_path: Pa
         assert send(client(tls={"ca": str(authority.ca), "verifyName": False}), there.url).status == 200
 
 
-def test_the_detector_proves_who_it_is(tmp_path: Path) -> None:
+def test_the_detector_presents_its_client_certificate(tmp_path: Path) -> None:
     authority = Authority(tmp_path)
     certificate, key = authority.sign("detector")
     own = {"ca": str(authority.ca), "certificate": str(certificate), "key": str(key)}
@@ -161,7 +161,7 @@ def test_the_detector_proves_who_it_is(tmp_path: Path) -> None:
             send(client(tls={"ca": str(authority.ca)}), there.url)
 
 
-def test_a_renewed_secret_is_used_from_then_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_renewed_secret_is_used_for_later_requests(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("WAYSIDE_SECRETS", str(tmp_path))
     (tmp_path / "hook").mkdir()
     token = tmp_path / "hook" / "token"
@@ -187,7 +187,7 @@ def test_a_variable_and_credentials_become_headers(tmp_path: Path, monkeypatch: 
     assert there.requests[0].headers["authorization"] == "Basic YW5uOnBhc3M="
 
 
-def test_an_endpoint_that_repeats_the_headers_betrays_no_secret(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_secrets_echoed_by_an_endpoint_are_redacted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("WAYSIDE_KEY", "Bearer abcdef")
     with endpoint(echoes_headers()) as there:
         why = judge(send(client(headers=[{"name": "Authorization", "variable": "WAYSIDE_KEY"}]), there.url))[1]
@@ -203,7 +203,7 @@ def test_an_endpoint_that_repeats_the_headers_betrays_no_secret(monkeypatch: pyt
         *((status, "AGAIN") for status in (408, 425, 429, 500, 501, 503, 599)),
     ],
 )
-def test_what_follows_from_a_status(status: int, verdict: str) -> None:
+def test_each_http_status_has_its_disposition(status: int, verdict: str) -> None:
     assert judge(Answer(status))[0].name == verdict
 
 
@@ -237,6 +237,6 @@ def test_retry_after_is_understood_in_both_forms(text: str, seconds: float) -> N
         ({"name": "X", "secretKeyRef": {"name": "s", "key": "../other/key"}}, "pattern"),
     ],
 )
-def test_headers_that_cannot_be_are_refused(header: dict[str, Any], reported: str) -> None:
+def test_invalid_headers_are_rejected(header: dict[str, Any], reported: str) -> None:
     with pytest.raises(ValidationError, match=re.escape(reported)):
         HttpHeader.model_validate(header)

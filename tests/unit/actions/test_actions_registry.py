@@ -82,9 +82,7 @@ def test_an_action_gets_its_parameters_as_its_model() -> None:
         ("lamp", {"colour": "red", "color": "red"}, "plugin.parameters.color: unknown field"),
     ],
 )
-def test_what_is_wrong_with_an_action_is_reported_with_its_field(
-    name: str, parameters: dict[str, Any], problem: str
-) -> None:
+def test_errors_of_an_action_are_reported_by_field(name: str, parameters: dict[str, Any], problem: str) -> None:
     (found,) = action_problems(rule(name, **parameters), a_detector())
     assert problem in str(found)
     assert str(found).startswith("spec.actions[0].plugin.")
@@ -100,7 +98,7 @@ def test_check_reports_line_and_column(tmp_path: Path) -> None:
     assert "r.yaml:8:49: spec.actions[0].plugin.parameters.colour: must be a string; got 3" in str(problem)
 
 
-def test_a_rule_whose_action_is_refused_continues_as_it_last_was() -> None:
+def test_a_rule_whose_action_is_rejected_keeps_its_last_good_version() -> None:
     index, detector = RuleIndex(), a_detector()
     index.compile([rule("lamp", colour="red")], detector, stream_readers(detector).fields)
     (kept,), (refusal,) = index.compile([rule("lamp")], detector, stream_readers(detector).fields)
@@ -109,7 +107,7 @@ def test_a_rule_whose_action_is_refused_continues_as_it_last_was() -> None:
     assert "plugin.parameters.colour" in str(refusal)
 
 
-def test_of_two_packages_with_the_same_action_the_detectors_own_wins(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_built_in_action_wins_over_a_package_with_the_same_name(monkeypatch: pytest.MonkeyPatch) -> None:
     own = [EntryPoint("lamp", "detector.actions:Action", OFFERS.group)]
     monkeypatch.setattr(entrypoints, "_foreign", lambda entry: entry not in own)
     others = entrypoints.entry_points(group=OFFERS.group)

@@ -53,7 +53,7 @@ def test_a_document_has_the_message_its_sender_and_its_time() -> None:
     }
 
 
-def test_a_sample_has_the_same_id_in_each_document_and_no_two_have_the_same() -> None:
+def test_document_ids_are_unique_and_stable_for_each_sample() -> None:
     samples = [
         sample(b"1"),
         sample(b"1"),  # with clock Data a client may send the same twice at one time
@@ -69,7 +69,7 @@ def test_a_sample_has_the_same_id_in_each_document_and_no_two_have_the_same() ->
     assert len(set(ids)) == len(samples)
 
 
-def test_a_payload_that_cannot_be_decoded_is_kept_as_it_came() -> None:
+def test_an_undecodable_payload_is_stored_as_received() -> None:
     made = documents().make(sample(b"no json"))
     document = bson.decode(made.document)
     assert made.undecoded
@@ -88,14 +88,14 @@ ANYTHING = st.recursive(
 
 @settings(max_examples=40)
 @given(st.dictionaries(NAMES, ANYTHING, max_size=4))
-def test_what_a_message_holds_comes_back_as_it_was_also_beside_what_bson_does_not_know(value: dict[str, Any]) -> None:
+def test_message_values_round_trip_beside_values_that_bson_does_not_support(value: dict[str, Any]) -> None:
     assert bson.decode(bson_bytes({"msg": value}))["msg"] == value
     with_care = bson.decode(bson_bytes({"msg": value, "wide": 2**63}))
     assert with_care["msg"] == value
     assert with_care["wide"] == Decimal128(str(2**63))
 
 
-def test_numbers_stay_what_they_are() -> None:
+def test_numbers_keep_their_values() -> None:
     made = bson_bytes({"a": math.nan, "b": math.inf, "c": 2**60, "d": 2**64 - 1, "e": 10**40, "f": np.float32(0.5)})
     back = bson.decode(made)
     assert math.isnan(back["a"])
@@ -106,13 +106,13 @@ def test_numbers_stay_what_they_are() -> None:
     assert back["f"] == 0.5
 
 
-def test_numpy_names_and_texts_that_bson_does_not_know_become_something_that_it_does() -> None:
+def test_numpy_values_names_and_texts_unsupported_by_bson_are_converted() -> None:
     value = {1: np.arange(3), "a\0b": np.int64(5), "text": "\ud800", "set": {1.0}, "view": memoryview(b"ab")}
     back = bson.decode(bson_bytes({"msg": value}))["msg"]
     assert back == {"1": [0, 1, 2], "a\N{SYMBOL FOR NULL}b": 5, "text": "?", "set": [1.0], "view": b"ab"}
 
 
-def test_a_message_nested_deeper_than_mongodb_takes_is_refused_by_name() -> None:
+def test_a_message_nested_too_deeply_for_mongodb_is_rejected_by_name() -> None:
     value: Any = 2**70
     for _ in range(300):
         value = [value]
@@ -120,7 +120,7 @@ def test_a_message_nested_deeper_than_mongodb_takes_is_refused_by_name() -> None
         bson_bytes({"msg": value})
 
 
-def test_a_document_beyond_16_mb_goes_to_a_file_as_a_whole() -> None:
+def test_a_document_beyond_16_mb_is_stored_whole_in_a_file() -> None:
     numbers = json.dumps([0.5] * 1_500_000).encode()
     made = documents(above=2**16).make(sample(numbers))
     document = bson.decode(made.document)
@@ -132,7 +132,7 @@ def test_a_document_beyond_16_mb_goes_to_a_file_as_a_whole() -> None:
     assert str(LARGEST) in document["note"]
 
 
-def test_without_a_place_for_files_what_is_too_large_is_cut_and_reported() -> None:
+def test_without_a_folder_for_files_documents_too_large_are_truncated_and_reported() -> None:
     made = documents().make(sample(bytes(17 * 2**20), stream="blob"))
     document = bson.decode(made.document)
     assert len(made.document) < 1000
@@ -141,7 +141,7 @@ def test_without_a_place_for_files_what_is_too_large_is_cut_and_reported() -> No
     assert not made.files
 
 
-def test_only_binary_fields_above_the_size_leave_the_document() -> None:
+def test_only_binary_fields_above_the_size_are_stored_in_files() -> None:
     message = {"small": b"x" * 100, "large": b"y" * 101, "text": "z" * 1000, "list": [{"data": b"w" * 200}]}
     slim, files = detach(message, 100, "place")
     assert slim["small"] == b"x" * 100
@@ -200,7 +200,7 @@ def test_images_become_png_pixel_by_pixel(encoding: str, dtype: str, channels: i
     assert (of_png(file) == pixels[:, :, order]).all()
 
 
-def test_images_that_png_cannot_hold_are_files_as_they_are() -> None:
+def test_images_without_a_png_equivalent_are_stored_unconverted() -> None:
     image = {"encoding": "32FC1", "width": 2.0, "height": 2.0, "step": 8.0, "is_bigendian": 0.0, "data": bytes(16)}
     assert png(image) is None
     assert png({**image, "encoding": "mono8", "data": b""}) is None
@@ -258,13 +258,13 @@ def test_point_clouds_become_pcd_with_all_their_fields(*, big: bool, padding: in
         assert (read[name] == points[name]).all()
 
 
-def test_a_cloud_whose_fields_overlap_is_no_pcd() -> None:
+def test_a_point_cloud_with_overlapping_fields_is_not_written_as_pcd() -> None:
     message, _ = cloud()
     message["fields"][1]["offset"] = 2.0
     assert pcd(message) is None
     assert detach(message, 10, "place")[1][0].path == "place.bin"
 
 
-def test_an_image_in_a_message_that_lies_about_its_size_is_a_file_as_it_is() -> None:
+def test_an_image_with_a_wrong_declared_size_is_stored_unconverted() -> None:
     image = {"encoding": "rgb8", "width": "wide", "height": 2.0, "step": 8.0, "data": bytes(16)}
     assert detach(image, 10, "place")[1][0].path == "place.bin"

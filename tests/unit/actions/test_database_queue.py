@@ -33,7 +33,7 @@ def test_a_spool_that_cannot_be_read_is_counted_and_replaced(tmp_path: Path) -> 
     assert a_queue(tmp_path, losses).first() == Write("d", "c", [b"1"], [])
 
 
-def test_a_record_that_is_no_request_is_counted_and_costs_no_other(tmp_path: Path) -> None:
+def test_an_invalid_spool_record_is_counted_and_affects_no_other(tmp_path: Path) -> None:
     losses: Counter[str] = Counter()
     queue = a_queue(tmp_path, losses)
     add(queue, b"0", b"1")
@@ -46,7 +46,7 @@ def test_a_record_that_is_no_request_is_counted_and_costs_no_other(tmp_path: Pat
     assert queue.first() is None
 
 
-def test_a_request_that_moves_to_the_disk_while_it_is_sent_is_removed_there(tmp_path: Path) -> None:
+def test_a_request_spooled_while_being_sent_is_removed_from_the_spool(tmp_path: Path) -> None:
     queue = a_queue(tmp_path, Counter())
     add(queue, b"0", b"1")
     assert queue.first() == Write("d", "c", [b"0"])

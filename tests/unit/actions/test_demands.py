@@ -49,12 +49,12 @@ def changed(**fields: Any) -> Demand:
     return dataclasses.replace(DEMAND, episode=msgspec.structs.replace(DEMAND.episode, **of_episode), **fields)
 
 
-def test_comes_back_from_its_task_through_json() -> None:
+def test_a_demand_round_trips_through_the_json_of_its_task() -> None:
     stored = json.loads(json.dumps(to_task(DEMAND).to_json()))
     assert from_task(ApplicationTask.model_validate(stored)) == DEMAND
 
 
-def test_the_name_does_not_depend_on_what_may_change() -> None:
+def test_the_name_does_not_depend_on_mutable_fields() -> None:
     assert changed(parameters={}, values={}, template="other", rule_digest="9").name == DEMAND.name
 
 
@@ -71,13 +71,13 @@ def test_parts_of_the_name_do_not_run_into_each_other() -> None:
 
 
 @given(st.from_regex(r"[a-z0-9]([-a-z0-9]{0,61}[a-z0-9])?", fullmatch=True), st.text(max_size=20))
-def test_the_name_is_one_that_kubernetes_takes(rule: str, subject: str) -> None:
+def test_the_name_is_a_valid_kubernetes_name(rule: str, subject: str) -> None:
     name = changed(rule=rule, subject=subject).name
     assert len(name) <= 63
     assert NAME.fullmatch(name)
 
 
-def test_a_holder_longer_than_a_label_is_shortened_and_stays_apart() -> None:
+def test_a_holder_longer_than_a_label_is_shortened_uniquely() -> None:
     holders = ["d" * 60 + ".pod-1", "d" * 60 + ".pod-2", "d"]
     labels = [holder_label(holder) for holder in holders]
     assert labels[2] == "d"
@@ -86,7 +86,7 @@ def test_a_holder_longer_than_a_label_is_shortened_and_stays_apart() -> None:
     assert to_task(changed(holder=holders[0])).metadata.labels[HOLDER_LABEL] == labels[0]
 
 
-def test_what_json_cannot_carry_is_left_out() -> None:
+def test_values_that_json_does_not_support_are_omitted() -> None:
     values = {"nan": float("nan"), "none": None, "list": [1.0, float("inf")], "map": {"x": float("-inf"), "y": (1,)}}
     task = to_task(changed(values=values, parameters={"gone": None, "kept": False}))
     assert task.spec.event is not None
@@ -98,11 +98,11 @@ def test_an_ended_demand_reports_its_end() -> None:
     assert to_task(DEMAND, 1_767_225_604_000_000_003).spec.end_time == "2026-01-01T00:00:04.000000003Z"
 
 
-def test_a_persons_task_is_no_demand() -> None:
+def test_a_manually_created_task_is_not_a_demand() -> None:
     task = {"metadata": {"name": "mine"}, "spec": {"templateName": "scene-recorder"}}
     assert from_task(ApplicationTask.model_validate(task | {"kind": "ApplicationTask"})) is None
 
 
-def test_what_does_not_fit_is_refused_by_field() -> None:
+def test_an_invalid_task_is_rejected_by_field() -> None:
     with pytest.raises(ValueError, match="subject"):
         to_task(changed(subject="x" * 600))

@@ -93,7 +93,7 @@ def test_a_demand_is_a_task_from_its_start_to_its_end(tmp_path: Path) -> None:
     assert stored(tmp_path)[B.name]["metadata"]["creationTimestamp"] == "2026-01-01T00:00:02Z"
 
 
-def test_what_is_due_when_it_stops_is_still_done(tmp_path: Path) -> None:
+def test_due_changes_are_written_before_the_reconciler_stops(tmp_path: Path) -> None:
     async def drive() -> None:
         async with reconciling(tmp_path) as reconciler:
             reconciler.update(by_name(A), {})
@@ -104,7 +104,7 @@ def test_what_is_due_when_it_stops_is_still_done(tmp_path: Path) -> None:
     assert ends(tmp_path) == {A.name: format_time(7), B.name: None}
 
 
-def test_a_demand_whose_end_nobody_reports_ends_now(tmp_path: Path) -> None:
+def test_a_demand_without_a_reported_end_ends_now(tmp_path: Path) -> None:
     async def drive() -> None:
         async with reconciling(tmp_path, now=lambda: 42) as reconciler:
             reconciler.update(by_name(A), {})
@@ -115,7 +115,7 @@ def test_a_demand_whose_end_nobody_reports_ends_now(tmp_path: Path) -> None:
     assert ends(tmp_path) == {A.name: format_time(42)}
 
 
-def test_nothing_is_ended_before_the_engine_has_spoken(tmp_path: Path) -> None:
+def test_no_task_is_ended_before_the_first_demands_of_the_engine(tmp_path: Path) -> None:
     put(tmp_path, task_manifest(to_task(A)))
     before = stored(tmp_path)
 
@@ -143,7 +143,7 @@ def test_nothing_is_changed_without_permission(tmp_path: Path) -> None:
     asyncio.run(drive())
 
 
-def test_a_task_found_under_the_name_is_adopted_and_put_right(tmp_path: Path) -> None:
+def test_an_existing_task_of_the_same_name_is_adopted_and_updated(tmp_path: Path) -> None:
     async def drive() -> DeployCounts:
         async with reconciling(tmp_path, NEVER) as reconciler:
             await eventually(lambda: reconciler.looks > 0, "it has looked")
@@ -155,7 +155,9 @@ def test_a_task_found_under_the_name_is_adopted_and_put_right(tmp_path: Path) ->
     assert asyncio.run(drive()) == DeployCounts(adopted=1, patched=1)
 
 
-def test_another_holders_task_under_the_name_is_left_alone(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_task_of_another_holder_with_the_same_name_is_left_alone(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     foreign = task_manifest(to_task(A))
     foreign["spec"]["requester"]["holder"] = "somebody-else"
     file = put(tmp_path, foreign)
@@ -174,7 +176,7 @@ def test_another_holders_task_under_the_name_is_left_alone(tmp_path: Path, caplo
     assert caplog.text.count("belongs to another holder") == 1, "logged once, then only counted"
 
 
-def test_what_a_person_deletes_comes_back_and_what_they_end_stays_ended(tmp_path: Path) -> None:
+def test_a_manually_deleted_task_is_recreated_and_a_manually_ended_one_stays_ended(tmp_path: Path) -> None:
     async def drive() -> DeployCounts:
         async with reconciling(tmp_path) as reconciler:
             reconciler.update(by_name(A, B), {})
@@ -233,7 +235,7 @@ def test_an_outage_delays_and_loses_nothing(tmp_path: Path, caplog: pytest.LogCa
     assert caplog.text.count("cannot update tasks; retrying with backoff") == 1
 
 
-def test_a_demand_that_makes_no_task_is_refused_and_harms_no_other(tmp_path: Path) -> None:
+def test_a_demand_without_a_valid_task_is_rejected_and_affects_no_other(tmp_path: Path) -> None:
     async def drive() -> DeployCounts:
         async with reconciling(tmp_path) as reconciler:
             reconciler.update(by_name(demand("x" * 600), A), {})
@@ -250,7 +252,7 @@ MOVES = st.lists(
 
 @settings(max_examples=25)
 @given(MOVES, st.integers(0, 3))
-def test_only_the_newest_demands_count_however_they_came(moves: list[dict[str, int]], pauses: int) -> None:
+def test_only_the_newest_demands_count(moves: list[dict[str, int]], pauses: int) -> None:
     """Each move is a full set: subjects, and a parameter that may have changed. A demand that ended does not return."""
     sets: list[dict[str, Demand]] = []
     reported: dict[str, int] = {}
@@ -284,7 +286,7 @@ def test_tasks_of_a_replay_go_into_one_file_in_the_order_of_their_starts(tmp_pat
     assert [each.object.name for each in documents] == [*sorted([B.name, C.name]), late.name]
 
 
-def test_a_file_that_is_no_task_is_left_alone(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_file_without_a_task_is_left_alone(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     (tmp_path / "notes.yaml").write_text("just: notes")
     (tmp_path / "half.yaml").write_text("kind: [")
     assert asyncio.run(restore(FileTaskStore(tmp_path, HOLDER))) == []

@@ -41,7 +41,7 @@ def after(step: StoreChange, demand: Demand | None, stored: StoredTask | None) -
 
 
 @given(st.none() | DEMANDS, st.none() | STORED, st.booleans())
-def test_at_most_three_steps_lead_to_what_is_demanded(
+def test_at_most_three_steps_reach_the_demanded_state(
     demand: Demand | None, stored: StoredTask | None, held: bool
 ) -> None:
     before = stored
@@ -73,7 +73,7 @@ def test_nothing_is_due_before_both_sides_are_known() -> None:
     assert ledger.see(Snapshot({}, 1)) == [DEMAND.name]
 
 
-def test_what_the_store_reports_late_does_not_undo_what_is_known_since() -> None:
+def test_late_reports_of_the_store_do_not_undo_newer_knowledge() -> None:
     ledger = Ledger()
     ledger.accept({DEMAND.name: DEMAND}, {})
     ledger.see(Snapshot({}, 3))

@@ -42,7 +42,7 @@ STEPS = st.lists(
 
 @settings(max_examples=30)
 @given(STEPS)
-def test_it_has_what_was_put_and_not_dropped_in_this_order_whatever_happens(
+def test_the_store_keeps_added_records_in_order_until_they_are_dropped(
     tmp_path_factory: pytest.TempPathFactory, steps: list[tuple[str, str, bytes]]
 ) -> None:
     folder, losses = tmp_path_factory.mktemp("store"), Losses()
@@ -75,7 +75,7 @@ def test_it_has_what_was_put_and_not_dropped_in_this_order_whatever_happens(
     assert not losses
 
 
-def test_it_holds_no_more_than_it_may(tmp_path: Path, losses: Losses) -> None:
+def test_the_store_stays_within_its_bounds(tmp_path: Path, losses: Losses) -> None:
     store = DurableStore(tmp_path / "s.db", losses, 100)
     assert store.put("a", bytes(50))
     assert store.put("b", bytes(50))
@@ -87,9 +87,7 @@ def test_it_holds_no_more_than_it_may(tmp_path: Path, losses: Losses) -> None:
     assert store.keys("") == ["b", "c", "d"]
 
 
-def test_the_file_does_not_grow_with_what_is_dropped_and_shrinks_when_it_is_empty(
-    tmp_path: Path, losses: Losses
-) -> None:
+def test_the_file_does_not_grow_with_dropped_records_and_shrinks_when_empty(tmp_path: Path, losses: Losses) -> None:
     store = DurableStore(tmp_path / "s.db", losses)
 
     def size() -> int:
@@ -108,7 +106,7 @@ def test_the_file_does_not_grow_with_what_is_dropped_and_shrinks_when_it_is_empt
     assert size() < 3_000_000
 
 
-def test_a_record_that_a_crash_cut_off_takes_nothing_else_with_it(tmp_path: Path, losses: Losses) -> None:
+def test_a_record_truncated_by_a_crash_affects_no_other(tmp_path: Path, losses: Losses) -> None:
     store = DurableStore(tmp_path / "s.db", losses)
     for letter in "ab":
         store.put(letter, letter.encode())
@@ -126,7 +124,7 @@ def corrupted(path: Path, old: bytes, new: bytes) -> None:
     path.write_bytes(content.replace(old, new))
 
 
-def test_a_damaged_record_is_reported_and_costs_no_other(tmp_path: Path, losses: Losses) -> None:
+def test_a_damaged_record_is_reported_and_affects_no_other(tmp_path: Path, losses: Losses) -> None:
     path = tmp_path / "s.db"
     store = DurableStore(path, losses)
     for number in range(4):
@@ -146,7 +144,7 @@ def test_a_damaged_record_is_reported_and_costs_no_other(tmp_path: Path, losses:
     assert not files(tmp_path)
 
 
-def test_a_record_of_which_the_disk_lost_a_part_is_reported_and_costs_no_other(tmp_path: Path, losses: Losses) -> None:
+def test_a_partly_lost_record_is_reported_and_affects_no_other(tmp_path: Path, losses: Losses) -> None:
     path = tmp_path / "s.db"
     store = DurableStore(path, losses)
     for letter in "abc":
@@ -197,7 +195,9 @@ def test_a_full_disk_leaves_the_records_as_they_were(tmp_path: Path, losses: Los
     assert contents(DurableStore(path, losses)) == {"a": b"whole", "c": b"fits"}
 
 
-def test_records_that_the_disk_does_not_remove_are_gone_until_the_next_start(tmp_path: Path, losses: Losses) -> None:
+def test_records_that_cannot_be_removed_from_disk_are_hidden_until_the_next_start(
+    tmp_path: Path, losses: Losses
+) -> None:
     path = tmp_path / "s.db"
     store = DurableStore(path, losses)
     for letter in "abc":
@@ -221,7 +221,7 @@ def test_a_folder_that_cannot_be_used_is_named(tmp_path: Path, losses: Losses) -
         DurableStore(tmp_path / "s.db", losses)
 
 
-def test_a_file_has_one_user_and_no_other_may_read_it(tmp_path: Path, losses: Losses) -> None:
+def test_a_file_is_locked_and_readable_only_by_its_owner(tmp_path: Path, losses: Losses) -> None:
     store = DurableStore(tmp_path / "s.db", losses)
     with pytest.raises(StoreInUseError, match=r"another process uses .*s\.db: give each detector its own"):
         DurableStore(tmp_path / "s.db", losses)
@@ -232,9 +232,7 @@ def test_a_file_has_one_user_and_no_other_may_read_it(tmp_path: Path, losses: Lo
     DurableStore(tmp_path / "s.db", losses).close()
 
 
-def test_two_actions_at_the_same_time_have_files_of_their_own_and_the_next_takes_both_over(
-    tmp_path: Path, losses: Losses
-) -> None:
+def test_concurrent_actions_have_separate_files_and_the_next_run_adopts_both(tmp_path: Path, losses: Losses) -> None:
     first, second = action_store(tmp_path, "j", losses), action_store(tmp_path, "j", losses)
     other = action_store(tmp_path, "j.x", losses)
     for store, key in ((first, "a"), (second, "b"), (other, "c")):

@@ -29,7 +29,7 @@ def parameters(drive: Drive) -> list[Any]:
     return [demand.parameters for demand in drive.engine.demands().values()]
 
 
-def test_parameters_that_follow_change_with_what_they_are_of_and_the_demand_keeps_its_name() -> None:
+def test_with_follow_parameters_change_and_the_demand_keeps_its_name() -> None:
     drive = Drive(a_detector(), following(v="${speed}", fixed=3))
     drive.take(speed(0.5, 20), until=1)
     before, version = drive.engine.demands(), drive.engine.demands_version
@@ -42,7 +42,7 @@ def test_parameters_that_follow_change_with_what_they_are_of_and_the_demand_keep
     assert drive.engine.demands_version != version
 
 
-def test_without_follow_they_stay_as_they_were() -> None:
+def test_without_follow_parameters_stay_unchanged() -> None:
     rule = a_rule(signals=SIGNALS, when="speed > 10", actions=[a_deploy("d", parameters={"v": "${speed}"})])
     drive = Drive(a_detector(), rule)
     drive.take(speed(0.5, 20), speed(1.5, 25), until=2)
@@ -65,7 +65,7 @@ def test_a_parameter_that_is_unknown_or_fails_keeps_its_last_value_while_the_oth
     assert counters.unfollowed == 4 + 2 * 2
 
 
-def test_one_that_is_null_is_left_out_and_comes_back() -> None:
+def test_a_null_parameter_is_omitted_until_it_has_a_value_again() -> None:
     drive = Drive(a_detector(), following(v="${speed > 20.0 ? null : speed}", w=1))
     drive.take(speed(0.5, 20), until=1)
     drive.take(speed(1.5, 25), until=2)
@@ -94,7 +94,7 @@ def test_an_action_begins_to_follow_when_its_rule_changes() -> None:
     assert parameters(drive) == [{"v": 35}]
 
 
-def test_a_replays_tasks_have_the_parameters_that_they_had_last() -> None:
+def test_the_tasks_of_a_replay_have_their_last_parameters() -> None:
     arrivals = [speed(0.5, 20), speed(1.5, 30), speed(2.5, 40), speed(3.5, 5), speed(4.5, 5)]
     outcome = replay_arrivals([arrivals], a_detector(), [following(v="${speed}")])
     (task,) = outcome.tasks.values()

@@ -29,13 +29,13 @@ def problems(folder: Path, rule: str) -> list[str]:
     return [str(each).removeprefix(f"{folder}/") for each in found]
 
 
-def test_the_guides_rule_has_nothing_wrong(tmp_path: Path) -> None:
+def test_the_guides_rule_has_no_findings(tmp_path: Path) -> None:
     (example,) = yaml_blocks(GUIDE)
     assert len(yaml.safe_load(example)["actions"]) == 3
     assert problems(tmp_path, HEAD + "".join(f"  {line}\n" for line in example.splitlines())) == []
 
 
-def test_the_built_in_action_requests_what_the_rule_has() -> None:
+def test_the_built_in_action_gets_the_settings_of_the_rule() -> None:
     assert Notify.Parameters is Parameters
 
 
@@ -63,7 +63,7 @@ def test_the_built_in_action_requests_what_the_rule_has() -> None:
         ("{zenoh: {key: a}, rate: {messages: 0}}", "spec.actions[0].notify.rate.messages"),
     ],
 )
-def test_what_is_wrong_is_reported_with_its_place(tmp_path: Path, notify: str, reported: str) -> None:
+def test_errors_are_reported_by_field(tmp_path: Path, notify: str, reported: str) -> None:
     found = problems(tmp_path, HEAD + SIGNAL + notify + "\n")
     assert len(found) == 1, found
     assert found[0].startswith("r.yaml:9:")

@@ -66,13 +66,13 @@ def test_each_message_is_settled_once_and_each_episode_in_order(
         assert mine == [each for each in waiting if episode in each.episodes]
 
 
-def test_a_full_outbox_takes_nothing_more() -> None:
+def test_a_full_outbox_rejects_messages() -> None:
     box = Outbox(2, 3600.0)
     assert [box.add(message(name)) for name in "abc"] == [True, True, False]
     assert len(box) == 2
 
 
-def test_an_endpoint_that_is_away_is_left_alone_as_a_whole_and_longer_each_time() -> None:
+def test_an_absent_endpoint_is_retried_with_growing_backoff_for_all_messages() -> None:
     box, now = Outbox(10, 1e9), 0.0
     for name in "ab":
         box.add(message(name))
@@ -89,7 +89,7 @@ def test_an_endpoint_that_is_away_is_left_alone_as_a_whole_and_longer_each_time(
     assert len(set(waits)) > 10, "there is jitter in it"
 
 
-def test_a_message_that_is_not_liked_holds_up_no_other() -> None:
+def test_a_rejected_message_delays_no_other() -> None:
     box = Outbox(10, 3600.0)
     for name in "ab":
         box.add(message(name))
@@ -102,7 +102,7 @@ def test_a_message_that_is_not_liked_holds_up_no_other() -> None:
 
 
 @pytest.mark.parametrize(("retry_after", "waited"), [(100.0, 100.0), (1e9, LONGEST_RETRY_AFTER)])
-def test_what_an_endpoint_requests_is_heeded_within_reason(retry_after: float, waited: float) -> None:
+def test_retry_after_is_honoured_up_to_a_bound(retry_after: float, waited: float) -> None:
     box = Outbox(10, 1e9)
     box.add(message("a"))
     taken = box.take(0.0)
@@ -111,7 +111,7 @@ def test_what_an_endpoint_requests_is_heeded_within_reason(retry_after: float, w
     assert box.wait(0.0) == waited
 
 
-def test_what_is_too_old_is_given_up_after_an_attempt() -> None:
+def test_an_expired_message_is_given_up_after_an_attempt() -> None:
     box = Outbox(10, 60.0)
     box.add(message("a"))
     taken = box.take(0.0)
@@ -124,7 +124,7 @@ def test_what_is_too_old_is_given_up_after_an_attempt() -> None:
 
 
 @given(st.integers(1, 5), st.lists(st.integers(0, 6), max_size=30))
-def test_the_budget_is_never_exceeded_in_any_stretch_of_its_time(messages: int, pauses: list[int]) -> None:
+def test_the_rate_budget_holds_in_every_interval_of_its_length(messages: int, pauses: list[int]) -> None:
     budget, now, sent = RateLimit(messages, 10.0), 0.0, []
     for pause in pauses:
         now += pause
@@ -136,7 +136,7 @@ def test_the_budget_is_never_exceeded_in_any_stretch_of_its_time(messages: int, 
 
 
 @given(st.lists(st.tuples(st.sampled_from(["", "A1", "B7"]), st.integers(0, 3)), max_size=30), st.integers(1, 10))
-def test_every_event_is_in_one_group_with_its_like_and_waits_no_longer_than_it_must(
+def test_every_event_is_in_one_group_of_its_kind_and_waits_within_the_bound(
     reported: list[tuple[str, int]], most: int
 ) -> None:
     groups, now = Groups(["road"], 5.0, most), 0.0
@@ -164,7 +164,7 @@ def test_every_event_is_in_one_group_with_its_like_and_waits_no_longer_than_it_m
     assert groups.next_due() is None
 
 
-def test_a_group_has_an_id_of_its_events_and_is_a_cloudevent() -> None:
+def test_a_group_is_a_cloudevent_with_an_id_derived_from_its_events() -> None:
     some = [notice("a"), notice("a", "ended"), notice("b")]
     event = event_of_group(some, "notify", [], 2)
     assert event["id"] == event_of_group(some, "notify", [], 3)["id"] != event_of_group(some[:2], "notify", [], 2)["id"]

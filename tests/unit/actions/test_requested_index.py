@@ -26,7 +26,7 @@ def stop(identity: str, **fields: object) -> RecordingRequest:
     return RecordingRequest.model_validate({"do": "stop", "id": identity, **fields})
 
 
-def test_times_are_relative_to_ones_own_clock() -> None:
+def test_times_are_relative_to_the_own_clock() -> None:
     _, entry = RecordingIndex().start(
         start("x", before="5s", ago="2s", maximumDuration="1m"), OnRequest(), STREAMS, NOW
     )
@@ -34,14 +34,14 @@ def test_times_are_relative_to_ones_own_clock() -> None:
     assert (entry.since, entry.until) == (NOW - 7 * SECOND, NOW + 60 * SECOND)
 
 
-def test_a_request_gets_no_more_time_than_is_allowed() -> None:
+def test_the_duration_of_a_request_is_limited() -> None:
     allowed = OnRequest(maximum_duration=PositiveDuration("10s"))
     _, entry = RecordingIndex().start(start("x", maximumDuration="1h"), allowed, STREAMS, NOW)
     assert entry is not None
     assert entry.until == NOW + 10 * SECOND
 
 
-def test_a_stop_counts_from_the_end_of_its_cause_and_never_prolongs() -> None:
+def test_a_stop_counts_from_the_end_of_its_cause_and_never_extends_the_recording() -> None:
     for fields, until in (
         ({"ago": "1s", "after": "3s"}, 2),
         ({"ago": "9s"}, -9),
@@ -58,7 +58,7 @@ def test_a_stop_counts_from_the_end_of_its_cause_and_never_prolongs() -> None:
 
 
 @given(st.lists(st.tuples(st.sampled_from(["start", "stop", "done", "failed", "running"]), st.integers(0, 4))))
-def test_an_id_is_begun_once_and_never_more_at_a_time_than_are_allowed(happenings: list[tuple[str, int]]) -> None:
+def test_an_id_starts_one_recording_and_concurrent_recordings_are_limited(happenings: list[tuple[str, int]]) -> None:
     index, allowed, open_ones, begun = RecordingIndex(), OnRequest(maximum_recordings=2), set[str](), set[str]()
     for what, number in happenings:
         identity = f"x{number}"
@@ -83,7 +83,7 @@ def test_an_id_is_begun_once_and_never_more_at_a_time_than_are_allowed(happening
         assert all(states[each] in (Progress.RECORDING, Progress.ENDING) for each in open_ones)
 
 
-def test_what_is_over_is_forgotten_at_last() -> None:
+def test_finished_recordings_are_eventually_forgotten() -> None:
     index = RecordingIndex()
     for number in range(600):
         index.start(start(f"x{number}"), OnRequest(), STREAMS, NOW)

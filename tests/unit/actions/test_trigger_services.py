@@ -11,7 +11,7 @@ from detector.streams.codecs.definitions import Definition
 from detector.streams.codecs.ros import standard, types_with
 
 
-def test_type_hashes_are_those_that_ros_computes() -> None:
+def test_type_hashes_match_those_of_ros() -> None:
     """Those of example_interfaces and std_srvs as their nodes announce them (rmw_zenoh's design, a foreign client)."""
     add = service("example_interfaces/srv/AddTwoInts", "int64 a\nint64 b\n---\nint64 sum\n", standard())
     assert add.type_hash == "RIHS01_e118de6bf5eeb66a2491b5bda11202e7b68f198d6f67922cf30364858239c81a"
@@ -64,13 +64,13 @@ def test_a_definition_may_use_messages_of_the_detector() -> None:
         (None, {}, "unknown service type a/srv/B: give its .srv file as definition"),
     ],
 )
-def test_what_does_not_fit_is_reported_with_its_place(
+def test_invalid_requests_are_reported_by_field(
     definition: str | None, request_: dict[str, Any], reported: str
 ) -> None:
     with pytest.raises(ServiceError, match=reported):
         service("a/srv/B", definition, standard()).request(request_)
 
 
-def test_bytes_that_are_no_response_are_reported() -> None:
+def test_an_undecodable_response_is_reported() -> None:
     with pytest.raises(ServiceError, match="the response is not of type std_srvs/srv/Trigger"):
         service("std_srvs/srv/Trigger", None, standard()).response(b"\x00\x01\x00\x00\x01\xff\xff")

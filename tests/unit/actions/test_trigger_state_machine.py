@@ -18,7 +18,7 @@ def a_recording(
     return RemoteRecording(Order("x", {}), Timeouts(maximum, give_up, renew), 0, -1, resumed=resumed)
 
 
-def test_a_recording_is_started_again_stopped_and_awaited() -> None:
+def test_a_recording_is_started_with_retries_stopped_and_awaited() -> None:
     recording = a_recording()
     assert recording.look(0) is NextRequest.START
     recording.answered(0, RECORDING)
@@ -36,7 +36,7 @@ def test_a_recording_is_started_again_stopped_and_awaited() -> None:
     assert recording.report.files == ("a",)
 
 
-def test_an_episode_that_is_over_before_the_start_is_confirmed_is_recorded_nevertheless() -> None:
+def test_an_episode_that_ends_before_its_start_is_confirmed_is_still_recorded() -> None:
     recording = a_recording()
     recording.failed(0, "silence", silent=True)
     recording.end(0.1, 0.1)
@@ -46,7 +46,7 @@ def test_an_episode_that_is_over_before_the_start_is_confirmed_is_recorded_never
     assert recording.look(0.5) is NextRequest.STOP
 
 
-def test_what_is_not_confirmed_is_requested_later_and_later_and_given_up() -> None:
+def test_unconfirmed_requests_are_retried_with_backoff_and_given_up() -> None:
     recording = a_recording()
     times = []
     for tenth in range(2000):
@@ -73,7 +73,7 @@ def test_a_stop_that_is_given_up_is_reported() -> None:
     assert recording.problem == "gave up waiting for the confirmation of the stop: silence"
 
 
-def test_what_is_refused_is_requested_again_and_then_needs_no_stop() -> None:
+def test_a_rejected_start_is_retried_and_needs_no_stop() -> None:
     recording = a_recording(give_up=1)
     for now in (0.0, 0.5, 1.5):
         assert recording.look(now) is NextRequest.START
@@ -116,7 +116,7 @@ def test_a_system_that_counts_the_time_itself_reports_it() -> None:
 
 
 @given(st.lists(st.tuples(st.sampled_from(["ask", "end"]), st.sampled_from([*Progress, None])), max_size=40))
-def test_whatever_is_answered_a_recording_comes_to_its_end(happenings: list[tuple[str, Progress | None]]) -> None:
+def test_a_recording_always_reaches_a_final_state(happenings: list[tuple[str, Progress | None]]) -> None:
     """And while it is not finished, there is always a time of the next request."""
     recording, now = a_recording(give_up=20), 0.0
 

@@ -57,7 +57,7 @@ def mounted(one: Detector) -> dict[str, Any]:
     return {path: {key: value for key, value in each.items() if key != "name"} for path, each in found.items()}
 
 
-def test_each_folder_is_in_a_volume_that_lasts_where_a_claim_is_given() -> None:
+def test_each_folder_is_in_a_persistent_volume_if_a_claim_is_given() -> None:
     given = detector(
         state={"path": "/var/lib/wayside"},
         recordings={"path": "/data/recordings"},
@@ -86,12 +86,12 @@ def test_each_folder_is_in_a_volume_that_lasts_where_a_claim_is_given() -> None:
     }
 
 
-def test_a_folder_beside_one_whose_name_it_begins_with_has_a_volume_of_its_own() -> None:
+def test_folders_with_a_common_name_prefix_have_separate_volumes() -> None:
     given = detector(state={"path": "/data2"}, pod=ON_A_CLAIM)
     assert mounted(given)["/data2"] == {"emptyDir": {}}
 
 
-def test_the_secrets_are_those_that_the_detector_names_and_those_that_rules_may_use() -> None:
+def test_the_mounted_secrets_are_those_of_the_detector_and_those_permitted_to_rules() -> None:
     mqtt = {"name": "broker", "plugin": "mqtt", "parameters": {"url": "mqtts://b", "credentialsSecretName": "broker"}}
     given = detector(
         zenoh={"connect": ["tls/zenoh:7447"], "tlsSecretName": "zenoh"},
@@ -102,13 +102,13 @@ def test_the_secrets_are_those_that_the_detector_names_and_those_that_rules_may_
     assert secrets_of(given) == ["broker", "mongo", "pager", "zenoh"]
 
 
-def test_what_the_detector_follows_by_itself_does_not_change_the_pod() -> None:
+def test_fields_that_the_detector_reloads_do_not_change_the_pod() -> None:
     changed = detector(clientTimeout="7s", ruleSelector={"matchLabels": {"a": "b"}}, buffer={"bytes": "1Gi"})
     assert detector_objects(changed, DEFAULTS) == detector_objects(detector(), DEFAULTS)
 
 
 @pytest.mark.parametrize(("user", "fields"), [(None, {}), (7, {"runAsUser": 7, "runAsGroup": 7, "fsGroup": 7})])
-def test_the_user_is_the_one_of_the_manager_or_left_to_the_cluster(user: int | None, fields: dict[str, int]) -> None:
+def test_the_pods_user_is_the_managers_or_left_to_the_cluster(user: int | None, fields: dict[str, int]) -> None:
     made = detector_objects(detector(), replace(DEFAULTS, user=user))[-1]["spec"]["template"]["spec"]
     security = made["securityContext"]
     assert {name: security[name] for name in security if name in ("runAsUser", "runAsGroup", "fsGroup")} == fields
@@ -119,7 +119,7 @@ def test_the_user_is_the_one_of_the_manager_or_left_to_the_cluster(user: int | N
             parse_user(wrong)
 
 
-def test_all_objects_are_the_detectors_own_and_the_pod_runs_with_its_account() -> None:
+def test_all_objects_are_owned_by_the_detector_and_the_pod_runs_with_its_account() -> None:
     found = detector_objects(detector(), DEFAULTS)
     assert [each["kind"] for each in found] == ["ServiceAccount", "Role", "RoleBinding", "Deployment"]
     for each in found:
@@ -138,7 +138,7 @@ def test_all_objects_are_the_detectors_own_and_the_pod_runs_with_its_account() -
     assert selector <= deployment["spec"]["template"]["metadata"]["labels"].items()
 
 
-def test_the_image_and_resources_are_the_detectors_where_it_gives_them() -> None:
+def test_the_detectors_image_and_resources_override_the_defaults() -> None:
     (container,) = pod(detector())["containers"]
     assert container["image"] == IMAGE
     assert container["resources"]["limits"] == {"memory": "1Gi"}
@@ -150,7 +150,7 @@ def test_the_image_and_resources_are_the_detectors_where_it_gives_them() -> None
     assert given["nodeSelector"] == {"site": "a"}
 
 
-def test_settings_for_all_detectors_are_in_each_pod_and_a_detectors_own_win() -> None:
+def test_settings_for_all_detectors_are_in_each_pod_and_own_settings_win() -> None:
     environment = {"OTEL_EXPORTER_OTLP_ENDPOINT": "http://all:4318", "B": "all"}
     defaults = PodDefaults(IMAGE, PullPolicy.ALWAYS, ("registry",), environment)
     key = {"name": "collector", "key": "headers"}
@@ -175,7 +175,7 @@ def test_settings_for_all_detectors_are_in_each_pod_and_a_detectors_own_win() ->
     assert names[:2] == ["POD_NAME", "POD_UID"]
 
 
-def test_metrics_by_tls_are_probed_by_tls_and_their_secret_is_not_among_those_of_rules() -> None:
+def test_metrics_over_tls_are_probed_over_tls_and_their_secret_is_hidden_from_rules() -> None:
     given = pod(detector(), PodDefaults(IMAGE, metrics_secret="metrics"))
     (container,) = given["containers"]
     folder = "/etc/wayside/metrics-certificates"
@@ -197,7 +197,7 @@ def test_metrics_by_tls_are_probed_by_tls_and_their_secret_is_not_among_those_of
         (["--detector-image", "a", "--detector-env", "POD_NAME=b"], "POD_NAME is set automatically in each pod"),
     ],
 )
-def test_options_for_the_pods_that_make_no_sense_are_refused(options: list[str], logged: str) -> None:
+def test_invalid_options_for_the_pods_are_rejected(options: list[str], logged: str) -> None:
     refused = CliRunner().invoke(app, ["run", *options])
     assert refused.exit_code == 2
     assert logged in " ".join(refused.stderr.replace("│", " ").split())
@@ -236,13 +236,13 @@ def test_options_for_the_pods_that_make_no_sense_are_refused(options: list[str],
         ),
     ],
 )
-def test_what_is_no_pod_is_refused(spec: dict[str, Any], logged: str) -> None:
+def test_invalid_pod_specs_are_rejected(spec: dict[str, Any], logged: str) -> None:
     with pytest.raises(ValidationError, match="Detector") as refused:
         detector(**spec)
     assert logged in str(refused.value)
 
 
-def test_without_a_mode_folders_are_the_machines() -> None:
+def test_without_a_mode_folders_are_local_paths() -> None:
     assert detector(mode=None, state={"path": "state"}).spec.folders == {"state.path": "state"}
 
 
@@ -279,7 +279,7 @@ def deployment(available: int) -> dict[str, Any]:
     }
 
 
-def test_it_runs_when_its_pod_is_ready_and_otherwise_reports_why() -> None:
+def test_a_detector_runs_when_its_pod_is_ready_and_otherwise_reports_the_reason() -> None:
     assert running(deployment(1), []).holds
     assert running(None, []).reason == "NotReady"
     assert "0 of 1 pods" in running(deployment(0), []).message
@@ -288,7 +288,7 @@ def test_it_runs_when_its_pod_is_ready_and_otherwise_reports_why() -> None:
     assert "cannot pull image x" in pulled.message
 
 
-def test_the_condition_goes_with_the_mode() -> None:
+def test_the_condition_is_removed_with_the_mode() -> None:
     logged = detector_status(detector(), [], NOW, NOT_RUN)
     condition = find(logged.conditions, "Running")
     assert condition is not None
@@ -328,7 +328,7 @@ def test_a_restarted_manager_keeps_that_a_detector_does_not_run() -> None:
     assert readiness(detector_status(failing, [], NOW))["Ready"] == ("False", "ImagePullFailed")
 
 
-def test_the_guide_shows_a_detector_that_keeps_its_files_and_what_resources_are_the_default() -> None:
+def test_the_guide_shows_persistent_folders_and_the_default_resources() -> None:
     text = guide("detectors")
     shown = yaml.safe_load(yaml_blocks(text)[0])
     shown["metadata"] |= {"namespace": "site", "uid": "u-1"}

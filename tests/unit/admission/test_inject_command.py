@@ -61,7 +61,7 @@ WORKLOADS: list[tuple[str, tuple[str, ...]]] = [
 
 
 @pytest.mark.parametrize(("kind", "path"), WORKLOADS)
-def test_the_template_of_what_makes_pods_gets_it(detector: Path, kind: str, path: tuple[str, ...]) -> None:
+def test_pod_templates_of_workloads_are_injected(detector: Path, kind: str, path: tuple[str, ...]) -> None:
     raw: Json = template()
     for step in reversed(path):
         raw = {step: raw}
@@ -77,7 +77,7 @@ def test_the_template_of_what_makes_pods_gets_it(detector: Path, kind: str, path
     assert again.stdout == done.stdout
 
 
-def test_all_else_passes_through_and_lists_are_looked_into(detector: Path) -> None:
+def test_other_objects_pass_unchanged_and_lists_are_searched(detector: Path) -> None:
     pods = [{"apiVersion": "v1", "kind": "Pod", **template(name="a")}, {"apiVersion": "v1", "kind": "Pod", "spec": {}}]
     other = {
         "apiVersion": "example.com/v1",
@@ -94,7 +94,7 @@ def test_all_else_passes_through_and_lists_are_looked_into(detector: Path) -> No
     assert passed == other
 
 
-def test_the_detectors_own_image_wins(detector: Path) -> None:
+def test_the_detectors_image_wins_over_the_option(detector: Path) -> None:
     detector.write_text(DETECTOR + "  pod: {image: 'own:2'}\n")
     done = injected("-f", str(detector), given=[{"kind": "Pod", **template()}])
     assert yaml.safe_load(done.stdout)["spec"]["initContainers"][0]["image"] == "own:2"
@@ -110,7 +110,7 @@ def error(*arguments: str) -> str:
     return "\n".join(reported)
 
 
-def test_what_cannot_be_used_is_reported_with_its_place_and_the_remedy(detector: Path, tmp_path: Path) -> None:
+def test_invalid_input_is_reported_by_place_with_the_remedy(detector: Path, tmp_path: Path) -> None:
     (pod := tmp_path / "pod.yaml").write_text(yaml.safe_dump({"kind": "Pod", **template(name="car")}))
     assert "Detector town has no image: give --detector-image" in error("-f", str(pod), "-f", str(detector))
     assert "Detector town is in none of the files" in error("-f", str(pod), *IMAGE)

@@ -55,7 +55,7 @@ def answered(review: dict[str, Any], findings: Findings = WRONG) -> dict[str, An
 OBJECT: dict[str, Any] = {"metadata": {"name": "fast", "labels": {"a": "b"}}, "spec": {"when": "x"}}
 
 
-def test_a_new_object_that_is_wrong_is_refused_with_its_fields() -> None:
+def test_an_invalid_new_object_is_rejected_by_field() -> None:
     response = answered(question(new=OBJECT))
     assert (response["allowed"], response["warnings"]) == (False, ["it is early"])
     assert (response["status"]["code"], response["status"]["message"]) == (422, "spec.when: is wrong")
@@ -63,7 +63,7 @@ def test_a_new_object_that_is_wrong_is_refused_with_its_fields() -> None:
     assert (cause["field"], cause["message"]) == ("spec.when", "is wrong")
 
 
-def test_a_doubt_alone_is_a_warning() -> None:
+def test_a_finding_of_severity_warning_is_only_a_warning() -> None:
     response = answered(question(new=OBJECT), Findings((), ("it is early",)))
     assert (response["allowed"], response["warnings"]) == (True, ["it is early"])
 
@@ -79,7 +79,7 @@ METADATA = st.fixed_dictionaries(
 
 
 @given(METADATA, METADATA, st.sampled_from(["", "status", "scale"]))
-def test_what_leaves_the_spec_as_it_is_is_never_refused(new: Any, old: Any, subresource: str) -> None:
+def test_an_update_without_a_spec_change_is_never_rejected(new: Any, old: Any, subresource: str) -> None:
     spec = {"when": "wrong as it was"}
     changed, stored = {"metadata": new, "spec": spec, "status": {"n": 1}}, {"metadata": old, "spec": spec}
     response = answered(question("UPDATE", changed, stored, subResource=subresource))
@@ -100,12 +100,12 @@ def test_what_leaves_the_spec_as_it_is_is_never_refused(new: Any, old: Any, subr
     ],
     ids=["deleted", "connected", "task", "instance", "going", "status"],
 )
-def test_what_is_not_looked_at_passes_without_a_word(review: dict[str, Any]) -> None:
+def test_kinds_without_checks_are_allowed_silently(review: dict[str, Any]) -> None:
     assert answered(review) == {"uid": "u1", "allowed": True}
 
 
 @given(st.lists(st.text(max_size=40).map(lambda text: text * 60), max_size=40))
-def test_warnings_are_few_short_lines_whatever_is_in_them(texts: list[str]) -> None:
+def test_warnings_are_limited_in_number_and_length(texts: list[str]) -> None:
     warnings = answered(question(new=OBJECT), Findings((), tuple(texts))).get("warnings", [])
     assert len(warnings) <= MOST_REPORTED + 1
     assert all(len(each) <= LONGEST and each.isprintable() for each in warnings)
@@ -114,18 +114,18 @@ def test_warnings_are_few_short_lines_whatever_is_in_them(texts: list[str]) -> N
 @pytest.mark.parametrize(
     "requested", [None, [], {}, {"apiVersion": "admission.k8s.io/v1"}, question() | {"request": {}}]
 )
-def test_what_is_no_review_is_reported_to_be_none(requested: Any) -> None:
+def test_an_invalid_review_is_reported(requested: Any) -> None:
     with pytest.raises(ReviewError, match="only the API server may call this path"):
         read(requested)
 
 
-def test_of_a_kind_that_is_not_looked_at_nothing_is_kept() -> None:
+def test_unknown_kinds_are_dropped_and_names_are_sanitized() -> None:
     assert read(question(new=OBJECT, kind="Anything\n")).kind == ""
     named = {"metadata": {"name": "a\nb"}, "spec": {}}
     assert answered(question(new=named))["status"]["details"]["name"] == "a b"
 
 
-def test_the_configuration_covers_three_kinds_and_stands_in_nobodys_way() -> None:
+def test_the_webhook_configuration_covers_three_kinds_and_fails_open() -> None:
     made = webhook_configuration(WebhookClientConfig.of_service("wayside/manager:8443"), b"PEM", ["b", "a"])
     (webhook,) = made["webhooks"]
     service = {"namespace": "wayside", "name": "manager", "port": 8443, "path": "/admission"}
@@ -138,7 +138,7 @@ def test_the_configuration_covers_three_kinds_and_stands_in_nobodys_way() -> Non
 
 
 @pytest.mark.parametrize("url", ["http://a", "https://", "a:1", "https://a/b", "https://u@a", "https://a:123456"])
-def test_a_place_that_is_none_is_refused(url: str) -> None:
+def test_an_invalid_webhook_address_is_rejected(url: str) -> None:
     with pytest.raises(ValueError, match="must be https://HOST:PORT"):
         WebhookClientConfig.of_url(url)
     with pytest.raises(ValueError, match="must be NAMESPACE/NAME"):
@@ -191,7 +191,7 @@ def reviewed(
     return response
 
 
-def test_what_a_rule_has_with_its_detector_is_looked_up_before_it_is_reported() -> None:
+def test_a_rules_findings_about_its_detector_are_confirmed_at_the_api_server() -> None:
     old, new = detector(stream="odometry"), detector()
     assert reviewed(rule(), old, live=(new,)) == {"uid": "u1", "allowed": True}
     assert reviewed(rule(), live=(new,)) == {"uid": "u1", "allowed": True}
@@ -199,18 +199,18 @@ def test_what_a_rule_has_with_its_detector_is_looked_up_before_it_is_reported() 
     assert reviewed(counting("many", "fast"), new, live=(new, rule())) == {"uid": "u1", "allowed": True}
 
 
-def test_where_it_cannot_be_looked_up_it_is_a_warning() -> None:
+def test_an_unconfirmed_finding_is_a_warning() -> None:
     response = reviewed(rule(), detector(stream="odometry"))
     assert response["allowed"]
     assert "no stream pose" in response["warnings"][0]
 
 
-def test_what_the_rule_alone_has_is_refused_without_looking_up() -> None:
+def test_findings_about_the_rule_alone_reject_it_without_a_lookup() -> None:
     response = reviewed(rule(when="sped > 3"))
     assert response["status"]["message"].startswith("spec.when: line 1, column 1: `sped`")
 
 
-def test_a_detector_that_leaves_rules_without_their_stream_is_warned_of_them() -> None:
+def test_removing_a_stream_that_rules_use_gives_a_warning() -> None:
     before, after = detector(), detector(stream="odometry")
     response = reviewed(after, before, rule(), old=before)
     assert response["allowed"]
@@ -218,7 +218,7 @@ def test_a_detector_that_leaves_rules_without_their_stream_is_warned_of_them() -
     assert "warnings" not in reviewed(detector(clientTimeout="9s", stream="odometry"), after, rule(), old=after)
 
 
-def test_a_template_that_a_rule_names_is_looked_up_before_it_is_missed() -> None:
+def test_a_template_named_by_a_rule_is_looked_up_before_it_is_reported_missing() -> None:
     missed = reviewed(deploying(), detector(), live=(detector(),))
     assert missed["allowed"]
     assert "there is no ApplicationTemplate app" in missed["warnings"][0]
@@ -259,10 +259,10 @@ def test_a_namespace_with_too_many_reviews_gets_no_more_and_others_get_theirs() 
     asyncio.run(scenario())
 
 
-def test_namespaces_that_are_not_looked_after_are_not_judged() -> None:
+def test_objects_of_unmanaged_namespaces_are_not_checked() -> None:
     assert reviewed(rule(when="sped > 3"), namespaces=("other",)) == {"uid": "u1", "allowed": True}
 
 
-def test_an_object_that_is_none_is_refused() -> None:
+def test_an_unparsable_object_is_rejected() -> None:
     broken = rule().model_copy(update={"kind": "Detector"})
     assert "spec.streams: is missing" in reviewed(broken)["status"]["message"]

@@ -115,7 +115,7 @@ def applied(document: Json, operations: list[Json]) -> Json:
 
 
 @given(specs, detectors)
-def test_it_comes_in_once_by_its_patch_and_takes_nothing_from_the_pod(spec: Json, of: Detector) -> None:
+def test_the_sidecar_is_injected_once_and_the_patch_removes_nothing(spec: Json, of: Detector) -> None:
     before = copy.deepcopy(spec)
     metadata = {"name": "car", "labels": LABELS}
     found = injection(metadata, spec, "site", of, DEFAULTS)
@@ -142,7 +142,7 @@ def test_it_comes_in_once_by_its_patch_and_takes_nothing_from_the_pod(spec: Json
     assert not taken & {port["containerPort"] for port in mine.get("ports", [])}
 
 
-def test_nothing_of_the_pod_waits_for_it() -> None:
+def test_no_container_of_the_pod_waits_for_the_sidecar() -> None:
     made = sidecar(injected(pod(), detector()))
     assert made["restartPolicy"] == "Always"
     assert "startupProbe" not in made
@@ -178,7 +178,7 @@ def test_the_sidecar_uses_its_own_token_and_passes_the_restricted_standard() -> 
     }
 
 
-def test_its_folders_secrets_and_resources_are_as_of_a_standalone_detectors_pod() -> None:
+def test_the_sidecars_folders_secrets_and_resources_match_a_standalone_detector() -> None:
     pod_fields = {"image": "own:2", "secretNames": ["pager"], "resources": {"limits": {"memory": "2Gi"}}}
     given_one = {
         "state": {"path": "/state"},
@@ -201,7 +201,7 @@ def test_the_guides_pod_gets_the_guides_detector() -> None:
     assert found.addition is not None
 
 
-def test_what_is_needed_to_pull_its_image_or_would_keep_the_pod_from_starting_is_seen_to() -> None:
+def test_pull_secrets_are_added_and_conflicts_that_block_the_pod_are_avoided() -> None:
     variables = [{"name": "TOKEN", "valueFrom": {"secretKeyRef": {"name": "pager", "key": "token"}}}]
     defaults = PodDefaults(IMAGE, pull_secrets=("registry", "mirror"))
     given_one = pod(imagePullSecrets=[{"name": "registry"}, {"name": "own"}])["spec"]
@@ -213,7 +213,7 @@ def test_what_is_needed_to_pull_its_image_or_would_keep_the_pod_from_starting_is
     assert token["valueFrom"]["secretKeyRef"] == {"name": "pager", "key": "token", "optional": True}
 
 
-def test_in_the_nodes_network_it_takes_no_port() -> None:
+def test_on_the_host_network_the_sidecar_opens_no_port() -> None:
     mine = sidecar(injected(pod(hostNetwork=True), detector()))
     assert "ports" not in mine
     assert "livenessProbe" not in mine
@@ -234,20 +234,22 @@ def test_in_the_nodes_network_it_takes_no_port() -> None:
         (pod() | {"metadata": {"labels": LABELS, "annotations": MIRROR}}, detector(), "static"),
     ],
 )  # fmt: skip
-def test_why_a_pod_goes_without_is_reported_with_the_remedy(requested: Json, of: Detector | None, logged: str) -> None:
+def test_a_pod_without_its_sidecar_gets_the_reason_and_the_remedy(
+    requested: Json, of: Detector | None, logged: str
+) -> None:
     assert logged in why_not(requested, of)
 
 
-def test_a_detector_that_is_not_accepted_comes_into_no_pod() -> None:
+def test_a_detector_that_is_not_accepted_is_not_injected() -> None:
     wrong = [{"name": "pose", "key": "vehicles/${client:*}/pose", "encoding": "json", "stamp": "msg.t +"}]
     assert "is not accepted" in why_not(pod(), detector(streams=wrong))
 
 
-def test_a_manager_that_runs_no_detectors_reports_it() -> None:
+def test_a_manager_without_a_detector_image_reports_it() -> None:
     assert "--detector-image" in why_not(pod(), detector(), None)
 
 
-def test_a_pod_that_requests_none_or_has_a_container_of_the_name_is_left_alone() -> None:
+def test_a_pod_without_a_request_or_with_a_container_of_that_name_is_left_alone() -> None:
     unlabelled = pod() | {"metadata": {"name": "car"}}
     assert why_not(unlabelled, None) == ""
     theirs = pod(containers=[{"name": CONTAINER, "image": "mine:1"}])
@@ -279,7 +281,7 @@ def test_the_answer_always_allows_with_a_patch_or_a_warning() -> None:
     assert "created without a detector: label wayside.dev/detector" in response["warnings"][0]
 
 
-def test_only_a_new_pod_is_looked_at() -> None:
+def test_only_new_pods_are_considered() -> None:
     for more in (
         {"operation": "UPDATE"},
         {"subResource": "ephemeralcontainers"},
@@ -291,7 +293,7 @@ def test_only_a_new_pod_is_looked_at() -> None:
             read_pod(none)
 
 
-def test_the_accounts_and_no_others_are_bound_to_what_the_detector_needs() -> None:
+def test_only_the_listed_accounts_are_bound_to_the_detectors_role() -> None:
     role, binding = detector_objects(detector(serviceAccountNames=["vehicle", "bus"]), DEFAULTS)
     assert [each["name"] for each in binding["subjects"]] == ["bus", "vehicle"]
     rules = {
@@ -305,7 +307,7 @@ def test_the_accounts_and_no_others_are_bound_to_what_the_detector_needs() -> No
     assert detector_objects(detector(serviceAccountNames=[]), DEFAULTS)[1]["subjects"] == []
 
 
-def test_who_puts_it_into_pods_by_hand_gets_the_same_rights() -> None:
+def test_manual_injection_prints_the_same_rights() -> None:
     options = ["detector-rbac", "town", "-n", "site", "--pod-account", "vehicle"]
     done = CliRunner().invoke(app, options)
     assert list(yaml.safe_load_all(done.stdout)) == sidecar_roles("site", "town", ["vehicle"])
@@ -318,7 +320,7 @@ def state(one: Json, **how: Any) -> Json:
     return one | {"status": {"phase": "Running", "initContainerStatuses": [{"name": name, "image": IMAGE, **how}]}}
 
 
-def test_the_condition_reports_in_how_many_pods_it_runs_and_what_keeps_it_from_running() -> None:
+def test_the_condition_reports_the_number_of_running_pods_and_the_reasons_of_others() -> None:
     of = detector()
     runs = state(injected(pod(), of), state={"running": {}}, ready=True)
     logged = carried(of, [runs, pod()])
@@ -342,7 +344,7 @@ def test_the_condition_reports_in_how_many_pods_it_runs_and_what_keeps_it_from_r
     assert carried(detector(serviceAccountNames=[]), []).reason == "NoAccounts"
 
 
-def test_pods_that_are_over_are_no_trouble() -> None:
+def test_finished_pods_are_ignored() -> None:
     of, killed = detector(), {"terminated": {"exitCode": 137}}
     one = state(injected(pod(restartPolicy="OnFailure"), of), state=killed)
     over = one | {"status": one["status"] | {"containerStatuses": [{"name": "main", "state": killed}]}}
@@ -373,7 +375,7 @@ def test_pods_that_are_over_are_no_trouble() -> None:
         ({"pod": {"resources": {"requests": {"a.b/gpu": "1"}}}}, "requests.a.b/gpu: must equal limits.a.b/gpu; got 1"),
     ],
 )
-def test_what_makes_no_sense_is_refused_by_its_field(spec: Json, logged: str) -> None:
+def test_invalid_settings_are_rejected_by_field(spec: Json, logged: str) -> None:
     with pytest.raises(ValidationError) as refused:
         detector(**spec)
     assert logged in str(refused.value)

@@ -70,7 +70,7 @@ def failures(measures: Measures) -> str:
     )
 
 
-def test_a_question_is_answered_and_what_is_none_is_not(folder: Path) -> None:
+def test_a_valid_review_is_answered_and_an_invalid_request_is_rejected(folder: Path) -> None:
     measures = Measures()
 
     async def review(requested: Any) -> dict[str, Any]:
@@ -95,7 +95,7 @@ def test_a_question_is_answered_and_what_is_none_is_not(folder: Path) -> None:
     assert failures(measures).endswith(" 5.0")
 
 
-def test_nothing_is_answered_before_everything_is_known(folder: Path) -> None:
+def test_no_review_is_answered_before_the_cache_is_complete(folder: Path) -> None:
     known: list[bool] = []
 
     async def review(requested: Any) -> dict[str, Any]:
@@ -121,7 +121,7 @@ def test_an_overloaded_manager_requests_a_wait(folder: Path) -> None:
     served(folder, ReviewHandler(review, lambda: True, Measures()), scenario, headers=headers)
 
 
-def test_those_beyond_the_limit_are_sent_away_at_once(folder: Path) -> None:
+def test_reviews_beyond_the_limit_are_rejected_at_once(folder: Path) -> None:
     all_there, proceed = asyncio.Event(), asyncio.Event()
     waiting: list[Any] = []
 
@@ -143,13 +143,13 @@ def test_those_beyond_the_limit_are_sent_away_at_once(folder: Path) -> None:
     served(folder, ReviewHandler(review, lambda: True, Measures()), scenario)
 
 
-def test_a_certificate_is_for_the_hosts_given_and_its_key_for_its_owner_alone(folder: Path) -> None:
+def test_a_certificate_names_the_given_hosts_and_its_key_is_readable_by_the_owner_only(folder: Path) -> None:
     text = ssl._ssl._test_decode_cert(str(folder / "tls.crt"))  # type: ignore[attr-defined]
     assert text["subjectAltName"] == (("IP Address", "127.0.0.1"), ("DNS", "manager.wayside.svc"))
     assert (folder / "tls.key").stat().st_mode & 0o077 == 0
 
 
-def test_renewed_files_are_taken_whole_or_not_at_all(folder: Path) -> None:
+def test_renewed_certificate_files_are_loaded_atomically(folder: Path) -> None:
     certificate = ServingCertificate(folder, "--admission-certificates")
     assert not certificate.reload()
     old = {each.name: each.read_bytes() for each in folder.iterdir()}
@@ -211,7 +211,7 @@ def command(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str,
     return command
 
 
-def test_check_reports_where_in_the_files_what_would_be_refused_is(
+def test_check_reports_rejections_with_file_and_line(
     command: Callable[..., tuple[int, str, str]], tmp_path: Path
 ) -> None:
     file = tmp_path / "all.yaml"
@@ -245,7 +245,7 @@ def test_check_reports_where_in_the_files_what_would_be_refused_is(
     assert command("check", str(file), "--ignore", "invalid-rule")[0] == 2
 
 
-def test_check_finds_nothing_that_would_be_refused_in_the_examples(
+def test_check_finds_no_rejections_in_the_examples(
     command: Callable[..., tuple[int, str, str]],
 ) -> None:
     folders = sorted({str(each.parent) for each in Path("examples").rglob("template*.yaml")})
@@ -268,7 +268,7 @@ def test_check_finds_nothing_that_would_be_refused_in_the_examples(
         (["webhooks", "--service", "a/b", "--ca-bundle", "pyproject.toml"], "contains no certificate"),
     ],
 )
-def test_bad_usage_is_one_line_with_the_remedy(
+def test_a_usage_error_is_one_line_with_the_remedy(
     command: Callable[..., tuple[int, str, str]], arguments: list[str], part: str
 ) -> None:
     code, out, logged = command(*arguments)

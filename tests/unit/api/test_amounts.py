@@ -28,7 +28,7 @@ def test_a_duration_is_a_sum_of_numbers_with_units(text: str, ns: int) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "1", "1 s", "-1s", "1d", "s", "1.s", ".5s", "1e3s", "1000000h", "1s1"])
-def test_other_text_is_no_duration(text: str) -> None:
+def test_other_text_is_rejected_as_a_duration(text: str) -> None:
     with pytest.raises(ValueError, match="must be a duration with units, such as 500ms, 10s"):
         Duration.parse(text)
 
@@ -60,13 +60,13 @@ def test_a_quantity_is_rounded_up_to_bytes(text: str, size: int) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "much", "-1", "1 Gi", "1gi", "1e", "1i", ".", "e9"])
-def test_other_text_is_no_quantity(text: str) -> None:
+def test_other_text_is_rejected_as_a_quantity(text: str) -> None:
     with pytest.raises(ValueError, match="must be a quantity, such as 512Mi"):
         Quantity.parse(text)
 
 
 @pytest.mark.parametrize("text", ["1", "010", "0.5", ".5Gi", "1.0", "0.000000001", "100000000000000000"])
-def test_what_has_a_digit_above_zero_is_a_positive_quantity(text: str) -> None:
+def test_a_quantity_with_a_digit_above_zero_is_positive(text: str) -> None:
     assert PositiveQuantity.parse(text).value == Quantity.parse(text).value > 0
 
 

@@ -208,7 +208,7 @@ def test_json_with_tabs_and_a_byte_order_mark_is_read(tmp_path: Path) -> None:
     assert len(load_documents([tmp_path])) == 2
 
 
-def test_times_and_yes_stay_what_they_are_to_the_author(tmp_path: Path) -> None:
+def test_times_and_yes_stay_text(tmp_path: Path) -> None:
     file = tmp_path / "f.yaml"
     file.write_text(
         "apiVersion: wayside.dev/v1alpha1\nkind: Detector\nmetadata: {name: d}\nspec:\n"
@@ -222,7 +222,7 @@ def test_times_and_yes_stay_what_they_are_to_the_author(tmp_path: Path) -> None:
     assert document.object.spec.zenoh.scouting is True
 
 
-def test_aliases_that_multiply_themselves_are_refused(tmp_path: Path) -> None:
+def test_yaml_alias_bombs_are_rejected(tmp_path: Path) -> None:
     lines = ["  a0: &a0 [x, x, x, x, x, x, x, x, x]"]
     lines += [f"  a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]" for n in range(1, 9)]
     (found,) = problems(tmp_path, HEAD + "\n".join(lines))
@@ -259,7 +259,7 @@ def reported(file: Path) -> tuple[Problem, ...]:
 
 @settings(max_examples=150, deadline=None)
 @given(st.dictionaries(fields, values, max_size=4) | values, st.booleans())
-def test_whatever_a_file_holds_it_is_read_or_its_problems_are_reported(
+def test_any_file_is_read_or_its_problems_are_reported(
     tmp_path_factory: pytest.TempPathFactory, spec: Any, as_json: bool
 ) -> None:
     raw = {"apiVersion": "wayside.dev/v1alpha1", "kind": "EventRule", "metadata": {"name": "r"}, "spec": spec}
@@ -270,7 +270,7 @@ def test_whatever_a_file_holds_it_is_read_or_its_problems_are_reported(
 
 @settings(max_examples=200, deadline=None)
 @given(st.text(alphabet="abc: -[]{}!&*\"'#|>%@`\t\n\x01,?=<~1", max_size=40))
-def test_whatever_a_line_holds_nothing_else_is_raised(tmp_path_factory: pytest.TempPathFactory, line: str) -> None:
+def test_any_line_raises_only_document_errors(tmp_path_factory: pytest.TempPathFactory, line: str) -> None:
     file = tmp_path_factory.mktemp("any") / "f.yaml"
     file.write_text(HEAD + "  when: " + line + "\n", encoding="utf-8")
     assert all(problem.line > 0 and problem.message for problem in reported(file))

@@ -40,7 +40,7 @@ def test_the_examples_are_right_by_the_schema(file: Path, validator: Draft7Valid
         ("scope:", "scoop:", "scoop"),
     ],
 )
-def test_what_is_misspelt_is_found(old: str, new: str, word: str, validator: Draft7Validator) -> None:
+def test_misspelt_fields_are_found(old: str, new: str, word: str, validator: Draft7Validator) -> None:
     text = (ROOT / "examples/cooperative-recording/rules.yaml").read_text()
     assert old in text
     errors = [*validator.iter_errors(yaml.safe_load(text.replace(old, new)))]

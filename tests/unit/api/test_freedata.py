@@ -11,7 +11,7 @@ from wayside.api.freedata import MAXIMUM_BYTES, bounded, fitting, size
 HALF = "x" * (MAXIMUM_BYTES // 2)
 
 
-def test_a_map_may_take_64_kib_and_no_more() -> None:
+def test_a_map_may_take_at_most_64_kib() -> None:
     full = {"a": "x" * (MAXIMUM_BYTES - size({"a": ""}))}
     assert bounded(full) is full
     with pytest.raises(
@@ -32,6 +32,6 @@ def test_a_sixth_is_not(value: Any) -> None:
     assert fitting({"a": value, "b": 1}) == {"b": 1}
 
 
-def test_of_too_much_the_largest_values_are_left_out() -> None:
+def test_the_largest_values_of_oversized_data_are_omitted() -> None:
     assert fitting({"a": 1, "b": HALF, "c": f"{HALF}x", "d": "text"}) == {"a": 1, "b": HALF, "d": "text"}
     assert fitting({"a": f"{HALF}{HALF}", "b": HALF}) == {"b": HALF}

@@ -18,6 +18,6 @@ def test_several_documents_read_back_as_they_were() -> None:
     assert list(yaml.safe_load_all(to_yaml(objects))) == objects
 
 
-def test_what_stands_twice_is_written_twice() -> None:
+def test_repeated_objects_are_written_without_aliases() -> None:
     shared = {"a": [1]}
     assert "&" not in to_yaml([{"first": shared, "second": shared}])

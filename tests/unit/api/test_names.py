@@ -13,7 +13,7 @@ subjects = st.tuples(st.lists(texts, max_size=3), st.none() | texts)
 
 
 @given(texts)
-def test_what_is_encoded_can_be_read_back(text: str) -> None:
+def test_encoded_names_can_be_read_back(text: str) -> None:
     assert decode(encode(text)) == text
 
 
@@ -44,6 +44,6 @@ def test_a_subjects_text_contains_its_clients_and_element(subject: tuple[list[st
 
 
 @pytest.mark.parametrize("text", ["", "~", "~x", "~fleetx", "a+", "+", "a b", "a~b~c", "%zz", "%FF"])
-def test_what_is_no_subject_is_refused(text: str) -> None:
+def test_an_invalid_subject_is_rejected(text: str) -> None:
     with pytest.raises(ValueError, match=r"the subject must be|can't decode"):
         parse_subject(text)

@@ -34,7 +34,7 @@ TABLE_1 = {
 }
 
 
-def test_the_files_are_those_that_the_models_make_no_more_and_no_fewer() -> None:
+def test_the_crd_files_are_exactly_those_generated_from_the_models() -> None:
     stale = "crds/ is stale: run `python -m wayside.api`"
     assert {file.name for file in CRDS.iterdir()} == set(FILES), stale
     for name, text in FILES.items():
@@ -154,7 +154,7 @@ def test_kinds_have_their_short_names_status_and_selectable_fields() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(FILES))
-def test_no_rule_is_about_what_may_be_a_number_or_text(name: str) -> None:
+def test_no_cel_rule_validates_int_or_string_fields(name: str) -> None:
     """Kubernetes 1.31 takes such text for as long as a request may be, and refuses the CRD for the cost of the rule."""
     nodes = [schema_of(name.removeprefix("wayside.dev_").removesuffix(".yaml"))]
     while nodes:

@@ -48,6 +48,6 @@ def test_all_requirements_must_be_met(selector: dict[str, Any], text: str, match
         {"key": "site", "operator": "in", "values": ["north"]},
     ],
 )
-def test_a_requirement_that_makes_no_sense_is_refused(requirement: dict[str, Any]) -> None:
+def test_an_invalid_requirement_is_rejected(requirement: dict[str, Any]) -> None:
     with pytest.raises(ValidationError):
         LabelSelector.model_validate({"matchExpressions": [requirement]})

@@ -36,16 +36,16 @@ def test_always_nine_digits_in_utc() -> None:
         ("1969-12-31T23:59:59.999999999Z", -1),
     ],
 )
-def test_reads_what_others_write(text: str, ns: int) -> None:
+def test_times_of_other_programs_are_read(text: str, ns: int) -> None:
     assert parse_time(text) == ns
 
 
 @pytest.mark.parametrize("text", ["", "yesterday", "2026-01-01", "2026-13-01T00:00:00Z", "2026-01-01T00:00:00", "1"])
-def test_refuses_what_is_no_time(text: str) -> None:
+def test_invalid_times_are_rejected(text: str) -> None:
     with pytest.raises(ValueError, match=r"must be a time"):
         parse_time(text)
 
 
-def test_refuses_a_year_beyond_9999() -> None:
+def test_a_year_beyond_9999_is_rejected() -> None:
     with pytest.raises(ValueError, match="years 1 to 9999"):
         format_time(YEAR_10000)

@@ -66,13 +66,13 @@ def test_alerts_and_dashboard_query_only_what_the_programs_export() -> None:
     assert requested - exported() == set()
 
 
-def test_every_panel_is_within_what_is_chosen() -> None:
+def test_every_panel_filters_by_the_dashboard_variables() -> None:
     for panel in json.loads(DASHBOARD.read_text())["panels"]:
         for target in panel.get("targets", []):
             assert target["expr"].count('{namespace=~"$namespace"}') == len(NAME.findall(target["expr"]))
 
 
-def test_every_alert_reports_what_is_wrong_and_has_a_case_in_which_it_fires() -> None:
+def test_every_alert_has_a_description_and_a_test_case_in_which_it_fires() -> None:
     cases = yaml.safe_load(CASES.read_text())["tests"]
     fired = {each["alertname"] for case in cases for each in case["alert_rule_test"] if each.get("exp_alerts")}
     silent = {each["alertname"] for case in cases for each in case["alert_rule_test"] if not each.get("exp_alerts")}

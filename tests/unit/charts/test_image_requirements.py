@@ -31,7 +31,7 @@ PINS = {"requirements.txt": pins("requirements.txt"), "requirements-full.txt": p
 
 
 @pytest.mark.parametrize(("file", "extras"), [("requirements.txt", EXTRAS), ("requirements-full.txt", FULL)])
-def test_the_image_has_what_the_programs_need(file: str, extras: tuple[str, ...]) -> None:
+def test_the_image_has_the_dependencies_of_the_programs(file: str, extras: tuple[str, ...]) -> None:
     requested = [
         *PROJECT["dependencies"],
         *(each for extra in extras for each in PROJECT["optional-dependencies"][extra]),
@@ -42,7 +42,7 @@ def test_the_image_has_what_the_programs_need(file: str, extras: tuple[str, ...]
         assert requirement.specifier.contains(PINS[file][name][0]), "run `make requirements`"
 
 
-def test_every_package_is_pinned_by_hashes_and_the_full_image_has_all_of_the_other_one() -> None:
+def test_every_package_is_pinned_by_hash_and_the_full_image_includes_the_slim_one() -> None:
     small, full = PINS.values()
     for each in (small, full):
         assert [name for name, (_, block) in each.items() if "--hash=sha256:" not in block] == []
@@ -57,7 +57,7 @@ def test_the_base_is_pinned_by_its_digest_and_the_user_is_not_root() -> None:
     assert re.search(r"^USER 65532:65532$", DOCKERFILE, re.MULTILINE)
 
 
-def test_what_the_dockerfile_copies_exists_and_is_let_through() -> None:
+def test_copied_paths_of_the_dockerfile_exist_and_are_not_ignored() -> None:
     let_through = {line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line.startswith("!")}
     copied = {
         name for line in re.findall(r"^COPY (?!--from)(.*) \S+$", DOCKERFILE, re.MULTILINE) for name in line.split()

@@ -40,7 +40,7 @@ def test_a_kind_that_is_not_allowed_is_in_no_role() -> None:
     assert ("", "secrets") in verbs(dict(PLURALS))
 
 
-def test_nothing_is_granted_by_a_wildcard_and_no_rights_can_be_given_on() -> None:
+def test_no_right_is_granted_by_wildcard_and_none_can_be_delegated() -> None:
     for rule in merged_rules(rights(dict(PLURALS))):
         assert "*" not in str(rule)
         assert not {"escalate", "bind", "impersonate"} & set(rule["verbs"])
@@ -52,7 +52,7 @@ def test_namespaces_have_a_role_each() -> None:
     assert where == [(kind, each) for each in ("a", "b") for kind in ("Role", "RoleBinding")] + own
 
 
-def test_all_namespaces_can_be_read_and_those_that_are_granted_written() -> None:
+def test_all_namespaces_are_readable_and_only_granted_ones_writable() -> None:
     everywhere = roles({DEPLOYMENT: "deployments"}, [], LEASE, ACCOUNT, "m", detectors=True, granted=["a", "b", "a"])
     assert [(each["kind"], each["metadata"].get("namespace")) for each in everywhere] == [
         ("ClusterRole", None),
@@ -94,14 +94,14 @@ def test_invalid_combinations_are_refused(arguments: list[str], logged: str) -> 
     assert logged in " ".join(done.output.replace("│", " ").split())
 
 
-def test_a_kind_that_nobody_knows_is_looked_up_in_a_cluster(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unknown_kind_is_looked_up_in_the_cluster(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("KUBECONFIG", "/nonexistent")
     done = CliRunner().invoke(app, ["rbac", "--allowed-kinds", "example.com/v1/Widget"])
     assert isinstance(done.exception, ConfigurationError)
     assert "cannot look up the plural of example.com/v1/Widget" in str(done.exception)
 
 
-def test_what_is_missing_is_reported_with_its_purpose_and_the_remedy(caplog: pytest.LogCaptureFixture) -> None:
+def test_missing_rights_are_reported_with_their_purpose_and_the_remedy(caplog: pytest.LogCaptureFixture) -> None:
     needed = {(each.resource, each.vital): each for each in rights({DEPLOYMENT: "deployments"})}
     report_missing([(needed["deployments", False], "patch", "a")])
     (logged,) = caplog.messages
@@ -113,7 +113,7 @@ def test_what_is_missing_is_reported_with_its_purpose_and_the_remedy(caplog: pyt
         report_missing([(needed["pods", True], "list", None)])
 
 
-def test_the_guides_command_gives_what_the_guides_manager_needs() -> None:
+def test_the_guides_command_prints_the_rights_of_the_guides_manager() -> None:
     text = guide("manager").replace("\\\n", " ")
     command, run = (
         shlex.split(line.partition("|")[0])[2:]

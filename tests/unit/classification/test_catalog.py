@@ -68,7 +68,7 @@ def test_the_same_word_in_two_dimensions_is_two_values() -> None:
     assert not any(external.values())
 
 
-def test_of_one_dimension_either_value_will_do_and_of_several_all_must() -> None:
+def test_values_of_one_dimension_are_alternatives_and_dimensions_are_combined() -> None:
     def left(*only: str) -> list[str]:
         return names(catalog(ALL, choose(only)).entries)
 
@@ -86,12 +86,12 @@ def test_of_one_dimension_either_value_will_do_and_of_several_all_must() -> None
         ("incidence", "incidence has no value ''; its values are Frequent"),
     ],
 )
-def test_what_the_scheme_does_not_have_is_refused_with_what_it_has(text: str, shows: str) -> None:
+def test_unknown_dimensions_and_values_are_rejected_with_the_known_ones(text: str, shows: str) -> None:
     with pytest.raises(ChoiceError, match=shows):
         choose([text])
 
 
-def test_rules_of_one_name_are_distinguished_by_where_they_are() -> None:
+def test_rules_of_the_same_name_are_distinguished_by_their_source() -> None:
     one, other = an_entry("r", "examples/a/rules.yaml:3"), an_entry("r", "examples/b/rules.yaml:3")
     labels = catalog([other, one, BATTERY]).labels()
     assert [labels[one], labels[other], labels[BATTERY]] == ["r (a/rules.yaml:3)", "r (b/rules.yaml:3)", "battery"]
@@ -208,14 +208,16 @@ def test_the_command_writes_json_for_other_programs(rules: Path, tmp_path: Path)
         (["x.yaml", "--format", "pdf"], "'pdf' is not one of"),
     ],
 )
-def test_wrong_usage_is_one_line(arguments: list[str], shows: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_usage_error_of_catalog_is_one_line(
+    arguments: list[str], shows: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run(*arguments) == 2
     reported = capsys.readouterr().err
     assert shows in reported
     assert reported.count("\n") == 1
 
 
-def test_without_an_api_server_it_is_reported_what_else_this_command_can_do(
+def test_without_an_api_server_the_alternatives_are_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("KUBECONFIG", str(tmp_path / "nowhere"))

@@ -161,7 +161,7 @@ WAYS = [
 
 
 @pytest.mark.parametrize("given_way", WAYS, ids=lambda each: each.shows.removeprefix("spec.classification.")[:60])
-def test_a_contradiction_is_reported_and_what_fits_is_not(given_way: ContradictionCase) -> None:
+def test_a_contradiction_is_reported_and_the_corrected_rule_is_not(given_way: ContradictionCase) -> None:
     warnings = reported(given_way.given, **given_way.spec)
     assert any(warning.startswith(given_way.shows) for warning in warnings), warnings
     assert reported(given_way.right, **given_way.spec) == []
@@ -207,12 +207,12 @@ RIGHT: dict[str, tuple[str, str, dict[str, Any]]] = {
 
 
 @pytest.mark.parametrize("case", RIGHT)
-def test_what_may_be_right_is_not_warned_of(case: str) -> None:
+def test_a_classification_that_may_be_right_gives_no_warning(case: str) -> None:
     dimension, values, spec = RIGHT[case]
     assert reported({dimension: values.split()}, **spec) == []
 
 
-def test_what_a_named_rule_looks_at_counts_as_well() -> None:
+def test_signals_of_a_referenced_rule_count_too() -> None:
     spec = {
         "signals": [{"name": "starts", "ruleName": "other", "over": "30m", "aggregate": "Count"}],
         "when": "starts > 2",
@@ -225,7 +225,7 @@ def test_what_a_named_rule_looks_at_counts_as_well() -> None:
     assert reported({"observationPeriod": ["LongTerm"], "detectionAlgorithm": ["LearningBased"]}, other, **spec) == []
 
 
-def test_a_models_window_counts_and_one_of_samples_may_be_any_time() -> None:
+def test_a_models_window_counts_and_a_sample_window_has_no_length() -> None:
     def model(**window: Any) -> dict[str, Any]:
         return {
             "signals": [SPEED, a_model({"name": "x", "window": {"signals": ["v"], **window}})], "when": "risk > 0.5"

@@ -56,7 +56,7 @@ SIGNALS = {each.aggregate: each for each in compiled(DETECTOR, a_rule(signals=_S
 
 @settings(max_examples=150)
 @given(_windows())
-def test_aggregates_of_ranges_are_those_of_windows(
+def test_aggregates_over_ranges_match_those_of_single_windows(
     drawn: tuple[list[Any], list[int], list[bool] | None, list[tuple[int, int]]],
 ) -> None:
     values, times, taken, windows = drawn

@@ -36,7 +36,7 @@ HEAVY = NETWORK | RECORDINGS | ACTIONS_AND_STREAMS | OBSERVING | {"scipy"}
 EVALUATING = {"asyncio", "cel_expr_python", "msgspec", "numpy", "pydantic", "rosbags", "yaml"}
 
 
-def test_no_garbage_is_looked_for_while_importing_nor_in_what_was_imported() -> None:
+def test_garbage_collection_pauses_during_imports_and_skips_imported_objects() -> None:
     try:
         with importing():
             assert not gc.isenabled()
@@ -57,7 +57,7 @@ def loaded(code: str, *words: str) -> set[str]:
 
 @pytest.mark.parametrize("package", ["detector.commands", "application_manager"])
 @pytest.mark.parametrize("words", [["--help"], ["run", "--help"]], ids=" ".join)
-def test_help_loads_nothing_that_only_a_running_command_needs(package: str, words: list[str]) -> None:
+def test_help_loads_no_package_of_running_commands(package: str, words: list[str]) -> None:
     of_typer = {"pydantic", "rich"}  # it lays out the help and checks options with them
     assert loaded(LOADED.format(package=package), *words) & (HEAVY | EVALUATING) <= of_typer
 
@@ -80,12 +80,12 @@ def test_help_loads_nothing_that_only_a_running_command_needs(package: str, word
         ),
     ],
 )
-def test_a_command_on_files_loads_neither_networks_nor_recordings(
+def test_a_command_on_files_loads_neither_zenoh_nor_recording_libraries(
     package: str, words: list[str], needs_not: set[str]
 ) -> None:
     assert not loaded(LOADED.format(package=package), *words) & needs_not
 
 
-def test_a_detector_loads_what_its_detector_and_options_request_and_no_more() -> None:
+def test_a_detector_loads_only_the_packages_of_its_settings_and_options() -> None:
     code = "import sys, detector.live.service; print(*sys.modules)"
     assert loaded(code) & HEAVY == {"zenoh"}

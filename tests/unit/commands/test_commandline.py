@@ -18,7 +18,7 @@ APPS = [
 
 
 @pytest.mark.parametrize(("app", "incomplete", "lacks"), APPS)
-def test_bad_usage_is_one_line_that_names_program_and_help(
+def test_a_usage_error_is_one_line_with_program_and_help(
     app: typer.Typer, incomplete: list[str], lacks: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for arguments in (incomplete, [*incomplete, "--debug"], ["--debug", *incomplete]):
@@ -57,7 +57,7 @@ def test_errors_of_tasks_side_by_side_are_a_line_each(capsys: pytest.CaptureFixt
     assert reported(group, capsys) == "program: a\nprogram: b\n"
 
 
-def test_with_debug_and_for_defects_the_trace_is_kept(capsys: pytest.CaptureFixture[str]) -> None:
+def test_tracebacks_are_shown_with_debug_and_for_defects(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(ValueError, match="no cluster"):
         reported(ValueError("no cluster"), capsys, "--debug")
     with pytest.raises(KeyError):

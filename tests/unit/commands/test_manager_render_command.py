@@ -113,7 +113,7 @@ def test_a_task_that_waits_and_a_capped_sum_are_reported_without_an_error(render
     assert "load: the sum of 2 values, 8, is capped at the maximum of 5" in result.stderr
 
 
-def test_bad_files_and_bad_options_are_one_clear_line_and_exit_code_2(
+def test_bad_files_and_options_are_one_line_and_exit_code_2(
     render: Any, command: Callable[..., Result], tmp_path: Path
 ) -> None:
     wrong = render({**TEMPLATE, "spec": {"manifests": "x"}})

@@ -18,7 +18,7 @@ FAST = a_rule(
 BRIEF = [arrival(0.5, "a", {"v": 20}), arrival(2.5, "a", {"v": 0}), arrival(9.0, "a", {"v": 0})]
 
 
-def test_an_episode_that_starts_and_ends_between_two_looks_has_its_task_too() -> None:
+def test_an_episode_that_starts_and_ends_between_two_writes_has_its_task_too() -> None:
     outcome = replay_arrivals([BRIEF], a_detector(), [FAST])
     (task,) = outcome.tasks.values()
     assert [event.started for event in outcome.events] == [True, False]
@@ -37,7 +37,7 @@ def test_with_clock_data_the_tasks_are_the_same() -> None:
     assert {*replay_arrivals([stamped], data, [FAST]).tasks} == {*plain.tasks}
 
 
-def test_a_pause_of_hours_is_a_gap_over_which_an_open_episode_holds() -> None:
+def test_an_open_episode_continues_over_a_gap_of_hours() -> None:
     detector = a_detector(clientTimeout="1h")
     outcome = replay_arrivals([[arrival(0.5, "a", {"v": 20}), arrival(8000, "a", {"v": 20})]], detector, [FAST])
     assert [event.started for event in outcome.events] == [True]
@@ -53,7 +53,7 @@ def test_a_misspelt_field_is_reported_after_the_replay() -> None:
     assert '"w"' in note
 
 
-def test_an_intake_file_that_is_cut_gives_what_it_holds_and_reports_it() -> None:
+def test_a_truncated_intake_file_is_replayed_up_to_the_cut_with_a_warning() -> None:
     detector = a_detector()
     start = {"kind": "start", "holder": "h", "detector": detector.to_json(), "rules": [FAST.to_json()]}
     records = [Control(START, start), *BRIEF[:2], Control(at(2.5), {"kind": "cut", "reason": "killed"})]
@@ -62,7 +62,7 @@ def test_an_intake_file_that_is_cut_gives_what_it_holds_and_reports_it() -> None
     assert [event.started for event in outcome.events] == [True]
 
 
-def test_a_refused_change_of_a_rule_in_an_intake_file_ends_no_episode_as_it_ended_none_live() -> None:
+def test_a_rejected_rule_change_in_an_intake_file_ends_no_episode_as_live() -> None:
     detector = a_detector()
     broken = FAST.to_json() | {"spec": FAST.to_json()["spec"] | {"when": "w > 10"}}
     start = {"kind": "start", "holder": "h", "detector": detector.to_json(), "rules": [FAST.to_json()]}
@@ -87,7 +87,7 @@ class NullSink:
     def demands(self, demands: object, ended: object) -> None: ...
 
 
-def test_with_clock_data_the_evaluation_rests_between_its_looks_however_old_the_stamps_are() -> None:
+def test_with_clock_data_the_evaluation_sleeps_between_ticks_even_with_old_stamps() -> None:
     detector = a_detector(clock="Data")
     evaluator = Evaluator(
         an_engine(detector), Intake(lambda: START), NullSink(), now=lambda: at(1e6), on_failure=lambda error: None

@@ -44,7 +44,7 @@ def expected(live: set[str]) -> set[str]:
 
 
 @given(st.lists(st.tuples(st.sampled_from(("enter", "leave")), st.sampled_from(NAMES)), max_size=40))
-def test_the_oldest_are_within_and_every_change_is_reported(steps: list[Step]) -> None:
+def test_the_oldest_tasks_are_within_the_budget_and_every_change_is_reported(steps: list[Step]) -> None:
     index = BudgetIndex(POLICY)
     live: set[str] = set()
     for step, name in steps:
@@ -62,7 +62,7 @@ def test_the_oldest_are_within_and_every_change_is_reported(steps: list[Step]) -
         assert len(moved) <= 3  # looks at the task that two budgets move in opposite directions, too
 
 
-def test_one_beyond_them_waits_and_reports_for_what() -> None:
+def test_a_task_beyond_the_budget_waits_and_reports_the_budget() -> None:
     index = BudgetIndex(POLICY)
     for name in ("t2", "t1", "t0"):
         index.enter(made(name))
@@ -81,7 +81,7 @@ def test_one_beyond_them_waits_and_reports_for_what() -> None:
         ("town/det:max-tasks=-1", "max-tasks"),
     ],
 )
-def test_a_policy_that_is_none_is_refused_with_its_form(text: str, problem: str) -> None:
+def test_an_invalid_policy_is_rejected_with_the_valid_form(text: str, problem: str) -> None:
     with pytest.raises(ValueError, match=problem) as refused:
         HolderPolicy.parse(text)
     assert "must be " in str(refused.value)

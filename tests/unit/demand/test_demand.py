@@ -69,7 +69,7 @@ def test_a_key_without_a_value_is_refused_with_the_remedy() -> None:
 # --- Merging
 
 
-def test_each_strategy_merges_in_its_way() -> None:
+def test_each_merge_strategy_gives_its_result() -> None:
     decision = only(
         of(
             task("low", {"region": "n", "sources": ["b", "a"], "rateHz": 20, "delay": 7, "mode": "low"}),
@@ -86,12 +86,12 @@ def test_each_strategy_merges_in_its_way() -> None:
     assert decision.tasks == ("high", "low")
 
 
-def test_a_default_counts_only_where_no_task_gives_the_parameter() -> None:
+def test_a_default_applies_only_if_no_task_sets_the_parameter() -> None:
     assert only(of(task("a", {"region": "n"}))).parameters == {"region": "n", "rateHz": 10, "mode": "plain"}
     assert only(of(task("a", {"region": "n", "rateHz": 2}))).parameters["rateHz"] == 2
 
 
-def test_a_task_that_differs_where_all_must_agree_contributes_nothing_at_all() -> None:
+def test_with_strategy_same_a_differing_task_contributes_nothing() -> None:
     first = task("first", {"region": "n", "model": "small", "sources": ["a"]})
     later = task("later", {"region": "n", "model": "large", "sources": ["b"], "rateHz": 50}, created=1)
     outcome = of(later, first)
@@ -108,7 +108,7 @@ def test_a_task_that_differs_where_all_must_agree_contributes_nothing_at_all() -
         assert part in verdict.message
 
 
-def test_priority_beats_age_and_age_beats_the_name() -> None:
+def test_higher_priority_wins_then_age_then_name() -> None:
     parameters = [{"region": "n", "model": model} for model in ("x", "y", "z")]
     oldest = task("c", parameters[0], created=0)
     name_first = task("a", parameters[1], created=1)
@@ -117,7 +117,7 @@ def test_priority_beats_age_and_age_beats_the_name() -> None:
     assert only(of(task("b", parameters[0]), task("a", parameters[1]))).parameters["model"] == "y"
 
 
-def test_a_conflict_dissolves_when_the_other_task_ends() -> None:
+def test_a_conflict_is_resolved_when_the_other_task_ends() -> None:
     first = {"region": "n", "model": "small"}
     later = task("later", {"region": "n", "model": "large"}, created=1)
     assert only(of(task("first", first), later)).tasks == ("first",)
@@ -171,14 +171,14 @@ def test_more_than_64_kib_are_refused() -> None:
     assert "65537 bytes" in over.verdicts["a"].message
 
 
-def test_an_unknown_template_is_named_and_harms_nobody() -> None:
+def test_an_unknown_template_is_named_and_affects_no_other_task() -> None:
     outcome = of(task("a", of="nowhere"), task("b", {"region": "n"}))
     assert outcome.verdicts["a"].reason == "TemplateNotFound"
     assert "'nowhere'" in outcome.verdicts["a"].message
     assert only(outcome).tasks == ("b",)
 
 
-def test_a_persons_instance_is_neither_changed_nor_released() -> None:
+def test_a_manually_created_instance_is_neither_changed_nor_released() -> None:
     mine = instance(by_person=True, parameters={"n": 1})
     outcome = of(task("a"), templates=[template()], instances=[mine])
     decision = only(outcome)
@@ -189,7 +189,7 @@ def test_a_persons_instance_is_neither_changed_nor_released() -> None:
 # --- Linger
 
 
-def test_the_last_demand_leaving_starts_the_linger_and_keeps_the_parameters() -> None:
+def test_the_end_of_the_last_demand_starts_the_linger_with_its_parameters() -> None:
     spec = {"lifecycle": {"linger": "20s"}}
     decision = only(of(task("a", ended=True), templates=[template(**spec)], instances=[instance()]))
     assert (decision.release_time, decision.next_change, decision.parameters) == (NOW + 20, NOW + 20, None)
@@ -223,7 +223,7 @@ def lost(unchanged: float, spec: dict[str, Any] = RELEASE, *, renewed: bool = Tr
     return of(held, templates=[template(**spec)], leases={"det": LeaseView(unchanged, 15, renewed)}, **more)
 
 
-def test_a_holder_counts_until_its_lease_was_unchanged_for_its_duration_and_after() -> None:
+def test_a_holder_counts_until_its_lease_was_not_renewed_for_its_duration_and_the_grace_period() -> None:
     before = lost(24.9)
     assert only(before).tasks == ("a",)
     assert only(before).next_change == pytest.approx(NOW + 0.1)
@@ -232,7 +232,7 @@ def test_a_holder_counts_until_its_lease_was_unchanged_for_its_duration_and_afte
     assert lost(25).instances == {}
 
 
-def test_policy_hold_and_a_person_never_lapse() -> None:
+def test_policy_hold_and_tasks_without_a_holder_never_lapse() -> None:
     assert only(lost(10_000, HOLD)).tasks == ("a",)
     assert only(lost(10_000, held=task("a"))).tasks == ("a",)
 
@@ -250,7 +250,7 @@ def test_a_holder_lost_for_over_an_hour_finishes_its_tasks_until_it_returns() ->
     assert lost(0, held=held).verdicts["a"].kind is VerdictKind.COUNTS
 
 
-def test_a_lost_holder_takes_no_part_in_merging() -> None:
+def test_values_of_a_lost_holder_are_not_merged() -> None:
     outcome = of(
         task("a", {"region": "n", "model": "small"}, holder="det"),
         task("b", {"region": "n", "model": "large"}, created=1),

@@ -85,18 +85,18 @@ def of(*tasks: ApplicationTask, **more: Any) -> NamespaceOutcome:
         ({"Ready": ("False", 500), "Suspended": ("False", 10)}, False, NOW + 50),
     ],
 )
-def test_it_is_overdue_after_its_timeout_in_one_go_and_in_time_after_as_long(
+def test_an_instance_is_overdue_after_not_ready_for_the_timeout_and_recovers_after_ready_as_long(
     since: Any, beyond: bool, change: float | None
 ) -> None:
     assert overdue(runs(**since), template(**FULL), NOW) == ("60s" if beyond else "", change)
 
 
-def test_what_is_suspended_has_all_the_time_and_so_has_what_has_no_timeout() -> None:
+def test_suspended_instances_and_those_without_a_timeout_are_never_overdue() -> None:
     assert overdue(runs(Ready=("False", 500), suspended=True), template(**FULL), NOW) == ("", None)
     assert overdue(runs(Ready=("False", 500)), template("lite", **LITE), NOW) == ("", None)
 
 
-def test_an_update_that_is_refused_makes_nothing_overdue_that_runs() -> None:
+def test_a_rejected_update_makes_no_running_instance_overdue() -> None:
     app = runs(Ready=("False", 500), Applied=("False", 500))
     assert overdue(app, template(**FULL), NOW)[0] == "60s"
     assert app.status is not None
@@ -105,7 +105,7 @@ def test_an_update_that_is_refused_makes_nothing_overdue_that_runs() -> None:
 
 
 @given(st.lists(st.tuples(st.booleans(), st.integers(1, 100)), min_size=1, max_size=12))
-def test_it_changes_only_after_a_whole_timeout_in_the_other_state(series: list[tuple[bool, int]]) -> None:
+def test_the_state_changes_only_after_a_full_timeout_in_the_other_one(series: list[tuple[bool, int]]) -> None:
     """Each pair is whether the app is ready, and for how many seconds; a new manager looks each second."""
     of, app, status = template(**FULL), runs(), ApplicationInstanceStatus()
     now, ready_since, previous = NOW, NOW, False
@@ -136,7 +136,7 @@ def condition(type_: str, holds: bool, since: float) -> Condition:
 # --- What the demand turns to
 
 
-def test_the_fallback_serves_with_what_it_knows_and_the_first_one_tries_on() -> None:
+def test_the_fallback_serves_with_its_known_parameters_and_the_primary_keeps_trying() -> None:
     outcome = of(wants(parameters={"sources": ["car1"]}), wants("b"))
     assert (outcome.instances[NORTH].wanted, outcome.instances[LITE_NORTH].tasks) == (True, ("a", "b"))
     assert outcome.instances[LITE_NORTH].parameters == {"region": "north"}
@@ -148,7 +148,7 @@ def test_the_fallback_serves_with_what_it_knows_and_the_first_one_tries_on() -> 
     )
 
 
-def test_both_instances_report_it() -> None:
+def test_both_instances_report_the_fallback() -> None:
     outcome = of(wants())
     first, other = outcome.instances[NORTH], outcome.instances[LITE_NORTH]
     (timed_out,) = fallback_conditions([], first.overdue, first.fallback, first.stands_in_for)
@@ -159,7 +159,7 @@ def test_both_instances_report_it() -> None:
     assert NORTH in stands_in.message
 
 
-def test_it_returns_and_the_fallback_lingers() -> None:
+def test_the_demand_returns_to_the_primary_and_the_fallback_lingers() -> None:
     back = runs(Ready=("True", 60), TimedOut=("True", 400))
     outcome = of(wants(), instances=[back, runs("lite", Ready=("True", 300))])
     assert (outcome.verdicts["a"].reason, outcome.verdicts["a"].instance) == ("Accepted", NORTH)
@@ -168,7 +168,7 @@ def test_it_returns_and_the_fallback_lingers() -> None:
     assert of(wants(), instances=[soon]).verdicts["a"].instance == LITE_NORTH
 
 
-def test_own_tasks_of_the_fallback_and_those_that_turn_to_it_share_it() -> None:
+def test_tasks_of_the_fallback_template_and_redirected_tasks_share_its_instance() -> None:
     outcome = of(wants(), task("own", {"region": "north"}, of="lite", priority=1))
     assert outcome.instances[LITE_NORTH].tasks == ("own", "a")
     assert outcome.verdicts["own"].reason == "Accepted"
@@ -185,13 +185,13 @@ def test_own_tasks_of_the_fallback_and_those_that_turn_to_it_share_it() -> None:
         ([template("lite", parameters={"region": {"type": "string", "enum": ["south"]}})], "spec.parameters.region"),
     ],
 )
-def test_where_the_fallback_cannot_serve_the_task_reports_why_and_stays(other: Any, shows: str) -> None:
+def test_a_task_stays_with_its_template_and_reports_why_the_fallback_cannot_serve(other: Any, shows: str) -> None:
     verdict = of(wants(), templates=[template(**FULL), *other]).verdicts["a"]
     assert (verdict.kind, verdict.reason, verdict.instance) == (VerdictKind.COUNTS, "FallbackFailed", NORTH)
     assert shows in verdict.message
 
 
-def test_nothing_turns_where_nobody_demands_it_or_it_is_suspended_or_its_holder_is_lost() -> None:
+def test_no_fallback_without_demand_or_while_suspended_or_with_a_lost_holder() -> None:
     assert LITE_NORTH not in of().instances
     assert LITE_NORTH not in of(wants(), task("s", {"region": "north"}, operation="Suspend")).instances
     lost = of(wants(holder="det"), leases={"det": LeaseView(1000, 15)})
@@ -204,7 +204,7 @@ def test_a_fallback_waits_for_a_place_like_all_others() -> None:
     assert "the namespace is at its limit" in verdict.message
 
 
-def test_two_that_fall_back_to_each_other_hand_nothing_on() -> None:
+def test_templates_that_fall_back_to_each_other_do_not_forward_redirected_tasks() -> None:
     lite = {**LITE, "lifecycle": {"readyTimeout": "60s", "fallback": {"templateName": "app"}}}
     templates = [template(**FULL), template("lite", **lite)]
     other = runs("lite", Ready=("False", 100), TimedOut=("True", 40))
@@ -237,7 +237,7 @@ def demands(which: Any) -> list[ApplicationTask]:
 
 @few
 @given(drawn, st.sets(st.sampled_from("xyz")), st.none() | st.integers(1, 4), st.randoms())
-def test_no_order_and_no_duplication_changes_anything(
+def test_order_and_duplication_of_objects_do_not_matter(
     which: Any, slow: set[str], limit: int | None, source: random.Random
 ) -> None:
     live, existing = demands(which), [late(each) for each in sorted(slow)]
@@ -250,7 +250,7 @@ def test_no_order_and_no_duplication_changes_anything(
 
 @few
 @given(drawn, st.sets(st.sampled_from("xyz")), st.none() | st.integers(1, 4), st.randoms())
-def test_the_manager_comes_to_the_same_whatever_it_hears_of_first(
+def test_the_managers_decisions_do_not_depend_on_the_order_of_events(
     which: Any, slow: set[str], limit: int | None, source: random.Random
 ) -> None:
     live, existing = demands(which), [late(each) for each in sorted(slow)]

@@ -100,16 +100,16 @@ def test_a_higher_priority_preempts_and_both_tasks_name_the_other() -> None:
     assert running(of(served(low))) == {"low"}
 
 
-def test_one_that_never_ran_was_not_preempted() -> None:
+def test_an_instance_that_never_ran_does_not_report_preemption() -> None:
     assert of(wants("low"), wants("high", priority=5, created=1)).verdicts["low"].reason == "LimitReached"
 
 
-def test_an_equal_one_never_preempts_though_it_is_older() -> None:
+def test_an_older_task_of_equal_priority_never_preempts() -> None:
     outcome = of(wants("old"), wants("new", created=9), instances=[runs("new")])
     assert (running(outcome), going(outcome)) == ({"new"}, set())
 
 
-def test_what_lingers_yields_first_and_the_one_that_would_go_first() -> None:
+def test_lingering_instances_yield_first_in_order_of_their_deadlines() -> None:
     lingering = [runs("a", release_at=NOW + 20), runs("b", release_at=NOW + 10)]
     first = of(wants("c"), instances=lingering, limit=2)
     assert (running(first), going(first)) == (set(), {"b"})
@@ -117,7 +117,7 @@ def test_what_lingers_yields_first_and_the_one_that_would_go_first() -> None:
     assert going(of(wants("b"), instances=[*lingering], limit=2)) == set()
 
 
-def test_what_is_being_deleted_has_its_place_until_it_is_gone() -> None:
+def test_an_instance_being_deleted_keeps_its_place_until_it_is_gone() -> None:
     there = runs("a")
     metadata = there.metadata.model_copy(update={"deletion_timestamp": format_seconds(NOW)})
     outcome = of(wants("b"), instances=[there.model_copy(update={"metadata": metadata})])
@@ -125,14 +125,14 @@ def test_what_is_being_deleted_has_its_place_until_it_is_gone() -> None:
     assert f"starts once {there.name} is deleted" in outcome.verdicts["b"].message
 
 
-def test_a_lower_limit_stops_the_last_in_order() -> None:
+def test_lowering_the_limit_stops_the_last_in_order() -> None:
     tasks = [wants("a"), wants("b", created=1), wants("c", created=2)]
     outcome = of(*tasks, instances=[runs(each) for each in "abc"], limit=2)
     assert (running(outcome), going(outcome)) == ({"a", "b"}, {"c"})
     assert outcome.verdicts["c"].reason == "LimitReached"
 
 
-def test_the_namespace_has_a_limit_over_all_templates_and_the_baseline_comes_last() -> None:
+def test_the_namespace_limit_covers_all_templates_and_baselines_rank_last() -> None:
     always = template("always", baseline={"parameters": {}})
     templates = [limited(None), limited(None, "map"), always]
     tasks = [wants("a"), wants("b", of="map", created=1), wants("c", of="map", created=2)]
@@ -150,17 +150,17 @@ def test_both_limits_hold_at_once() -> None:
 
 
 @pytest.mark.parametrize("annotation", ["wayside.dev/pause", "wayside.dev/hold"])
-def test_what_a_person_keeps_is_not_preempted_and_counts(annotation: str) -> None:
+def test_a_manually_held_instance_is_not_preempted_and_counts(annotation: str) -> None:
     kept = runs("low", annotations={annotation: "anna"})
     outcome = of(wants("low"), wants("high", priority=5), instances=[kept])
     assert (running(outcome), going(outcome)) == ({"low"}, set())
 
 
-def test_what_a_person_made_takes_no_place() -> None:
+def test_a_manually_created_instance_takes_no_place() -> None:
     assert running(of(wants("a"), instances=[runs("mine", by_person=True)])) == {"a"}
 
 
-def test_what_acts_on_an_instance_without_a_place_waits_with_it() -> None:
+def test_tasks_that_act_on_an_instance_without_a_place_wait_too() -> None:
     tasks = [wants("a"), wants("b", created=1), task("stop", {"region": "b"}, operation="Suspend")]
     verdict = of(*tasks).verdicts["stop"]
     assert (verdict.kind, verdict.reason) == (VerdictKind.WAITING, "NothingRuns")
@@ -268,7 +268,7 @@ class SimulatedNamespace:
 
 @few
 @given(demands, demands, limits, st.randoms())
-def test_no_order_and_no_duplication_changes_anything(before: Any, drawn: Any, bounds: Any, source: Any) -> None:
+def test_order_and_duplication_of_objects_do_not_matter(before: Any, drawn: Any, bounds: Any, source: Any) -> None:
     site, live = SimulatedNamespace(bounds), tasks_of(drawn)
     site.settle(tasks_of(before, "b"), linger=False)
     expected = site.outcome(live)
@@ -281,9 +281,7 @@ def test_no_order_and_no_duplication_changes_anything(before: Any, drawn: Any, b
 
 @few
 @given(st.lists(demands, min_size=1, max_size=4), limits, st.sampled_from([0, 4]), st.randoms())
-def test_no_limit_is_ever_exceeded_whatever_comes_and_whatever_is_slow(
-    history: Any, bounds: Any, uptime: int, source: Any
-) -> None:
+def test_no_limit_is_ever_exceeded_in_any_order_of_steps(history: Any, bounds: Any, uptime: int, source: Any) -> None:
     site = SimulatedNamespace(bounds, uptime)
     for index, drawn in enumerate(history):
         live = tasks_of(drawn, f"h{index}-")
@@ -318,7 +316,7 @@ def test_a_higher_priority_never_waits_while_a_lower_one_runs(before: Any, drawn
 
 @few
 @given(demands, demands, limits)
-def test_it_comes_to_rest_and_a_demand_that_goes_restores_what_was(drawn: Any, more: Any, bounds: Any) -> None:
+def test_decisions_converge_and_an_ended_demand_restores_the_former_state(drawn: Any, more: Any, bounds: Any) -> None:
     site, live = SimulatedNamespace(bounds), tasks_of(drawn)
     site.settle(live)
     before = set(site.instances)
@@ -333,7 +331,7 @@ def test_it_comes_to_rest_and_a_demand_that_goes_restores_what_was(drawn: Any, m
 
 @few
 @given(demands, limits, st.integers(0, 40))
-def test_from_nothing_the_first_in_order_run(drawn: Any, bounds: Any, seconds: int) -> None:
+def test_with_no_instances_the_first_in_order_run(drawn: Any, bounds: Any, seconds: int) -> None:
     """The order by hand: one after the other, as far as there is room; and time alone changes nothing."""
     site, live = SimulatedNamespace(bounds), tasks_of(drawn)
     expected: dict[str, str] = {}

@@ -33,17 +33,17 @@ def annotated(annotation: str, value: str = "true", **more: Any) -> ApplicationI
 
 
 @pytest.mark.parametrize(("value", "counts"), [("", True), ("true", True), ("anna, measuring", True), ("False", False)])
-def test_an_annotation_counts_whatever_its_value_but_for_false(value: str, counts: bool) -> None:
+def test_an_annotation_counts_with_any_value_except_false(value: str, counts: bool) -> None:
     assert is_paused(annotated(PAUSE_ANNOTATION, value)) is counts
     assert is_held(annotated(HOLD_ANNOTATION, value)) is counts
 
 
-def test_a_held_instance_is_not_released_and_lingers_from_when_the_hold_is_gone() -> None:
+def test_a_held_instance_is_not_released_and_lingers_once_the_hold_is_removed() -> None:
     assert decided(annotated(HOLD_ANNOTATION, release_at=NOW - 5)).release_time is None
     assert decided(instance()).release_time == NOW + 30
 
 
-def test_a_held_instance_serves_demands_as_ever() -> None:
+def test_a_held_instance_serves_demands_normally() -> None:
     decision = decided(annotated(HOLD_ANNOTATION), task("a", {"rate": 5}))
     assert (decision.parameters, decision.tasks) == ({"rate": 5}, ("a",))
 
@@ -57,11 +57,11 @@ def test_a_paused_instance_keeps_its_values_and_is_not_released() -> None:
     assert not decided(paused, task("a", {"rate": 3})).withheld
 
 
-def test_a_persons_instance_can_be_paused_too() -> None:
+def test_a_manually_created_instance_can_be_paused_too() -> None:
     assert decided(annotated(PAUSE_ANNOTATION, by_person=True)).paused
 
 
-def test_the_status_reports_who_keeps_it_and_once_more_when_that_is_over() -> None:
+def test_the_status_reports_pause_and_hold_and_their_end() -> None:
     assert list(manual_conditions(instance())) == []
     held = annotated(HOLD_ANNOTATION, "anna, measuring")
     (state,) = manual_conditions(held)

@@ -34,7 +34,7 @@ def lease(renewed: str, duration: int = 3, **metadata: Any) -> dict[str, Any]:
     }
 
 
-def test_a_lease_is_as_old_as_we_have_seen_it_unchanged() -> None:
+def test_the_age_of_a_lease_is_the_observed_time_without_change() -> None:
     index = LeaseIndex()
     assert index.observe(KEY, lease("2020-01-01T00:00:00Z"), 10.0) is False
     index.observe(KEY, lease("2020-01-01T00:00:00Z"), 12.0)
@@ -44,7 +44,7 @@ def test_a_lease_is_as_old_as_we_have_seen_it_unchanged() -> None:
     assert index.view(KEY) == LeaseView(1.5, 3.0, renewed=True)
 
 
-def test_time_in_which_nobody_looked_reports_nothing() -> None:
+def test_time_without_observations_does_not_count() -> None:
     index = LeaseIndex()
     index.observe(KEY, lease("a"), 0.0)
     assert index.view(KEY).unchanged == 0.0
@@ -52,7 +52,7 @@ def test_time_in_which_nobody_looked_reports_nothing() -> None:
     assert index.due(KEY, 3.0)
 
 
-def test_the_longer_a_lease_is_overdue_the_rarer_it_is_looked_at() -> None:
+def test_overdue_leases_are_read_with_growing_intervals() -> None:
     index = LeaseIndex()
     index.observe(KEY, lease("a"), 0.0)
     looks = []
@@ -67,14 +67,14 @@ def test_the_longer_a_lease_is_overdue_the_rarer_it_is_looked_at() -> None:
     assert all(later - 3 <= (earlier - 3) * 1.25 + 1 for earlier, later in itertools.pairwise(looks))
 
 
-def test_seeing_the_same_again_is_no_renewal() -> None:
+def test_an_unchanged_lease_is_not_a_renewal() -> None:
     index = LeaseIndex()
     index.observe(KEY, lease("a"), 0.0)
     assert index.observe(KEY, lease("a", resourceVersion="9", labels={"x": "y"}), 6.0) is False
     assert index.view(KEY).unchanged == 6.0
 
 
-def test_a_lease_that_vanishes_is_no_renewal_but_one_that_appears_is() -> None:
+def test_a_new_lease_is_a_renewal_and_a_deleted_one_is_not() -> None:
     index = LeaseIndex()
     index.observe(KEY, lease("a"), 0.0)
     assert index.observe(KEY, None, 4.0) is False
@@ -84,7 +84,7 @@ def test_a_lease_that_vanishes_is_no_renewal_but_one_that_appears_is() -> None:
     assert index.view(KEY).unchanged == 0.0
 
 
-def test_the_first_look_at_a_lease_is_no_sign_of_life_even_after_an_earlier_request() -> None:
+def test_the_first_observation_of_a_lease_is_not_a_renewal_even_after_an_earlier_request() -> None:
     index = LeaseIndex()
     index.expect(KEY, 1.0)
     assert index.view(KEY).unchanged == 0.0
@@ -96,7 +96,7 @@ def test_the_first_look_at_a_lease_is_no_sign_of_life_even_after_an_earlier_requ
     assert index.observe(KEY, lease("b"), 4.0) is True
 
 
-def test_a_lease_that_was_looked_for_and_appears_is_a_sign_of_life() -> None:
+def test_a_lease_that_appears_after_it_was_missing_is_a_renewal() -> None:
     index = LeaseIndex()
     index.expect(KEY, 1.0)
     index.observe(KEY, None, 2.0)
@@ -104,7 +104,7 @@ def test_a_lease_that_was_looked_for_and_appears_is_a_sign_of_life() -> None:
     assert index.view(KEY).renewed
 
 
-def test_a_holder_without_a_lease_counts_from_when_we_first_heard_of_it() -> None:
+def test_a_holder_without_a_lease_counts_from_its_first_mention() -> None:
     index = LeaseIndex()
     assert index.view(KEY) == LeaseView(0.0, DEFAULT_DURATION, renewed=False)  # which changes nothing
     index.expect(KEY, 7.0)
@@ -113,21 +113,21 @@ def test_a_holder_without_a_lease_counts_from_when_we_first_heard_of_it() -> Non
     assert index.view(KEY).unchanged == 2.0
 
 
-def test_what_concerns_nobody_is_forgotten() -> None:
+def test_leases_without_demands_are_forgotten() -> None:
     index = LeaseIndex()
     index.observe(KEY, lease("a"), 0.0)
     index.forget_except([])
     assert index.view(KEY).unchanged == 0.0
 
 
-def test_an_outage_does_not_count() -> None:
+def test_time_during_an_outage_does_not_count() -> None:
     time = HealthyTime(longest=5)
     for now, succeeded in ((0, True), (1, True), (2, False), (20, False), (21, True), (22, True)):
         time.look(float(now), succeeded=succeeded)
     assert time.elapsed == 2.0
 
 
-def test_a_time_in_which_we_stood_still_does_not_count() -> None:
+def test_time_while_the_manager_was_suspended_does_not_count() -> None:
     time = HealthyTime(longest=5)
     for now in (0.0, 60.0, 61.0):
         time.look(now, succeeded=True)

@@ -39,14 +39,14 @@ def decided(cache: ClusterCache, at: float) -> Decision:
     return found.decision
 
 
-def test_a_deadline_holds_from_when_it_was_decided_though_no_status_reports_it_yet() -> None:
+def test_a_deadline_counts_from_its_decision_before_any_status_has_it() -> None:
     cache = cache_with(instance())
     assert decided(cache, 0).release_time == NOW + 30
     assert decided(cache, 20).release_time == NOW + 30
     assert decided(cache, 31).release_time == NOW + 30
 
 
-def test_a_demand_that_came_and_went_restarts_the_linger_though_the_status_has_the_old_deadline() -> None:
+def test_a_short_demand_restarts_the_linger_though_the_status_has_the_old_deadline() -> None:
     cache = cache_with(instance(release_at=NOW + 10))
     assert decided(cache, 0).release_time == NOW + 10
     claim(cache, task("a"))
@@ -55,11 +55,11 @@ def test_a_demand_that_came_and_went_restarts_the_linger_though_the_status_has_t
     assert decided(cache, 9).release_time == NOW + 9 + 30
 
 
-def test_after_a_restart_the_status_is_what_is_known() -> None:
+def test_after_a_restart_the_deadline_of_the_status_counts() -> None:
     assert decided(cache_with(instance(release_at=NOW + 10)), 5).release_time == NOW + 10
 
 
-def test_the_deadline_of_a_namesake_is_worth_nothing() -> None:
+def test_the_deadline_of_a_former_instance_of_the_same_name_is_ignored() -> None:
     cache = cache_with(instance())
     assert decided(cache, 0).release_time == NOW + 30
     successor = instance()
@@ -69,7 +69,7 @@ def test_the_deadline_of_a_namesake_is_worth_nothing() -> None:
     assert decided(cache, 20).release_time == NOW + 50
 
 
-def test_the_deadline_of_what_is_gone_is_forgotten() -> None:
+def test_the_deadline_of_a_deleted_instance_is_forgotten() -> None:
     cache = cache_with(instance(release_at=NOW + 10))
     decided(cache, 0)
     entry = cache.store.get(INSTANCE, NAME)

@@ -50,7 +50,7 @@ def index_of(answers: Answers) -> ClaimIndex:
     return ClaimIndex(ClaimEvaluator(answers, lambda _: None))  # type: ignore[arg-type]  it has what is used
 
 
-def test_a_key_that_only_reads_parameters_is_worked_out_at_once_and_all_else_elsewhere() -> None:
+def test_a_key_of_plain_parameters_is_computed_inline_and_others_in_workers() -> None:
     for key in ("${parameters.region}", "lane-${ parameters.region }", "fixed"):
         answers = Answers()
         index_of(answers).note(NAME, Entry({}, task()), template(key))
@@ -65,7 +65,7 @@ def test_a_key_that_only_reads_parameters_is_worked_out_at_once_and_all_else_els
         assert answers.requested
 
 
-def test_a_task_keeps_the_claim_that_it_had_until_the_new_one_is_known() -> None:
+def test_a_task_keeps_its_old_claim_until_the_new_one_is_known() -> None:
     answers = Answers()
     index, made = index_of(answers), template(pattern="^[a-z]+$")
     first = claim_or_verdict(made, task())
@@ -85,7 +85,7 @@ def test_a_task_keeps_the_claim_that_it_had_until_the_new_one_is_known() -> None
     assert (verdict.kind, index.claim(NAME), index.pending(OF)) == (VerdictKind.FINISHED, None, False)
 
 
-def test_a_template_is_unsettled_until_all_tasks_that_were_there_are_known() -> None:
+def test_a_template_is_unsettled_until_the_claims_of_all_existing_tasks_are_known() -> None:
     answers = Answers()
     settled: list[tuple[str, str]] = []
     index, made = index_of(answers), template(pattern="^[a-z]+$")
@@ -103,7 +103,7 @@ def test_a_template_is_unsettled_until_all_tasks_that_were_there_are_known() -> 
     assert index.pending(OF)  # the later one, which nothing can run for yet
 
 
-def test_a_claim_that_takes_too_much_is_refused_and_settles_nothing() -> None:
+def test_a_claim_that_times_out_is_rejected_and_leaves_the_template_unsettled() -> None:
     answers = Answers()
     index, made = index_of(answers), template(pattern="^[a-z]+$")
     index.note(NAME, Entry({}, task()), made)

@@ -141,7 +141,7 @@ def numbered(made: Kind, number: int, status: dict[str, Any] | None = None) -> K
     return type(made).model_validate({**raw, **({"status": status} if status else {})})
 
 
-def test_what_is_being_made_has_its_place_already() -> None:
+def test_an_instance_being_created_already_has_its_place() -> None:
     manager = Manager(1)
     manager.sees(limited(1))
     manager.sees(task("a", {"region": "a"}))

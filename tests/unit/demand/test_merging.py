@@ -57,7 +57,7 @@ def test_the_order_does_not_matter(strategy: str, data: st.DataObject, source: r
 
 @pytest.mark.parametrize("strategy", IDEMPOTENT)
 @given(data=st.data())
-def test_a_value_sent_twice_is_as_sent_once(strategy: str, data: st.DataObject) -> None:
+def test_a_duplicated_value_does_not_change_the_result(strategy: str, data: st.DataObject) -> None:
     logged = data.draw(st.lists(KINDS[strategy][1], min_size=1, max_size=5))
     assert merged(parameter(strategy), *logged, logged[0]) == merged(parameter(strategy), *logged)
 
@@ -90,14 +90,14 @@ def test_a_sum_is_exact_and_is_an_integer_where_it_can_be() -> None:
 
 
 @given(st.lists(st.integers(0, 9), min_size=1, max_size=6), st.integers(9, 30))
-def test_a_sum_is_held_at_the_maximum_and_it_is_reported(logged: list[int], maximum: int) -> None:
+def test_a_sum_is_capped_at_the_maximum_and_reported(logged: list[int], maximum: int) -> None:
     declared = {"p": parameter("Sum", minimum=0, maximum=maximum)}
     result = merge(declared, [Contribution(str(index), {"p": value}) for index, value in enumerate(logged)])
     assert result.parameters["p"] == min(sum(logged), maximum)
     assert bool(result.capped) == (sum(logged) > maximum)
 
 
-def test_the_instance_reports_that_a_sum_is_capped_and_when_it_is_no_more() -> None:
+def test_the_instance_reports_when_a_sum_is_capped_and_no_longer_capped() -> None:
     bandwidth = {"type": "number", "merge": "Sum", "maximum": 50, "description": "Mbit/s"}
     templates = [template(parameters={"rate": bandwidth})]
     here = instance()
@@ -118,7 +118,7 @@ def test_the_instance_reports_that_a_sum_is_capped_and_when_it_is_no_more() -> N
 
 
 @given(st.lists(st.tuples(st.sampled_from(["x", "y"]), NUMBERS), min_size=1, max_size=5))
-def test_where_all_must_agree_those_that_take_part_do(logged: list[tuple[str, Any]]) -> None:
+def test_with_strategy_same_all_contributing_tasks_agree(logged: list[tuple[str, Any]]) -> None:
     declared = {
         "same": Parameter.model_validate({"type": "string"}),
         "max": Parameter.model_validate({"type": "number", "merge": "Max"}),
@@ -150,7 +150,7 @@ def test_where_all_must_agree_those_that_take_part_do(logged: list[tuple[str, An
         ({"type": "string", "default": "a", "required": True}, "remove required or default"),
     ],
 )
-def test_a_parameter_that_makes_no_sense_is_refused(spec: dict[str, Any], message: str) -> None:
+def test_an_invalid_parameter_definition_is_rejected(spec: dict[str, Any], message: str) -> None:
     with pytest.raises(ValidationError, match=message):
         Parameter.model_validate(spec)
 

@@ -61,7 +61,7 @@ def values(outcome: NamespaceOutcome, name: str = NORTH) -> dict[str, Any]:
 # --- Reconfigure
 
 
-def test_a_reconfiguration_lies_over_the_merged_values_and_falls_back() -> None:
+def test_a_reconfiguration_overrides_the_merged_values_until_it_ends() -> None:
     low = change("low", {"region": "north", "rateHz": 2, "sources": ["z"]})
     outcome = of(deploy("a", rateHz=20, sources=["a"]), deploy("b", rateHz=30, sources=["b"]), low)
     assert values(outcome) == {"rateHz": 2, "sources": ["z"]}  # below what the others merge to, and not merged with it
@@ -91,14 +91,14 @@ def test_a_reconfiguration_starts_nothing_and_waits_visibly() -> None:
         assert "waits until a Deploy task does" in verdict.message
 
 
-def test_what_lingers_is_not_reconfigured() -> None:
+def test_lingering_instances_are_not_reconfigured() -> None:
     outcome = of(change("c", {"region": "north", "rateHz": 2}), instances=[instance(NORTH, key="north")])
     assert outcome.instances[NORTH].parameters is None
     assert outcome.instances[NORTH].release_time is not None
     assert outcome.verdicts["c"].kind is VerdictKind.WAITING
 
 
-def test_without_the_keys_parameters_it_is_for_all_instances() -> None:
+def test_a_reconfiguration_without_key_parameters_covers_all_instances() -> None:
     outcome = of(deploy("a"), deploy("b", "south"), change("c", {"rateHz": 2}))
     assert [values(outcome, name)["rateHz"] for name in (NORTH, SOUTH)] == [2, 2]
     assert outcome.verdicts["c"].message == f"reconfigures instances {NORTH}, {SOUTH}"
@@ -107,7 +107,7 @@ def test_without_the_keys_parameters_it_is_for_all_instances() -> None:
     assert [values(only, name)["rateHz"] for name in (NORTH, SOUTH)] == [10, 2]
 
 
-def test_one_for_all_reports_where_it_conflicts() -> None:
+def test_a_reconfiguration_of_all_instances_reports_its_conflicts() -> None:
     here = change("here", {"region": "north", "model": "large"}, priority=1)
     outcome = of(deploy("a"), deploy("b", "south"), here, change("all", {"model": "tiny"}))
     assert (values(outcome)["model"], values(outcome, SOUTH)["model"]) == ("large", "tiny")
@@ -134,13 +134,15 @@ TWO = {
         (stop("c", {"region": "n", "rateHz": 1}), FUSION, "InvalidParameters", "a Suspend task cannot change"),
     ],
 )
-def test_what_cannot_act_on_what_runs_is_refused(wrong: Any, spec: Any, reason: str, message: str) -> None:
+def test_a_task_that_cannot_act_on_running_instances_is_rejected(
+    wrong: Any, spec: Any, reason: str, message: str
+) -> None:
     verdict = of(wrong, spec=spec).verdicts["c"]
     assert (verdict.kind, verdict.reason) == (VerdictKind.REFUSED, reason)
     assert message in verdict.message
 
 
-def test_a_capped_sum_below_a_reconfiguration_is_not_spoken_of() -> None:
+def test_a_capped_sum_overridden_by_a_reconfiguration_is_not_reported() -> None:
     heavy = [deploy("a", load=6), deploy("b", load=6)]
     assert of(*heavy).instances[NORTH].capped == (
         "load: the sum of 2 values, 12, is capped at the maximum of 9",
@@ -164,12 +166,12 @@ def test_a_suspension_wins_from_the_highest_priority_that_deploys(priority: int,
         assert "spec.priority: 1 is below the priority 2 of task b" in verdict.message
 
 
-def test_a_task_that_is_refused_outbids_nobody() -> None:
+def test_a_rejected_task_outranks_no_other() -> None:
     outcome = of(deploy("a", model="x"), task("b", {"region": "north", "model": "y"}, created=1), stop("s", {}))
     assert outcome.instances[NORTH].suspended is True
 
 
-def test_a_suspension_is_for_all_instances_or_for_that_of_its_key_and_starts_nothing() -> None:
+def test_a_suspension_covers_all_instances_or_that_of_its_key_and_starts_none() -> None:
     both = [deploy("a"), deploy("b", "south")]
     assert [each.suspended for each in of(*both, stop("s")).instances.values()] == [True, True]
     assert of(*both, stop("s", {"region": "south"})).instances[NORTH].suspended is False
@@ -209,7 +211,7 @@ def test_a_baseline_runs_without_tasks_and_merges_with_them() -> None:
     assert of(spec=spec, instances=[instance()]).instances["app"].release_time is None
 
 
-def test_all_must_agree_with_a_baseline_where_the_strategy_is_same() -> None:
+def test_with_strategy_same_tasks_must_agree_with_the_baseline() -> None:
     outcome = of(task("a", {"model": "large"}, priority=9), spec=with_baseline(model="small"))
     assert values(outcome, "app")["model"] == "small"
     assert "of the template's baseline" in outcome.verdicts["a"].message
@@ -220,7 +222,7 @@ def test_a_baseline_is_reconfigured_and_suspended_by_any_priority() -> None:
     assert (values(outcome, "app")["rateHz"], outcome.instances["app"].suspended) == (3, True)
 
 
-def test_a_baseline_that_does_not_fit_is_reported_to_the_template_and_one_beside_a_key_is_refused() -> None:
+def test_an_invalid_baseline_is_reported_on_the_template_and_one_with_a_key_is_rejected() -> None:
     with pytest.raises(RenderError, match=r"spec\.baseline\.parameters\.rateHz: 99 is above the maximum of 50"):
         Renderer(template(**with_baseline(rateHz=99)), Policy())
     assert of(spec=with_baseline(rateHz=99)).instances == {}
@@ -282,7 +284,7 @@ def made(outcome: NamespaceOutcome, existing: list[ApplicationInstance]) -> list
 
 @few
 @given(tasks(), st.randoms())
-def test_no_order_and_no_duplication_changes_anything(live: list[ApplicationTask], source: random.Random) -> None:
+def test_order_and_duplication_of_objects_do_not_matter(live: list[ApplicationTask], source: random.Random) -> None:
     shuffled = [*live, *source.sample(live, len(live) // 2)]
     source.shuffle(shuffled)
     assert of(*shuffled) == of(*live)
@@ -290,7 +292,7 @@ def test_no_order_and_no_duplication_changes_anything(live: list[ApplicationTask
 
 @few
 @given(tasks(), tasks(), st.randoms())
-def test_a_manager_that_saw_anything_before_comes_to_the_same_as_a_fresh_one(
+def test_decisions_do_not_depend_on_the_managers_history(
     before: list[ApplicationTask], live: list[ApplicationTask], source: random.Random
 ) -> None:
     instances = made(of(*before), [])
@@ -308,7 +310,7 @@ def test_a_manager_that_saw_anything_before_comes_to_the_same_as_a_fresh_one(
 
 @few
 @given(tasks(), tasks())
-def test_a_task_that_comes_and_goes_restores_what_was(
+def test_a_task_that_starts_and_ends_restores_the_former_state(
     live: list[ApplicationTask], others: list[ApplicationTask]
 ) -> None:
     extra = [each.model_copy(update={"metadata": each.metadata.model_copy(update={"name": f"x-{each.name}"})})
@@ -321,7 +323,7 @@ def test_a_task_that_comes_and_goes_restores_what_was(
 
 @few
 @given(tasks())
-def test_every_task_reports_what_became_of_it_and_none_but_deploy_makes_anything_run(
+def test_every_task_has_a_result_and_only_deploy_starts_instances(
     live: list[ApplicationTask],
 ) -> None:
     outcome = of(*live)

@@ -10,7 +10,7 @@ def text(size: int) -> str:
     return "x" * (size - 2)  # with its quotes
 
 
-def test_a_parameter_may_be_as_large_as_a_task_and_no_larger() -> None:
+def test_a_parameter_may_be_at_most_as_large_as_a_task() -> None:
     assert too_large({}, []) == ""
     assert too_large({"a": text(freedata.MAXIMUM_BYTES)}, []) == ""
     assert too_large({"a": text(freedata.MAXIMUM_BYTES + 1)}, []).startswith(

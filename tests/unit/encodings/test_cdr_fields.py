@@ -136,7 +136,7 @@ def test_values_are_plain_as_decoded_or_missing() -> None:
     assert not found.odd
 
 
-def test_a_path_through_what_has_no_members_makes_every_message_odd() -> None:
+def test_a_path_through_a_scalar_makes_every_message_odd() -> None:
     reader = CdrDecoder("nav_msgs/msg/Odometry").field_reader([("child_frame_id", "x"), ("pose", "covariance", 36)])
     assert reader is not None
     found = reader([cdr(odometry())] * 2)
@@ -144,7 +144,7 @@ def test_a_path_through_what_has_no_members_makes_every_message_odd() -> None:
     assert [list(column) for column in found.columns] == [[MISSING] * 2] * 2
 
 
-def test_without_paths_only_what_cannot_be_read_is_reported() -> None:
+def test_without_paths_only_unreadable_payloads_are_reported() -> None:
     assert assert_reads_as_decoded(CdrDecoder("geometry_msgs/msg/PoseStamped"), [], [cdr(pose_stamped()), b""]) == 1
 
 
@@ -217,20 +217,20 @@ def test_many_integers_beyond_doubles_read_as_decoded() -> None:
     assert assert_reads_as_decoded(decoder, paths, [bytes(payload) for payload in payloads]) == 0
 
 
-def test_texts_that_come_by_the_thousands_and_long_ones_read_as_decoded() -> None:
+def test_many_texts_and_long_texts_read_as_decoded() -> None:
     payloads = [cdr(make("std_msgs/String", data=f"text {number}")) for number in range(5000)]
     payloads += [cdr(make("std_msgs/String", data="x" * 10_000))] * 2
     assert_reads_as_decoded(CdrDecoder("std_msgs/msg/String"), [("data",)], payloads * 2)
 
 
 @pytest.mark.parametrize("text", ["float64[0] none\nuint8 x", "string s\nNothing[0] none\nfloat64 x"])
-def test_types_with_empty_arrays_are_read_whole(text: str) -> None:
+def test_types_with_empty_arrays_are_decoded_whole(text: str) -> None:
     nothing = "\n" + "=" * 80 + "\nMSG: test_msgs/Nothing\n"
     types = with_type(text + (nothing if "Nothing" in text else ""))
     assert CdrDecoder("test_msgs/msg/Own", types).field_reader([("x",)]) is None
 
 
-def test_types_that_hold_too_much_are_read_whole() -> None:
+def test_types_with_too_many_fields_are_decoded_whole() -> None:
     line = "=" * 80
     doubled = [f"{line}\nMSG: test_msgs/T{n}\n{chr(10).join(f'T{n + 1} f{m}' for m in range(6))}" for n in range(7)]
     deep = "\n".join(["T0 x", *doubled, f"{line}\nMSG: test_msgs/T7\nstring x"])

@@ -64,7 +64,7 @@ def test_a_message_larger_than_the_copying_limit_reads_the_same() -> None:
 
 
 @pytest.mark.parametrize("value", [0, EXACT, EXACT + 1, 2**63 - 1, -(2**63)])
-def test_integers_that_no_double_holds_stay_integers(value: int) -> None:
+def test_integers_beyond_doubles_stay_integers(value: int) -> None:
     expected = int if abs(value) > EXACT else float
     scalar = CdrDecoder("std_msgs/msg/Int64").decode(cdr(make("std_msgs/Int64", data=value)))["data"]
     layout = make("std_msgs/MultiArrayLayout", dim=[], data_offset=0)
@@ -110,7 +110,7 @@ def test_types_without_a_header_have_no_stamp() -> None:
         cdr(pose_stamped(nanoseconds=SECOND)),
     ],
 )
-def test_a_stamp_that_is_none_is_refused(raw: bytes) -> None:
+def test_an_invalid_stamp_is_rejected(raw: bytes) -> None:
     with pytest.raises(DecodeError, match=r"geometry_msgs/msg/PoseStamped"):
         decoder(MESSAGES[0]).stamp(raw)
 
@@ -148,7 +148,7 @@ def test_json_reads_back_with_doubles(value: Any) -> None:
 
 
 @pytest.mark.parametrize("payload", [b"", b"NaN", b"[Infinity]", b"{'a': 1}", b"[1,]", b"\xff", b"1 2"])
-def test_what_json_does_not_know_is_refused(payload: bytes) -> None:
+def test_nonstandard_json_is_rejected(payload: bytes) -> None:
     with pytest.raises(DecodeError, match="not JSON"):
         JsonDecoder().decode(payload)
 
@@ -166,7 +166,7 @@ def test_the_codec_follows_the_stream(encoding: Encoding) -> None:
     assert type(codec_for(Stream(name="s", key="${client:*}", encoding=encoding, **kind))) is codecs[encoding]
 
 
-def test_an_unknown_type_names_the_stream_the_type_and_what_is_close() -> None:
+def test_an_unknown_type_is_reported_with_its_stream_and_similar_types() -> None:
     stream = Stream(name="pose", key="${client:*}", encoding=Encoding.CDR, type="geometry_msgs/msg/PoseStampd")
     with pytest.raises(
         UnknownTypeError, match=r"streams\[pose\]\.type.*PoseStampd.*did you mean geometry_msgs/msg/Pose"
@@ -198,7 +198,7 @@ VALID = {
 
 
 @pytest.mark.parametrize("encoding", VALID)
-def test_a_detector_counts_what_it_cannot_read_and_continues(encoding: str) -> None:
+def test_a_detector_counts_unreadable_payloads_and_continues(encoding: str) -> None:
     stream = {"name": "s", "key": "${client:*}", "encoding": encoding, **(POSES if encoding == "cdr" else {})}
     looked = {"name": "n", "stream": "s", "where": "has(msg.x)", "over": "10s", "aggregate": "Count"}
     drive = Drive(a_detector(stream), a_rule("r", signals=[looked], when="n >= 0"))

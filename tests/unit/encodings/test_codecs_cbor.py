@@ -27,7 +27,7 @@ values = st.recursive(
 
 
 @given(values, st.booleans(), st.booleans())
-def test_what_cbor2_writes_reads_back_with_doubles(value: Any, canonical: bool, indefinite: bool) -> None:
+def test_output_of_cbor2_reads_back_with_doubles(value: Any, canonical: bool, indefinite: bool) -> None:
     written = cbor2.dumps(value, canonical=canonical, indefinite_containers=indefinite and not canonical)
     decoded = CborDecoder().decode(written)
     assert decoded == value
@@ -55,7 +55,7 @@ def test_what_cbor2_writes_reads_back_with_doubles(value: Any, canonical: bool, 
     ],
     ids=str,
 )
-def test_what_json_has_no_word_for_has_a_plain_reading(value: Any, read: Any) -> None:
+def test_cbor_values_without_a_json_equivalent_are_read_as_plain_values(value: Any, read: Any) -> None:
     decoded = CborDecoder().decode(cbor2.dumps(value))
     assert decoded == read
     assert type(decoded) is type(read)
@@ -85,7 +85,7 @@ CYCLE = b"\xd8\x1c\x81\xd8\x1d\x00"  # tag 28: a list of one item, tag 29: that 
     ],
     ids=lambda value: repr(value[:20]) if isinstance(value, bytes) else value,
 )
-def test_what_is_no_cbor_is_refused(payload: bytes, words: str) -> None:
+def test_invalid_cbor_is_rejected(payload: bytes, words: str) -> None:
     with pytest.raises(DecodeError, match=words):
         CborDecoder().decode(payload)
 

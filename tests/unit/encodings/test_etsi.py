@@ -50,14 +50,14 @@ def test_a_cam_is_a_map_in_si_units_with_null_for_what_is_unavailable() -> None:
 
 
 @pytest.mark.parametrize("name", PDUS)
-def test_whatever_pycrate_encodes_is_read_alike(name: str) -> None:
+def test_any_message_encoded_by_pycrate_is_decoded_equally(name: str) -> None:
     decoder = EtsiDecoder("etsi/" + name.split(maxsplit=1)[0])
     for seed in range(60):
         raw, expected = random_message(name, random.Random(f"{name}{seed}"))
         assert decoder.decode(raw) == expected, seed
 
 
-def test_a_stream_without_type_takes_messages_of_all_kinds_and_one_with_type_no_others() -> None:
+def test_a_stream_without_a_type_accepts_all_messages_and_one_with_a_type_only_its_own() -> None:
     denm, _ = random_message("denm", random.Random(1))
     assert "denm" in EtsiDecoder().decode(denm)
     with pytest.raises(DecodeError, match=r"message 1 \(etsi/denm\), but the stream is of etsi/cam"):
@@ -125,7 +125,7 @@ PUBLISHED = (
         (lambda chance: random_message("mapem", chance), lambda read: None),
     ],
 )
-def test_stamps_of_messages_that_contain_the_whole_time_and_of_those_that_contain_none(raw: Any, seconds: Any) -> None:
+def test_messages_have_a_stamp_only_if_they_contain_the_whole_time(raw: Any, seconds: Any) -> None:
     message, expected = raw(random.Random(3))
     wanted = seconds(expected)
     assert EtsiDecoder().stamp_near(message, NOW) == (None if wanted is None else round(wanted * 1000) * 1_000_000)

@@ -108,9 +108,7 @@ def test_a_message_that_no_package_defines_is_read_by_the_users_modules() -> Non
         ({"late-part": True, "grouped": 0, "further": "tram"}, {"late_part": True, "grouped": 0.0, "further": "tram"}),
     ],
 )
-def test_extensions_are_read_and_those_that_the_definition_does_not_know_are_passed_over(
-    sent: dict[str, Any], seen: dict[str, Any]
-) -> None:
+def test_known_extensions_are_read_and_unknown_ones_are_skipped(sent: dict[str, Any], seen: dict[str, Any]) -> None:
     raw = perception(**sent)
     now = EtsiDecoder("etsi/cpm", OwnDefinitions((PERCEPTION, DICTIONARY))).decode(raw)["payload"]
     assert {key: now[key] for key in now if key not in ("managementContainer", "parts")} == seen
@@ -126,7 +124,7 @@ def test_the_users_modules_leave_messages_of_other_kinds_and_of_the_first_versio
     assert decoder.decode(perception())["header"]["messageId"] == 14.0
 
 
-def test_a_message_whose_definition_has_its_time_elsewhere_has_no_stamp() -> None:
+def test_a_message_without_a_standard_time_field_has_no_stamp() -> None:
     elsewhere = PERCEPTION.replace("managementContainer SEQUENCE", "timing SEQUENCE")
     tools = encoder(DICTIONARY, elsewhere)
     header = {"protocolVersion": 2, "messageId": 14, "stationId": 7}
@@ -229,7 +227,7 @@ def test_random_bytes_are_read_or_refused_for_every_kind_of_type() -> None:
         ([], r"spec.streams\[0\].type: no package provides the ASN.1 definition of etsi/cpm: name the files"),
     ],
 )
-def test_what_is_wrong_with_modules_is_reported_with_their_field(modules: list[dict[str, str]], problem: str) -> None:
+def test_errors_in_asn1_modules_are_reported_by_field(modules: list[dict[str, str]], problem: str) -> None:
     stream = {"name": "cpm", "key": "its/${client:*}/cpm", "encoding": "uper", "type": "etsi/cpm"}
     with pytest.raises(DetectorError, match=problem) as raised:
         stream_readers(a_detector(stream, asn1=modules))

@@ -24,7 +24,7 @@ SEED = 103_097
 
 
 @pytest.mark.parametrize("name", PDUS)
-def test_only_decode_errors_come_of_ten_thousand_hostile_messages(name: str) -> None:
+def test_ten_thousand_hostile_messages_raise_only_decode_errors(name: str) -> None:
     chance = random.Random(name)
     decoder = EtsiDecoder("etsi/" + name.split(maxsplit=1)[0])
     valid = [random_message(name, chance)[0] for _ in range(20)]
@@ -43,12 +43,12 @@ def test_only_decode_errors_come_of_ten_thousand_hostile_messages(name: str) -> 
 
 
 @given(st.binary(max_size=60), st.sampled_from([b"\x11\x00\x1a\x01", b"\x12\x00\x1a\x01\x03\x81\x00\x40", b"\x03\x81"]))
-def test_only_decode_errors_come_of_noise_behind_headers(raw: bytes, headers: bytes) -> None:
+def test_noise_after_valid_headers_raises_only_decode_errors(raw: bytes, headers: bytes) -> None:
     with suppress(DecodeError):
         message_in(headers + raw)
 
 
-def test_what_cannot_be_read_is_counted_and_the_rest_continues() -> None:
+def test_unreadable_its_messages_are_counted_and_others_continue() -> None:
     stream = {"name": "cam", "key": "its/${client:*}/cam", "encoding": "uper", "type": "etsi/cam"}
     rule = a_rule(
         signals=[{"name": "at", "stream": "cam", "value": "msg.cam.generationDeltaTime"}],

@@ -125,12 +125,12 @@ ENCRYPTED = {
         (bytes(70_000), "an ITS packet must have at most 65535 bytes; got 70000"),
     ],
 )
-def test_what_carries_no_readable_message_reports_why(raw: bytes, problem: str) -> None:
+def test_packets_without_a_readable_message_report_the_reason(raw: bytes, problem: str) -> None:
     with pytest.raises(DecodeError, match=problem):
         message_in(raw)
 
 
-def test_envelopes_in_envelopes_come_to_an_end() -> None:
+def test_nesting_of_envelopes_is_bounded() -> None:
     raw = CAM
     for _ in range(3000):
         raw = b"\x03\x80\x82" + len(raw).to_bytes(2, "big") + raw

@@ -50,7 +50,7 @@ def test_values_are_plain_as_decoded_or_missing() -> None:
     assert [type(value) for value in column(("a",), *payloads)[:2]] == [float, int]
 
 
-def test_a_path_through_what_has_no_members_makes_the_message_odd() -> None:
+def test_a_path_through_a_json_scalar_makes_the_message_odd() -> None:
     reader = JsonDecoder().field_reader([("a", "x"), ("b",)])
     assert reader is not None
     found = reader([b'{"a": {"x": 1}, "b": 2}', b'{"a": "x", "b": 2}', b'{"a": null}', b"[]", b"{}", b'{"a": {}}'])
@@ -66,7 +66,7 @@ def test_paths_that_lie_below_each_other_and_indices_are_read() -> None:
     assert [list(values) for values in found.columns] == [[1.0], [{"x": 1.0}], [1.0], [2.0], [MISSING]]
 
 
-def test_without_paths_only_what_cannot_be_read_is_reported() -> None:
+def test_without_paths_only_unreadable_payloads_are_reported() -> None:
     assert assert_reads_as_decoded(JsonDecoder(), [], [b"{}", b"1", b"{"]) == 1
 
 
@@ -91,7 +91,7 @@ def test_thousands_of_hostile_payloads_read_as_decoded() -> None:
 @pytest.mark.parametrize(
     "skipped", [b'[%s"]"]', b'[%s"["]', rb'["\"",%s"\\"]', b'{"a":{},"b":[%s]}', b'["","[[",[%s],"]]"]']
 )
-def test_depth_counts_in_what_is_skipped_too(skipped: bytes, depth: int) -> None:
+def test_depth_counts_in_skipped_values_too(skipped: bytes, depth: int) -> None:
     fill = b"[" * (depth - 2) + b"]" * (depth - 2) + b","
     for inner in (fill, fill + b"[[], {}, []]," * 20, b'{"x":' * (depth - 2) + b"0" + b"}" * (depth - 2) + b","):
         payload = b'{"x": 1, "skipped": ' + skipped.replace(b"%s]", inner[:-1] + b"]").replace(b"%s", inner) + b"}"
@@ -100,7 +100,7 @@ def test_depth_counts_in_what_is_skipped_too(skipped: bytes, depth: int) -> None
 
 @pytest.mark.parametrize("depth", [MAX_DEPTH - 1, MAX_DEPTH])
 @pytest.mark.parametrize(("first", "last"), [(b'"]"', b'"["'), (rb'"\"]\""', rb'"\"[\""'), (rb'"]\\"', rb'"[\\"')])
-def test_brackets_in_texts_hide_no_depth(first: bytes, last: bytes, depth: int) -> None:
+def test_brackets_in_texts_do_not_count_as_nesting(first: bytes, last: bytes, depth: int) -> None:
     nested_lists = (b"[" + first + b",") * depth + b"0" + (b"," + last + b"]") * depth
     refused = assert_reads_as_decoded(JsonDecoder(), [("x",)], [b'{"x": 1, "skipped": ' + nested_lists + b"}"])
     assert refused == (depth == MAX_DEPTH)
@@ -125,7 +125,7 @@ def test_messages_that_fit_are_not_decoded_whole() -> None:
 
 
 @pytest.mark.parametrize("path", [(0,), (0, "x"), ('"',), ("a", "\\"), ("\0",), ("\ud800",)])
-def test_what_needs_the_whole_message_has_no_reader(path: Path) -> None:
+def test_paths_that_need_the_whole_message_have_no_field_reader(path: Path) -> None:
     assert JsonDecoder().field_reader([path, ("x",)]) is None
 
 

@@ -118,7 +118,7 @@ def test_a_text_may_hold_all_that_it_refers_to() -> None:
         ("int32 x", False),
     ],
 )
-def test_the_stamp_is_that_of_the_header_wherever_it_stands(fields: str, stamped: bool) -> None:
+def test_the_stamp_is_that_of_the_header_at_any_position(fields: str, stamped: bool) -> None:
     store = other_store({"a_msgs/msg/A": fields})
     empty = {"x": 1, "text": "abc", "more": np.array([1], np.int8)}
     header = store.types["std_msgs/msg/Header"](store.types["builtin_interfaces/msg/Time"](8, 9), "")
@@ -176,11 +176,11 @@ A, B = "a_msgs/msg/A", "a_msgs/msg/B"
         (f"int32 X={'9' * 5000}", "line 1: 'int32 X=999"),
     ],
 )
-def test_what_is_wrong_with_a_definition_is_reported_with_its_line(text: str, words: str) -> None:
+def test_errors_in_a_definition_are_reported_with_their_line(text: str, words: str) -> None:
     assert words in wrong((A, text))[A]
 
 
-def test_what_is_wrong_between_definitions_is_reported() -> None:
+def test_errors_between_definitions_are_reported() -> None:
     assert "a_msgs/msg/A → a_msgs/msg/B → a_msgs/msg/A" in wrong((A, "B b"), (B, "A a"))[A]
     assert "defines a_msgs/msg/A differently" in wrong((A, "int32 x"), (B, "A a\n===\nMSG: a_msgs/A\nint64 x"))[B]
     chain = [(f"a_msgs/msg/N{n}", f"N{n + 1} one\nN{n + 1} two") for n in range(70)]
@@ -189,7 +189,7 @@ def test_what_is_wrong_between_definitions_is_reported() -> None:
 
 @settings(max_examples=150, deadline=None)
 @given(st.data())
-def test_a_strange_text_is_a_definition_or_an_error(data: st.DataObject) -> None:
+def test_any_text_is_a_definition_or_an_error(data: st.DataObject) -> None:
     text = data.draw(st.sampled_from([*TEXTS.values(), ""]))
     for _ in range(data.draw(st.integers(1, 4))):
         place = data.draw(st.integers(0, len(text)))
@@ -377,7 +377,7 @@ def test_a_definition_that_cannot_be_read_is_an_error_unless_the_type_is_known(
     assert ("using the known one" in caplog.text) is bool(text)
 
 
-def test_a_definition_of_the_recording_that_lacks_a_part_is_reported(tmp_path: Path) -> None:
+def test_an_incomplete_definition_in_a_recording_is_reported(tmp_path: Path) -> None:
     with pytest.raises(DetectorError, match=r"spec\.messages\[0\]\.definition: line 1: x is of fleet_msgs/msg/Nowhere"):
         stream_readers(with_recorded(mcap(tmp_path / "a.mcap", "Nowhere x")))
 
