@@ -1,11 +1,11 @@
-"""The API server, as both programs need it: JSON objects in and out, over one shared client of kubernetes.aio.
+"""The Kubernetes client of both programs: JSON objects in and out, over one shared client of kubernetes.aio.
 
-The generated model classes are not used: they cost more time than the requests, and a manifest is JSON anyway.
+The generated model classes are not used: they take more time than the requests, and a manifest is JSON anyway.
 
 An API server that is overloaded or just starting rejects requests with 429, or with 503 and Retry-After. A paced client
-retries these after the requested time, and sends nothing else in the meantime. Only an active manager writes: each
-write needs its response within the time for which the manager may act, and the API server itself aborts writes that
-take longer.
+retries these after the requested time, and sends nothing else in the meantime. Only an active manager writes: the
+timeout of each write is at most the time for which the manager may act, and the API server aborts writes that take
+longer.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ _JSON_PATCH = "application/json-patch+json"
 _STRATEGIC = "application/strategic-merge-patch+json"
 _JSON = "application/json"
 _TIMEOUT = 15.0  # s for one request
-_CONNECTING = 2.0  # s for a connection to be opened; less than what lies between an old manager's end and a new one
-_PATIENCE = 30.0  # s in which a request is sent again that the API server rejected unprocessed
-_FIRST, _MOST = 10, 100  # objects of a list's first page, and of any: each may have 1.5 MB
+_CONNECTING = 2.0  # s to open a connection; less than the pause between an old manager and a new one
+_PATIENCE = 30.0  # s in which a request that the API server rejected unprocessed is retried
+_FIRST, _MOST = 10, 100  # objects of the first page of a list, and of any page; an object may have 1.5 MB
 _PAGE_BYTES = 4 * 1024 * 1024
-_RESTARTS = 3  # of a list whose rest is not there any more
-_NO_RIGHT = re.compile(r'User ".*" cannot \w+ resource ')  # RBAC's words; a quota refuses with 403 too
+_RESTARTS = 3  # of a list whose remaining pages have expired
+_NO_RIGHT = re.compile(r'User ".*" cannot \w+ resource ')  # the message of RBAC; a quota also refuses with 403
 _NO_CONNECTION = (TimeoutError, aiohttp.ClientError, OSError)
 _NAMESPACE = re.compile(r"/namespaces/([^/]+)/")
 
 NO_ANSWER = "none"
-"""The code of a request that the API server did not answer."""
+"""The code of a request without a response of the API server."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,12 +72,12 @@ _DECODE_PAGE = msgspec.json.Decoder(_Page).decode
 
 
 class Client:
-    """The verbs. Each raises ApiError where the API server refuses, and Unreachable where it does not answer.
+    """The verbs. Each raises ApiError if the API server refuses the request, and Unreachable if it does not respond.
 
     Attributes:
-        may_act: for how many seconds we may write; none or less: not at all, and each write raises NotActive.
-        may_write: whether we may write in a namespace; where not, each write raises NotGranted. None: as it comes.
-        open_until: until when, on the monotonic clock, a write may yet be done that was sent and not answered.
+        may_act: the number of seconds for which the client may write; if it is 0 or less, each write raises NotActive.
+        may_write: whether the client may write in a namespace; if not, each write raises NotGranted. None: not checked.
+        open_until: the time on the monotonic clock until which a write without a response may still be executed.
     """
 
     def __init__(
@@ -94,13 +94,13 @@ class Client:
         """Prepare; nothing is sent yet.
 
         Args:
-            configuration: where the API server is, and the account.
-            program: the name for the API server's audit log.
-            field_manager: of what is written.
-            remedy: what to do where the account lacks a right.
-            measure: gets the method of each request, its seconds and the code of the answer, or NO_ANSWER.
-            pacing: lets requests begin; None: each begins at once, and is not sent again.
-            timeout: seconds in which a request must be answered.
+            configuration: the address of the API server, and the account.
+            program: the user agent, for the API server's audit log.
+            field_manager: the field manager of all writes.
+            remedy: the remedy for a missing right, for the error's text.
+            measure: receives the method of each request, its seconds, and the code of the response or NO_ANSWER.
+            pacing: decides when requests start; None: each starts at once, and is not retried.
+            timeout: the timeout of a request, in seconds.
         """
         self.configuration = configuration
         self.may_act: Callable[[], float] = lambda: math.inf
@@ -134,10 +134,11 @@ class Client:
     async def pages(
         self, resource: Resource, namespace: str | None, *, labels: str = "", fields: str = "", size: int = _FIRST
     ) -> AsyncIterator[tuple[Iterator[Object], str]]:
-        """The objects and the version of `list`, page by page: `size` at first, then as many as make some 4 MiB.
+        """Yields the pages of a list, each with the resourceVersion of the list. The first page has `size` objects,
+        later pages about 4 MiB.
 
-        Each object is decoded when it is reached: Python needs up to twenty times the size of the text. When
-        the rest of the list has expired (410), it restarts, and objects may come twice.
+        Each object is decoded when it is iterated, since decoding multiplies its size by up to twenty. If the remaining
+        pages have expired (410), the list restarts, and objects may be yielded twice.
         """
         kind = {"apiVersion": resource.api_version, "kind": resource.kind}
         query = {"labelSelector": labels, "fieldSelector": fields}
@@ -162,7 +163,8 @@ class Client:
     async def list(
         self, resource: Resource, namespace: str | None, *, labels: str = "", fields: str = "", limit: int = 0
     ) -> tuple[list[Object], str]:
-        """The objects, with apiVersion and kind, and the resourceVersion of the list; read from the storage itself.
+        """The objects, with apiVersion and kind, and the resourceVersion of the list. It is a consistent read from the
+        storage.
 
         `limit`: the maximum number of objects; 0: no limit.
         """
@@ -210,7 +212,7 @@ class Client:
             raise _unreachable(request, error) from error
 
     async def apply(self, resource: Resource, manifest: Object, *, dry_run: bool = False) -> Object:
-        """Server-side apply, as the one field manager that we are; with `dry_run`, nothing is stored."""
+        """Server-side apply with force, as this client's field manager. With `dry_run`, nothing is stored."""
         metadata = manifest["metadata"]
         path = resource.path(metadata["namespace"], metadata["name"])
         query = {**self._strictly, "force": "true", **({"dryRun": "All"} if dry_run else {})}
@@ -229,7 +231,7 @@ class Client:
         return await self._request("PATCH", resource.path(namespace, name), self._strictly, body, _MERGE)
 
     async def merge(self, resource: Resource, namespace: str, name: str, body: Object) -> bool:
-        """Merge into the object; whether it was there."""
+        """Merge into the object. Returns whether it exists."""
         try:
             await self._request("PATCH", resource.path(namespace, name), self._ours, body, _MERGE)
         except ApiError as error:
@@ -239,21 +241,22 @@ class Client:
         return True
 
     async def patch(self, resource: Resource, namespace: str, name: str, uid: str, changes: Sequence[Object]) -> Object:
-        """Apply a JSON patch to the object with this uid; as stored."""
+        """Apply a JSON patch to the object with this uid. Returns the object as stored."""
         test = {"op": "test", "path": "/metadata/uid", "value": uid}
         return await self._request("PATCH", resource.path(namespace, name), self._ours, [test, *changes], _JSON_PATCH)
 
     async def merge_members(self, resource: Resource, name: str, body: Object) -> Object:
-        """Merge into an object of the cluster, lists by their members' names."""
+        """Merge into a cluster-scoped object; lists are merged by the names of their items."""
         return await self._request("PATCH", resource.path(None, name), self._ours, body, _STRATEGIC)
 
     async def scale(self, resource: Resource, namespace: str, name: str, version: str, replicas: int) -> Object:
-        """Set the replicas of the object by its subresource `scale`, if it is still of this resourceVersion."""
+        """Set the replicas of the object by its subresource `scale`, if it still has this resourceVersion."""
         body = {"metadata": {"resourceVersion": version}, "spec": {"replicas": replicas}}
         return await self._request("PATCH", resource.path(namespace, name, "scale"), self._ours, body, _MERGE)
 
     async def delete(self, resource: Resource, namespace: str, name: str, uid: str) -> bool:
-        """Delete the object with this uid, and in the background what it owns. Returns whether it was there."""
+        """Delete the object with this uid, and the objects that it owns in the background. Returns whether it
+        existed."""
         options = {
             "apiVersion": "v1",
             "kind": "DeleteOptions",
@@ -263,7 +266,7 @@ class Client:
         try:
             await self._request("DELETE", resource.path(namespace, name), body=options)
         except ApiError as error:
-            if error.code in (404, 409):  # gone, or another object of the same name
+            if error.code in (404, 409):  # it does not exist, or has another uid
                 return False
             raise
         return True
@@ -275,12 +278,12 @@ class Client:
         )
 
     async def replace(self, resource: Resource, manifest: Object) -> Object:
-        """Put the object as it is, if it is still of the resourceVersion that the manifest has."""
+        """Replace the object, if it still has the resourceVersion of the manifest."""
         metadata = manifest["metadata"]
         return await self._request("PUT", resource.path(metadata["namespace"], metadata["name"]), self._ours, manifest)
 
     async def review(self, resource: Resource, question: Object) -> Object:
-        """Send a query by POST, which changes nothing: a standby may as well."""
+        """Send a review by POST. It changes nothing, so a standby may send it too."""
         return await self._request("POST", resource.path(None), body=question, writes=False)
 
     async def server_version(self) -> str:
@@ -288,7 +291,7 @@ class Client:
         return str((await self._request("GET", "/version"))["gitVersion"])
 
     async def discover(self, api_version: str) -> dict[tuple[str, str], Resource]:
-        """The kinds of a group and version, by apiVersion and kind; none where the cluster does not have it."""
+        """The kinds of a group and version, by apiVersion and kind; empty if the cluster does not have the group."""
         root = f"/apis/{api_version}" if "/" in api_version else f"/api/{api_version}"
         try:
             answer = await self._request("GET", root)
@@ -322,7 +325,7 @@ class Client:
             raise NotGranted(namespace)
 
     async def _send(self, request: _Request) -> bytes:
-        """Send a request; where the client is paced, retry it for up to 30 s while it is rejected unprocessed."""
+        """Send a request. A paced client retries it for up to 30 s while the API server rejects it unprocessed."""
         deadline = time.monotonic() + _PATIENCE
         found = _NAMESPACE.search(request.path)
         namespace = found[1] if found is not None and request.writes else ""
@@ -348,7 +351,7 @@ class Client:
             seconds = min(seconds, self.may_act())
             if seconds <= 0:
                 raise NotActive
-            query["timeout"] = f"{max(1, int(seconds * 1000))}ms"  # the API server gives up when we do
+            query["timeout"] = f"{max(1, int(seconds * 1000))}ms"  # the API server gives up at the same time
         limit = aiohttp.ClientTimeout(total=seconds, connect=_CONNECTING if request.writes else None)
         url = self.configuration.host + request.path + (f"?{urlencode(query)}" if query else "")
         began, code = time.monotonic(), NO_ANSWER
@@ -380,7 +383,7 @@ class Client:
             status = self._decode(raw)
         except (msgspec.DecodeError, UnicodeDecodeError):
             status = None
-        if not isinstance(status, dict):  # a proxy's page in place of a Status: its beginning is the message
+        if not isinstance(status, dict):  # a proxy's page instead of a Status: its beginning is the message
             return ApiError(code, raw[:500].decode(errors="replace"), seconds)
         details = status.get("details") or {}
         causes = tuple(cause.get("reason", "") for cause in details.get("causes") or ())

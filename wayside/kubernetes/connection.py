@@ -1,4 +1,4 @@
-"""Finding the API server: a kubeconfig, or the pod's own account."""
+"""Finds the API server and the credentials: a kubeconfig, or the pod's service account."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from wayside.inputerror import InputError
 from wayside.kubernetes.client import Client
 
 FOLDER = Path("/var/run/secrets/kubernetes.io/serviceaccount")
-"""Where Kubernetes puts the account of a pod."""
+"""The folder in which Kubernetes mounts the service account of a pod."""
 
 _CONNECTIONS = 32
 _TIMEOUT = 10.0  # s for one request
@@ -27,7 +27,7 @@ _READ_EVERY = 1.0  # s
 _DEFAULT_FILE = "~/.kube/config"
 _REMEDY = "set KUBECONFIG to a kubeconfig file, or run in a pod with a service account"
 _BROKEN = (ConfigException, OSError, YAMLError, ValueError, TypeError, KeyError, AttributeError)
-"""What the loader stumbles over in files that are no text, no YAML or of another shape: it checks little itself."""
+"""The errors of the loader for files that are not text, not YAML or have another structure: it checks little itself."""
 
 # The package claims to be typed, yet these are not.
 _load_kube_config: Any = load_kube_config
@@ -37,30 +37,31 @@ log = logging.getLogger(__name__)
 
 
 class AccountError(Exception):
-    """The pod's account is not there, or not whole; the message names what is missing."""
+    """The pod's service account is missing or incomplete; the message names the missing part."""
 
 
 class ConfigurationError(InputError):
-    """There is no usable kubeconfig, or the cluster lacks what the program needs."""
+    """There is no usable kubeconfig, or the cluster does not have what the program needs."""
 
 
 @dataclass(frozen=True)
 class ApiAccess:
-    """Where the API server is, with the account, and the account's own namespace."""
+    """The address of the API server with the credentials, and the namespace of the account."""
 
     configuration: Configuration
     namespace: str
 
 
 async def load_access(kubeconfig: Path | None = None, otherwise: str = "") -> ApiAccess:
-    """The kubeconfig of KUBECONFIG; in a pod without it, the pod's account; else that of the default file.
+    """The access by the kubeconfig of KUBECONFIG; without it, by the service account in a pod, else by the default
+    kubeconfig.
 
     Args:
-        kubeconfig: a file in place of these.
-        otherwise: what else the user can do where there is none; the error's text ends with it.
+        kubeconfig: a file to use instead of these.
+        otherwise: another remedy for a missing kubeconfig; the error's text ends with it.
 
     Raises:
-        ConfigurationError: there is none that can be used; the message names the file and what is wrong with it.
+        ConfigurationError: there is no usable configuration; the message names the file and the problem.
     """
     remedy = f"{_REMEDY}; or {otherwise}" if otherwise else _REMEDY
     configuration = Configuration()
@@ -77,7 +78,7 @@ async def load_access(kubeconfig: Path | None = None, otherwise: str = "") -> Ap
     if not any(each.is_file() for each in files):
         raise ConfigurationError(f"kubeconfig {shown}: there is no such file: {remedy}")
     try:
-        # Given here, since the library reads the variable when it is imported.
+        # Passed explicitly, since the library reads the variable at import.
         loader = await _load_kube_config(
             config_file=os.pathsep.join(map(str, files)), client_configuration=configuration, persist_config=False
         )
@@ -94,7 +95,7 @@ async def load_configuration() -> Configuration:
 
 @dataclass(frozen=True)
 class Cluster:
-    """A connection and the namespace that it is meant for."""
+    """A connection and its namespace."""
 
     client: Client
     namespace: str
@@ -104,11 +105,11 @@ class Cluster:
 async def connect(
     program: str, namespace: str | None = None, kubeconfig: Path | None = None, *, otherwise: str = ""
 ) -> AsyncIterator[Cluster]:
-    """The one connection that all parts of a program share. Nothing is sent yet: the server may be unavailable.
+    """The one connection that all parts of a program share. Nothing is sent yet, so the server may be unavailable.
 
     Args:
         program: its name, also as field manager of what it writes.
-        namespace: where to work. Default: the account's own.
+        namespace: the namespace to work in. Default: that of the account.
         kubeconfig: see `load_access`.
         otherwise: see `load_access`.
 
@@ -124,7 +125,7 @@ async def connect(
 
 
 def _reason(error: BaseException) -> str:
-    """Why the file cannot be used, in one line."""
+    """The reason why the file cannot be used, in one line."""
     if isinstance(error, UnicodeDecodeError):
         return "it is not UTF-8 text"
     if isinstance(error, OSError):
@@ -138,9 +139,9 @@ def _reason(error: BaseException) -> str:
 
 
 def use_pod_account(configuration: Configuration, folder: Path = FOLDER) -> None:
-    """Have the configuration reach the API server as the pod's account, and follow its token.
+    """Configure access with the pod's service account, and reload its token when it is renewed.
 
-    Raises AccountError where the environment or the folder lacks something.
+    Raises AccountError if a part of the environment or of the folder is missing.
     """
     host, port = (os.environ.get(f"KUBERNETES_SERVICE_{each}") or "" for each in ("HOST", "PORT"))
     if not host or not port:
@@ -156,7 +157,7 @@ def use_pod_account(configuration: Configuration, folder: Path = FOLDER) -> None
     def refresh(of: Configuration) -> None:
         of.api_key["BearerToken"] = f"Bearer {token.newest()}"
 
-    settings: Any = configuration  # whose type has no hook
+    settings: Any = configuration  # its type does not declare the hook
     settings.refresh_api_key_hook = refresh
 
 
@@ -167,10 +168,10 @@ def pod_namespace() -> str:
 
 
 class _Token:
-    """The token of the pod's account, as it was read last: a file that the kubelet replaces while we run.
+    """The token of the pod's service account, from a file that the kubelet replaces from time to time.
 
-    It is renewed long before it ends (after 80 % of its life), and the API server may stop taking the old one at any
-    time. So the file is read again before a request that is made a second or more after the last reading.
+    The kubelet renews the token after 80 % of its lifetime, and the API server may reject the old one at any time. So a
+    request that is sent a second or more after the last reading reads the file again.
     """
 
     def __init__(self, file: Path) -> None:
@@ -180,7 +181,7 @@ class _Token:
         self._reported = False
 
     def read(self) -> str:
-        """The token. Raises AccountError where there is none."""
+        """Read the token. Raises AccountError if there is none."""
         self._read_at = time.monotonic()
         try:
             found = self._file.read_text().strip()
@@ -194,7 +195,7 @@ class _Token:
         return found
 
     def newest(self) -> str:
-        """The token, read again if it is time; the last one while the file cannot be read, which is logged once."""
+        """The token, read again if it is time. While the file cannot be read, which is logged once, the last token."""
         if time.monotonic() - self._read_at < _READ_EVERY:
             return self._token
         try:

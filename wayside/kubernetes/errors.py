@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 _BAD_MANIFEST = "failed to create typed patch object"
-_TRANSIENT = frozenset({401, 408, 409, 429})  # 401: a token that was just renewed is read again with the next request
+_TRANSIENT = frozenset({401, 408, 409, 429})  # 401: the next request reads a renewed token
 
 
 class RequestError(Exception):
     """A request to the API server failed.
 
     Attributes:
-        reason: one word, as the API server gives it.
-        retry_after: seconds to wait that the API server requests; None where it requests none.
-        permanent: whether repeating the request is in vain.
+        reason: the API server's reason, one word.
+        retry_after: the seconds to wait that the API server requests; None if it requests none.
+        permanent: whether a retry cannot succeed.
     """
 
     reason = "Unknown"
@@ -20,8 +20,8 @@ class RequestError(Exception):
     permanent = False
 
 
-class Unreachable(RequestError):  # noqa: N818  a state of the world
-    """The API server gave no answer."""
+class Unreachable(RequestError):  # noqa: N818  a state, not a fault
+    """The API server did not respond."""
 
     reason = "NoAnswer"
 
@@ -34,14 +34,14 @@ class NotActive(Unreachable):
 
 
 class NotGranted(Unreachable):
-    """The account may not write in this namespace: nothing is written there, and nothing needs to be tried again."""
+    """The account may not write in this namespace: nothing is written there, and a retry is useless."""
 
     def __init__(self, namespace: str) -> None:
         super().__init__(f"namespace {namespace} is not granted to this manager, which writes nothing there")
 
 
 class ApiError(RequestError):
-    """The API server refused.
+    """The API server refused the request.
 
     Attributes:
         code: the HTTP status.
@@ -68,16 +68,16 @@ class ApiError(RequestError):
 
     @property
     def exists(self) -> bool:
-        """Whether there is an object of the name already."""
+        """Whether an object of the name already exists."""
         return self.code == 409 and self.reason == "AlreadyExists"
 
     @property
     def terminating(self) -> bool:
-        """Whether the namespace is going or gone."""
+        """Whether the namespace is terminating or deleted."""
         gone = self.code == 404 and self.message.startswith("namespaces ")
         return gone or "NamespaceTerminating" in self.causes
 
     @property
     def replaced(self) -> bool:
-        """Whether the object has another uid than the request requires: it was replaced by a namesake."""
+        """Whether the object has another uid than the request requires: another object has replaced it."""
         return self.code == 409 and "UID in precondition" in self.message

@@ -1,11 +1,11 @@
 """The last check before a write is sent: whether this manager is still active.
 
-Between the first check and the sending a connection is opened, and a process may be stopped for any time. So the check
-is repeated where the bytes are handed to the socket, in one go with that.
+Between the first check and the sending of the request, a connection is opened, and the process may be suspended for any
+time. So the check is repeated immediately before the bytes are passed to the socket.
 
-What is left are the microseconds between that look and the system call: a process that is stopped just there, for
-longer than it may act, sends this one write when it continues. No client can exclude that. The active manager then sees
-what came of it, and puts it right like anything else that nobody demands.
+Only the microseconds between this check and the system call remain: a process that is suspended there for longer than
+it may act sends this one write when it continues. No client can exclude that. The active manager then observes the
+result, and corrects it like any other object that nobody demands.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from typing import Any
 import aiohttp
 
 writing: ContextVar[Callable[[], float] | None] = ContextVar("writing", default=None)
-"""Set while a write is sent: for how many seconds it may be. A request that only reads leaves it None."""
+"""During a write: returns the number of seconds for which it may be sent. None during a read."""
 
 
 class FencedRequest(aiohttp.ClientRequest):
-    """A request that is not sent once its time is over; it fails like one whose connection broke."""
+    """A request that is not sent after its time is over. It fails like one whose connection broke."""
 
     async def send(self, conn: Any) -> aiohttp.ClientResponse:
-        """Send it. Raises ClientConnectionError where its time is over."""
+        """Send the request. Raises ClientConnectionError if its time is over."""
         if _over():
             raise aiohttp.ClientConnectionError(_REASON)
         return await super().send(conn)

@@ -1,11 +1,11 @@
-"""Leases: the names of holders' Leases, and which of several processes holds one. Pure.
+"""Leases: the names of holders' Leases, and the election of the one process that holds a Lease. Pure.
 
-Each process judges a Lease on its own monotonic clock. The holder renews the Lease and may act until a deadline after
-it *sent* its last renewal that was taken. Another process takes the Lease once it has itself *observed it unchanged*
-for its duration, or at once where it was released. Since a renewal is sent before anyone can observe it and the
-deadline is shorter than the duration, the old one has stopped before a new one begins, whatever their clocks show and
-however long either was stopped: every write of the Lease carries the resourceVersion that was read, so only one of two
-can succeed. No time written by others is believed.
+Each process measures time on its own monotonic clock, and ignores the times that others write. The holder renews the
+Lease, and may act until a deadline after it *sent* its last successful renewal. Another process takes the Lease after
+it has *observed it unchanged* for its duration, or at once if it was released. A renewal is sent before anyone can
+observe it, and the deadline is shorter than the duration. So the old holder stops before a new one starts, even if
+clocks differ or a process was suspended. Every write of the Lease carries the resourceVersion that was read, so only
+one of two concurrent writes succeeds.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ PREFIX = "wayside-"
 """The prefix of the names of all holders' Leases."""
 
 HOLDER_LEASE_LABEL = "wayside.dev/holder-lease"
-"""On all holders' Leases, with the value `true`: the manager watches these alone, and not those of every node."""
+"""The label of all holders' Leases, with the value `true`. The manager watches only these, and not the Leases of
+nodes."""
 
 DEFAULT_DURATION = 15.0
 """The default duration of a Lease, in seconds, if the Lease does not specify one."""
@@ -34,21 +35,21 @@ def lease_name(holder: str) -> str:
 
 
 def holder_of(name: str) -> str | None:
-    """Whose Lease has this name; None where it is no holder's."""
+    """The holder whose Lease has this name; None if the name is not that of a holder's Lease."""
     return name.removeprefix(PREFIX) if name.startswith(PREFIX) else None
 
 
 @dataclass(slots=True)
 class LeaseCandidate:
-    """What one process knows of the Lease, and until when it may act. Times are seconds of its monotonic clock.
+    """One process's knowledge of the Lease, and the time until which it may act, in seconds of its monotonic clock.
 
     Attributes:
-        identity: who it is; a container that is started again in its pod is the same, since the former has ended.
-        duration: seconds that a Lease must be observed unchanged before another process takes it; whole, as the API
-            has it.
-        deadline: seconds after the sending of the last renewal in which the process may act.
-        holder: who held the Lease when it was seen last; empty: nobody, or nothing was seen yet.
-        until: when its time is over, unless it renews.
+        identity: the identity of the process. A restarted container of a pod keeps it, since its predecessor has ended.
+        duration: the seconds for which a Lease must be unchanged before another process takes it; an integer, as in
+            the API.
+        deadline: the seconds after the last renewal was sent in which the process may act.
+        holder: the last observed holder of the Lease; empty if there was none, or nothing was observed.
+        until: the time at which the process must stop, unless it renews the Lease.
     """
 
     identity: str
@@ -61,16 +62,16 @@ class LeaseCandidate:
     _was_held: bool = False
 
     def remaining(self, now: float) -> float:
-        """For how many seconds it may act; none or less: it may not."""
+        """The number of seconds for which it may act; 0 or less: it may not."""
         return self.until - now
 
     @property
     def created(self) -> str:
-        """When the Lease was created, by the API server; empty while there is none."""
+        """The creation time of the Lease, set by the API server; empty while there is no Lease."""
         return str(self._metadata().get("creationTimestamp", ""))
 
     def observe(self, lease: Mapping[str, Any] | None, now: float) -> None:
-        """Note the Lease as it was read, None where there is none."""
+        """Note the Lease as it was read; None if it does not exist."""
         if _version(lease) != _version(self._seen):
             self._since = now
         self._seen = lease
@@ -78,24 +79,25 @@ class LeaseCandidate:
             self.holder = _spec(lease).get("holderIdentity") or ""
         self._was_held = self._was_held or bool(self.holder)
         if lease is not None and self.holder != self.identity:
-            self.until = _ANCIENT  # another one, or nobody: whatever we believed is over
+            self.until = _ANCIENT  # another holder or none: this process may no longer act
 
     def may_take(self, now: float) -> bool:
-        """Whether it may write itself into the Lease: that is its own, free, or was unchanged for its duration."""
+        """Whether it may write itself into the Lease: it is the holder, there is none, or the Lease was unchanged for
+        its duration."""
         if self.holder == self.identity:
             return True
         if self._seen is None:
-            # One that vanished may have a holder that has not noticed; where none was ever seen, there is none.
+            # A deleted Lease may have a holder that has not noticed it yet, unless none was ever observed.
             return not self._was_held or now - self._since >= self.duration
         return not self.holder or now - self._since >= self.lasts
 
     @property
     def lasts(self) -> float:
-        """The duration of the Lease as it was seen last."""
+        """The last observed duration of the Lease, in seconds."""
         return float(_spec(self._seen).get("leaseDurationSeconds") or self.duration)
 
     def draft(self, name: str, namespace: str, time: float) -> dict[str, Any]:
-        """The Lease to write, held by this process; `time` in seconds since 1970 is for people to read."""
+        """The Lease to write, held by this process. `time`, in seconds since the epoch, is only for people."""
         spec, metadata = dict(_spec(self._seen)), self._metadata() or {"name": name, "namespace": namespace}
         if spec.get("holderIdentity") != self.identity or "acquireTime" not in spec:
             spec["acquireTime"] = _micro(time)
@@ -104,20 +106,20 @@ class LeaseCandidate:
         return _lease(metadata, spec)
 
     def released(self, time: float) -> dict[str, Any] | None:
-        """The Lease to write so that a standby takes it at once; None where it is not this process's."""
+        """The Lease to write so that a standby takes it at once; None if this process is not its holder."""
         if self._seen is None or self.holder != self.identity:
             return None
         spec = {key: value for key, value in _spec(self._seen).items() if key != "holderIdentity"}
         return _lease(self._metadata(), spec | {"renewTime": _micro(time)})
 
     def took(self, stored: Mapping[str, Any], sent: float, now: float) -> None:
-        """Note that the Lease, as drafted and sent at `sent`, was stored."""
+        """Note that the Lease that was sent at `sent` is stored."""
         self.observe(stored, now)
         if self.holder == self.identity:
             self.until = sent + self.deadline
 
     def _metadata(self) -> dict[str, Any]:
-        """As read, so that labels stay, and with the resourceVersion; empty where there is no Lease."""
+        """The metadata as read, to keep the labels and the resourceVersion; empty if there is no Lease."""
         metadata = (self._seen or {}).get("metadata") or {}
         return {key: value for key, value in metadata.items() if key != "managedFields"}
 
@@ -131,7 +133,7 @@ def _spec(lease: Mapping[str, Any] | None) -> Mapping[str, Any]:
 
 
 def _version(lease: Mapping[str, Any] | None) -> tuple[str, str]:
-    """What any write changes."""
+    """The part of the metadata that every write changes."""
     metadata = (lease or {}).get("metadata") or {}
     return metadata.get("uid", ""), metadata.get("resourceVersion", "")
 

@@ -1,10 +1,12 @@
-"""The pace of requests: a limited number at once, few writes in one namespace, none while the API server wants a pause.
+"""The pace of requests: a maximum number at once, few writes per namespace, and none while the API server requests a
+pause.
 
-Namespaces take turns, and one has as many writes under way as the API server answers without a queue: a flood in one
-leaves the others both the places here and the API server's time. docs/decisions/0029 has the measurements.
+Namespaces take turns, and each has only as many writes in flight as the API server processes without queueing them. So
+many writes in one namespace leave the others both places in this queue and time of the API server. docs/decisions/0029
+has the measurements.
 
-A request that waits here has not begun, so its own time limit does not count yet. The workers of the queues bound the
-number of waiting requests: each worker sends those of one instance.
+The timeout of a request starts only after it has waited here. The number of workers bounds the number of waiting
+requests: each worker sends the requests of one instance.
 """
 
 from __future__ import annotations
@@ -17,23 +19,23 @@ from contextlib import asynccontextmanager
 from typing import Generic, TypeVar
 
 AT_ONCE = 24
-"""Requests that are under way at the same time, of all queues together; watches are apart."""
+"""The maximum number of requests in flight, for all queues together; watches do not count."""
 
 LONGEST_HOLD = 60.0
-"""The maximum seconds of a Retry-After that are respected."""
+"""The maximum pause after a Retry-After, in seconds."""
 
 MOST_WRITES = 8
-"""Writes of one namespace that are under way at the same time, where the API server is quick."""
+"""The maximum number of writes of one namespace in flight, if the API server is fast."""
 
 Item = TypeVar("Item")
 
-_SAMPLE = 16  # writes, whose mean time decides the next step
-_SPARSE, _DENSE = 0.3, 1.0  # of a namespace's writes, those that wait at the API server: TCP Vegas' alpha and beta
-_MEMORY = 300.0  # s; the quickest time is that of this period and the one before
+_SAMPLE = 16  # writes whose mean duration decides about the next step
+_SPARSE, _DENSE = 0.3, 1.0  # writes of a namespace that wait at the API server: alpha and beta of TCP Vegas
+_MEMORY = 300.0  # s; the shortest duration is that of this period and the previous one
 
 
 class FairQueue(Generic[Item]):
-    """A queue that is fair by namespace: namespaces take turns, so a flood of items in one delays no other."""
+    """A queue that is fair to namespaces: they take turns, and a flood of items in one delays no other."""
 
     def __init__(self) -> None:
         self._waiting: OrderedDict[str, deque[Item]] = OrderedDict()  # the first has the next turn
@@ -45,20 +47,20 @@ class FairQueue(Generic[Item]):
         return namespace in self._waiting
 
     def count(self, namespace: str) -> int:
-        """How many items of the namespace wait."""
+        """The number of waiting items of the namespace."""
         return len(self._waiting.get(namespace, ()))
 
     def add(self, namespace: str, item: Item) -> None:
-        """Put an item behind the others of its namespace."""
+        """Append an item to those of its namespace."""
         self._waiting.setdefault(namespace, deque()).append(item)
 
     def next(self, may: Callable[[str], bool] = lambda _: True) -> Item | None:
-        """Take the next item out of the namespaces that may have a turn; None where none waits in any of these."""
+        """Take the next item of the namespaces that may have a turn; None if no item of these waits."""
         taken = self.take(may)
         return None if taken is None else taken[1]
 
     def take(self, may: Callable[[str], bool]) -> tuple[str, Item] | None:
-        """The same, with its namespace."""
+        """As `next`, with the namespace of the item."""
         for namespace, items in self._waiting.items():
             if may(namespace):
                 item = items.popleft()
@@ -71,14 +73,14 @@ class FairQueue(Generic[Item]):
 
 
 class CongestionWindow:
-    """The maximum number of writes of one namespace that are under way: the congestion control of TCP Vegas.
+    """The maximum number of writes of one namespace in flight, by the congestion control of TCP Vegas.
 
-    The quickest mean time of writes is the API server's own time for them. The rest of their time now, they wait there,
-    and by Little's law that gives how many of a namespace's writes wait. An idle API server answers many requests as
-    quickly as one, so the share grows; a busy one takes longer for each, so the share shrinks.
+    The shortest mean duration of writes is the API server's processing time. Any longer duration is waiting time, from
+    which Little's law gives the number of waiting writes of a namespace. An idle API server answers many requests as
+    fast as one, so the window grows; a busy one takes longer for each, so the window shrinks.
 
     Attributes:
-        room: the number of writes.
+        room: the maximum number of writes.
     """
 
     def __init__(self) -> None:
@@ -88,7 +90,7 @@ class CongestionWindow:
         self._since = 0.0
 
     def note(self, took: float, now: float) -> None:
-        """A write took this time, in seconds; `now` is on any clock that goes forward."""
+        """Note the duration of a write, in seconds; `now` is the time of any monotonic clock, in seconds."""
         self._times.append(took)
         if len(self._times) < _SAMPLE:
             return
@@ -106,10 +108,10 @@ class CongestionWindow:
 
 
 class Pacing:
-    """Lets requests begin."""
+    """Decides when requests may start."""
 
     def __init__(self, at_once: int = AT_ONCE, share: CongestionWindow | None = None) -> None:
-        """`share`: of writes in one namespace; None: any number."""
+        """`share` limits the writes in one namespace; None: no limit."""
         self._at_once = at_once
         self._share = share
         self._under_way = 0
@@ -119,26 +121,26 @@ class Pacing:
 
     @property
     def held(self) -> float:
-        """For how many seconds no request begins."""
+        """The number of seconds for which no request starts."""
         return max(0.0, self._held_until - time.monotonic())
 
     def hold(self, seconds: float) -> None:
-        """Let no request begin for this time, as the API server requests; a shorter time shortens no longer one."""
+        """Start no request for this time, as requested by the API server. A pending longer hold stays in effect."""
         self._held_until = max(self._held_until, time.monotonic() + seconds)
 
     @asynccontextmanager
     async def turn(self, writes_in: str = "") -> AsyncIterator[None]:
-        """Wait for a place, and for the end of a hold; the request runs within the block.
+        """Wait for a place, and for the end of a hold. The request runs within the block.
 
-        `writes_in`: the namespace of a write; empty: it is none, or not in a namespace.
+        `writes_in`: the namespace of a write; empty for a read, and for a write outside of namespaces.
         """
         await self._place(writes_in)
         try:
-            while (left := self.held) > 0:  # noqa: ASYNC110  it may be prolonged meanwhile
+            while (left := self.held) > 0:  # noqa: ASYNC110  the hold may be extended meanwhile
                 await asyncio.sleep(left)
             began = time.monotonic()
             yield
-            if writes_in and self._share is not None:  # a refused one, which raises, does not take the usual time
+            if writes_in and self._share is not None:  # a refused write raises, and its duration is not typical
                 now = time.monotonic()
                 self._share.note(now - began, now)
         finally:

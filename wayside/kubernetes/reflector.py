@@ -1,8 +1,8 @@
-"""A list of objects that is kept current: list, watch from there, and list again when in doubt.
+"""A reflector: keeps a list of objects current by a list, a watch from its resourceVersion, and regular new lists.
 
-A watch may lose its connection, or the server may lose the history that it needs (410), and no watch proves that
-nothing was missed. So each watch lasts one resync period only, and a new list follows however it ends. Intermediate
-states do not matter: the list is the current state.
+A watch may lose its connection, the server may lose the history that the watch needs (410), and no watch proves that it
+missed nothing. So each watch lasts for only one resync period, and a new list always follows it. Intermediate states do
+not matter: the list is the current state.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ _PAUSE = 0.1
 
 @dataclass(frozen=True)
 class Replaced:
-    """All existing objects; any other object known before is deleted."""
+    """The list of all existing objects. Any other known object has been deleted."""
 
     objects: list[Object]
     version: int
-    """The resource version of the list: changes of an object with a greater one are newer than the list."""
+    """The resource version of the list. Objects with a greater resource version are newer than the list."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Changed:
 
 @dataclass(frozen=True)
 class Deleted:
-    """An object was deleted; has its last state."""
+    """An object was deleted. `object` is its last state."""
 
     object: Object
 
@@ -51,7 +51,7 @@ Change = Replaced | Changed | Deleted
 
 
 def version_of(obj: Object) -> int:
-    """An object's resource version; the API guarantees that they are integers that only grow."""
+    """An object's resource version. The API guarantees that it is an integer that only grows."""
     return int(obj["metadata"]["resourceVersion"])
 
 
@@ -63,19 +63,19 @@ class Reflector:
     resource: Resource
     namespace: str
     labels: str = field(default="", kw_only=True)
-    """Only what this label selector matches."""
+    """The label selector of the objects to follow."""
     fields: str = field(default="", kw_only=True)
-    """Only what this field selector matches."""
+    """The field selector of the objects to follow."""
     resync: float = field(default=30.0, kw_only=True)
-    """Seconds after which all is listed again, even if nothing seems to be missing."""
+    """The resync period, in seconds, after which the objects are listed again."""
     lists: int = field(default=0, init=False)
-    """Number of lists until now."""
+    """The number of successful lists."""
     outages: int = field(default=0, init=False)
-    """How often the server stopped responding or refused."""
+    """The number of times that the server stopped responding, or began to refuse requests."""
     _backoff: Backoff = field(default_factory=lambda: Backoff(0.1, 5.0), init=False)
 
     async def follow(self) -> AsyncGenerator[Change, None]:
-        """The list, then its changes. Never ends and raises nothing; errors are logged, counted and retried."""
+        """Yields the list, then its changes. Never ends and never raises; errors are logged, counted and retried."""
         while True:
             try:
                 objects, version = await self.client.list(
@@ -86,9 +86,9 @@ class Reflector:
                 async with aclosing(self._watch(version)) as changes:
                     async for change in changes:
                         yield change
-                await asyncio.sleep(_PAUSE)  # do not flood a server that ends each watch at once with lists
+                await asyncio.sleep(_PAUSE)  # a server that ends each watch at once must not receive a flood of lists
             except RequestError as error:
-                gone = isinstance(error, ApiError) and error.code == 410  # its history, but the server is there
+                gone = isinstance(error, ApiError) and error.code == 410  # expired, but the server responds
                 await asyncio.sleep(_PAUSE if gone else self._failed(error))
 
     async def _watch(self, since: str) -> AsyncGenerator[Change, None]:

@@ -12,7 +12,7 @@ Object = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class Resource:
-    """Where a kind lives."""
+    """The API resource of a kind."""
 
     api_version: str
     kind: str
@@ -30,7 +30,7 @@ class Resource:
         return self.api_version.rpartition("/")[2]
 
     def path(self, namespace: str | None, name: str = "", subresource: str = "") -> str:
-        """The path of the collection (over all namespaces for None), or of the object named."""
+        """The path of the collection (in all namespaces for None), or of the named object."""
         root = f"/apis/{self.api_version}" if self.group else f"/api/{self.api_version}"
         scope = f"/namespaces/{quote(namespace)}" if self.namespaced and namespace else ""
         return "/".join(part for part in (f"{root}{scope}/{self.plural}", quote(name), subresource) if part)

@@ -1,4 +1,4 @@
-"""Requests to the API server that are repeated: until it answers, or again and again."""
+"""Repeated requests to the API server: until it responds, or periodically."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ log = logging.getLogger(__name__)
 
 
 async def until_answered(request: Callable[[], Awaitable[Answer]], pause: float = FIRST_PAUSE) -> Answer:
-    """The answer, however long it takes; logs once that the API server is away, overloaded or starting.
+    """The response, however long it takes. Logs once that the API server is unavailable, overloaded or starting.
 
     Args:
         request: sends the request once.
-        pause: seconds until the second attempt; the pauses grow with further ones.
+        pause: seconds until the second attempt; further pauses grow.
 
     Raises:
-        ApiError: what another attempt cannot change, such as missing rights or credentials.
+        ApiError: an error that a retry cannot change, such as missing rights or credentials.
     """
     backoff = Backoff(pause, LONGEST_PAUSE)
 
@@ -46,12 +46,13 @@ async def until_answered(request: Callable[[], Awaitable[Answer]], pause: float 
 
 
 async def repeatedly(look: Callable[[], Awaitable[object]], every: float, problem: str) -> None:
-    """Look again and again, until cancelled. A failure is logged once for each reason, and retried at the next look.
+    """Call `look` periodically, until cancelled. A failure is logged once for each reason, and retried at the next
+    call.
 
     Args:
-        look: looks once.
-        every: seconds between two looks, unless the API server requests more.
-        problem: what cannot be done, for the log; empty where somebody else reports failures.
+        look: one attempt.
+        every: seconds between two calls, unless the API server requests more.
+        problem: the problem, for the log; empty if failures are reported elsewhere.
     """
     reported = ""
     while True:

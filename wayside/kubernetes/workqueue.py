@@ -1,10 +1,12 @@
-"""Keys to reconcile: each at most once at a time, several at once, again after a failure.
+"""A work queue of keys to reconcile: keys are processed concurrently, each by at most one worker, and retried on
+failure.
 
-Namespaces take turns, and none may have all workers where a `share` is given: a flood of keys in one delays no other.
+Namespaces take turns, and with a `share`, none can occupy all workers. So a flood of keys in one namespace does not
+delay the others.
 
-A key that is added while it waits is not added again; added while it runs, it runs once more afterwards. So
-there are never more entries than objects, and the queue needs no other bound. A failure is tried again after a growing,
-jittered pause, or after what the API server requests.
+A key that is added while it waits is queued only once; if it is added while a worker processes it, it is processed once
+more afterwards. So the queue never has more entries than there are objects, and needs no other bound. A failed key is
+retried with exponential backoff and jitter, or after the time that the API server requests.
 """
 
 from __future__ import annotations
@@ -34,17 +36,17 @@ log = logging.getLogger(__name__)
 
 
 class Measure(Protocol):
-    """Takes the time of each reconciliation, in seconds, and whether it failed and is retried."""
+    """Receives the duration of each reconciliation, in seconds, and whether it failed and is retried."""
 
     def __call__(self, queue: str, seconds: float, *, failed: bool) -> None:
-        """A queue's work on one key ended."""
+        """Called when the work on one key of a queue has ended."""
 
 
 class WorkQueue(Generic[Key]):
     """Runs `work(key)` for every key added, on `concurrency` workers.
 
-    While keys of a namespace wait in the queue `after`, those of the namespace in this one are slowed down to four a
-    second and worker.
+    While keys of a namespace wait in the queue `after`, each worker processes at most four keys of that namespace per
+    second.
     """
 
     def __init__(
@@ -61,10 +63,10 @@ class WorkQueue(Generic[Key]):
         Args:
             name: for logs and metrics.
             work: reconciles a key.
-            concurrency: how many keys are worked on at a time.
-            after: the queue that goes first.
-            measure: gets each reconciliation.
-            share: how many keys of one namespace are worked on at a time; None: any number.
+            concurrency: the number of workers.
+            after: the queue with precedence over this one.
+            measure: receives the duration of each reconciliation.
+            share: the maximum number of workers for one namespace; None: no limit.
         """
         self.name = name
         self._measure = measure
@@ -86,19 +88,19 @@ class WorkQueue(Generic[Key]):
 
     @property
     def depth(self) -> tuple[int, int]:
-        """How many keys wait for a worker, and how many for their time."""
+        """The number of keys that wait for a worker, and of keys that wait for their time."""
         return len(self._queued), len(self._timers)
 
     def __len__(self) -> int:
-        """Number of keys that wait for a worker, or that a worker processes."""
+        """The number of keys that wait for a worker or are being processed."""
         return len(self._queued) + len(self._running)
 
     async def idle(self) -> None:
-        """Wait until no key waits for a worker and none is processed; keys that wait for their time do not count."""
+        """Wait until no key waits for a worker or is being processed; keys that wait for their time do not count."""
         await self._idle.wait()
 
     def stuck(self, limit: float) -> str | None:
-        """The key that a worker is at for longer than this number of seconds, in words; any thread may call it."""
+        """A text about a key whose processing takes longer than `limit` seconds; None if there is none. Thread-safe."""
         now = time.monotonic()
         for key, began in list(self._running.items()):
             if now - began > limit:
@@ -116,7 +118,7 @@ class WorkQueue(Generic[Key]):
             self._idle.clear()
 
     def add_at(self, key: Key, when: float) -> None:
-        """Enqueue the key at `when`, in seconds since 1970; the earliest time counts."""
+        """Enqueue the key at `when`, in seconds since the epoch. Of several times for a key, the earliest counts."""
         self._add_after(key, max(_SHORTEST_DELAY, when - time.time()))
 
     def _add_after(self, key: Key, delay: float) -> None:
@@ -133,12 +135,13 @@ class WorkQueue(Generic[Key]):
         self.add(key)
 
     def finish(self) -> None:
-        """Begin no further key, for good: `run` returns once those that are worked on are done."""
+        """Start no further key: `run` returns once the keys in progress are done."""
         self._ending = True
         self._wake.set()
 
     async def run(self) -> None:
-        """Work until cancelled, or finished. Cancelled, it can be run again, and continues with what waits."""
+        """Work until cancelled or finished. After a cancellation it can run again, and continues with the waiting
+        keys."""
         try:
             async with asyncio.TaskGroup() as group:
                 for index in range(self._concurrency):
@@ -164,7 +167,7 @@ class WorkQueue(Generic[Key]):
             _heed_cancellation()
 
     def _leave(self, key: Key, namespace: str) -> None:
-        """Note that the key is not processed any more."""
+        """Note that the key is no longer being processed."""
         del self._running[key]
         self._at_work[namespace] -= 1
         if not self._at_work[namespace]:
@@ -178,7 +181,7 @@ class WorkQueue(Generic[Key]):
             self._idle.set()
 
     async def _take(self) -> Key | None:
-        """Wait for the key whose turn it is; None at the end."""
+        """Wait for the next key; None once the queue is finished."""
         yields_until = math.inf
         while not self._ending:
             key = self._waiting.next(lambda namespace: self._may(namespace) and not self._yields(namespace))
@@ -195,11 +198,11 @@ class WorkQueue(Generic[Key]):
         return None
 
     def _may(self, namespace: str) -> bool:
-        """Whether the namespace has not its share of the workers yet."""
+        """Whether the namespace has fewer workers than its share."""
         return self._share is None or self._at_work[namespace] < self._share
 
     def _yields(self, namespace: str) -> bool:
-        """Whether keys of the namespace wait in the queue before this one."""
+        """Whether keys of the namespace wait in the queue with precedence."""
         return self._after is not None and namespace in self._after._waiting
 
     async def _once(self, key: Key) -> None:
@@ -212,7 +215,7 @@ class WorkQueue(Generic[Key]):
             pause = self._pause(key, error.retry_after)
             log.warning("%s %s: %s; retrying in %.1f s", self.name, _text(key), error, pause)
             self._add_after(key, pause)
-        except Exception:  # a defect in one key's work must not stop the others; it is logged, and tried again
+        except Exception:  # a defect in the work on one key must not stop the others: it is logged and retried
             pause = self._pause(key, None)
             log.exception("cannot reconcile %s %s; retrying in %.1f s", self.name, _text(key), pause)
             self._add_after(key, pause)
@@ -228,14 +231,14 @@ class WorkQueue(Generic[Key]):
 
 
 def _heed_cancellation() -> None:
-    """Be cancelled where a cancellation was lost: gather gives an error of one of its parts in place of it."""
+    """Raise a cancellation that was lost: `gather` raises an error of one of its parts instead."""
     task = asyncio.current_task()
     if task is not None and task.cancelling():
         raise asyncio.CancelledError
 
 
 def _namespace(key: object) -> str:
-    """The namespace of a name, or of a kind with a name; a key of another form has none."""
+    """The namespace of a key: a (namespace, name), or a kind with such a name; empty for keys of another form."""
     match key:
         case (str(namespace), str()) | (_, (str(namespace), str())):
             return namespace

@@ -11,20 +11,20 @@ from typing import TypeVar
 Failure = TypeVar("Failure", bound=BaseException)
 Result = TypeVar("Result")
 
-_DOUBLINGS = 30  # beyond them every pause has its cap
+_DOUBLINGS = 30  # beyond these, every pause has reached its cap
 
 
 def pause_after(failures: int, first: float, longest: float) -> float:
-    """Seconds to wait after failures in a row: `first` doubled with each further one, up to `longest`.
+    """Seconds to wait after consecutive failures: `first`, doubled with each further failure, up to `longest`.
 
-    With jitter: between half and all of it.
+    With jitter: between half of this time and all of it.
     """
     whole = min(longest, first * 2.0 ** min(failures - 1, _DOUBLINGS))
     return whole * random.uniform(0.5, 1.0)  # noqa: S311  no secret
 
 
 class Backoff:
-    """The pauses after the failures of one thing."""
+    """The pauses after consecutive failures of one operation."""
 
     def __init__(self, first: float, cap: float) -> None:
         """Seconds: the pause after the first failure, and the longest one."""
@@ -34,16 +34,16 @@ class Backoff:
         """Failures since the last success."""
 
     def fail(self, at_least: float = 0.0) -> float:
-        """Count a failure; the seconds to wait now.
+        """Count a failure. Returns the seconds to wait now.
 
         Args:
-            at_least: seconds that the other side requests; limited by the cap.
+            at_least: the seconds that the other side requests; limited by the cap.
         """
         self.failures += 1
         return min(self._cap, max(at_least, pause_after(self.failures, self._first, self._cap)))
 
     def succeed(self) -> None:
-        """Start over: the next failure waits the first pause."""
+        """Reset: the next failure has the first pause again."""
         self.failures = 0
 
 
@@ -56,10 +56,10 @@ def retry(
     """The result of the first attempt that does not fail.
 
     Args:
-        attempt: returns the result, also where nothing is wanted any more.
-        failure: what an attempt may raise to be repeated; all else is raised.
-        failed: handles a failure; returns the seconds until the next attempt. What it raises is raised.
-        sleep: waits that many seconds; may return earlier.
+        attempt: returns the result, or anything once no result is needed any more.
+        failure: the type of exception that is retried; any other exception is raised.
+        failed: handles a failure, and returns the seconds until the next attempt. It may raise to end the retries.
+        sleep: waits for this number of seconds; it may return earlier.
     """
     while True:
         try:

@@ -1,6 +1,6 @@
 """The common behaviour of all commands: an error is one clear line, and `--debug` prints the traceback.
 
-Bad usage and bad input end with exit code 2; `--debug` may stand before or after the command.
+Wrong usage and wrong input end with exit code 2. `--debug` can be before or after the command.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class LogFormat(StrEnum):
 
 
 LogFormatOption = Annotated[
-    LogFormat, typer.Option(envvar="WAYSIDE_LOG_FORMAT", help="Log lines for people, or one JSON object a line.")
+    LogFormat, typer.Option(envvar="WAYSIDE_LOG_FORMAT", help="The format of log lines; json: one object per line.")
 ]
 MetricsCertificates = Annotated[
     Path | None,
@@ -37,12 +37,12 @@ MetricsCertificates = Annotated[
 ]
 CheckedFiles = Annotated[list[Path] | None, typer.Argument(help="YAML files or folders.")]
 IgnoredFindings = Annotated[
-    list[str] | None, typer.Option(metavar="NAME", help="Do not report the warnings of this name; may be repeated.")
+    list[str] | None, typer.Option(metavar="NAME", help="Do not report warnings of this name; may be repeated.")
 ]
 ListFindings = Annotated[bool, typer.Option("--list", help="Print the names of all findings, and exit.")]
 
 _WIDTH = 160
-"""Width in columns of a table that goes into a pipe or a file."""
+"""The width of a table in a pipe or a file, in columns."""
 
 BAD_INPUT = 2
 INTERRUPTED = 130
@@ -54,13 +54,13 @@ _UsageError = cast("type[typer.BadParameter]", typer.BadParameter.__mro__[1])
 
 
 def run_cli(app: typer.Typer, program: str, expected: tuple[type[Exception], ...], arguments: Sequence[str]) -> int:
-    """Run the command line and report errors; return the exit code.
+    """Run the command line and report errors. Returns the exit code.
 
     Args:
         app: the commands; its callback takes `--debug`.
-        program: its name.
-        expected: errors of the input, printed without a traceback; any other error keeps its traceback.
-        arguments: without the program's name.
+        program: the name of the program.
+        expected: the errors of the input, which are printed without a traceback; other errors keep theirs.
+        arguments: the arguments without the program's name.
     """
     debug = DEBUG in arguments
     arguments = [*([DEBUG] if debug else []), *(each for each in arguments if each != DEBUG)]
@@ -68,7 +68,7 @@ def run_cli(app: typer.Typer, program: str, expected: tuple[type[Exception], ...
         return app(arguments, prog_name=program, standalone_mode=False) or 0
     except typer.Abort:
         return INTERRUPTED
-    except Exception as error:  # the program's edge: what is not expected is raised again
+    except Exception as error:  # the edge of the program: an unexpected error is raised again
         causes = _leaves(error)
         if not all(isinstance(each, (_UsageError, *(() if debug else expected))) for each in causes):
             raise
@@ -78,12 +78,12 @@ def run_cli(app: typer.Typer, program: str, expected: tuple[type[Exception], ...
 
 
 def log_to_stderr(form: str, *, debug: bool) -> None:
-    """Write log lines in this form to stderr; `debug`: more of them."""
+    """Write log lines in this form to stderr; with `debug`, more of them."""
     logging.basicConfig(level=logging.DEBUG if debug else logging.INFO, format=form, stream=sys.stderr)
 
 
 def table_console(*, stderr: bool = False) -> Console:
-    """The console for tables: as wide as the terminal, and of a fixed width into a pipe or a file."""
+    """The console for tables: as wide as the terminal, or with a fixed width for a pipe or a file."""
     from rich.console import Console  # noqa: PLC0415  not for `--help` alone
 
     found = Console(stderr=stderr)
@@ -91,13 +91,14 @@ def table_console(*, stderr: bool = False) -> Console:
 
 
 def log_as(wanted: LogFormat) -> None:
-    """Write log lines so from now on. JSON: one object a line with `time`, `level`, `logger` and `message`.
+    """Write log lines in this format from now on. JSON: one object per line with `time`, `level`, `logger` and
+    `message`.
 
-    An exception is in the object too, as `exc_info`, so that a collector gets it in one piece.
+    The object also contains an exception, as `exc_info`, so that a log collector receives it as one record.
     """
     if wanted is LogFormat.TEXT:
         return
-    from pythonjsonlogger.json import JsonFormatter  # noqa: PLC0415  of use to a program that runs alone
+    from pythonjsonlogger.json import JsonFormatter  # noqa: PLC0415  only long-running programs use it
 
     names = {"levelname": "level", "name": "logger"}
     for handler in logging.getLogger().handlers:
@@ -105,10 +106,10 @@ def log_as(wanted: LogFormat) -> None:
 
 
 def leave() -> NoReturn:
-    """End the process with exit code 0, now that all is closed and written.
+    """End the process with exit code 0, after everything is closed and written.
 
-    A thread in native code (Zenoh's, an action's that was left behind) may be on its way back into Python just then.
-    The interpreter's own end would unwind it, which native code answers by aborting: "exception not rethrown".
+    A thread in native code (of Zenoh, or of an abandoned action) may just return into Python at this time. The
+    interpreter's normal exit would unwind that thread, and the native code would abort: "exception not rethrown".
     """
     logging.shutdown()
     sys.stdout.flush()
@@ -117,20 +118,20 @@ def leave() -> NoReturn:
 
 
 def refuse(message: str) -> NoReturn:
-    """Refuse the command line, for what the parser cannot see."""
+    """Refuse the command line for a reason that the parser does not check."""
     raise typer.BadParameter(message)
 
 
 def _report(program: str, error: BaseException) -> None:
     if not isinstance(error, _UsageError):
         print(f"{program}: {error}", file=sys.stderr)  # noqa: T201  the one place
-    elif message := error.format_message():  # else the help is the answer, and is printed already
+    elif message := error.format_message():  # otherwise the help is already printed
         command = error.ctx.command_path if error.ctx is not None else program
         print(f"{program}: {' '.join(message.split()).rstrip('.')}; see {command} --help", file=sys.stderr)  # noqa: T201
 
 
 def _leaves(error: BaseException) -> list[BaseException]:
-    """The errors of a group, however nested."""
+    """The errors in a group, at any level."""
     if not isinstance(error, BaseExceptionGroup):
         return [error]
     return [leaf for each in error.exceptions for leaf in _leaves(each)]

@@ -1,4 +1,4 @@
-"""Files that are replaced as a whole: no reader sees a part of one, and a killed process leaves none."""
+"""Files that are replaced atomically: no reader sees a partial file, and a killed process leaves none."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from pathlib import Path
 
 
 def replace_file(path: Path, content: bytes | str, *, draft: Path | None = None, durable: bool = False) -> None:
-    """Write the file under another name in its folder, and rename it when it is complete.
+    """Write the content to another file in the same folder, and rename that file when it is complete.
 
     Args:
         path: the file.
-        content: bytes, or text that becomes UTF-8.
-        draft: the other name; None: hidden, the same for every process that writes this file.
-        durable: whether the content is on disk before the file is renamed.
+        content: bytes, or text, which is encoded as UTF-8.
+        draft: the other file; None: a hidden file, the same for every process that writes this file.
+        durable: whether to sync the content to disk before the file is renamed.
 
     Raises:
-        OSError: it could not be written; the file is as before.
+        OSError: the content could not be written; the file is unchanged.
     """
     draft = draft or path.with_name(f".{path.name}.new")
     try:
@@ -34,7 +34,7 @@ def replace_file(path: Path, content: bytes | str, *, draft: Path | None = None,
 
 
 def sync_folder(folder: Path) -> None:
-    """Wait until the names of the folder's files are on disk: otherwise a loss of power might bring the old ones back.
+    """Sync the folder to disk, so that renamed files keep their new names after a power loss.
 
     Raises OSError.
     """

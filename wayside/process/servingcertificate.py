@@ -1,7 +1,7 @@
-"""The certificate of a server: two files, as cert-manager mounts them, which are followed.
+"""The certificate of a server, from two files, as cert-manager mounts them. It is reloaded when the files change.
 
-A renewed Secret changes in its mount without a restart. New files are checked first, and used for all later connections
-only if they are valid; until then the old ones stay.
+The files of a mounted Secret change without a restart. Changed files are used for new connections once they are valid;
+until then, the previous certificate stays in use.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ class ServingCertificate:
     """A TLS context for servers, whose certificate and key are those in the folder."""
 
     def __init__(self, folder: Path, option: str) -> None:
-        """`option` names the folder in messages. Raises CertificateError where it holds no valid pair."""
+        """`option` names the folder in messages. Raises CertificateError if the folder has no valid certificate and
+        key."""
         self._files = folder / CERTIFICATE, folder / KEY
         self._option = option
         self._logged = ""
@@ -42,7 +43,7 @@ class ServingCertificate:
             raise CertificateError(f"{option} {folder}: {_reason(error)}") from error
 
     def refresh(self) -> None:
-        """Use the files' new contents if they have changed and are valid; log what happens, and a problem once."""
+        """Load the files if they have changed and are valid. Logs a renewal, and each problem once."""
         try:
             changed = self.reload()
         except (OSError, ssl.SSLError) as error:
@@ -56,15 +57,15 @@ class ServingCertificate:
                 log.info("%s: using the renewed certificate", self._option)
 
     async def follow(self) -> None:
-        """Use the files' new contents whenever they change, until cancelled."""
+        """Call `refresh` periodically, until cancelled."""
         while True:
             await asyncio.sleep(EVERY)
             self.refresh()
 
     def reload(self) -> bool:
-        """Use the files if they have changed; whether they have.
+        """Load the files if they have changed. Returns whether they have.
 
-        Raises OSError or ssl.SSLError for files that are not valid; then the previous ones stay.
+        Raises OSError or ssl.SSLError for files that are not valid; the previous certificate then stays in use.
         """
         digest = self._digest()
         if digest == self._seen:
@@ -79,7 +80,7 @@ class ServingCertificate:
 
 
 def _reason(error: OSError) -> str:
-    """What is wrong with the files, in one line."""
+    """The problem of the files, in one line."""
     if isinstance(error, ssl.SSLError):
         if error.reason == "KEY_VALUES_MISMATCH":
             return f"{KEY} is not the key of {CERTIFICATE}: give a certificate and its own key"

@@ -1,4 +1,4 @@
-"""The only module that imports OpenTelemetry: spans that are over, with ids of our choice, into the SDK's exporter."""
+"""The only module that imports OpenTelemetry: passes completed spans, with given ids, to the SDK's exporter."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from wayside.process.tracing import ENDPOINTS
 _QUEUE = 2048
 """The SDK's default for OTEL_BSP_MAX_QUEUE_SIZE."""
 _PATIENCE = 2.0
-"""Seconds that the end of the program waits for the exporter."""
+"""The seconds for which the program waits for the exporter at its end."""
 
 
 class _Ids(IdGenerator):
-    """Gives the ids that the present span of this thread is to have, else random ones."""
+    """Generates the ids that are set for the next span of this thread; otherwise random ids."""
 
     def __init__(self) -> None:
         self._random = RandomIdGenerator()
@@ -44,7 +44,7 @@ class _Ids(IdGenerator):
 
 
 class _Exporter(SpanExporter):
-    """The OTLP exporter, and what becomes of spans there."""
+    """The OTLP exporter, with counts of exported and failed spans."""
 
     def __init__(self) -> None:
         self._inner = OTLPSpanExporter()
@@ -66,7 +66,7 @@ class _Exporter(SpanExporter):
 
 
 class _Bounded(SpanProcessor):
-    """Before the SDK's queue: what finds it full is dropped and counted, instead of what waits the longest."""
+    """Precedes the SDK's queue. If the queue is full, new spans are dropped and counted, instead of the oldest ones."""
 
     def __init__(self) -> None:
         self._exporter = _Exporter()
@@ -95,11 +95,11 @@ class _Bounded(SpanProcessor):
 
 
 class Tracing:
-    """Takes spans, from any thread: the SDK, as the standard environment variables set it."""
+    """Exports spans with the SDK, as configured by the standard environment variables. Thread-safe."""
 
     def __init__(self, service: str, *, export: bool) -> None:
-        """`service` counts where OTEL_SERVICE_NAME or OTEL_RESOURCE_ATTRIBUTES name none."""
-        # Failures are counted and reported on request; the SDK would log each batch.
+        """`service` is the service name if OTEL_SERVICE_NAME and OTEL_RESOURCE_ATTRIBUTES do not define one."""
+        # Failures are counted and reported in the status; the SDK would log each batch.
         logging.getLogger("opentelemetry.exporter").setLevel(logging.CRITICAL)
         own = {} if _names_service() else {"service.name": service}
         self._ids = _Ids()
@@ -111,12 +111,12 @@ class Tracing:
 
     @property
     def dropped(self) -> int:
-        """Spans that found the queue full."""
+        """The number of spans that were dropped because the queue was full."""
         return self._bounded.dropped if self._bounded is not None else 0
 
     @property
     def failed(self) -> int:
-        """Spans that the endpoint did not take."""
+        """The number of spans that the endpoint did not accept."""
         return self._bounded.failed if self._bounded is not None else 0
 
     @property
@@ -125,12 +125,12 @@ class Tracing:
         return next((os.environ[each] for each in ENDPOINTS if os.environ.get(each)), "")
 
     def sampled(self, context: TraceContext, name: str) -> bool:
-        """Whether the trace that begins with this span is recorded; the result is always the same for a trace."""
+        """Whether the trace that begins with this span is recorded. The result is always the same for a trace."""
         decision = self._provider.sampler.should_sample(None, context.trace_id, name).decision
         return decision is Decision.RECORD_AND_SAMPLE
 
     def emit(self, span: Span) -> TraceContext:
-        """Queue a span; where it stands. Never waits."""
+        """Queue a span, without waiting. Returns its position in the trace."""
         parent = None if span.parent is None else trace.set_span_in_context(_remote(span.parent))
         self._ids.wanted.context = span.context
         try:
@@ -150,7 +150,7 @@ class Tracing:
         return TraceContext(at.trace_id, at.span_id, at.trace_flags.sampled)
 
     def close(self) -> None:
-        """Hand over what waits, for at most two seconds."""
+        """Export the queued spans, for at most two seconds."""
         closing = threading.Thread(target=self._provider.shutdown, name="spans", daemon=True)
         closing.start()
         closing.join(_PATIENCE)

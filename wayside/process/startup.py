@@ -1,11 +1,11 @@
-"""Process start: installs a signal handler before the imports, and defers garbage collection while they run.
+"""Process start: installs a signal handler before the imports, and disables garbage collection during the imports.
 
 The first process of a container receives no signal without a handler. Without one, a container that is stopped while
 its program still imports (a second or more) would run for the whole grace period, and its pod with it: a Job that ends
 immediately would take half a minute.
 
-Imported objects are never freed. Collecting garbage during the imports costs a tenth of the start, and later a pause of
-a long-lived process each time.
+Imported objects are never freed. Garbage collection during the imports would take a tenth of the start time, and later
+collections would scan these objects again, with a pause each time.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ ENDED = 128 + signal.SIGTERM
 
 
 def end_on_sigterm() -> None:
-    """End at once on SIGTERM, until a handler that ends in good order takes the place of this one."""
+    """End at once on SIGTERM, until a handler for a graceful shutdown replaces this one."""
     signal.signal(signal.SIGTERM, _end)
 
 
 @contextmanager
 def importing() -> Iterator[None]:
-    """Around imports: within, no garbage is looked for; afterwards not in what was made within."""
+    """Around imports: disables garbage collection, and later excludes the objects that were created within."""
     gc.disable()
     try:
         yield

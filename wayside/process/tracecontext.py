@@ -1,7 +1,7 @@
 """The position of a span in its trace, in W3C's Trace Context format (https://www.w3.org/TR/trace-context/). Pure.
 
-The ids of what a detector does follow from the episode's id: a replay, a restarted detector, and every receiver of
-the episode in another way, all come to the same trace.
+The ids of a detector's spans are derived from the ID of the episode. So a replay, a restarted detector and every
+receiver of the episode compute the same trace.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Attribute = str | int | float | bool | Sequence[str]
 
 @dataclass(frozen=True, slots=True)
 class TraceContext:
-    """A span: 128 bits that name its trace, 64 bits that name it, and whether the trace is recorded."""
+    """A span: the 128-bit id of its trace, its own 64-bit id, and whether the trace is recorded."""
 
     trace_id: int
     span_id: int
@@ -30,7 +30,7 @@ class TraceContext:
         return f"00-{self.trace_id:032x}-{self.span_id:016x}-{int(self.sampled):02x}"
 
     def child(self, name: str) -> TraceContext:
-        """A span of the same trace; of the same parent and name, always the same one."""
+        """A span of the same trace. The same parent and name always give the same span."""
         return replace(self, span_id=_number(f"{self.trace_id:032x}", f"{self.span_id:016x}", name, bits=64))
 
 
@@ -46,13 +46,13 @@ class Span:
     """Its own position; None: any position in its parent's trace."""
     attributes: Mapping[str, Attribute] = field(default_factory=dict)
     links: Sequence[TraceContext] = ()
-    """Spans, mostly of other traces, that have to do with this one."""
+    """Related spans, mostly of other traces."""
     error: str | None = None
-    """Why it failed, where it did."""
+    """The reason of the failure; None if there was none."""
 
 
 def parse_traceparent(text: object) -> TraceContext | None:
-    """The span of a header `traceparent`; None where it is none of version 00."""
+    """The span of a header `traceparent`; None if it is not a valid header of version 00."""
     found = _TRACEPARENT.fullmatch(text) if isinstance(text, str) else None
     if found is None:
         return None
@@ -60,11 +60,11 @@ def parse_traceparent(text: object) -> TraceContext | None:
 
 
 def episode_context(episode: str) -> TraceContext:
-    """The span of an episode, by its id: the first one of its trace."""
+    """The span of an episode, by its ID. It is the root of its trace."""
     return TraceContext(_number("trace", episode, bits=128), _number("episode", episode, bits=64))
 
 
 def _number(*parts: str, bits: int) -> int:
-    """A number other than zero, which names no span, by a hash over the parts; none of them holds a NUL."""
+    """A number by a hash over the parts. It is never zero, which is not a valid id; no part may contain a NUL."""
     digest = hashlib.sha256("\0".join(parts).encode()).digest()
     return int.from_bytes(digest[: bits // 8], "big") or 1

@@ -2,9 +2,10 @@
 
     OTEL_EXPORTER_OTLP_ENDPOINT=http://collector:4318   (or OTEL_EXPORTER_OTLP_TRACES_ENDPOINT)
 
-All else is set by the standard variables too, e.g. OTEL_SERVICE_NAME, OTEL_RESOURCE_ATTRIBUTES, OTEL_TRACES_SAMPLER.
-Spans are exported after they end, with their times, and never wait: at most OTEL_BSP_MAX_QUEUE_SIZE (2048) wait for the
-exporter, which runs on a thread of its own; what finds them full is dropped and counted, and so is what was not taken.
+The other settings are standard variables as well, e.g. OTEL_SERVICE_NAME, OTEL_RESOURCE_ATTRIBUTES,
+OTEL_TRACES_SAMPLER. Spans are exported after they end, by a separate thread; the caller never waits. At most
+OTEL_BSP_MAX_QUEUE_SIZE (2048) spans are queued. Further spans are dropped and counted; spans that the endpoint does not
+accept are counted as failed.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ def tracing(service: str, *, export: bool = True) -> Tracing | None:
     """The exporter of spans; None without an endpoint in the environment. A failure to create it is logged.
 
     Args:
-        service: the service's name where OTEL_SERVICE_NAME gives none.
-        export: False: nothing is sent, as in a replay, which only needs the places of spans.
+        service: the service name if the environment does not define one.
+        export: False: nothing is sent, as in a replay, which only needs the positions of spans.
     """
     environment = os.environ
     endpoint = next((each for each in ENDPOINTS if environment.get(each)), None)
