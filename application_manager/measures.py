@@ -18,12 +18,12 @@ _WORK = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 15)  # s of a request 
 
 
 def gauge(name: str, text: str, value: float) -> Metric:
-    """A number as of now, for a collector."""
+    """The current value of a number, for a collector."""
     return GaugeMetricFamily(f"{PREFIX}{name}", text, value)
 
 
 def gauges(name: str, text: str, label: str, values: Iterable[tuple[str, float]]) -> Metric:
-    """A number for each value of a label, as of now."""
+    """The current value of a number for each value of a label."""
     family = GaugeMetricFamily(f"{PREFIX}{name}", text, labels=(label,))
     for of, value in values:
         family.add_metric((of,), value)
@@ -31,11 +31,11 @@ def gauges(name: str, text: str, label: str, values: Iterable[tuple[str, float]]
 
 
 class Measures:
-    """The counters and histograms; one of them for a manager, and only its event loop's thread writes them.
+    """The counters and histograms of a manager; only its event loop's thread writes them.
 
     Attributes:
-        registry: where collectors that read the cache are registered as well.
-        looked: when the last resync ended, well or not, on the monotonic clock; the start before that.
+        registry: also for the collectors that read the cache.
+        looked: when the last resync ended, successful or not, on the monotonic clock; before the first one, the start.
     """
 
     def __init__(self) -> None:
@@ -68,7 +68,7 @@ class Measures:
         ProcessCollector(registry=self.registry)
 
     def text(self) -> bytes:
-        """What a scrape gets, in Prometheus' text format."""
+        """The response to a scrape, in Prometheus' text format."""
         return generate_latest(self.registry)
 
     def applied(self, seconds: float) -> None:
@@ -84,7 +84,7 @@ class Measures:
         self._refusals.labels(reason).inc()
 
     def reconciled(self, queue: str, seconds: float, *, failed: bool) -> None:
-        """A queue's work on one key ended."""
+        """A queue finished its work on one key."""
         self._reconciled.labels(queue).observe(seconds)
         if failed:
             self._failures.labels(queue).inc()
@@ -94,7 +94,7 @@ class Measures:
         self._failures.labels("watch").inc()
 
     def requested(self, method: str, seconds: float, code: str) -> None:
-        """The API server answered with an HTTP status, or `none`."""
+        """The API server responded with an HTTP status; `none`: it did not respond."""
         self._requests.labels(method).observe(seconds)
         if not code.startswith(("2", "3")):
             self._errors.labels(code).inc()
@@ -108,7 +108,7 @@ class Measures:
         self._unposted.labels(cause).inc()
 
     def reviewed(self, kind: str, answer: str) -> None:
-        """A question of the API server was `allowed`, `warned` of or `refused`; or `failed`, then of no kind."""
+        """A review was `allowed`, `warned` about or `refused`; or it `failed`, then without a kind."""
         self._reviews.labels(kind, answer).inc()
 
     def job_done(self, seconds: float) -> None:
@@ -116,7 +116,7 @@ class Measures:
         self._jobs.observe(seconds)
 
     def job_exceeded(self) -> None:
-        """A job was ended, and its worker process with it."""
+        """A job was stopped, and its worker process with it."""
         self._exceeded.inc()
 
     def active(self, active: bool) -> None:

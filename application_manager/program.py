@@ -1,4 +1,4 @@
-"""The console script: it can end before the slow imports."""
+"""The console script: it can exit before the slow imports."""
 
 from __future__ import annotations
 

@@ -16,18 +16,18 @@ from wayside.api.applicationinstance import InstancePhase
 from wayside.api.applicationtask import TaskPhase
 
 NO_PHASE = "None"
-"""The phase of what the manager has not looked at yet."""
+"""The phase of an object that the manager has not processed yet."""
 
 
 class Overview(Collector):
-    """Gauges over the cache and the queues: by name, how many keys wait for a worker, and how many for their time."""
+    """Gauges of the cache and the queues. `queues` yields name, keys waiting for a worker, keys waiting for a time."""
 
     def __init__(self, cache: ClusterCache, queues: Callable[[], Iterable[tuple[str, int, int]]]) -> None:
         self._cache = cache
         self._queues = queues
 
     def collect(self) -> Iterator[Metric]:
-        """The metrics as of now."""
+        """The current metrics."""
         yield self._phases("tasks", "ApplicationTasks by phase", TASK, TaskPhase)
         yield self._phases("instances", "ApplicationInstances by phase", INSTANCE, InstancePhase)
         statuses = (entry.raw.get("status") or {} for _, entry in self._cache.store.all(TEMPLATE))

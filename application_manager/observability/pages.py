@@ -18,28 +18,28 @@ from wayside.process.servingcertificate import ServingCertificate
 FOLDER_OPTION = "--metrics-certificates"
 
 STALLED_AFTER = 300.0
-"""Seconds without the end of a resync, at the least, after which the manager counts as stalled."""
+"""The minimum number of seconds without a finished resync after which the manager counts as stalled."""
 
-_RESYNCS = 3  # and this multiple of the time between two
+_RESYNCS = 3  # and this multiple of the resync interval
 
 Lack = Callable[[], str | None]
-"""What is missing, in words; None where nothing is."""
+"""Why the manager is not ready, as text; None if it is ready."""
 
 _TEXT = "text/plain; version=0.0.4; charset=utf-8"
 
 
 class _Queue(Protocol):
-    """What reports a worker that is at one key for too long."""
+    """Reports a worker that processes one key for too long."""
 
     def stuck(self, limit: float) -> str | None:
-        """The key and for how long, in words."""
+        """The key and the time, as text."""
 
 
 def stalled(measures: Measures, every: float, queues: Sequence[_Queue] = (), least: float = STALLED_AFTER) -> Lack:
-    """Whether work has stalled: no resync has ended, or a worker was at one key, for too long. Any thread may call it.
+    """Reports stalled work: no resync has ended, or a worker processes one key, for too long. Any thread may call it.
 
-    A resync that fails, the API server being away, ends as well. `every`: seconds between two resyncs; `least`: seconds
-    that count as too long, or three times `every` if that is more.
+    A resync that fails because the API server is unreachable counts as ended. `every`: seconds between two resyncs;
+    `least`: the minimum limit in seconds; the limit is three times `every` if that is more.
     """
     limit = max(least, _RESYNCS * every)
 
@@ -62,13 +62,11 @@ async def pages(
     role: Callable[[], str] = str,
     certificates: Path | None = None,
 ) -> AsyncIterator[int | None]:
-    """Serve on all addresses while the block runs; the port, None where none is wanted. Port 0 takes a free one.
+    """Serve on all addresses while the block runs; yields the port, or None if `port` is None. Port 0 takes a free one.
 
-    `role` is what /readyz has beside "ok", if anything: a standby is ready as well.
-
-    `certificates`: the folder with tls.crt and tls.key, which may change; None: without TLS.
-
-    Raises ConfigurationError where the port is taken, CertificateError where there is no valid certificate.
+    `role`: what /readyz adds to "ok", if anything: a standby is ready as well. `certificates`: the folder with tls.crt
+    and tls.key, which may change; None: without TLS. Raises ConfigurationError if the port is in use, CertificateError
+    if there is no valid certificate.
     """
     if port is None:
         yield None
@@ -96,7 +94,7 @@ async def pages(
         except OSError as error:
             reason = error.strerror or error
             raise ConfigurationError(f"--metrics-port {port}: {reason}: give another port") from error
-        # With port 0, IPv6 has a port of its own; an IPv4 address is a pair.
+        # With port 0, IPv6 has its own port; an IPv4 address is a pair.
         yield next(int(each[1]) for each in sorted(runner.addresses, key=len))
     finally:
         if following is not None:

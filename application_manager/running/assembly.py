@@ -1,7 +1,7 @@
 """Wires the queues to their work.
 
-Events come in through the router, which enqueues keys. The work of a queue writes, notes in the cache what it did, and
-enqueues what depends on it.
+Events come in through the router, which enqueues keys. The work of a queue writes, notes the result in the cache, and
+enqueues the objects that depend on it.
 """
 
 from __future__ import annotations
@@ -45,21 +45,21 @@ from wayside.kubernetes.workqueue import Key, WorkQueue
 if TYPE_CHECKING:
     from wayside.process.spans import Tracing
 
-_JUDGING_PAUSE = 0.3  # s from a change of a template, rule or detector to its status: several changes are one
+_JUDGING_PAUSE = 0.3  # s from a change of a template, rule or detector to its status: it combines several changes
 _INSTANCE_WORKERS = 16
-_INSTANCE_SHARE = 6  # of these for one namespace: more requests at once make each take longer, also those of others
+_INSTANCE_SHARE = 6  # of these for one namespace: more concurrent requests slow down all namespaces
 _CONFIGURATION_WORKERS = 4
-_JUDGING_WORKERS = 4  # one a namespace: they mostly wait for worker processes
+_JUDGING_WORKERS = 4  # one per namespace: they mostly wait for worker processes
 _STATUS_WORKERS = 4
-_STATUS_SHARE = 2  # few: what runs goes before its status
+_STATUS_SHARE = 2  # few: work on instances comes before their statuses
 
 
 class Assembly:
-    """All queues of a manager, and what they share.
+    """All queues of a manager, and their shared state.
 
     Attributes:
-        detector_index: what is known of Detectors that are run; `detectors`: the queue of these.
-        pool: runs users' expressions.
+        detector_index: the state of the Detectors that the manager runs; `detectors`: their queue.
+        pool: evaluates users' expressions.
         queues: all of them.
     """
 
@@ -96,7 +96,7 @@ class Assembly:
         def statuses_of(name: str, reconcile: Callable[[Name], Awaitable[None]]) -> WorkQueue[Name]:
             return queue(name, self._where_active(reconcile), _STATUS_WORKERS, _STATUS_SHARE)
 
-        # The work is made below, since it enqueues.
+        # The work is created below, because it enqueues.
         self._instances = instances
         self._statuses = statuses_of("instance status", self._reconcile_instance_status)
         self._tasks = statuses_of("task", self._reconcile_task)
@@ -181,7 +181,7 @@ class Assembly:
         self._rule_work = RuleWork(self.cache, statuses, self.pool, self.detector_index)
 
     async def close(self) -> None:
-        """End what works in the background."""
+        """Stop the background work."""
         await self._answers.close()
         await self.pool.close()
         await self.charts.close()
@@ -191,9 +191,9 @@ class Assembly:
         self._status_work.report(name, decision, None)
 
     def begin_term(self, children: Iterable[Resource]) -> None:
-        """Begin a term as the active manager: forget what this one did, since others may have acted meanwhile.
+        """Start to act: forget the results of this manager, because others may have acted meanwhile.
 
-        `children` are the kinds of what templates create.
+        `children`: the kinds of the objects of templates.
         """
         self.cache.forget_work()
         self.publisher.forget()
@@ -207,12 +207,12 @@ class Assembly:
             self._configurations.add(name)
 
     async def _looks_after(self, namespace: str) -> bool:
-        """Whether this manager works in the namespace, and no older one does. Raises NotGranted if it may not write."""
-        await self.client.check_granted(namespace)  # before any read: otherwise each object there would cost one
+        """Whether this manager, and no older one, is active in the namespace. Raises NotGranted if it may not write."""
+        await self.client.check_granted(namespace)  # before any read: otherwise each object there would cost a request
         return not self.cache.overlap.yields(namespace)
 
     def _where_active(self, reconcile: Callable[[Name], Awaitable[None]]) -> Callable[[Name], Awaitable[None]]:
-        """The same work, in namespaces that this manager looks after."""
+        """The same work, limited to namespaces in which this manager is active."""
 
         async def work(name: Name) -> None:
             if await self._looks_after(name[0]):
@@ -241,7 +241,7 @@ class Assembly:
             await self._rule_work.reconcile(key)
 
     def _judge(self, key: RuleKey) -> None:
-        """Enqueue the check of a rule or Detector; a Detector's objects are reconciled before."""
+        """Enqueue the check of a rule or Detector; a Detector's objects are reconciled first."""
         self._rules.add_at(key, time.time() + _JUDGING_PAUSE)
         if key[0] == DETECTOR:
             self.detectors.add(key[1])

@@ -1,7 +1,8 @@
-"""The manager's distance to its memory limit, and whether it may accept more tasks.
+"""The manager's memory headroom, which determines whether it accepts more tasks.
 
-Beyond a limit the kernel ends the process, and with it the work for all namespaces. So beyond 85 % of it, tasks that
-were never served are not taken in: their statuses give the reason, and a resync takes them in once there is room again.
+Beyond its memory limit, the kernel kills the process, and with it the work for all namespaces. So above 85 % of the
+limit, tasks that were never served are not accepted: their statuses give the reason, and a resync accepts them once
+memory is free.
 """
 
 from __future__ import annotations
@@ -18,16 +19,16 @@ from prometheus_client.registry import Collector
 
 from application_manager.measures import gauge
 
-_FULL, _ROOM = 0.85, 0.75  # of the limit: beyond the first it is tight, until it is below the second
+_FULL, _ROOM = 0.85, 0.75  # of the limit: memory is short above the first, until it is below the second
 _LOOK_EVERY = 0.5  # s
 _LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
-_UNLIMITED = 1 << 60  # bytes: what version 1 of cgroups has in place of `max`
+_UNLIMITED = 1 << 60  # bytes: cgroups v1 has this instead of `max`
 
 log = logging.getLogger(__name__)
 
 
 def container_limit() -> int | None:
-    """The memory limit of the container, in bytes; None where there is none."""
+    """The memory limit of the container, in bytes; None if there is none."""
     for each in _LIMITS:
         try:
             found = each.read_text().strip()
@@ -38,16 +39,16 @@ def container_limit() -> int | None:
 
 
 class Headroom(Collector):
-    """Compares what the manager and its worker processes have in memory with the limit; also as metrics."""
+    """Compares the resident memory of the manager and its worker processes with the limit; also as metrics."""
 
     def __init__(self, limit: int | None) -> None:
-        """`limit`: bytes; None: nothing is ever tight."""
+        """`limit`: bytes; None: memory is never short."""
         self.limit = limit
         self._tight = False
         self._looked = 0.0  # on the monotonic clock
 
     def tight(self) -> bool:
-        """Whether nothing more should be taken in."""
+        """Whether memory is short, so that no new tasks are accepted."""
         now = time.monotonic()
         if self.limit is not None and now - self._looked > _LOOK_EVERY:
             self._looked = now
@@ -55,7 +56,7 @@ class Headroom(Collector):
         return self._tight
 
     def collect(self) -> Iterator[Metric]:
-        """The metrics as of now."""
+        """The current metrics."""
         what = "of the manager and its worker processes"
         yield gauge("memory_bytes", f"Resident memory {what}", _resident())
         yield gauge("memory_tight", "1 while memory is short and no new tasks are accepted", self.tight())
@@ -75,11 +76,11 @@ class Headroom(Collector):
 
 
 def _resident() -> int:
-    """Bytes that this process and its children have in memory; what they share counts for each of them."""
+    """Resident bytes of this process and its children; shared memory counts for each of them."""
     children = Path(f"/proc/self/task/{os.getpid()}/children")
     try:
         pids = ["self", *children.read_text().split()]
-    except OSError:  # a kernel that does not list them
+    except OSError:  # a kernel without this list
         pids = ["self"]
     return sum(map(_resident_of, pids))
 
@@ -92,7 +93,7 @@ def _resident_of(pid: str) -> int:
 
 
 def _return_free_memory() -> None:
-    """Have the allocator give back what is free: it keeps it else, and it would count as in use."""
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # of glibc alone
+    """Make the allocator return free memory to the kernel: otherwise it keeps it, and it counts as used."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc only
     if trim is not None:
         trim(0)

@@ -20,14 +20,14 @@ from application_manager.workers.pool import CPU_TIME
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """The options of the command line, which explains them; None means nowhere or no limit.
+    """The options of the command line, which documents them; None: not given, or no limit.
 
     Attributes:
         namespaces: empty: all.
         resync, ttl_after_finished, stalled_after, watch_timeout, cpu_time: seconds.
         memory_limit: bytes.
-        lease: by which one of several managers is active.
-        detectors: what holds for the pods of detectors; None: no detector is run.
+        lease: of leader election.
+        detectors: the defaults for the pods of detectors; None: run no detectors.
     """
 
     policy: Policy = field(default_factory=Policy)
@@ -45,7 +45,7 @@ class Options:
     admission: WebhookOptions | None = None
     lease: LeaseKey = field(default_factory=lambda: LeaseKey("default"))
     stalled_after: float = STALLED_AFTER
-    watch_timeout: float = 90.0  # the API server sends each watch a bookmark a minute
+    watch_timeout: float = 90.0  # the API server sends a bookmark per watch and minute
     detectors: PodDefaults | None = None
     memory_limit: int | None = None
     cpu_time: float = CPU_TIME

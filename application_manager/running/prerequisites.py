@@ -1,4 +1,4 @@
-"""The checks before the manager starts: the kinds that it needs, and its rights."""
+"""The checks before the manager starts: the kinds that it needs, and its permissions."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ log = logging.getLogger(__name__)
 
 
 OLDEST = (1, 31)
-"""The oldest Kubernetes that works: 1.30 drops `selectableFields` of CRDs, by which an instance's tasks are listed."""
+"""The oldest supported Kubernetes: 1.30 ignores `selectableFields` of CRDs, by which an instance's tasks are listed."""
 
 
 async def recent_enough(client: Client) -> str:
-    """The API server's version. Raises ConfigurationError where it is older than `OLDEST`."""
+    """The API server's version. Raises ConfigurationError if it is older than `OLDEST`."""
     version = await until_answered(client.server_version)
     found = re.match(r"v?(\d+)\.(\d+)", version)
     if found is not None and (int(found[1]), int(found[2])) < OLDEST:
@@ -39,9 +39,9 @@ async def recent_enough(client: Client) -> str:
 
 
 async def selectable(client: Client, namespaces: tuple[str, ...]) -> None:
-    """Look whether tasks can be listed by their template: CRDs of an older release, or a proxy, may not have it.
+    """Check that tasks can be listed by their template: CRDs of an older release, or a proxy, may not support it.
 
-    Raises ConfigurationError where not.
+    Raises ConfigurationError if they cannot.
     """
     namespace = next(iter(sorted(namespaces)), None)
     try:
@@ -56,9 +56,9 @@ async def selectable(client: Client, namespaces: tuple[str, ...]) -> None:
 
 
 async def discovered(client: Client, policy: Policy) -> dict[KindKey, Resource]:
-    """Where our own kinds and those of the policy live; a kind that the cluster lacks is left out, and logged.
+    """The resources of our own kinds and those of the policy; a kind that the cluster lacks is left out, and logged.
 
-    Raises ConfigurationError where one of our own lacks, or one that is allowed is not namespaced.
+    Raises ConfigurationError if one of our own kinds is missing, or an allowed one is not namespaced.
     """
     found: dict[KindKey, Resource] = {}
     for version in sorted({each[0] for each in (*OWN, POD, *policy.kinds)}):

@@ -1,8 +1,8 @@
 """The running manager: starts watches, queues and servers in order, and stops them together.
 
-The order matters: all objects are listed before anything is decided, so that nothing is stopped for want of knowing
-what demands it. Then the watches and the periodic looks run side by side, and while this manager is the active one the
-queues too (`acting`); if one of them ends, all do. A standby knows all that the active one knows, and does nothing.
+The order matters: all objects are listed before any decision, so that nothing is stopped because a demand is not known
+yet. Then the watches and the periodic lists run concurrently and, while this manager is active, the queues as well
+(`acting`); if one of them ends, all end. A standby has the same caches as the active manager, and writes nothing.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ class Manager:
         self._work = work
         self._leadership = leadership
         client, options, resources, measures = work.client, work.options, work.resources, work.measures
-        # Pods always: those of workloads show why they do not run.
+        # Always Pods: the pods of workloads show why these do not run.
         children = [resources[kind] for kind in sorted({*options.policy.kinds, POD}) if kind in resources]
         self._listing = Resync(
             cache=work.cache,
@@ -154,7 +154,7 @@ class Manager:
                 await self._work.close()
 
     async def _first(self) -> None:
-        """Learn whether we are active, then list everything, so that who is active decides on what it saw since."""
+        """Determine whether we are active, then list everything, so that an active manager decides on newer lists."""
         await until_answered(self._leadership.look)
         await self._listing.first()
 
@@ -194,8 +194,8 @@ class Manager:
         )
 
     async def _begin(self, again: bool) -> None:
-        """Get ready to act. Where others may have acted since we looked, what we know comes from the cluster alone."""
-        if again:  # else it is listed since the Lease is ours
+        """Prepare to act. If others may have acted since the last list, everything is read from the cluster again."""
+        if again:  # otherwise everything was listed after we acquired the Lease
             self._work.begin_term(self._listing.children)
             await self._listing.first()
             self._work.publish_all()
@@ -203,14 +203,14 @@ class Manager:
 
     async def _announce(self, watching: asyncio.Event, stop: asyncio.Event) -> None:
         await watching.wait()
-        _on_signals(stop)  # kopf has put its own handlers in their place, which wait for tasks of ours
+        _on_signals(stop)  # kopf has replaced them with its own handlers, which wait for tasks of ours
         where = (
             f"namespaces {', '.join(self._work.options.namespaces)}"
             if self._work.options.namespaces
             else "all namespaces"
         )
         log.info("watching %s", where)
-        await asyncio.Event().wait()  # `_act` is who ends all, once nothing is written any more
+        await asyncio.Event().wait()  # `_act` ends all others, after the last write
 
     async def _watch(self, watching: asyncio.Event) -> None:
         await watch(

@@ -1,7 +1,7 @@
-"""Ends a manager that has stalled, so that Kubernetes starts it again and a standby takes over meanwhile.
+"""Ends a manager that has stalled, so that Kubernetes restarts it and a standby takes over.
 
-A thread of its own looks, since an event loop that hangs cannot look at itself. It counts its own steps and not the
-clock: a process that was stopped as a whole (a stopped container, a sleeping machine) has not stalled.
+It runs in its own thread, because an event loop that hangs cannot check itself. It counts its own steps instead of
+reading the clock: a process that was stopped as a whole (a paused container, a sleeping machine) has not stalled.
 """
 
 from __future__ import annotations
@@ -15,22 +15,25 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 
 SILENT = 30.0
-"""Seconds without a sign of life of the event loop after which it hangs, at the most."""
+"""The maximum number of seconds without a sign of life of the event loop before it counts as hanging."""
 
 PERSISTENT = 10.0
-"""Seconds for which a stall must be seen, so that a process that was stopped has time to continue."""
+"""Seconds for which a stall must last, so that a process that was stopped has time to continue."""
 
 STALLED = 70
-"""The exit code of a manager that was ended: EX_SOFTWARE."""
+"""The exit code after a stall: EX_SOFTWARE."""
 
 _STEP = 1.0  # s
 
 Stall = Callable[[], str | None]
-"""What has stalled, in words; None where nothing has. Another thread calls it, so it must only read."""
+"""Reports what has stalled, as text; None: nothing. It is called from another thread, so it must only read."""
 
 
 def end_process(reason: str) -> None:
-    """End the process at once, and log the reason and where every thread is. It takes no lock: its holder may hang."""
+    """End the process immediately, and log the reason and the stacks of all threads.
+
+    It takes no lock: the thread that has it may hang.
+    """
     when = time.strftime("%Y-%m-%d %H:%M:%S")
     line = f"{when},000 CRITICAL watchdog: {reason}; ending this manager, to be restarted\n"
     os.write(2, line.encode())
@@ -42,9 +45,9 @@ def end_process(reason: str) -> None:
 async def watchdog(
     stalled: Stall, silent: float = SILENT, *, step: float = _STEP, end: Callable[[str], None] = end_process
 ) -> AsyncIterator[None]:
-    """Look after the event loop that this is entered in, and after what `stalled` reports, while the block runs.
+    """Supervise the current event loop, and the work that `stalled` reports on, while the block runs.
 
-    `silent`: seconds after which an event loop without a sign of life hangs; `step`: seconds between two looks; `end`
+    `silent`: the maximum seconds without a sign of life of the event loop; `step`: seconds between two checks; `end`
     ends the process.
     """
     beats, over = [0], threading.Event()

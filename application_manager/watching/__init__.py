@@ -1,1 +1,1 @@
-"""Watches, periodic lists and Leases: each event enters the cache, and what it concerns is enqueued."""
+"""Watches, periodic lists and Leases: each event enters the cache, and the objects that it concerns are enqueued."""

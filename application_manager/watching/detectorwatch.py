@@ -1,6 +1,6 @@
 """Lists the objects of the detectors that the manager runs, and the pods with sidecars, every few seconds.
 
-There are few of them, and a look shows all that a watch could have missed.
+There are few of them, and a list contains everything that a watch could have missed.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _PODS = Resource("v1", "Pod", "pods")
 
 @dataclass(frozen=True, slots=True)
 class DetectorWatch:
-    """Lists them, in these namespaces, everywhere where there are none; `detector` enqueues a Detector."""
+    """Lists them in these namespaces, or in all if there are none; `detector` enqueues a Detector."""
 
     cache: ClusterCache
     client: Client
@@ -34,13 +34,13 @@ class DetectorWatch:
     detector: Callable[[Name], None]
 
     async def run(self) -> None:
-        """Look until cancelled, where the manager runs detectors."""
+        """List them until cancelled, if the manager runs detectors."""
         if self.index.defaults is None:
             await asyncio.Event().wait()
         await repeatedly(self.look, LOOK_EVERY, "cannot list the objects of detectors")
 
     async def look(self) -> None:
-        """Look once. Raises ApiError or Unreachable."""
+        """List them once. Raises ApiError or Unreachable."""
         objects: list[Object] = []
         for resource in _KINDS:
             objects += await self._list(resource, SELECTOR)

@@ -17,17 +17,17 @@ from wayside.kubernetes.leases import lease_name
 from wayside.kubernetes.resources import LEASES, Resource
 
 LOOK_EVERY = 1.0  # s
-_AT_ONCE = 8  # Leases read at once: few, since what runs goes before
+_AT_ONCE = 8  # concurrent reads of Leases: few, because work on instances comes first
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class LeaseWatch:
-    """Measures the time in which we reach the API server, on which Leases expire.
+    """Measures the time in which the API server responds, by which Leases expire.
 
-    `probe`: what is listed to see whether the API server and its storage answer, in one of the namespaces, if there are
-    any; `instance` enqueues an instance.
+    `probe`: the resource to list for checking the API server and its storage, in one of the managed namespaces if there
+    are any; `instance` enqueues an instance.
     """
 
     cache: ClusterCache
@@ -37,7 +37,7 @@ class LeaseWatch:
     instance: Callable[[Name], None]
 
     async def run(self) -> None:
-        """Look until cancelled. Reading never holds up the look at the health, by which all Leases are checked."""
+        """Check until cancelled. Reading Leases never delays the health check, on which all Leases depend."""
         async with asyncio.TaskGroup() as group:
             group.create_task(self._measure(), name="health")
             group.create_task(self._read(), name="overdue leases")
@@ -68,9 +68,9 @@ class LeaseWatch:
         return True
 
     async def read_due(self) -> None:
-        """Read the Leases that are unchanged for longer than they last; changes also come by watching.
+        """Read the Leases that were unchanged for longer than their duration; the watch reports changes as well.
 
-        One that cannot be read is left as it was seen last, and does not concern the others.
+        A Lease that cannot be read keeps its last observation, and does not affect the others.
         """
         at = self.cache.healthy.elapsed
         gate = asyncio.Semaphore(_AT_ONCE)
@@ -81,7 +81,7 @@ class LeaseWatch:
             log.warning("leases: %s%s", problems[0], others)
 
     async def _look_at(self, key: HolderKey, instances: Iterable[Name], gate: asyncio.Semaphore) -> Exception | None:
-        """Read one Lease; what failed, if anything."""
+        """Read one Lease; returns the error, if any."""
         async with gate:
             try:
                 raw = await self.client.get(LEASES, key[0], lease_name(key[1]))

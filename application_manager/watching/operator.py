@@ -30,8 +30,10 @@ from wayside.process.backoff import Backoff
 
 Handler = Callable[[Object], None]
 Relist = Callable[[Any, str | None, str], Awaitable[None]]
-"""Lists a resource of kopf's again: in a namespace, or in all for None, by a label selector. May raise ApiError or
-Unreachable."""
+"""Lists a resource of kopf's again: in a namespace, or in all for None, by a label selector.
+
+May raise ApiError or Unreachable.
+"""
 
 log = logging.getLogger(__name__)
 
@@ -39,7 +41,7 @@ _FIRST_PAUSE, _LONGEST_PAUSE = 0.1, 1.0  # s between attempts to reach the API s
 
 
 class _Pauses:
-    """An endless series of pauses, which restarts whenever kopf iterates: a watch never gives up."""
+    """An endless series of pauses, which restarts at each iteration by kopf: a watch never gives up."""
 
     def __iter__(self) -> Iterator[float]:
         backoff = Backoff(_FIRST_PAUSE, _LONGEST_PAUSE)
@@ -63,7 +65,7 @@ async def watch(
 
     `namespaces` empty: all. `relist` lists a kind and routes its objects; `failed` counts an object that could not be
     handled. `pulse` receives each watch's signs of life. `ready` is set once kopf has started. `connect` returns
-    credentials, at the start and again when the API server no longer accepts them.
+    credentials, at the start and when the API server no longer accepts them.
     """
     logging.getLogger("kopf").setLevel(logging.WARNING)
     registry = kopf.OperatorRegistry()
@@ -74,9 +76,9 @@ async def watch(
     settings.networking.request_timeout = 15
     settings.networking.connect_timeout = 5
     settings.watching.inactivity_timeout = NEVER  # see pulse
-    settings.watching.chunk_size = 1  # its list is for the version alone, see relaying
+    settings.watching.chunk_size = 1  # its list only provides the version, see relaying
     settings.process.ultimate_exiting_timeout = None
-    settings.queueing.exit_timeout = 0.1  # s; what is lost by stopping at once is seen again at the next start
+    settings.queueing.exit_timeout = 0.1  # s; the next start lists everything that is lost by stopping immediately
 
     async def login(**_: Any) -> kopf.ConnectionInfo:
         return await connect()
@@ -91,7 +93,7 @@ async def watch(
         kopf.on.event(resource.group, resource.version, resource.plural, registry=registry)(handled)
         settings.watching.label_selectors[resource.group, resource.version, resource.plural] = label
 
-    identity: Any = "application-manager"  # else kopf looks up the user's name, and a container's may have none
+    identity: Any = "application-manager"  # otherwise kopf looks up the user's name, which may not exist
     with pulsing(pulse), relaying(observe, vanished, relist, failed):
         await kopf.operator(
             registry=registry,
@@ -131,7 +133,7 @@ def relaying(observe: Handler, vanished: Handler, relist: Relist, failed: Callab
             version = raw["metadata"]["resourceVersion"]
             del event, raw
             yield {"type": "BOOKMARK", "object": {"metadata": {"resourceVersion": version}}}
-            await asyncio.sleep(0)  # many may have arrived: the work continues in between
+            await asyncio.sleep(0)  # many events may have arrived: let other tasks run in between
 
     async def fetch_objs(*, settings: Any, resource: Any, namespace: Any, **about: Any) -> AsyncIterator[Any]:
         version, labels = None, ",".join(sorted(set(settings.watching.label_selectors.collect(resource))))
@@ -142,7 +144,7 @@ def relaying(observe: Handler, vanished: Handler, relist: Relist, failed: Callab
             await relist(resource, namespace, labels)
         except RequestError as error:
             log.warning("cannot list %s; retrying with backoff: %s", resource.plural, error)
-            raise TimeoutError from error  # on which kopf retries the list
+            raise TimeoutError from error  # then kopf retries the list
         yield [], version
 
     watching.watch_objs, fetching.fetch_objs = watch_objs, fetch_objs

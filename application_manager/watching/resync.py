@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Resync:
-    """Lists our own kinds and those of instances' objects, in these namespaces, everywhere where there are none.
+    """Lists our own kinds and those of instances' objects, in these namespaces, or in all if there are none.
 
     `every`: seconds between two resyncs.
     """
@@ -39,15 +39,12 @@ class Resync:
     measures: Measures
 
     async def first(self) -> None:
-        """List everything, however long the API server takes to answer.
-
-        Raises ApiError where it refuses for good.
-        """
+        """List everything, however long the API server takes to respond. Raises ApiError if it refuses permanently."""
         await until_answered(self._everything)
         self.measures.resynced(well=True)
 
     async def resync(self, watching: asyncio.Event) -> None:
-        """List everything again and again, once the watches have begun, until cancelled."""
+        """List everything periodically, after the watches have started, until cancelled."""
         await watching.wait()
         await asyncio.sleep(self.every)
         while True:
@@ -63,7 +60,7 @@ class Resync:
             await asyncio.sleep(max(0.0, self.every - (time.monotonic() - began)))
 
     async def again(self, of_kopf: Any, namespace: str | None, labels: str) -> None:
-        """List one of kopf's resources, in a namespace or (None) in all, and route the objects and missed deletions.
+        """List one of kopf's resources, in a namespace or (None) in all; route its objects and missed deletions.
 
         Raises RequestError.
         """

@@ -1,6 +1,7 @@
-"""Routes events: each object enters the cache, and the router enqueues what depends on it.
+"""Routes events: each object enters the cache, and the router enqueues the objects that depend on it.
 
-Watch events, answers to our own writes, and lists all come through here. An object that is known already ends here.
+Watch events, responses to our own writes, and lists all come through here. A version that the cache already has is
+ignored.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Router:
-    """Puts events into the cache and enqueues what they concern; `rule` takes Detectors as well."""
+    """Puts events into the cache and enqueues the objects that they concern; `rule` also enqueues Detectors."""
 
     cache: ClusterCache
     applier: Applier
@@ -53,7 +54,7 @@ class Router:
     configuration: Enqueue
 
     def observe(self, raw: Object) -> None:
-        """Take an object as it was read."""
+        """Handle a raw object."""
         kind, name = kind_of(raw), name_of(raw)
         if kind == LEASE:
             self._lease(name, raw)
@@ -79,7 +80,7 @@ class Router:
             self._child(raw, old, entry)
 
     def vanished(self, raw: Object) -> None:
-        """An object was deleted."""
+        """Handle the deletion of an object."""
         kind, name = kind_of(raw), name_of(raw)
         if kind == LEASE:
             self._lease(name, None)
@@ -124,12 +125,12 @@ class Router:
                 self.rule((kind, name))
 
     def claimed(self, name: Name) -> None:
-        """The claim of a task may be another one now."""
+        """The claim of a task may have changed."""
         self._enqueue_all(self.cache.note_task(name))
         self.task(name)
 
     def settled(self, template: Name) -> None:
-        """The claims of all tasks of a template are known now."""
+        """All claims of a template's tasks are known now."""
         for name in self.cache.instances_of(template):
             self.instance(name)
 
@@ -144,7 +145,7 @@ class Router:
 
     def _claim_again(self, template: Name) -> None:
         """Determine the claims of all tasks of the template again, and enqueue its instances."""
-        touched = {template, *self.cache.instances_of(template)}  # its own name is that of its baseline
+        touched = {template, *self.cache.instances_of(template)}  # the baseline has the template's name
         touched |= self.cache.falling_back_to(template)
         for name in self.cache.claims.tasks_of(template):
             entry = self.cache.store.get(TASK, name)
@@ -163,7 +164,7 @@ class Router:
             if self.cache.pods.note(raw):
                 self._enqueue_owner(entry.raw)
             if _is_a_workloads(entry.raw):
-                return  # that its pods are ready, a workload reports itself
+                return  # the status of a workload reports that its pods are ready
         self.applier.note(entry.raw)
         if old is None or self._significance(old) != self._significance(entry) or self.applier.has_drifted(entry.uid):
             self._enqueue_owner(entry.raw)
@@ -171,7 +172,7 @@ class Router:
             self._enqueue_configuration(entry.raw)
 
     def _significance(self, entry: Entry) -> tuple[str, bool, str | None, bool]:
-        """What of an object matters to its instance; workloads change their status far more often."""
+        """The part of an object that matters to its instance; workloads change the rest of their status more often."""
         raw = entry.raw
         return entry.uid, "deletionTimestamp" in raw["metadata"], not_ready(raw), pods_left(raw) > 0
 
@@ -195,11 +196,11 @@ class Router:
         returns = renewed and (not before.renewed or before.unchanged >= before.duration)
         if returns:
             log.info("holder %s/%s renews its Lease again", *key)
-        if first or returns:  # only now is it known how long it lasts
+        if first or returns:  # only now is its duration known
             self._enqueue_all(self.cache.claims.holders().get(key, ()))
 
     def _rules(self, namespace: str) -> None:
-        """Rules and detectors of a namespace are checked together: either may be what is wrong with the other.
+        """Enqueue the checks of all rules and detectors of a namespace: one may cause an error of the other.
 
         Findings of rules about templates may have changed too.
         """
@@ -209,7 +210,7 @@ class Router:
                     self.rule((kind, name))
 
     def look_at(self, name: Name) -> None:
-        """Enqueue an instance, or all of a template where the name means these."""
+        """Enqueue an instance, or all instances of a template if the name stands for these."""
         self._enqueue_all([name])
 
     def _enqueue_all(self, instances: Iterable[Name]) -> None:
@@ -218,10 +219,10 @@ class Router:
 
 
 def _written(entry: Entry) -> tuple[object, ...]:
-    """What people write of a rule or a detector, or what is wrong with that."""
+    """The part of a rule or detector that its authors write, or the error in it."""
     return entry.raw["spec"], entry.problem, entry.raw["metadata"].get("labels")
 
 
 def _is_a_workloads(pod: Object) -> bool:
-    """Whether the pod belongs to a workload, and not to the instance itself."""
+    """Whether the pod belongs to a workload, and is not an object of the instance itself."""
     return controller_of(pod).get("kind") not in (None, ApplicationInstance.__name__)

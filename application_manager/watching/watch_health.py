@@ -1,9 +1,9 @@
-"""Supervises watches: one without an event or a bookmark is restarted, or the manager is ended.
+"""Supervises watches: a watch without an event or bookmark is restarted; if that does not help, the manager is ended.
 
-kopf has a timeout of its own for inactive watches, and it can kill them: its `asyncio.timeout` stays armed while kopf's
-consumer, and not the stream, is waiting. Expired there, as after a stall of the process, it cancels the consumer, and
-kopf takes that task as one that was meant to end. So that timeout is out of the way here, and ours is armed only while
-the stream is waited for. docs/decisions/0026 has the details.
+kopf has its own timeout for inactive watches, which can end them for good: its `asyncio.timeout` stays armed while
+kopf's consumer, not the stream, is waiting. If it expires at that time, as after a stall of the process, it cancels the
+consumer, and kopf treats that task as one that was meant to end. So kopf's timeout is set out of reach, and ours is
+armed only while the manager waits for the stream. docs/decisions/0026 has the details.
 """
 
 from __future__ import annotations
@@ -33,25 +33,25 @@ log = logging.getLogger(__name__)
 
 
 class WatchHealth(Collector):
-    """When each watch last gave a sign of life; also as metrics. Any thread may read."""
+    """When each watch last gave a sign of life; also as metrics. Any thread may read it."""
 
     def __init__(self, limit: float, healthy: Callable[[], float]) -> None:
-        """`limit`: seconds until a watch is restarted; `healthy`: seconds during which the API server answered."""
+        """`limit`: seconds until a watch is restarted; `healthy`: seconds during which the API server responded."""
         self.limit = limit
         self._healthy = healthy
         self._beats: dict[Watch, tuple[float, float]] = {}  # monotonic and healthy seconds
         self._restarts = 0
 
     def beat(self, watch: Watch) -> None:
-        """A sign of life."""
+        """Note a sign of life."""
         self._beats[watch] = time.monotonic(), self._healthy()
 
     def forget(self, watch: Watch) -> None:
-        """The account may not watch it, which was reported at the start."""
+        """Note that the account may not watch the resource, which was reported at the start."""
         self._beats.pop(watch, None)
 
     def restarted(self, watch: Watch) -> None:
-        """A watch was silent for too long and is begun again."""
+        """Note that a watch was silent for too long, and is restarted."""
         self._restarts += 1
         log.warning(
             "the watch of %s%s had no event or bookmark for %g s; restarting it",
@@ -61,11 +61,11 @@ class WatchHealth(Collector):
         )
 
     def begun(self, resource: str) -> bool:
-        """Whether a watch of the resource has begun."""
+        """Whether a watch of the resource has started."""
         return any(each == resource for each, _ in self._beats.copy())
 
     def dead(self) -> str | None:
-        """The watch that has had no sign of life for too long while the API server answered, in words."""
+        """The watch that gave no sign of life for too long although the API server responded, as text."""
         now = self._healthy()
         for (resource, _), (_, since) in self._beats.copy().items():
             if now - since > _LIMITS * self.limit:
@@ -73,7 +73,7 @@ class WatchHealth(Collector):
         return None
 
     def collect(self) -> Iterator[Metric]:
-        """The metrics as of now."""
+        """The current metrics."""
         now, ages = time.monotonic(), dict[str, float]()
         for (resource, _), (since, _) in self._beats.copy().items():
             ages[resource] = max(ages.get(resource, 0.0), now - since)
@@ -85,7 +85,7 @@ class WatchHealth(Collector):
 
 @contextmanager
 def pulsing(pulse: WatchHealth) -> Iterator[None]:
-    """Have kopf's watches give their signs of life while the block runs, and restart those that give none."""
+    """Make kopf's watches report signs of life while the block runs, and restart those that report none."""
     original = watching.watch_objs
 
     async def watch_objs(*, resource: Any, namespace: Any, **more: Any) -> AsyncIterator[Any]:
@@ -94,7 +94,7 @@ def pulsing(pulse: WatchHealth) -> Iterator[None]:
         pulse.beat(watch)
         while True:
             try:
-                async with asyncio.timeout(pulse.limit):  # only while the stream is waited for
+                async with asyncio.timeout(pulse.limit):  # only while it waits for the stream
                     event = await anext(stream)
             except StopAsyncIteration:
                 return

@@ -1,8 +1,8 @@
 """The work of the active manager only: reconciling, posting Events, publishing configurations.
 
-Several times over, if need be: a manager that cannot renew its Lease stops at once and becomes a standby, and may
-become active again. At the end of the process what is under way is finished, within a bound, and then the Lease is
-released.
+It may start and stop several times: a manager that cannot renew its Lease stops immediately and becomes a standby, and
+may become active again. At the end of the process, the current work is finished, within a time limit, and then the
+Lease is released.
 """
 
 from __future__ import annotations
@@ -17,25 +17,25 @@ from application_manager.cluster.leadership import Leadership
 from wayside.kubernetes.client import Client
 
 FINISHING = 3.0
-"""Seconds that what is under way at the end is given; the next start does what is given up then."""
+"""Seconds for the current work at the end; the next start repeats the unfinished work."""
 
-_AGAIN = 0.5  # s until a task that continues is cancelled again
+_AGAIN = 0.5  # s until a task that does not stop is cancelled again
 
 log = logging.getLogger(__name__)
 
 
 Begin = Callable[[bool], Awaitable[None]]
-"""Gets ready to act; True: somebody else may have acted since the first look at everything."""
+"""Prepares to act; True: another manager may have acted since the first lists."""
 
 
 class ActiveWork(Protocol):
-    """What works until it is cancelled, or finished."""
+    """Works until it is cancelled, or finished."""
 
     async def run(self) -> None:
         """Work."""
 
     def finish(self) -> None:
-        """End once what is under way is done."""
+        """Return after the current work is done."""
 
 
 async def acting(
@@ -46,7 +46,7 @@ async def acting(
     begin: Begin,
     stop: asyncio.Event,
 ) -> None:
-    """Act whenever this manager is active, until `stop` is set; the Lease is released then.
+    """Act whenever this manager is active, until `stop` is set; then the Lease is released.
 
     `reporters` report the work of the queues, and therefore end after them; `begin` is called each time before the
     work.
@@ -98,7 +98,7 @@ async def _run(workers: Sequence[ActiveWork]) -> None:
 
 
 async def ended(*tasks: asyncio.Task[Any]) -> None:
-    """Cancel the tasks until they have ended: one that gathers may lose its cancellation to an error of a part."""
+    """Cancel the tasks until they have ended: an error in a gathered part may swallow the cancellation."""
     pending = {each for each in tasks if not each.done()}
     while pending:
         for task in pending:
@@ -107,7 +107,7 @@ async def ended(*tasks: asyncio.Task[Any]) -> None:
 
 
 async def done_before(stop: asyncio.Event, work: Coroutine[None, None, None]) -> bool:
-    """Do the work unless `stop` is set meanwhile; whether it was done. Raises what the work does."""
+    """Do the work unless `stop` is set meanwhile; whether it was done. Raises the exceptions of the work."""
     working, stopping = asyncio.create_task(work), asyncio.create_task(stop.wait())
     try:
         await asyncio.wait((working, stopping), return_when=asyncio.FIRST_COMPLETED)
@@ -119,7 +119,7 @@ async def done_before(stop: asyncio.Event, work: Coroutine[None, None, None]) ->
 
 
 async def _release(leadership: Leadership, client: Client) -> None:
-    """Release the Lease, unless a request that was given up may yet be done: then it expires by itself."""
+    """Release the Lease, unless a request that was given up may still take effect: then the Lease expires by itself."""
     if not leadership.active:
         return
     if client.open_until > time.monotonic():

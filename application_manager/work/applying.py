@@ -1,9 +1,9 @@
-"""Applies an instance's rendered objects, and never touches objects of others.
+"""Applies an instance's rendered objects, and never changes objects of others.
 
-Before an object is applied for the first time it is looked for: one that exists and whose controller is not this
-instance is left alone. Every later apply carries the uid, so an object that was replaced meanwhile is a conflict and
-not a victim. Objects that the rendering has no more are pruned, but only once everything else was applied, only with
-our controller reference and with their uid as a precondition.
+Before the first apply of an object, the manager reads it: an existing object whose controller is not this instance is
+not changed. Every later apply contains the uid, so an object that was replaced meanwhile causes a conflict and is not
+overwritten. Objects that are no longer rendered are pruned, but only after everything else was applied, only with our
+controller reference and with their uid as a precondition.
 """
 
 from __future__ import annotations
@@ -50,34 +50,34 @@ log = logging.getLogger(__name__)
 
 
 class Applier:
-    """Applies, prunes and notices what others changed."""
+    """Applies and prunes objects, and detects drift."""
 
     def __init__(self, client: Client, store: Store, resources: Mapping[KindKey, Resource]) -> None:
         self._client = client
         self._store = store
         self._resources = dict(resources)
-        self._fields: dict[str, str] = {}  # uid → the fields that are ours, as of our last apply
+        self._fields: dict[str, str] = {}  # uid → the fields that we owned after our last apply
         self._drifted: set[str] = set()
         self._controlled: MembersByGroup[str, str, ObjectKey] = MembersByGroup()  # uid of the controller → uid → object
 
     def live(self, namespace: str, key: ObjectKey) -> Object | None:
-        """The object, where we watch it: it has an instance's label."""
+        """The object, if it is watched: it has an instance's label."""
         entry = self._store.get((key[0], key[1]), (namespace, key[2]))
         return entry.raw if entry is not None else None
 
     def note(self, raw: Object) -> None:
-        """Note an object seen by watching: somebody who takes a field from us makes it drift."""
+        """Note a watched object: if another client took over a field from us, the object has drifted."""
         uid, fields = raw["metadata"]["uid"], our_fields(raw)
         if self._fields.setdefault(uid, fields) != fields:
             self._drifted.add(uid)
         self._controlled.put(controller_uid(raw) or "", uid, object_key(raw))
 
     def has_drifted(self, uid: str) -> bool:
-        """Whether somebody took a field of the object from us."""
+        """Whether another client took over a field of the object."""
         return uid in self._drifted
 
     def begin(self, objects: Iterable[Object]) -> None:
-        """Take the objects as they are for undisturbed: what changed up to now, another manager may have done."""
+        """Forget all drift: until now, another manager may have been active and have changed the objects."""
         self._fields.clear()
         self._drifted.clear()
         for raw in objects:
@@ -91,7 +91,7 @@ class Applier:
         self._controlled.drop(controller_uid(raw) or "", uid)
 
     def pending(self, instance: ApplicationInstance, rendering: Rendering, known: LastApplied) -> list[Manifest]:
-        """The manifests that need applying: all of a new rendering, else those that are missing or have drifted."""
+        """The manifests to apply: all of a new rendering, otherwise those that are missing or have drifted."""
         if known.digest != rendering.digest:
             return list(rendering.manifests)
         return [
@@ -108,7 +108,7 @@ class Applier:
         return uid == recorded.get(key) and uid not in self._drifted
 
     async def look(self, namespace: str, manifests: Iterable[Manifest]) -> dict[ObjectKey, Object | None]:
-        """The objects as they are in the cluster, where we do not watch them already."""
+        """The current objects in the cluster, unless they are watched."""
         keys = [key for key in map(object_key, manifests) if self.live(namespace, key) is None]
         found = await asyncio.gather(*(self._get(namespace, key) for key in keys))
         return dict(zip(keys, found, strict=True))
@@ -121,10 +121,10 @@ class Applier:
         known: LastApplied,
         looked: Mapping[ObjectKey, Object | None],
     ) -> ApplyResult:
-        """Apply the manifests, which are all or some of the rendering, and prune what it has no more.
+        """Apply all or some manifests of the rendering, and prune the objects that are no longer rendered.
 
-        `looked` is from `look`, for the same manifests. Raises ApiError or Unreachable for what may pass, once all
-        else was tried.
+        `looked`: the result of `look` for the same manifests. Raises ApiError or Unreachable for a temporary error,
+        after all other objects were tried.
         """
         began = time.time_ns()
         wanted = rendering.keys()
@@ -147,7 +147,7 @@ class Applier:
         if problems:
             there = references({**dict.fromkeys(wanted), **uids})
             return ApplyResult(_refused(problems), there, complete=False, took=(began, time.time_ns()))
-        # What has the instance as controller is its own, recorded or not.
+        # An object whose controller is the instance belongs to it, recorded or not.
         controlled = self._controlled.get(instance.metadata.uid, {})
         for key in (recorded.keys() | set(controlled.values())) - wanted:
             await self._prune(instance, key)
@@ -188,9 +188,9 @@ class Applier:
         return await self._client.get(await self.resource(key), namespace, key[2])
 
     async def resource(self, key: ObjectKey) -> Resource:
-        """Where the object's kind lives. Raises ApiError where the cluster does not have it."""
+        """The resource of the object's kind. Raises ApiError if the cluster does not have it."""
         kind = key[:2]
-        if kind not in self._resources:  # a kind that was allowed once, or was added to the cluster since we started
+        if kind not in self._resources:  # a kind that was allowed before, or was added to the cluster after our start
             self._resources |= await self._client.discover(key[0])
         if kind not in self._resources:
             raise ApiError(404, f"the cluster has no kind {key[0]}/{key[1]}")
@@ -205,10 +205,10 @@ async def apply_owned(
     live: Object | None,
     recorded: str | None = None,
 ) -> Object | ApplyProblem:
-    """Apply an object with its owner as controller, unless it is somebody else's; the object, or what prevents it.
+    """Apply an object with its owner as controller, unless it belongs to another; returns the object, or the problem.
 
-    `live`: the object as it is, None where there is none; its uid is a precondition. `recorded`: its uid, if the
-    owner's status lists it. Raises RequestError for what may pass, and for a namespace that is being deleted.
+    `live`: the current object, None if there is none; its uid is a precondition. `recorded`: its uid, if the owner's
+    status lists it. Raises RequestError for a temporary error, and for a namespace that is being deleted.
     """
     what = f"{manifest['kind']} {manifest['metadata']['name']}"
     if live is not None:
@@ -233,7 +233,7 @@ def _refused(problems: Sequence[ApplyProblem]) -> ConditionState:
 
 
 def _readable(message: str) -> str:
-    """The API server's refusal without the Go around a wrong type."""
+    """The API server's refusal, without the Go syntax around a wrong type."""
     typed = re.fullmatch(r"failed to create typed patch object \([^)]*\): \.?(.*)", message, re.DOTALL)
     if typed is None:
         return message

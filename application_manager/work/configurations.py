@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class ConfigurationWork:
-    """Brings configurations out."""
+    """Announces configurations."""
 
     cache: ClusterCache
     client: Client
@@ -37,7 +37,7 @@ class ConfigurationWork:
     async def reconcile(self, name: Name) -> None:
         """Publish the instance's configuration, and announce it to those of its pods that do not have it.
 
-        Raises RequestError for what may pass.
+        Raises RequestError for a temporary error.
         """
         instance = self.cache.instance(name)
         live = self.applier.live(name[0], config_map_key(name[1]))

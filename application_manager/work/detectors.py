@@ -1,10 +1,11 @@
 """Reconciles the detectors that the manager runs: applies their objects, or deletes them.
 
-What is not the Detector's own is left alone: an object of the same name that it does not control. What it owns goes
-with it, by Kubernetes' garbage collection, and without its mode by us.
+An object of the same name that the Detector does not control is not changed. When the Detector is deleted, Kubernetes'
+garbage collection deletes its objects; when its mode is removed, the manager does.
 
-A pod that requested a sidecar and was created without it gets an Event: the API server's review comes before there is a
-pod, or not at all where no manager is there. So the pods are looked at afterwards, within an hour after they were made.
+A pod that requested a sidecar and was created without it gets an Event. The review cannot create it, because it comes
+before the pod exists, or never if no manager is available. So the pods are checked afterwards, within an hour after
+their creation.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ from wayside.times import parse_seconds
 
 _RESOURCES = {each[1]: Resource(*each) for each in KINDS}
 
-NEW = 3600.0  # s after its making in which a pod has its Event; as long as Kubernetes keeps Events, so none comes again
+NEW = 3600.0  # s after its creation in which a pod gets its Event, which Kubernetes keeps as long
 _NOBODY = "it was created before its Detector, or while no webhook was available"
 
 log = logging.getLogger(__name__)
@@ -55,7 +56,7 @@ class _Posted:
 
 @dataclass(frozen=True, slots=True)
 class DetectorWork:
-    """Makes, changes and removes a detector's objects; `judge` enqueues the Detector's status."""
+    """Creates, changes and deletes a detector's objects; `judge` enqueues the Detector's status."""
 
     cache: ClusterCache
     client: Client
@@ -63,17 +64,17 @@ class DetectorWork:
     judge: Callable[[Name], None]
     recorder: Recorder
     _posted: dict[Name, dict[str, _Posted]] = field(default_factory=dict)  # by Detector, then the pod's uid
-    _applied: dict[str, tuple[str, str]] = field(default_factory=dict)  # uid → what was applied, and our fields since
+    _applied: dict[str, tuple[str, str]] = field(default_factory=dict)  # uid → the last apply, our fields
 
     async def reconcile(self, name: Name) -> None:
-        """Make the Detector's objects, and note whether it runs. Raises RequestError for what may pass."""
+        """Apply the Detector's objects, and note whether it runs. Raises RequestError for a temporary error."""
         entry = self.cache.store.get(DETECTOR, name)
         self._report(name)
         if entry is None:
             self.index.processed.pop(name, None)
             return
         if not isinstance(entry.model, Detector) or entry.raw["metadata"].get("deletionTimestamp"):
-            return  # what is there stays, until the Detector can be read again or is gone
+            return  # the objects stay until the Detector can be read again or is deleted
         detector = entry.model
         if detector.spec.mode is None:
             await self._remove(name, entry.uid, self.index.owned(entry.uid))
@@ -98,9 +99,9 @@ class DetectorWork:
         return running(self.index.owned(detector.metadata.uid).get("Deployment"), self.index.troubles(name))
 
     async def _make_rights(self, name: Name, detector: Detector, defaults: PodDefaults) -> ConditionState:
-        """Give the accounts of others' pods what the detector needs in them; by the webhook it comes into them.
+        """Give the service accounts of other pods the permissions of the detector that the webhook injects into them.
 
-        Also where the Detector is not accepted: an account that it names no more has no rights any more.
+        Also if the Detector is not accepted: a service account that it no longer lists has no permissions any more.
         """
         manifests = detector_objects(detector, defaults)
         kinds = {each["kind"] for each in manifests}
@@ -113,7 +114,7 @@ class DetectorWork:
         return carried(detector, requesting)
 
     async def _apply(self, name: Name, detector: Detector, manifests: Iterable[Manifest]) -> ConditionState | None:
-        """Apply the objects, up to the first that something prevents; what that is, if anything."""
+        """Apply the objects, up to the first that fails; returns its problem, if any."""
         for manifest in manifests:
             problem = await self._apply_one(name, detector, manifest)
             if problem is not None:
@@ -147,7 +148,7 @@ class DetectorWork:
         return None
 
     async def _remove(self, name: Name, uid: str, kinds: Iterable[str]) -> None:
-        """Remove what the Detector controls of these kinds: with its mode as it is they are not needed."""
+        """Delete the objects of these kinds that the Detector controls: its mode does not need them."""
         for kind in list(kinds):
             raw = self.index.owned(uid).get(kind)
             if raw is None:
@@ -158,7 +159,7 @@ class DetectorWork:
             log.info("detector %s/%s: removed %s %s", *name, kind, raw["metadata"]["name"])
 
     def _report(self, name: Name) -> None:
-        """Post Events about the pods that request the Detector and run without it, once a pod and cause."""
+        """Post Events about the pods that request the Detector and run without it, once for each pod and cause."""
         entry, detector = self.cache.store.get(DETECTOR, name), self.cache.detector(name)
         version = entry.version if entry is not None else 0
         before, posted, now = self._posted.pop(name, {}), dict[str, _Posted](), time.time()

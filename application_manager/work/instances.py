@@ -1,7 +1,7 @@
 """Reconciles one instance: decides, applies the instance, applies its objects, in one pass.
 
-Nothing here waits for our own watch events: each answer of the API server enters the store, and the next step starts
-from it. What fails is tried again as a whole, from what is known then. How it went is noted in the cache's record of
+It waits for none of our own watch events: each response of the API server enters the store, and the next step uses it.
+After a failure, the whole pass is retried, with the state at that time. The result is noted in the cache's record of
 the instance, and reported afterwards (`instancestatus`).
 """
 
@@ -37,16 +37,16 @@ from wayside.process.backoff import pause_after
 
 log = logging.getLogger(__name__)
 
-_LOOK_AGAIN = 1.0  # s until an object that is on its way out is looked for again, should its watch event not come
-FIRST_PAUSE = 1.0  # s until what was refused is tried again, doubled with every refusal of the same
+_LOOK_AGAIN = 1.0  # s until an object that is being deleted is read again, in case its watch event is missing
+FIRST_PAUSE = 1.0  # s until the first retry after a refusal, doubled with each further refusal of the same content
 LONGEST_PAUSE = 30.0  # s
 
 
 @dataclass(frozen=True, slots=True)
 class _Start:
-    """What the work on one instance starts from. It is read from the cache in one go, so it belongs together.
+    """The input of the work on one instance, read from the cache at once, so it is consistent.
 
-    `existing` is None where the instance is to be made; `record`: how this process's last work on it went.
+    `existing` is None if the instance is to be created; `record`: the result of this process's last work on it.
     """
 
     name: Name
@@ -56,11 +56,11 @@ class _Start:
     record: WorkRecord | None
 
     def record_of(self, instance: ApplicationInstance) -> WorkRecord | None:
-        """The record, unless it is of a namesake."""
+        """The record, unless it is of another instance with the same name."""
         return self.record if self.record is not None and self.record.uid == instance.metadata.uid else None
 
     def known(self, instance: ApplicationInstance) -> LastApplied:
-        """What was applied until now: the record where there is one, since it is newer than the status."""
+        """The last apply: from the record if there is one, because it is newer than the status."""
         if (record := self.record_of(instance)) is not None:
             return LastApplied.read(record.digest, record.applied.objects)
         status = instance.status
@@ -75,18 +75,18 @@ class _Start:
 
 
 class Attempts:
-    """When a refused apply is retried, by instance: with backoff, and at once when something else is applied."""
+    """When a refused apply is retried, by instance: with backoff, and immediately if the content has changed."""
 
     def __init__(self) -> None:
-        self._refused: dict[Name, tuple[object, int, float]] = {}  # what, how often, and until when
+        self._refused: dict[Name, tuple[object, int, float]] = {}  # content, refusals, next attempt
 
     def waits_until(self, name: Name, what: object, now: float) -> float | None:
-        """Until when the same is not tried again, in seconds since 1970; None: it may be tried."""
+        """The time before which the same content is not retried, in seconds since 1970; None: it may be tried."""
         known, _, until = self._refused.get(name, (None, 0, 0.0))
         return until if known == what and now < until else None
 
     def note_refusal(self, name: Name, what: object, now: float) -> float:
-        """Note that it was refused; when it is to be tried again, in seconds since 1970."""
+        """Note that the content was refused; returns the time of the next attempt, in seconds since 1970."""
         known, times, _ = self._refused.get(name, (None, 0, 0.0))
         times = times + 1 if known == what else 1
         until = now + pause_after(times, FIRST_PAUSE, LONGEST_PAUSE)
@@ -94,7 +94,7 @@ class Attempts:
         return until
 
     def forget(self, name: Name) -> None:
-        """Note that nothing is refused, or that the instance is gone."""
+        """Note a success, or the deletion of the instance."""
         self._refused.pop(name, None)
 
 
@@ -104,12 +104,12 @@ class InstanceWork:
 
     Attributes:
         again: enqueues an instance at a time, in seconds since 1970.
-        done: called when an instance's record is new.
-        absent: called with the decision about an instance that neither exists nor should.
+        done: called when there is a new record of an instance.
+        absent: called with the decision about an instance that neither exists nor is to exist.
         configured: called when an instance's configuration was applied.
         objects: the objects of an instance, or why it has none; None: they are being computed, and the instance is
             enqueued once they are.
-        not_made: called with the reason why an instance cannot be made.
+        not_made: called with the reason why an instance cannot be created.
     """
 
     cache: ClusterCache
@@ -128,7 +128,7 @@ class InstanceWork:
     not_made: Callable[[Name, Decision, str], None] = lambda *_: None
 
     async def reconcile(self, name: Name) -> None:
-        """Make the cluster match what is demanded of this instance. Raises RequestError for what may pass."""
+        """Make the cluster match the decision about this instance. Raises RequestError for a temporary error."""
         try:
             await self._reconcile(name)
         except ApiError as error:
@@ -139,17 +139,17 @@ class InstanceWork:
 
     async def _reconcile(self, name: Name) -> None:
         if self.cache.is_unsettled(name):
-            return  # what runs stays: the claims of its tasks are being computed, and that enqueues it again
+            return  # the objects stay: the claims of its tasks are being computed, which enqueues it again afterwards
         if name in self.cache.places.being_made:
             await self._look_whether_it_was_made(name)
         decision = self._decide(name)
         if self._is_over(name, decision):
-            # What we know may have holes (a watch that broke, for one): nothing is stopped without looking.
+            # A watch may have missed events: nothing is stopped without listing the tasks.
             await self._list_tasks(name)
-            decision = self._decide(name)  # while the tasks were listed, the instance itself may have gone
+            decision = self._decide(name)  # the instance itself may have been deleted while the tasks were listed
             if decision is not None and self._is_over(name, decision) and await self._release(name, decision):
                 return
-        # From the decision to the first request nothing is awaited, so the decision is about what there is.
+        # There is no await from the decision to the first request, so the decision matches the cache.
         instance = self.cache.instance(name)
         if decision is not None and decision.next_change is not None:
             self.again(name, decision.next_change)
@@ -162,7 +162,7 @@ class InstanceWork:
             self.not_made(
                 name, decision, f"instance {name[1]} is being deleted; the manager creates it again afterwards"
             )
-            return  # its deletion enqueues it again
+            return  # the event of its deletion enqueues it again
         template = self.cache.template((name[0], decision.template))
         await self._make(_Start(name, decision, instance, template, self.cache.records.get(name)))
 
@@ -188,14 +188,14 @@ class InstanceWork:
             instance = parse_object(trimming.own(answer))
             if isinstance(instance, ApplicationInstance) and instance.metadata.deletion_timestamp is None:
                 await self._apply_objects(start, instance, rendering, looked)
-        finally:  # the cache learns of the instance afterwards, so that nothing comes between it and its objects
+        finally:  # the instance enters the cache afterwards: no other work starts before its objects are applied
             self.observe(answer)
             self.cache.places.being_made.discard(name)
 
     async def _apply_instance(
         self, start: _Start, manifest: Object, rendering: Rendering | ConditionState
     ) -> tuple[Object, dict[ObjectKey, Object | None]]:
-        """Apply the instance itself, and look for its objects where it is new; what is to be looked for is known."""
+        """Apply the instance itself and, if it is new, read its objects at the same time: their keys are known."""
         to_look = rendering.manifests if start.existing is None and isinstance(rendering, Rendering) else ()
         if start.existing is None:
             self.cache.places.being_made.add(start.name)  # it takes its place from here on
@@ -220,7 +220,7 @@ class InstanceWork:
         name, known, was_applied = start.name, start.known(instance), start.was_applied(instance)
         if not isinstance(rendering, Rendering):
             if rendering.reason == drafting.CHART_PENDING and was_applied is not None:
-                return  # what runs stays as it is, and nothing changes until the chart is rendered, or has failed
+                return  # the objects stay unchanged until the chart is rendered, or has failed
             self._note(start, instance, ApplyResult(rendering, references(known.objects), complete=False), known.digest)
             return
         await self.suspending.settle(instance, rendering)
@@ -259,7 +259,7 @@ class InstanceWork:
             self.again(name, self.attempts.note_refusal(name, trying, time.time()))
 
     async def _look_whether_it_was_made(self, name: Name) -> None:
-        """Look for the instance where an attempt to make it failed, and so may have made it or not."""
+        """Read the instance after a failed attempt to create it, which may have succeeded."""
         raw = await self.client.get(INSTANCES, name[0], name[1])
         if raw is not None:
             self.observe(raw)
@@ -267,7 +267,7 @@ class InstanceWork:
         self.cache.places.touch(name)
 
     def _leave(self, start: _Start, instance: ApplicationInstance) -> None:
-        """Note that the instance stays as it is, by a person's wish."""
+        """Note that the instance stays unchanged, because a person paused it."""
         known = start.known(instance)
         message = "unchanged since the instance was paused"
         state = (
@@ -278,9 +278,9 @@ class InstanceWork:
         self._note(start, instance, ApplyResult(state, references(known.objects), complete=False), known.digest)
 
     async def _announce(self, instance: ApplicationInstance, known: LastApplied, rendering: Rendering) -> None:
-        """Write down what will belong to the instance, before any of it is applied.
+        """Record the objects in the instance's status before any of them is applied.
 
-        An instance that was just created does without: whatever has its label, and it as controller, is its own.
+        Not for an instance that was just created: every object with its label and it as controller belongs to it.
         """
         announced = references({**dict.fromkeys(rendering.keys()), **known.objects})
         status = {"objects": [each.to_json() for each in announced]}
@@ -289,7 +289,7 @@ class InstanceWork:
 
     def _note(self, start: _Start, instance: ApplicationInstance, applied: ApplyResult, digest: str | None) -> None:
         too_large = start.decision.too_large
-        if too_large and applied.state.holds:  # what it has is applied, and not what is demanded
+        if too_large and applied.state.holds:  # its current values are applied, not the demanded ones
             applied = replace(applied, state=ConditionState("Applied", False, TOO_LARGE, too_large))
         before = start.record_of(instance)
         since = before.since if before is not None else time.time()
@@ -300,7 +300,7 @@ class InstanceWork:
         self.done(start.name)
 
     def _decide(self, name: Name) -> Decision | None:
-        """Decide, and enqueue the instances that the decision concerns too."""
+        """Decide, and enqueue the other instances that the decision concerns."""
         decided = self.cache.decide(name, time.time())
         self.cache.note(name, decided)
         for each in decided.enqueue:
@@ -308,7 +308,7 @@ class InstanceWork:
         return decided.decision
 
     def _is_over(self, name: Name, decision: Decision | None) -> bool:
-        """Whether the instance goes now: its linger is over, or another has its place."""
+        """Whether to release the instance now: its linger is over, or another has its place."""
         instance = self.cache.instance(name)
         if instance is None or instance.metadata.deletion_timestamp is not None or decision is None:
             return False
@@ -327,7 +327,7 @@ class InstanceWork:
         if instance is None:
             return False
         if self.cache.claims.pending((name[0], instance.spec.template_name)):
-            self.again(name, time.time() + _LOOK_AGAIN)  # one of the tasks that were listed may demand it
+            self.again(name, time.time() + _LOOK_AGAIN)  # one of the listed tasks may demand it
             return False
         await self.client.delete(INSTANCES, name[0], name[1], instance.metadata.uid)
         why = over.yields or "no demand arrived within its linger"

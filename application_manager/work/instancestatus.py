@@ -1,7 +1,7 @@
 """Writes the status and the Events of an instance after the work, and enqueues its tasks.
 
-A queue of its own, so that statuses never delay the work. Until a status is written, the cache's record of the instance
-replaces it; if the manager dies before, the next one repeats the work and finds nothing to do.
+It has its own queue, so that statuses never delay the work. Until a status is written, the cache's record of the
+instance replaces it; if the manager is killed before, the next one repeats the work, and has nothing to change.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from wayside.kubernetes.resources import Object
 
 _TROUBLES_SHOWN = 3
 _SETTLING = 2.0  # s
-_AGAIN = 5.0  # s until nodes and Events are looked at again for what is not ready for their sake
+_AGAIN = 5.0  # s until nodes and Events are read again for objects that are not ready because of them
 
 log = logging.getLogger(__name__)
 
@@ -85,7 +85,7 @@ class InstanceStatusWork:
         elif old.release_time is None and new.release_time is not None:
             note = f"no demand is left; the instance will be released at {new.release_time} unless a demand arrives"
             self.statuses.recorder.event(instance, EventReason.LINGERING, note, now)
-        # How many pods are ready stays with the instance: it changes often, and the tasks may be many.
+        # The number of ready pods is only in the instance's status: it changes often, and there may be many tasks.
         why_not = "" if applied.state.holds else applied.state.message
         reason = ""
         if applied.state.holds and suspended is not None and instance.spec.suspended:
@@ -110,16 +110,16 @@ class InstanceStatusWork:
         self.report(name, record.decision, service)
 
     def report_not_made(self, name: Name, decision: Decision, problem: str) -> None:
-        """Let the tasks know why the instance is not there that they demand."""
+        """Enqueue the tasks that demand an instance that does not exist, with the reason."""
         self.report(name, decision, InstanceProgress(name[1], applied=False, ready=False, problem=problem))
 
     def report(self, name: Name, decision: Decision | None, service: InstanceProgress | None) -> None:
-        """Let the tasks know whose verdict or service changed; the service is None where there is no instance."""
+        """Enqueue the tasks whose verdict or progress changed; the progress is None if there is no instance."""
         old = self.cache.served.pop(name, None)
         verdicts = decision.verdicts if decision is not None else {}
         before = old.decision.verdicts if old is not None else {}
         for task in before.keys() - verdicts.keys():
-            self.task_changed((name[0], task))  # one that means all instances may have others yet
+            self.task_changed((name[0], task))  # a task for all instances may have others yet
         if decision is None:
             return
         new = LastDecision(decision, service or InstanceProgress(name[1], applied=False, ready=False))
@@ -133,12 +133,12 @@ class InstanceStatusWork:
     def _troubles(
         self, name: Name, objects: Mapping[ObjectKey, Object | None], looked_up: Sequence[Trouble]
     ) -> list[Trouble]:
-        """Those of its pods, and why pods cannot be made or fit no node."""
+        """The problems of its pods, and why pods cannot be created or fit no node."""
         refused = [found for each in objects.values() if each is not None and (found := refused_pods(each)) is not None]
         return summary([*self.cache.pods.troubles(name), *refused, *looked_up])
 
     async def _looked_up(self, instance: ApplicationInstance, applied: ApplyResult) -> list[Trouble]:
-        """The troubles of what is not ready that no watch shows: no node is as required, pods are refused."""
+        """The causes of unready objects that no watch reports: no node meets the requirements, pods are refused."""
         if instance.spec.suspended:
             return []
         live = [each for each in self._live(instance, applied).values() if each is not None and not_ready(each)]
@@ -148,13 +148,13 @@ class InstanceStatusWork:
         return found
 
     async def _misfits(self, live: Sequence[Object]) -> list[Trouble]:
-        """Which of the objects require what no node has."""
+        """The objects whose requirements no node meets."""
         bound = [each for each in live if is_placed(each)]
         nodes = await self.nodes.labels() if bound else None
         return [] if nodes is None else [trouble for each in bound if (trouble := misplaced(each, nodes)) is not None]
 
     async def _refused(self, live: Sequence[Object]) -> list[Trouble]:
-        """Why pods of the objects are refused of which only Events have the reason."""
+        """Why pods of the objects are refused, for objects of which only Events report it."""
         without_pods = [each["metadata"] for each in live if lacks_pods(each)]
         troubles = [
             refused_by_events(await self.failed_pods.events(each["namespace"], each["uid"]), time.time())
@@ -181,14 +181,14 @@ class InstanceStatusWork:
                 missing.append(f"{kind} {name} {problem}")
         if not objects:
             return ConditionState("Ready", False, "NotApplied", "nothing is applied yet")
-        if not applied.holds:  # the previous version may run, but it is not the wanted one
+        if not applied.holds:  # the previous version may run, but it is not the demanded one
             return ConditionState("Ready", False, applied.reason, f"not applied: {applied.message}")
         if instance.spec.suspended:
             return ConditionState("Ready", False, "Suspended", "the instance is suspended")
         if missing:
             reason = troubles[0].reason.value if troubles else "NotReady"
             refused = [found for each in objects.values() if each is not None and (found := refused_pods(each))]
-            others = [each for each in troubles if each not in refused]  # which the message of the workload has already
+            others = [each for each in troubles if each not in refused]  # its message has the others
             return ConditionState("Ready", False, reason, ": ".join(filter(None, ("; ".join(missing), _text(others)))))
         return ConditionState("Ready", True, "Ready", "all workloads are ready")
 
@@ -196,7 +196,7 @@ class InstanceStatusWork:
 def _settles(instance: ApplicationInstance, record: WorkRecord, live: Iterable[Object | None]) -> float:
     """Until when the first status of an instance waits, in seconds since 1970, since its objects are about to change.
 
-    Their controllers look at new objects within a moment; without the wait, two statuses follow each other.
+    Their controllers process new objects within a moment; without the wait, there would be two statuses in succession.
     """
     known = instance.status is not None and instance.status.spec_hash is not None
     if known or not record.applied.state.holds or not any(each is not None and is_unseen(each) for each in live):
@@ -205,7 +205,7 @@ def _settles(instance: ApplicationInstance, record: WorkRecord, live: Iterable[O
 
 
 def _overdue(ready: ConditionState, decision: Decision) -> ConditionState:
-    """The condition Ready of what is beyond its readyTimeout: the reason is that, unless there is a better one."""
+    """The condition Ready of an overdue instance: its reason is ReadyTimeout, unless there is a more specific one."""
     if ready.holds or not decision.overdue or ready.reason == "Suspended":
         return ready
     reason = READY_TIMEOUT if ready.reason in ("NotReady", "NotApplied") else ready.reason
@@ -213,6 +213,6 @@ def _overdue(ready: ConditionState, decision: Decision) -> ConditionState:
 
 
 def _text(troubles: Sequence[Trouble]) -> str:
-    """The most important troubles, as a condition has them."""
+    """The most important problems, as text for a condition."""
     more = f"; and {len(troubles) - _TROUBLES_SHOWN} more" if len(troubles) > _TROUBLES_SHOWN else ""
     return "; ".join(each.text for each in troubles[:_TROUBLES_SHOWN]) + more

@@ -1,12 +1,12 @@
-"""The instances' configurations on Zenoh: each is published when it changes, and the reply to queries.
+"""Publishes the configurations of instances on Zenoh: each on change, and as the reply to queries.
 
-On `wayside/instances/<namespace>/<name>/configuration`, as a JSON object of file names and texts. A deletion of the key
-means that the instance is gone.
+The key is `wayside/instances/<namespace>/<name>/configuration`, the value a JSON object of file names and texts. A
+deletion of the key means that the instance was deleted.
 
-Zenoh has threads of its own and may be slow or away, so it never touches the event loop: the loop leaves what is newest
-of each instance here, and one thread brings it out. What is not yet out is replaced by what is newer, so there is at
-most one content for each instance. After a lost connection everything is published again, since nobody knows what was
-missed meanwhile.
+Zenoh has its own threads and may be slow or unavailable, so the event loop never waits for it: it stores the newest
+configuration of each instance here, and one thread publishes it. A newer configuration replaces one that is not
+published yet, so there is at most one for each instance. After a lost connection, everything is published again,
+because a change may have been missed meanwhile.
 """
 
 from __future__ import annotations
@@ -28,9 +28,11 @@ from wayside.process.backoff import Backoff, retry
 _ALL = "wayside/instances/*/*/configuration"
 _FIRST_PAUSE, _LONGEST_PAUSE = 0.2, 2.0  # s between attempts to reach the network
 _REPEATS = (0.0, 1.0, 5.0)
-"""Seconds after a new connection at which all is published: what is put before the other side has announced its
-subscribers reaches nobody."""
-_CLOSING = 2.0  # s that the thread is given to end
+"""Seconds after a new connection until everything is published.
+
+Before the other side has announced its subscribers, a message reaches nobody.
+"""
+_CLOSING = 2.0  # s for the thread to end
 
 log = logging.getLogger(__name__)
 
@@ -41,9 +43,9 @@ def key_of(name: Name) -> str:
 
 
 def settings(given: Sequence[str]) -> zenoh.Config:
-    """How to take part in the network: as a client of the endpoints given, or by the one file given.
+    """The Zenoh configuration: a client of the given endpoints, or the one given file.
 
-    Raises ConfigurationError for what is neither.
+    Raises ConfigurationError for anything else.
     """
     if len(given) == 1 and Path(given[0]).suffix in (".json5", ".json", ".yaml", ".yml"):
         try:
@@ -55,7 +57,7 @@ def settings(given: Sequence[str]) -> zenoh.Config:
         ("mode", "client"),
         ("connect/endpoints", list(given)),
         ("connect/timeout_ms", 0),
-        ("connect/exit_on_failure", True),  # we try again ourselves, and can be stopped meanwhile
+        ("connect/exit_on_failure", True),  # we retry ourselves, and can be stopped meanwhile
         ("scouting/multicast/enabled", False),
     ):
         try:
@@ -69,7 +71,7 @@ def settings(given: Sequence[str]) -> zenoh.Config:
 
 
 class Publisher:
-    """Takes configurations at once and publishes them in the background. Without a network it takes them for nothing.
+    """Accepts configurations immediately and publishes them in the background; without a network it discards them.
 
     `publish` and `withdraw` are for one thread, the event loop's.
     """
@@ -78,13 +80,13 @@ class Publisher:
         self._config = config
         self._lock = threading.Condition()
         self._contents: dict[str, bytes] = {}
-        self._pending: dict[str, None] = {}  # keys whose content, or whose end, is not out yet, in order
-        self._repeats: list[float] = []  # when all is to be published again, by the monotonic clock
+        self._pending: dict[str, None] = {}  # keys whose content or deletion is not published yet, in order
+        self._repeats: list[float] = []  # when to publish everything again, by the monotonic clock
         self._ended = False
         self._over = asyncio.Event()
 
     def publish(self, name: Name, files: Mapping[str, str]) -> None:
-        """Publish the content of the files if it differs."""
+        """Publish the content of the files if it changed."""
         key, content = key_of(name), json.dumps(files, ensure_ascii=False, sort_keys=True).encode()
         with self._lock:
             if self._config is not None and self._contents.get(key) != content:
@@ -93,7 +95,7 @@ class Publisher:
                 self._lock.notify()
 
     def withdraw(self, name: Name) -> None:
-        """Announce that the instance is gone, or has no configuration any more, if it had one."""
+        """Announce that the instance was deleted, or has no configuration any more, if it had one."""
         key = key_of(name)
         with self._lock:
             if self._contents.pop(key, None) is not None:
@@ -101,7 +103,7 @@ class Publisher:
                 self._lock.notify()
 
     def forget(self) -> None:
-        """Know of no configuration any more, without publishing it: another manager has published since."""
+        """Forget all configurations without publishing: another manager has published since."""
         with self._lock:
             self._contents.clear()
             self._pending.clear()
@@ -148,7 +150,7 @@ class Publisher:
             return
         with session:
             listener = session.info.declare_transport_events_listener(self._transport, history=True)
-            queryable = session.declare_queryable(_ALL, self._answer)  # both last as long as they are held
+            queryable = session.declare_queryable(_ALL, self._answer)  # both last as long as they are referenced
             while (pending := self._next()) is not None:
                 for key, content in pending:
                     if content is None:
@@ -177,7 +179,7 @@ class Publisher:
         return retry(lambda: None if self._ended else zenoh.open(config), zenoh.ZError, failed, pause)
 
     def _next(self) -> list[tuple[str, bytes | None]] | None:
-        """Wait for changes; None once we are to end."""
+        """Wait for changes; None at the end."""
         with self._lock:
             while not self._ended and not self._pending:
                 now = time.monotonic()

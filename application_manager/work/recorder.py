@@ -1,9 +1,9 @@
-"""Kubernetes Events: what happened to a task or an instance, for `kubectl describe` and `kubectl get events`.
+"""Kubernetes Events of tasks and instances, for `kubectl describe` and `kubectl get events`.
 
 The reasons are a fixed list. An Event follows from a change of a condition, which is stored in the cluster, so neither
-a restart nor a resync posts the same again. What is repeated is one Event with a series, as events.k8s.io has it.
-Namespaces take turns, and each has room for its own. About one object a few Events may be posted at once, then only
-now and then.
+a restart nor a resync posts it again. A repetition updates the series of its Event, as events.k8s.io defines.
+Namespaces take turns, and each has its own queue. A few Events about one object may be posted at once, then a limited
+rate.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ _REFRESHED = 60.0  # s between two changes of a series
 _KEPT = 4096  # Events that are remembered, since they may be repeated
 
 BURST = 10
-"""Events of one object that may follow each other at once."""
+"""The maximum number of Events about one object at once."""
 
 REFILL = 60.0
-"""Seconds after which one more may follow: an object that changes all the time has an Event a minute."""
+"""Seconds until one more is allowed: an object that changes all the time has an Event a minute."""
 
-_KEPT_BUCKETS = 10_000  # objects that are remembered; the one with the oldest Event is forgotten, and starts over
-_REPORT_EVERY = 60.0  # s between two lines in the log about Events that were dropped
-_NAME_LENGTH = 236  # characters of the object's name, for a pod's may have as many as the Event's
+_KEPT_BUCKETS = 10_000  # objects to remember; the one with the oldest Event is forgotten, and its limit starts again
+_REPORT_EVERY = 60.0  # s between two log lines about dropped Events
+_NAME_LENGTH = 236  # characters of the object's name in an Event's name, which has the same maximum length as a pod's
 _NOTE_LENGTH = 1024  # characters, as events.k8s.io allows
 
 log = logging.getLogger(__name__)
@@ -119,10 +119,10 @@ _OWN_REASONS = frozenset(
     }
     | _TROUBLES
 )
-"""Reasons of conditions that are those of their Events too."""
+"""Reasons of conditions that are also reasons of their Events."""
 
 _WARNINGS = frozenset({EventReason.REFUSED, EventReason.NOT_APPLIED}) | _OWN_REASONS
-_EXPECTED = frozenset({"Waiting", "ChartPending", "NotApplied", "NotReady"})  # reasons that come with every start
+_EXPECTED = frozenset({"Waiting", "ChartPending", "NotApplied", "NotReady"})  # reasons that occur at every start
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +135,7 @@ class _Event:
 
     @property
     def what(self) -> tuple[str, str, str]:
-        """What is equal in repetitions."""
+        """The fields that are equal in repetitions."""
         return self.regarding.metadata.uid, self.reason.value, self.note
 
 
@@ -151,31 +151,31 @@ class _Series:
 
 @dataclass(slots=True)
 class _Drops:
-    """Events that were dropped and not reported yet; reported at once, and then once a minute."""
+    """Counts dropped Events that are not logged yet; they are logged at once, and then once a minute."""
 
     count: int = 0
     why: str = ""
     reported: float | None = None  # on the monotonic clock
 
     def note(self, why: str) -> None:
-        """One was dropped."""
+        """Count a dropped Event."""
         self.count += 1
         self.why = why
 
     def due_in(self, now: float) -> float | None:
-        """Seconds until a report is due; None where there is nothing to report."""
+        """Seconds until the next log line; None if there is nothing to log."""
         if not self.count:
             return None
         return 0 if self.reported is None else max(0.0, self.reported + _REPORT_EVERY - now)
 
     def report(self, now: float) -> None:
-        """Log how many there were, and why the last one was dropped."""
+        """Log the number of dropped Events, and why the last one was dropped."""
         log.warning("dropped %d Events since the last report; the last one: %s", self.count, self.why)
         self.count, self.reported = 0, now
 
 
 class Recorder:
-    """Takes Events at once and posts them in the background."""
+    """Accepts Events immediately and posts them in the background."""
 
     def __init__(self, client: Client, measures: Measures | None = None) -> None:
         self._client = client
@@ -189,9 +189,10 @@ class Recorder:
         self._series: OrderedDict[tuple[str, str, str], _Series] = OrderedDict()
 
     def event(self, regarding: Kind, reason: EventReason, note: str, now: float, *, once: bool = False) -> None:
-        """Post an Event about the object, at `now` in seconds since 1970, unless there were too many of it.
+        """Post an Event about the object, at `now` in seconds since 1970, unless it has too many.
 
-        `once`: not if there is the same already, also of an earlier run: for what follows from no change of a status.
+        `once`: not if the same one exists already, also of an earlier run: for Events that do not follow from a change
+        of a status.
         """
         event = _Event(regarding, reason, note, now, once)
         if self._count_repetition(event):
@@ -206,7 +207,7 @@ class Recorder:
             self._wake.set()
 
     def _count_repetition(self, event: _Event) -> bool:
-        """Count an Event that was posted a short while ago; whether nothing is to be written about it yet."""
+        """Count the repetition of a recent Event; whether it is not written yet."""
         known = self._series.get(event.what)
         if known is None:
             return False
@@ -218,10 +219,11 @@ class Recorder:
         return event.now - known.written < _REFRESHED and known.count > 2
 
     def transitions(self, regarding: Kind, old: Sequence[Condition], new: Sequence[Condition], now: float) -> None:
-        """Post an Event for each condition that changed, if it is worth one: not yet being ready is none.
+        """Post an Event for each condition that changed, if it deserves one.
 
-        Nor is what follows from another condition: Stalled, Ready of what is not applied or not accepted, Applied of
-        what is ready at once. That a task is accepted at once is in its status, and what follows has its own Event.
+        Not for a condition that is not True yet, and not for one that follows from another: Stalled, Ready of an object
+        that is not applied or not accepted, Applied of an object that is immediately ready. The status shows that a
+        task was accepted immediately, and its later conditions have their own Events.
         """
         was_true = {each.type for each in old if each.status == "True"}
         is_false = {each.type for each in new if each.status == "False"}
@@ -243,7 +245,7 @@ class Recorder:
                 self.event(regarding, reason, each.message, now)
 
     def finish(self) -> None:
-        """Let `run` return once what waits is posted."""
+        """Let `run` return once all queued Events are posted."""
         self._ending = True
         self._wake.set()
 
@@ -263,7 +265,7 @@ class Recorder:
             self._drops.report(time.monotonic())
 
     async def _wait(self) -> None:
-        """Wait for an Event, or until dropped ones are to be reported."""
+        """Wait for an Event, or until dropped ones are to be logged."""
         self._wake.clear()
         with suppress(TimeoutError):
             async with asyncio.timeout(self._drops.due_in(time.monotonic())):
@@ -284,7 +286,7 @@ class Recorder:
             self._drops.note(str(error))
 
     async def _write(self, event: _Event) -> None:
-        """Post the Event, or bring the series of the one that it repeats up to date."""
+        """Post the Event, or update the series of the Event that it repeats."""
         known = self._series.get(event.what)
         if known is not None and known.count > 1:
             known.written = event.now
@@ -332,10 +334,10 @@ def _microseconds(seconds: float) -> str:
 
 
 class TokenBuckets:
-    """Tokens for each object: `BURST` at first, one more each `REFILL` seconds."""
+    """A token bucket for each object: `BURST` at first, one more each `REFILL` seconds."""
 
     def __init__(self) -> None:
-        self._left: OrderedDict[Hashable, tuple[float, float]] = OrderedDict()  # tokens, as of when
+        self._left: OrderedDict[Hashable, tuple[float, float]] = OrderedDict()  # tokens, and when they were counted
 
     def take(self, key: Hashable, now: float) -> bool:
         """Take a token of the object at `now`, in seconds; whether there was one."""

@@ -1,7 +1,7 @@
-"""Renders the objects of instances in worker processes; those of small templates that only read, in this one.
+"""Renders the objects of instances in worker processes; small templates that only read fields, in this process.
 
-What is not there yet is requested, and the instance enqueued once it is. A rendering that takes too much is a
-problem of its template, whose status gives it; what runs of the instance stays as it is.
+A missing result is requested, and the instance is enqueued once it is available. A rendering that exceeds its limits is
+an error of its template, whose status reports it; the instance's objects stay unchanged.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from application_manager.workers.jobs import objects_are_plain, render_instance,
 from application_manager.workers.process import Job
 from wayside.api import ApplicationInstance, ApplicationTemplate
 
-_PICKLED = 64  # templates that are kept as bytes
-_JUDGED = 1024  # templates of which is known whether they are plain
+_PICKLED = 64  # templates to keep as bytes
+_JUDGED = 1024  # templates for which the result is kept whether they only read fields
 
 Value = TypeVar("Value")
 _OfTemplates = OrderedDict[tuple[str, int], Value]  # by uid and generation
 
 
 class Renderings:
-    """Renders charts in the background. Only the event loop's thread uses it."""
+    """Renders instances in the background. Only the event loop's thread uses it."""
 
     def __init__(
         self,
@@ -43,7 +43,7 @@ class Renderings:
         again: Callable[[Name], None],
         template_changed: Callable[[Name], None],
     ) -> None:
-        """`again` enqueues an instance, `template_changed` a template whose renderings exceed the limit, or no more."""
+        """`again` enqueues an instance, `template_changed` a template that now exceeds the limits, or no more."""
         self._cache = cache
         self._answers = answers
         self._charts = charts
@@ -53,7 +53,7 @@ class Renderings:
         self._plain: _OfTemplates[bool] = OrderedDict()
 
     def objects(self, wanted: ApplicationInstance, template: TemplateState) -> Rendering | ConditionState | None:
-        """The instance's objects, or why it has none, as the condition Applied gives it; None: it is enqueued later."""
+        """The instance's objects, or the condition Applied if it has none; None: not available yet."""
         problem = drafting.without_template(wanted, template)
         if problem is not None or not isinstance(template, ApplicationTemplate):
             return problem
@@ -77,7 +77,7 @@ class Renderings:
         return None
 
     def forget(self, name: Name) -> None:
-        """Drop what is known of an instance that is deleted."""
+        """Forget an instance that was deleted."""
         for kind in ("rendering", "chart"):
             self._answers.forget((kind, *name))
         for template in [each for each, instances in self._cache.exceeded.items() if name in instances]:
@@ -105,7 +105,7 @@ class Renderings:
         )
 
     def _note(self, name: Name, template: Name, found: object | None) -> None:
-        """Note whether the instance's rendering exceeds the limit; nothing while it is being computed."""
+        """Note whether the instance's rendering exceeds the limits; nothing while it is being computed."""
         if found is None:
             return
         before = self._cache.exceeded.get(template, {}).get(name)
@@ -122,7 +122,7 @@ class Renderings:
 def _kept(
     known: _OfTemplates[Value], template: ApplicationTemplate, make: Callable[[ApplicationTemplate], Value], most: int
 ) -> Value:
-    """What is known of the template, made where it is not; those not requested for longest are forgotten."""
+    """The state of the template, created if it is missing; the least recently used ones are forgotten."""
     key = (template.metadata.uid, template.metadata.generation)
     if key not in known:
         known[key] = make(template)

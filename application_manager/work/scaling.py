@@ -20,7 +20,7 @@ from wayside.kubernetes.client import Client
 from wayside.kubernetes.errors import ApiError
 from wayside.kubernetes.resources import Object
 
-_ATTEMPTS = 5  # at a scale, where somebody else keeps changing the object
+_ATTEMPTS = 5  # attempts to scale an object that another client keeps changing
 
 log = logging.getLogger(__name__)
 
@@ -34,9 +34,9 @@ class WorkloadScaler:
     observe: Callable[[Object], None]
 
     async def settle(self, instance: ApplicationInstance, rendering: Rendering) -> None:
-        """Bring the workloads to where the instance's spec wants them, before its manifests are applied.
+        """Scale the workloads to what the instance's spec requires, before its manifests are applied.
 
-        Raises ApiError or Unreachable for what may pass.
+        Raises ApiError or Unreachable for a temporary error.
         """
         noted = {
             reference_key(each): each.replicas
@@ -71,12 +71,12 @@ class WorkloadScaler:
         await self._note(instance, {})
 
     def _is_at_zero(self, instance: ApplicationInstance, key: ObjectKey) -> bool:
-        """Whether the object, as watched, has no replicas; one that does not exist is made without any."""
+        """Whether the watched object has no replicas; an object that does not exist is created without any."""
         live = self.applier.live(instance.namespace, key)
         return live is None or live["spec"].get("replicas", 1) == 0
 
     async def _own(self, instance: ApplicationInstance, key: ObjectKey) -> Object | None:
-        """The object, read again; None where there is none, or one that is not the instance's."""
+        """The object, read again; None if there is none, or it does not belong to the instance."""
         raw = await self.client.get(await self.applier.resource(key), instance.namespace, key[2])
         return raw if raw is not None and controller_uid(raw) == instance.metadata.uid else None
 

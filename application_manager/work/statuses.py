@@ -1,4 +1,4 @@
-"""Writes the statuses of all kinds, only what differs, and Events about changed conditions."""
+"""Writes the statuses of all kinds, if they differ, and posts Events about changed conditions."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ class KindStatus(Protocol):
         """Its conditions."""
 
     def to_json(self) -> dict[str, Any]:
-        """It as the API server has it."""
+        """The status as JSON for the API server."""
 
 
 @dataclass(frozen=True, slots=True)
 class StatusWriter:
-    """Writes statuses; `observe` puts the API server's answer into the cache."""
+    """Writes statuses; `observe` puts the API server's response into the cache."""
 
     client: Client
     recorder: Recorder
@@ -42,10 +42,10 @@ class StatusWriter:
         now: float,
         conditions: Collection[str] | None = None,
     ) -> bool:
-        """Write what of a status is new, if anything; whether the object is there.
+        """Write the changed fields of a status, if any; returns whether the object exists.
 
-        `old` is None where it has none; `now` in seconds since 1970; `conditions`: the types of conditions whose
-        changes are worth an Event, None for all. Raises RequestError for what may pass.
+        `old` is None if it has no status; `now` is in seconds since 1970; `conditions`: the types of conditions whose
+        changes get an Event, None for all. Raises RequestError for a temporary error.
         """
         patch = difference(old.to_json() if old is not None else {}, new.to_json())
         if not patch:
@@ -57,7 +57,7 @@ class StatusWriter:
         return True
 
     async def merge(self, resource: Resource, regarding: Kind, patch: Object) -> bool:
-        """Merge into the status, null removes a field; whether the object is there. Raises the same."""
+        """Merge into the status, null removes a field; returns whether the object exists. Raises RequestError."""
         namespace, name, uid = regarding.namespace, regarding.name, regarding.metadata.uid
         try:
             self.observe(await self.client.patch_status(resource, namespace, name, uid, patch))

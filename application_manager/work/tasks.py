@@ -32,7 +32,7 @@ _SHED = Verdict(
     "the application manager is near its memory limit and accepts no new tasks: this task is accepted once memory is "
     "free; end tasks, or raise the limit",
 )
-_OWN_CONDITIONS = ("Accepted", "Finished")  # the others are the instance's, which has Events about them
+_OWN_CONDITIONS = ("Accepted", "Finished")  # the instance has Events about the others
 
 log = logging.getLogger(__name__)
 
@@ -56,7 +56,7 @@ class TaskWork:
     async def reconcile(self, name: Name) -> None:
         """Write the task's status if it differs; delete the task when its time has come.
 
-        Raises RequestError for what may pass.
+        Raises RequestError for a temporary error.
         """
         if name in self.cache.store.shed:
             await self._write_shed(name)
@@ -69,11 +69,11 @@ class TaskWork:
         if verdict.reason == RefusalReason.TEMPLATE_NOT_FOUND and await self._has_template(
             name[0], task.spec.template_name
         ):
-            return  # the watch of templates was behind that of tasks; the template's event enqueues the task again
+            return  # the watch of templates is behind that of tasks; the template's event enqueues the task again
         await self._write(name, task, verdict, service, generation)
 
     async def _write_shed(self, name: Name) -> None:
-        """Write that a task is not taken in; it is read for that alone."""
+        """Write that a task is not accepted for lack of memory; it is read only for this."""
         raw = await self.client.get(TASKS, *name)
         try:
             task = parse_object(trimming.own(raw)) if raw is not None else None
@@ -103,7 +103,7 @@ class TaskWork:
     def _measure(
         self, task: ApplicationTask, old: ApplicationTaskStatus, new: ApplicationTaskStatus, now: float
     ) -> None:
-        """Measure what became of the task, once for each change."""
+        """Measure the task's progress, once for each change."""
         for each in changed(old.conditions, new.conditions):
             if each.type == "Accepted" and each.status == "False":
                 self.measures.refused(each.reason)
@@ -122,7 +122,7 @@ class TaskWork:
         return found is not None
 
     def _verdict(self, name: Name, task: ApplicationTask) -> tuple[Verdict, InstanceProgress | None, int] | None:
-        """What became of the task, and of which generation of it; None where its instance was not looked at yet."""
+        """The task's verdict, and the generation on which it is based; None if its instance was not processed yet."""
         verdict = self.cache.claims.verdict(name)
         if verdict is not None:
             return verdict, None, task.metadata.generation
@@ -138,7 +138,7 @@ class TaskWork:
         return found.verdict, together(services) if services else None, found.generation
 
     def _decided(self, namespace: str, claimed: Claim) -> Iterator[Name]:
-        """The instances whose decisions the verdict of a claim takes."""
+        """The instances whose decisions determine the verdict of a claim."""
         yield from self.cache.meant((namespace, claimed.instance))
         served = self.cache.served.get((namespace, claimed.instance))
         fallback = served.decision.fallback if served is not None else None

@@ -30,21 +30,21 @@ if TYPE_CHECKING:
     from wayside.process.spans import Tracing
 
 _REMEMBERED = 10_000
-"""Tasks that are not ready yet; beyond it the oldest are forgotten, and their `ready` has the task as its parent."""
+"""Tasks that are not ready yet; beyond it, the oldest are forgotten, and the parent of their `ready` is the task."""
 _LINKS = 20
-"""Other tasks that a `reconcile` is linked to, the first in their order."""
+"""The maximum number of links of a `reconcile` to other tasks, in their order."""
 
 log = logging.getLogger(__name__)
 
 
 @dataclass
 class _Known:
-    """A task that is not ready yet: its `reconcile`, since when it is applied (ns), and what failed last."""
+    """A task that is not ready yet: its `reconcile`, the time at which it was applied (ns), and its last failure."""
 
     reconcile: TraceContext | None = None
     applied: int = 0
     failure: str = ""
-    unserved: bool = False  # it ended before anything was emitted that an instance did for it
+    unserved: bool = False  # it ended before a span of an instance's work was emitted
 
 
 class TaskTraces:
@@ -57,7 +57,7 @@ class TaskTraces:
         self._reported = False
 
     async def reconciling(self, name: Name, work: Callable[[Name], Awaitable[None]]) -> None:
-        """Do the work on an instance, and emit what it did for tasks."""
+        """Do the work on an instance, and emit its spans for tasks."""
         began, before = time.time_ns(), self._cache.records.get(name)
         try:
             await work(name)
@@ -67,7 +67,7 @@ class TaskTraces:
                 self._reconciled(name, began, record)
 
     def status_written(self, task: ApplicationTask, old: ApplicationTaskStatus, new: ApplicationTaskStatus) -> None:
-        """A task's status was written: emit what came of it."""
+        """A task's status was written: emit the spans of its progress."""
         context = _context(task)
         if context is None:
             return
@@ -94,7 +94,7 @@ class TaskTraces:
     ) -> None:
         """The task's demand is over: emit a failed `ready` if an instance served it and was never ready for it.
 
-        A task may end before its status names an instance; then `reconcile` alone shows that one served it.
+        A task may end before its status names an instance; then only `reconcile` shows that one served it.
         """
         known = self._known.get(task.metadata.uid)
         applied, ready = find(old.conditions, "Applied"), find(old.conditions, "Ready")
@@ -171,13 +171,13 @@ class TaskTraces:
 
 
 class LostSpans(Collector):
-    """Spans that nobody got, as a Prometheus metric."""
+    """The number of lost spans, as a Prometheus metric."""
 
     def __init__(self, tracing: Tracing) -> None:
         self._tracing = tracing
 
     def collect(self) -> Iterator[Metric]:
-        """The metric as of now."""
+        """The current metric."""
         family = CounterMetricFamily(f"{PREFIX}spans_dropped", "Spans that were lost", labels=("cause",))
         family.add_metric(("full",), self._tracing.dropped)
         family.add_metric(("failed",), self._tracing.failed)
@@ -185,7 +185,7 @@ class LostSpans(Collector):
 
 
 def _context(task: ApplicationTask) -> TraceContext | None:
-    """Where the task stands; None where it has no trace, or one that is not recorded."""
+    """The parent span in the task; None if it has no trace, or a trace that is not recorded."""
     context = parse_traceparent(task.metadata.annotations.get(TRACEPARENT_ANNOTATION))
     return context if context is not None and context.sampled else None
 

@@ -48,7 +48,7 @@ class RuleWork:
     detectors: DetectorIndex = field(default_factory=DetectorIndex)
 
     async def reconcile(self, key: RuleKey) -> None:
-        """Write the status of the rule or detector if it differs. Raises RequestError for what may pass."""
+        """Write the status of the rule or detector if it differs. Raises RequestError for a temporary error."""
         kind, name = key
         entry = self.cache.store.get(kind, name)
         if entry is None:
@@ -58,7 +58,7 @@ class RuleWork:
         await self.statuses.write(OWN[kind], _bare(entry), old if entry.raw.get("status") else None, new, now)
 
     async def _judged(self, kind: KindKey, name: Name, entry: Entry, now: float) -> tuple[Status, Status]:
-        """The status as it is and as it should be."""
+        """The current status and the new one."""
         namespace = name[0]
         written = entry.raw.get("status") or {}
         generation = int(entry.raw["metadata"].get("generation", 0))
@@ -95,7 +95,7 @@ class TemplateWork:
     again: Callable[[Name, float], None]
 
     async def reconcile(self, name: Name) -> None:
-        """Write the template's status if it differs. Raises RequestError for what may pass."""
+        """Write the template's status if it differs. Raises RequestError for a temporary error."""
         entry = self.cache.store.get(TEMPLATE, name)
         if entry is None:
             return
@@ -115,7 +115,7 @@ class TemplateWork:
         await self.statuses.write(TEMPLATES, regarding, old if entry.raw.get("status") else None, new, now)
 
     async def _challenge(self, regarding: Kind, own: TemplateManager, now: float) -> None:
-        """Find out by the template's status whether the other manager of the namespace is alive."""
+        """Test by the template's status whether the other manager of the namespace is alive."""
         other = self.cache.overlap.waits_for(regarding.namespace)
         note = f"the managers of the Leases {other} and {own.lease} manage the same namespace: the second one stands by"
         self.statuses.recorder.event(regarding, EventReason.MANAGERS_OVERLAP, note, now, once=True)
@@ -142,5 +142,5 @@ class TemplateWork:
 
 
 def _bare(entry: Entry) -> Kind:
-    """The object without spec and status, which may be none of its kind."""
+    """The object without spec and status, which may be invalid."""
     return Kind(kind=entry.raw["kind"], metadata=Metadata.model_validate(entry.raw["metadata"]))

@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Exceeded:
-    """The answer to a question whose job was ended; the text names the limit."""
+    """The result of a request whose job was stopped; the text names the limit."""
 
     message: str
 
@@ -45,10 +45,10 @@ class _Kept:
 
 
 class AnswerCache:
-    """Takes questions. Only the event loop's thread uses it."""
+    """Requests results. Only the event loop's thread uses it."""
 
     def __init__(self, pool: Pool, kept: int = KEPT) -> None:
-        """`kept`: bytes of answers that are kept."""
+        """`kept`: the maximum bytes of results to keep."""
         self._pool = pool
         self._limit = kept
         self._size = 0
@@ -58,13 +58,13 @@ class AnswerCache:
     def answer(
         self, key: Hashable, question: object, namespace: str, job: Callable[[], Job[object]], done: Callable[[], None]
     ) -> object | None:
-        """The answer, `Exceeded` where it takes too long; None at first, and then `done` is called once it is there.
+        """The result, `Exceeded` if it exceeds its limits; None while it is computed, after which `done` is called.
 
         Args:
-            key: the object that it is about.
-            question: what the answer follows from; compared with that of the answer that is there.
-            namespace: whose CPU time it takes.
-            done: called once, however the job ends; who still wants the answer requests it again.
+            key: the object that it concerns.
+            question: the input; the cached result is returned if it has the same one.
+            namespace: the CPU time is counted for it.
+            done: called once, however the job ends; callers that still need the result request it again.
         """
         known = self._kept.get(key)
         if known is not None and known.question == question and time.monotonic() < known.until:
@@ -76,13 +76,13 @@ class AnswerCache:
         return None
 
     def forget(self, key: Hashable) -> None:
-        """Drop the answer of an object that is deleted."""
+        """Forget the result of an object that was deleted."""
         known = self._kept.pop(key, None)
         if known is not None:
             self._size -= known.size
 
     async def close(self) -> None:
-        """End all work."""
+        """Stop all work."""
         tasks = list(self._requested.values())
         for task in tasks:
             task.cancel()

@@ -17,7 +17,7 @@ _ROOM = 64 * 1024  # bytes that are read ahead
 
 
 class EndedError(Exception):
-    """The process ended while it worked; `of_time`: since it used up its CPU time."""
+    """The process ended during a job; `of_time`: because it used up its CPU time."""
 
     def __init__(self, why: str, *, of_time: bool) -> None:
         super().__init__(why)
@@ -32,9 +32,9 @@ class Child:
 
     @classmethod
     async def start(cls, limit: float) -> Child:
-        """Start a process whose jobs have `limit` seconds of CPU time each. It imports what it needs meanwhile.
+        """Start a process whose jobs have `limit` seconds of CPU time each. It imports its modules in the meantime.
 
-        Raises OSError where there can be no further process.
+        Raises OSError if no further process can be started.
         """
         process = await asyncio.create_subprocess_exec(
             sys.executable,
@@ -51,9 +51,9 @@ class Child:
         return child
 
     async def do(self, job: bytes) -> tuple[bytes, float]:
-        """The result of a pickled job, pickled, and the seconds of CPU time that it took.
+        """The pickled result of a pickled job, and the seconds of CPU time that it took.
 
-        Raises EndedError where the process ended instead.
+        Raises EndedError if the process ended instead.
         """
         assert self._process.stdin is not None and self._process.stdout is not None  # noqa: S101, PT018  they are pipes
         try:
@@ -66,7 +66,7 @@ class Child:
             raise await self._ended() from None
 
     async def close(self) -> None:
-        """End the process, whatever it does."""
+        """End the process, whatever its state."""
         if self._process.returncode is None:
             with suppress(ProcessLookupError):
                 self._process.kill()
@@ -88,5 +88,5 @@ class Child:
 
 
 def pickled(job: object) -> bytes:
-    """A job as a process takes it."""
+    """A job in the form that is sent to a process."""
     return pickle.dumps(job, pickle.HIGHEST_PROTOCOL)

@@ -1,7 +1,7 @@
-"""What tasks request, computed in a worker process if that evaluates an expression or a pattern of the template.
+"""Computes claims, in a worker process if that evaluates an expression or a pattern of the template.
 
-A key that only puts parameters together (`${parameters.region}-${parameters.lane}`) is computed at once: it costs no
-more than to write it down.
+A key that only concatenates parameters (`${parameters.region}-${parameters.lane}`) is computed immediately: it costs no
+more than sending it.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from wayside.api import ApplicationTask, ApplicationTemplate
 
 
 class ClaimEvaluator:
-    """Works out claims."""
+    """Computes claims."""
 
     def __init__(self, answers: AnswerCache, done: Callable[[Name], None]) -> None:
-        """`done` is called with a task once its claim is there."""
+        """`done` is called with a task once its claim is available."""
         self._answers = answers
         self._done = done
 
     def __call__(self, template: TemplateState, task: ApplicationTask) -> Claim | Verdict | None:
-        """What the task claims, or its verdict where it claims nothing; None while that is being computed."""
+        """The claim of the task, or its verdict if it claims nothing; None while that is being computed."""
         if not isinstance(template, ApplicationTemplate) or claims_are_plain(template):
             return claim_or_verdict(template, task)
         over = finished(task)

@@ -1,8 +1,8 @@
-"""The jobs of the worker processes, for all that compiles or evaluates expressions of users.
+"""The jobs of the worker processes, for everything that compiles or evaluates users' expressions.
 
-A job is a function and its arguments, and its result follows from them alone. A template travels as bytes, since a
-process that has compiled it before need not read it again. The manager itself evaluates only small templates whose
-expressions just read: `${parameters.region}` costs no more than to write it down, and two switches between processes
+A job is a function and its arguments, on which alone its result depends. A template is passed as bytes, so that a
+process that has compiled it before need not parse it again. The manager itself evaluates only small templates whose
+expressions only read fields: `${parameters.region}` costs no more than sending it, and two switches between processes
 cost more than the work.
 """
 
@@ -24,11 +24,11 @@ from application_manager.core.objects.policy import Policy
 from application_manager.core.objects.rendering import ChartPending, Renderer, RenderError, Rendering
 from wayside.api import ApplicationInstance, ApplicationTemplate, Detector, EventRule
 
-_COMPILED = 64  # templates that a process keeps compiled
+_COMPILED = 64  # compiled templates that a process keeps
 _READ = re.compile(r"\$\{\s*(?:parameters|instance)(?:\.[A-Za-z_]\w*)+\s*\}")
 _LARGEST = 32 * 1024  # characters of the objects and files of a small template
 _MOST = 256  # expressions in them
-_VALUES = 16 * 1024  # characters of the values: with the above, of 4 MB at most
+_VALUES = 16 * 1024  # characters of the values: with the above, 4 MB at most
 
 
 def render_instance(
@@ -36,7 +36,7 @@ def render_instance(
 ) -> Rendering | ApplyProblem | ChartRequest:
     """An instance's objects, or why there are none, or the chart that is to be rendered first.
 
-    `template` is pickled; `chart` is what became of the instance's chart, where that was requested.
+    `template` is pickled; `chart` is the result for the instance's chart, if it was requested.
     """
     compiled = _compiled(template, policy)
     if isinstance(compiled, ApplyProblem):
@@ -58,19 +58,19 @@ def _compiled(template: bytes, policy: Policy) -> Renderer | ApplyProblem:
 
 
 def judge_detector(detector: Detector, old: Detector | None = None, rules: Sequence[EventRule] = ()) -> Findings:
-    """What is wrong with a detector; what is newly wrong with these rules is a remark, since they may follow."""
+    """The findings about a detector; new problems of these rules are remarks, because they may be changed next."""
     remarks = [each for rule in rules for each in newly_wrong(rule, detector, old)]
     return replace(detector_findings(detector), remarks=tuple(remarks))
 
 
 def claims_are_plain(template: ApplicationTemplate) -> bool:
-    """Whether what a task of the template claims takes no expression but plain reads of parameters."""
+    """Whether the claims of the template's tasks need no expressions except plain reads of parameters."""
     patterns = (each.pattern for each in template.spec.parameters.values())
     return _reads_alone(template.spec.key or "") and all(each is None for each in patterns)
 
 
 def objects_are_plain(template: ApplicationTemplate) -> bool:
-    """Whether the objects of the template's instances take none but such reads, and few of them."""
+    """Whether the template's objects need only a few such expressions."""
     if template.spec.helm is not None:
         return False
     text = _text([template.spec.manifests, template.spec.configuration])
@@ -78,7 +78,7 @@ def objects_are_plain(template: ApplicationTemplate) -> bool:
 
 
 def values_are_small(instance: ApplicationInstance) -> bool:
-    """Whether the instance's values are too small to make much of, however often they are read."""
+    """Whether the instance's values are so small that reading them many times gives a small result."""
     return len(_text(instance.spec.parameters)) <= _VALUES
 
 

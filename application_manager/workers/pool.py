@@ -1,8 +1,8 @@
-"""At most two worker processes, shared by all namespaces: the namespace that used the least CPU time is first.
+"""At most two worker processes, shared by all namespaces: the one that used the least CPU time comes first.
 
-No namespace has more than one of the two, so a template whose expressions take long delays others of its namespace and
-leaves the second process to all else. A process starts when there is work for it, and one that was ended for its CPU
-time is replaced at once.
+A namespace uses at most one of the two, so a template whose expressions take long delays others of its namespace and
+leaves the second process to the other namespaces. A process starts when there is work for it, and one that was ended
+for its CPU time is replaced immediately.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ PROCESSES = 2
 CPU_TIME = 3.0
 """Seconds of CPU time that a job may take, by default."""
 
-_ATTEMPTS = 2  # at a job whose process ended for another reason than its CPU time
-_FORGETTING = 30.0  # s in which the CPU time that a namespace has used counts half
+_ATTEMPTS = 2  # attempts of a job whose process ended for another reason than its CPU time
+_FORGETTING = 30.0  # s after which the CPU time that a namespace has used counts half
 
 log = logging.getLogger(__name__)
 
 
 class ExceededError(Exception):
-    """A job that was ended; the text names the limit."""
+    """A job was stopped; the text names the limit."""
 
 
 class JobError(Exception):
-    """A job that failed by a defect of ours."""
+    """A job failed because of a defect of ours."""
 
 
 @dataclass(eq=False, slots=True)
@@ -47,16 +47,16 @@ class _Ticket:
 
 
 class Runs(Protocol):
-    """Where jobs run."""
+    """Runs jobs."""
 
     async def run(self, namespace: str, job: Job[Result]) -> Result:
-        """The job's result. Raises ExceededError where it was ended for what it takes."""
+        """The job's result. Raises ExceededError if it was stopped for exceeding its limits."""
 
 
 class Pool:
-    """Does jobs. Only the event loop's thread uses it.
+    """Runs jobs. Only the event loop's thread uses it.
 
-    What waits is bounded by who waits: each object of the cluster, and each question of the API server, has one job.
+    The number of waiting jobs is limited by their callers: each object of the cluster, and each review, has one job.
     """
 
     def __init__(self, measures: Measures, cpu_time: float = CPU_TIME) -> None:
@@ -72,14 +72,14 @@ class Pool:
         self._closed = False
 
     async def run(self, namespace: str, job: Job[Result]) -> Result:
-        """What the job gives, in another process.
+        """The job's result, computed in another process.
 
-        Raises ExceededError where the job was ended for what it takes, and JobError where it raised an error.
+        Raises ExceededError if the job was stopped for exceeding its limits, and JobError if it raised an error.
         """
         return cast("Result", unpickled(await self.answer(namespace, job)))
 
     async def answer(self, namespace: str, job: Job[object]) -> bytes:
-        """The same, as it came: for `unpickled`. Raises the same."""
+        """The pickled result, for `unpickled`. Raises the same."""
         if self._closed:
             raise asyncio.CancelledError
         ticket = _Ticket(namespace, pickled(job), asyncio.get_running_loop().create_future())
@@ -102,7 +102,7 @@ class Pool:
         self._idle.clear()
 
     def _dispatch(self) -> None:
-        """Begin what may begin."""
+        """Start the jobs that may run."""
         while not self._closed and len(self._workers) < PROCESSES:
             ticket = self._next()
             if ticket is None:
@@ -119,10 +119,10 @@ class Pool:
         self._dispatch()
 
     def _next(self) -> _Ticket | None:
-        """The next job: of the namespace that has used the least among those of which none is running."""
+        """The next job: of the namespace that has used the least CPU time, among those without a running job."""
         now = time.monotonic()
         for namespace in [each for each, tickets in self._waiting.items() if all(t.answer.done() for t in tickets)]:
-            del self._waiting[namespace]  # nobody waits for it
+            del self._waiting[namespace]  # its caller no longer waits
         free = [each for each in self._waiting if not self._running[each]]
         if not free:
             return None
@@ -142,11 +142,11 @@ class Pool:
     def _charge(self, namespace: str, seconds: float) -> None:
         now = time.monotonic()
         self._used[namespace] = (self._lately(namespace, now) + seconds, now)
-        if len(self._used) > 1000:  # those of long ago
+        if len(self._used) > 1000:  # namespaces without recent jobs
             self._used = {each: used for each, used in self._used.items() if self._lately(each, now) > 0.001}
 
     async def _work(self, ticket: _Ticket) -> None:
-        """Do a job, and then others as long as there are any."""
+        """Run a job, and then further ones until there are none."""
         try:
             child = self._idle.pop() if self._idle else await Child.start(self.cpu_time)
             following: _Ticket | None = ticket
@@ -157,7 +157,7 @@ class Pool:
                 following = self._next()
                 if following is not None:
                     self._running[following.namespace] += 1
-                    self._dispatch()  # its namespace was the last in the way of another's
+                    self._dispatch()  # this namespace may have been the last obstacle of another job
         except Exception as error:
             self._running -= Counter((ticket.namespace,))
             if not ticket.answer.done():
@@ -166,7 +166,7 @@ class Pool:
         self._idle.append(child)
 
     async def _do(self, ticket: _Ticket, child: Child) -> Child:
-        """Do one job; the process for the next one."""
+        """Run one job; returns the process for the next one."""
         began = time.monotonic()
         try:
             answer, used = await child.do(ticket.job)

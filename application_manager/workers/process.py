@@ -1,8 +1,8 @@
-"""The process that runs users' expressions: one job after the other, each within its CPU time.
+"""The process that runs users' expressions: one job after the other, each within its limit of CPU time.
 
-CEL runs in C++ and holds the interpreter's lock meanwhile, so no thread, and no exception, could end it. The kernel
-can: a timer of the process's own CPU time (ITIMER_PROF) ends it by SIGPROF when a job takes longer. The manager sees by
-the signal what has happened, and starts another process. It is CPU time, so a busy machine makes no job fail.
+CEL runs in C++ and holds the interpreter's lock meanwhile, so neither a thread nor an exception could end it. The
+kernel can: a timer of the process's own CPU time (ITIMER_PROF) ends it by SIGPROF when a job takes longer. The manager
+recognises the signal, and starts another process. The limit is CPU time, so a busy machine makes no job fail.
 
 Frames are a length and a pickle, on standard input and output. The process ends when its input does.
 """
@@ -29,14 +29,14 @@ _NICENESS = 10  # where there is no idle class
 
 Result = TypeVar("Result")
 Job = Callable[[], Result]
-"""Something to work out that follows from its own content alone, and that can be pickled."""
+"""A computation that depends on its own content alone, and that can be pickled."""
 
 FAILED = -1.0
-"""In place of the CPU time: the job raised an error, a defect of ours, and the answer is its text."""
+"""Sent in place of the CPU time: the job raised an error, a defect of ours, whose text is the result."""
 
 
 def _yield_to_others() -> None:
-    """Run only when nothing else in the container wants the CPU, above all not the manager.
+    """Run only when nothing else in the container needs the CPU, above all not the manager.
 
     A nice value alone leaves the current process its time slice: each wake-up of the manager would wait for it.
     """
@@ -47,13 +47,13 @@ def _yield_to_others() -> None:
 
 
 def main() -> None:
-    """Answer until the input ends. The first frame is the limit of CPU time of each job, in seconds."""
+    """Process jobs until the input ends. The first frame is the limit of CPU time of each job, in seconds."""
     answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # what a library prints belongs to the log
+    os.dup2(2, 1)  # the output of a library belongs to the log
     resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # of a terminal: the manager ends us
-    # Before the first job, which is to be fast.
+    # Before the first job, so that it is fast.
     import application_manager.core.findings.templatefindings  # noqa: PLC0415
     import application_manager.workers.jobs  # noqa: F401, PLC0415
 
@@ -79,7 +79,7 @@ def _answer(frame: bytes) -> tuple[bytes, bool]:
     try:
         job: Job[Any] = pickle.loads(frame)  # noqa: S301  from the manager, which started us
         return pickle.dumps(job(), pickle.HIGHEST_PROTOCOL), True
-    except MemoryError:  # as CEL does in C++: the expression takes more than there is
+    except MemoryError:  # like CEL in C++: the expression needs more memory than there is
         os.abort()
     except Exception as error:  # noqa: BLE001  a defect in one job must not end the others
         return f"{type(error).__name__}: {error}".encode(), False

@@ -86,7 +86,7 @@ Place = tuple[str | int, ...]
 
 
 def secret_problems(rule: EventRule, detector: Detector) -> Iterator[RuleProblem]:
-    """The places at which a rule names one of the detector's own Secrets."""
+    """The fields in which a rule names one of the detector's own Secrets."""
     pod = detector.spec.pod
     given = set() if pod is None else {*pod.secret_names}
     own = {name for _, name in _named(detector.spec.to_json(), _OWN, ())} - given

@@ -24,11 +24,11 @@ def check_files(files: Sequence[Path], recordings: Sequence[Path], ignore: Seque
 
     Args:
         files: Detectors and EventRules.
-        recordings: are looked at, too, where the files are free of errors.
+        recordings: also replayed, if the files have no errors.
         ignore: the names of warnings that are not printed.
         strict: whether a warning fails the check.
 
-    Raises InputError where a name in `ignore` is not that of a warning.
+    Raises InputError if a name in `ignore` is not the name of a warning.
     """
     ignored = ignorable(ignore, CHECKS)
     try:

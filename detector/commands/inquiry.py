@@ -110,15 +110,14 @@ def _show_total(
 def _inquire_all(
     detector: Path | None, connect: list[str] | None, timeout: float
 ) -> tuple[list[bytes], dict[str, str]]:
-    """The statuses of all detectors of the file, else of every detector; and the detectors of the file that do not
-    respond, with the reasons.
+    """The statuses of the file's detectors, or of every one; and the file's detectors without response, with the reasons.
 
     Each network of the file's Detectors is queried separately: regions may have separate networks.
 
     Raises:
         NoAnswerError: no detector responds.
         NetworkError: without a file: no session.
-        DocumentError: the file is wrong, or holds no Detector.
+        DocumentError: the file is wrong, or contains no Detector.
     """
     if detector is None:
         return [answer.payload for answer in query_selected("status", {}, None, None, connect, timeout)], {}

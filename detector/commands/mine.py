@@ -47,15 +47,15 @@ def mine_recordings(
 
     Args:
         given: files, folders, patterns, URLs, and lists as @FILE.
-        output: the folder of the dataset, made where it is missing.
+        output: the folder of the dataset, created if it is missing.
         detector: a file with one Detector.
         rules: files or folders with EventRules.
-        processes: how many work side by side; None: one for each core that this process may use.
+        processes: the number of worker processes; None: one for each core that this process may use.
         dask: the address of a Dask scheduler, whose workers do the work; None: processes of this machine.
         record: run the rules' record actions.
-        sample: mine this many recordings, chosen by chance, the same ones each time.
-        limit: mine the first of them only.
-        share: as NUMBER/OF: do this part of the work, counted from 0, and leave the rest to others.
+        sample: mine only this number of recordings, chosen at random, but the same ones each time.
+        limit: mine only the first recordings, by name.
+        share: as NUMBER/OF: mine one share of the recordings, counted from 0; other processes mine the rest.
 
     Raises:
         ClusterError: the Dask cluster cannot be used.

@@ -1,4 +1,4 @@
-"""Implements `detector replay` and `detector check --recording`: recordings in, events, tasks and doubts out."""
+"""Implements `detector replay` and `detector check --recording`: recordings in, events, tasks and findings out."""
 
 from __future__ import annotations
 
@@ -71,8 +71,8 @@ def replay_files(
 
     Args:
         recordings: at least one file, folder or pattern.
-        output: the folder for events.jsonl and tasks.yaml, made where it is missing.
-        detector: a file with one Detector; None: the intake file brings its own.
+        output: the folder for events.jsonl and tasks.yaml, created if it is missing.
+        detector: a file with one Detector; None: the intake file contains its own.
         rules: files or folders with EventRules.
         as_one: merge all recordings by time; otherwise each is replayed on its own.
         kinds: the kinds of results to write in addition.
@@ -82,7 +82,7 @@ def replay_files(
         record: run the rules' record actions, into the folder clips of `output`.
 
     Raises:
-        VariantError: a variant cannot be made.
+        VariantError: a variant cannot be created.
         MissingExtraError: a result needs a package that is not installed.
         DocumentError, DetectorError, RecordingError, OSError: a file cannot be used; the text gives the reason.
     """
@@ -153,8 +153,7 @@ def _number(count: int, noun: str) -> str:
 def doubts_of(
     documents: Sequence[Document], recordings: Sequence[Path]
 ) -> tuple[list[Finding | Problem], list[RecordingError]]:
-    """Doubts that the recordings raise about the Detectors and their rules, and errors of recordings that cannot be
-    read.
+    """Findings of the recordings about the Detectors and their rules, and errors of recordings that cannot be read.
 
     Warnings that an annotation of the Detector or the rule ignores are left out.
     """
@@ -187,7 +186,7 @@ def _unignored(found: Iterable[Finding], detector: Detector, rules: Iterable[Eve
 def _topic_doubts(
     documents: Sequence[Document], gathered: Sequence[Recording], errors: dict[str, RecordingError]
 ) -> Iterator[Problem]:
-    """Doubts from the messages alone, before the replay; errors of recordings are noted."""
+    """Findings from the messages alone, before the replay; errors of recordings are noted."""
     readable = []
     for recording in gathered:
         try:

@@ -37,10 +37,10 @@ def try_expression(expression: str, recordings: Sequence[Path], stream: str | No
         expression: CEL over msg, as the value of a signal.
         recordings: at least one file, folder or pattern.
         stream: as `detector topics` names it; None: the one whose messages have the fields.
-        every: how often it is looked at, as 100ms.
+        every: the time between two evaluations, e.g. 100ms.
 
     Raises:
-        RecordingError: a recording is missing or damaged, or holds no message.
+        RecordingError: a recording is missing or damaged, or contains no message.
     """
     gathered = recordings_of(recordings)
     topics = survey(gathered).topics

@@ -85,7 +85,7 @@ def rule_findings(
 
 @dataclass(frozen=True, slots=True)
 class RuleContext:
-    """What a rule is checked with: the valid objects of its namespace, and the names of the others."""
+    """The context of a rule: the valid objects of its namespace, and the names of the invalid ones."""
 
     detectors: Sequence[Detector] = ()
     invalid_detectors: Sequence[str] = ()
@@ -94,7 +94,7 @@ class RuleContext:
     invalid_templates: Sequence[str] = ()
 
     def findings(self, rule: EventRule) -> Findings:
-        """What is wrong with the rule, and what its tasks would be refused for."""
+        """The findings about the rule, and why its tasks would be refused."""
         found = rule_findings(rule, self.detectors, self.invalid_detectors, self.rules)
         return replace(found, remarks=tuple(deploy_remarks(rule, self.templates, self.invalid_templates)))
 

@@ -1,1 +1,1 @@
-"""Reports: statuses, Events and explanations."""
+"""Statuses, Events and explanations."""

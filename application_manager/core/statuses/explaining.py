@@ -1,7 +1,7 @@
-"""Why a task is served or not, and why an instance runs as it does: one chain from the event to the pods. Pure.
+"""Explains why a task is served or not, and the state of an instance: one chain from the event to the pods. Pure.
 
-Of what the manager wrote, only what it alone can know counts (lost holders, deadlines): the demand is
-computed from what is live, by the same functions. So an explanation is also right while no manager runs.
+From the statuses it reads only the facts that the manager alone can know (lost holders, deadlines): it computes the
+demand from the live objects, with the same functions. So an explanation is also right while no manager runs.
 """
 
 from __future__ import annotations
@@ -45,17 +45,17 @@ _LATER = {
     Merge.ALL: "another task gives false",
     Merge.ANY: "another task gives true",
 }
-"""Why a value is outbid."""
+"""Why a value has no effect."""
 
 _BELOW = "a Reconfigure task overrides it"
 
 
 @dataclass(frozen=True, slots=True)
 class NamespaceSnapshot:
-    """What is live in one namespace: who has a place depends on all of it.
+    """The live objects of one namespace, because a place depends on all of them.
 
-    `objects`: those that the instance's status lists, None where one is gone; `pods`: those that have its label;
-    `leases`: by holder.
+    `objects`: those in the instance's status, None if one is missing; `pods`: those with its label; `leases`: by
+    holder.
     """
 
     templates: Sequence[ApplicationTemplate | InvalidTemplate]
@@ -67,7 +67,7 @@ class NamespaceSnapshot:
 
 
 def serving(found: NamespaceSnapshot, task: ApplicationTask, now: float) -> str | None:
-    """The name of the instance that serves the task, or that it claims; None where there is none, or all are meant.
+    """The name of the instance that serves the task, or that it claims; None if there is none, or it claims all.
 
     `now` is in seconds since 1970.
     """
@@ -82,7 +82,7 @@ def serving(found: NamespaceSnapshot, task: ApplicationTask, now: float) -> str 
 
 
 def _outcome(found: NamespaceSnapshot, now: float) -> NamespaceOutcome:
-    """What is demanded; where the manager has written that a limit holds which is its own alone, that."""
+    """The verdict; if the manager reported its own limit of instances, that verdict."""
     outcome = demand(found.templates, found.tasks, found.instances, _written_leases(found.tasks), now)
     limited = {each.name: verdict for each in found.tasks if (verdict := _written_limit(each)) is not None}
     verdicts = {
@@ -93,7 +93,7 @@ def _outcome(found: NamespaceSnapshot, now: float) -> NamespaceOutcome:
 
 
 def _written_limit(task: ApplicationTask) -> Verdict | None:
-    """The verdict of a task that has no place, as the manager wrote it: a limit of the namespace is its option."""
+    """The verdict of a task without a place, as reported by the manager: the namespace's limit is an option of it."""
     accepted = find(task.status.conditions, "Accepted") if task.status else None
     if accepted is None or accepted.reason not in (LIMIT_REACHED, PREEMPTED):
         return None
@@ -103,9 +103,9 @@ def _written_limit(task: ApplicationTask) -> Verdict | None:
 
 
 def explanation_of(found: NamespaceSnapshot, *, task: str | None, instance: str | None, now: float) -> Explanation:
-    """The chain of a task, or of an instance where `task` is None; these are names, of what is in `found`.
+    """The chain of a task or, if `task` is None, of an instance; these are names of objects in `found`.
 
-    `instance`: the one that serves the task, None where none does; `now` in seconds since 1970.
+    `instance`: the one that serves the task, None if none does; `now` is in seconds since 1970.
     """
     outcome = _outcome(found, now)
     decision = (outcome.instances | outcome.waiting).get(instance) if instance else None
@@ -140,12 +140,12 @@ def explanation_of(found: NamespaceSnapshot, *, task: str | None, instance: str 
 
 
 def _names(task: ApplicationTask, instance: str | None) -> bool:
-    """Whether a task that is over was served by the instance."""
+    """Whether the instance served a task that has finished."""
     return instance is not None and task.status is not None and task.status.instance_name == instance
 
 
 def _written_leases(tasks: Sequence[ApplicationTask]) -> dict[str, LeaseView]:
-    """Who is lost, as the manager has written it: nobody can see that a Lease is unchanged by looking once."""
+    """The lost holders, as reported by the manager: a single read cannot show that a Lease is unchanged."""
     holders = {each.spec.requester.holder for each in tasks}
     return {each: LeaseView(0.0, renewed=False) for each in holders if each is not None}
 
@@ -219,7 +219,7 @@ def _parameters(
     decision: Decision | None,
     existing: ApplicationInstance | None,
 ) -> list[ExplainedParameter]:
-    """Each parameter with its value and the contributions of tasks, also of those that do not count."""
+    """Each parameter with its value and the contributions of tasks, including those that do not count."""
     if not isinstance(template, ApplicationTemplate) or decision is None:
         return []
     merged = decision.parameters if decision.parameters is not None else existing.spec.parameters if existing else {}
@@ -231,7 +231,7 @@ def _parameters(
         and each.name in decision.verdicts
         and decision.verdicts[each.name].kind is VerdictKind.COUNTS
     }
-    # One that suspends gives parameters only to identify its instance.
+    # A Suspend task gives parameters only to identify its instance.
     speaking = [each for each in tasks if each.spec.operation is not Operation.SUSPEND and each.spec.end_time is None]
     always = template.spec.baseline.parameters if template.spec.baseline else {}
     result = []

@@ -1,7 +1,4 @@
-"""The shape of an explanation: what `application-manager explain -o json` prints.
-
-An interface: fields are only added.
-"""
+"""The schema of explanations, as printed by `application-manager explain -o json`. Fields are only added."""
 
 from __future__ import annotations
 
@@ -13,10 +10,10 @@ from wayside.api.base import Model
 
 
 class ExplainedContribution(Model):
-    """What one task gives for one parameter, and what came of it.
+    """The value of one task for one parameter, and its effect.
 
-    `effect` is `decides` (the merged value is this one), `part` (it is in it), `outbid` (another value counts), or
-    `none` (the task does not count).
+    `effect` is `decides` (it is the merged value), `part` (it is a part of the merged value), `outbid` (another value
+    counts), or `none` (the task does not count).
     """
 
     task: str
@@ -28,8 +25,8 @@ class ExplainedContribution(Model):
 class ExplainedParameter(Model):
     """One parameter of the template.
 
-    `source` is `tasks`, `default`, `baseline`, `earlier` (no task gives it now; the instance keeps what it
-    has), or `none`. `note` names the bound that holds a merged sum.
+    `source` is `tasks`, `default`, `baseline`, `earlier` (no task gives it now; the instance keeps its value), or
+    `none`. `note` names the bound that caps a merged sum.
     """
 
     name: str
@@ -41,10 +38,10 @@ class ExplainedParameter(Model):
 
 
 class ExplainedTask(Model):
-    """One task, and why it counts or does not.
+    """One task, and why it counts or not.
 
-    `phase` and `conditions` are as written; `verdict`, `reason` and `message` are computed now. `not_looked_at`: the
-    manager has not written of its present version.
+    `phase` and `conditions` come from its status; `verdict`, `reason` and `message` are computed now. `not_looked_at`:
+    the manager has not processed its current version.
     """
 
     name: str
@@ -76,9 +73,9 @@ class ExplainedTemplate(Model):
 
 
 class ExplainedInstance(Model):
-    """The instance; `exists` is false where it should be and is not yet.
+    """The instance; `exists` is false if it is demanded but does not exist yet.
 
-    Its template is the fallback's where that serves the task meanwhile.
+    If the fallback serves the task, this is the fallback's instance, with its template.
     """
 
     name: str
@@ -102,7 +99,7 @@ class ExplainedObject(Model):
 
 
 class ExplainedPod(Model):
-    """A pod of the instance; `problem` is what keeps it from running, where something does."""
+    """A pod of the instance; `problem` is the reason why it does not run, if it does not."""
 
     name: str
     phase: str
@@ -112,8 +109,7 @@ class ExplainedPod(Model):
 
 
 class Explanation(Model):
-    """The chain: the task in question, if it was one, its template, the instance and all of its tasks, the
-    merged parameters, the objects and the pods."""
+    """The chain: the task in question, if any, its template, the instance and its tasks, and their results."""
 
     task: ExplainedTask | None = None
     template: ExplainedTemplate

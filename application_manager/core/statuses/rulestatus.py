@@ -1,8 +1,7 @@
-"""Statuses of EventRules and Detectors: whether a detector can evaluate them, and if not, what is wrong where. Pure.
+"""Statuses of EventRules and Detectors: whether a detector can evaluate them, and the errors if not. Pure.
 
-The same compiler that the detector runs judges here. It does not know the message types of ROS, which are the
-detector's to know, so a misspelt type, or field of a message, is reported by the detector alone: what is accepted here
-is accepted as far as can be known, which the message adds.
+The compiler of the detector checks them here too. It does not know the ROS message types, so only the detector itself
+reports a wrong type or field of a message: the message of the condition states this limit.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ Status = EventRuleStatus | DetectorStatus
 
 RULE_INVALID = "RuleInvalid"
 DETECTOR_INVALID = "DetectorInvalid"
-"""Reasons of the condition Accepted of what cannot be evaluated."""
+"""Reasons of the condition Accepted of rules and detectors that cannot be evaluated."""
 
 RUNNING = "Running"
 """The condition's type."""
@@ -36,19 +35,19 @@ NOT_RUN = ConditionState(
     "the manager runs no detectors: start it with --detector-image, and apply the roles that `application-manager "
     "rbac --detectors` prints; or remove spec.mode and run the detector yourself",
 )
-"""The condition where the manager has no image."""
+"""The condition if the manager has no image of detectors."""
 
 NOT_ACCEPTED = ConditionState(
     RUNNING, False, "NotAccepted", "no objects are created for a Detector that is not accepted"
 )
-"""The condition of a Detector that cannot run and was never made."""
+"""The condition of a Detector that cannot run and has no objects."""
 
 _NOT_PROCESSED = ConditionState(
     RUNNING, False, "Pending", "the manager has not processed this generation yet", unknown=True
 )
-"""The condition of a Detector whose objects were not looked at since it changed."""
+"""The condition of a Detector whose objects were not checked since it changed."""
 
-_NAMES_LISTED = 5  # in a column of a table
+_NAMES_LISTED = 5  # names to list in a column of a table
 
 _AS_FAR_AS = "message types are checked only by the detector, which logs errors in them"
 
@@ -70,7 +69,7 @@ def rule_status(rule: EventRule, context: RuleContext, now: float) -> EventRuleS
 
 
 def _listed(names: Sequence[str]) -> str:
-    """The names as one text; of many, the first ones."""
+    """The names as one text, shortened if there are many."""
     more = f", and {len(names) - _NAMES_LISTED} more" if len(names) > _NAMES_LISTED else ""
     return ", ".join(names[:_NAMES_LISTED]) + more
 
@@ -78,9 +77,10 @@ def _listed(names: Sequence[str]) -> str:
 def detector_status(
     detector: Detector, rules: Sequence[EventRule], now: float, running: ConditionState | None = None
 ) -> DetectorStatus:
-    """The detector's status, given the rules of its namespace; `now` in seconds since 1970.
+    """The detector's status, given the rules of its namespace; `now` is in seconds since 1970.
 
-    `running`: whether this generation of it runs, with a mode; None where the manager has not looked since its start.
+    `running`: whether this generation of it runs, if it has a mode; None if the manager has not checked since its
+    start.
     """
     old = detector.status or DetectorStatus()
     generation = detector.metadata.generation
@@ -96,7 +96,7 @@ def detector_status(
 
 
 def _known_running(status: DetectorStatus, generation: int) -> ConditionState:
-    """Whether this generation of the detector runs, as its status has it."""
+    """Whether this generation of the detector runs, by its status."""
     known = find(status.conditions, RUNNING)
     if known is None or known.observed_generation != generation or known.status == "Unknown":
         return _NOT_PROCESSED
@@ -104,7 +104,7 @@ def _known_running(status: DetectorStatus, generation: int) -> ConditionState:
 
 
 def unreadable_status(status: Status, reason: str, problem: str, generation: int, now: float) -> Status:
-    """The status of a rule or detector that the API server took and that is none; `now` in seconds since 1970."""
+    """The status of an invalid rule or detector that the API server accepted; `now` is in seconds since 1970."""
     state = ConditionState("Accepted", False, reason, problem)
     conditions = concluded(status.conditions, [state], generation, now, stalled=(reason,))
     return status.model_copy(update={"observed_generation": generation, "conditions": conditions})
@@ -124,7 +124,7 @@ def _accepted(findings: Findings, reason: str) -> ConditionState:
 
 
 def carried(detector: Detector, pods: Sequence[Mapping[str, Any]]) -> ConditionState:
-    """The condition Running of a sidecar, by the pods that request it; pods that have ended do not count."""
+    """The condition Running of a Sidecar detector, by the pods that request it; finished pods do not count."""
     if not detector.spec.service_account_names:
         return ConditionState(
             RUNNING, False, "NoAccounts", "spec.serviceAccountNames: is empty: list the service accounts of its pods"
@@ -146,7 +146,7 @@ def carried(detector: Detector, pods: Sequence[Mapping[str, Any]]) -> ConditionS
 
 
 def _is_over(pod: Mapping[str, Any]) -> bool:
-    """Whether the pod has ended or is about to: a Job's, whose own containers have, and whose sidecars are about to."""
+    """Whether the pod has finished or is about to, like a Job's pod whose own containers have finished."""
     status, spec = pod.get("status") or {}, pod.get("spec") or {}
     if pod["metadata"].get("deletionTimestamp") or status.get("phase") in ("Succeeded", "Failed"):
         return True
@@ -159,7 +159,7 @@ def _runs(pod: Mapping[str, Any]) -> bool:
 
 
 def running(deployment: Mapping[str, Any] | None, troubles: Sequence[Trouble]) -> ConditionState:
-    """The condition Running, by the Deployment as it is and what keeps its pods from running."""
+    """The condition Running, by the Deployment and the problems of its pods."""
     if deployment is None:
         return ConditionState(RUNNING, False, "NotReady", "its Deployment does not exist yet")
     what = f"Deployment {deployment['metadata']['name']}"

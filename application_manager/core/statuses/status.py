@@ -1,7 +1,7 @@
 """Statuses of tasks, instances and templates. Pure.
 
-They are honest (Ready means that the workload is ready) and quiet: the same state gives the same status, so nothing is
-written that is known.
+They are truthful (Ready means that the workload is ready) and quiet: the same state gives the same status, so nothing
+known is written again.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Json = dict[str, Any]
 
 _NAMES_SHOWN = 20
 _PASSING = frozenset({"Retrying", "Paused"})
-"""Reasons of Applied=False beside which an instance's phase is Failed, and that need no change of the template."""
+"""Reasons of Applied=False with phase Failed that require no change of the template."""
 
 TEMPLATE_INVALID = "TemplateInvalid"
 """Reason of the condition Accepted of a template that cannot be rendered."""
@@ -36,15 +36,15 @@ TEMPLATE_INVALID = "TemplateInvalid"
 
 @dataclass(frozen=True, slots=True)
 class InstanceProgress:
-    """What an instance has given to its tasks until now.
+    """The progress of an instance for its tasks.
 
     Attributes:
         applied: whether all objects are as they should be.
         ready: whether its workloads are ready.
-        problem: why it is not applied or not ready, in words; empty where it only takes time.
-        reason: the problem's word for programs, where it keeps the instance from being ready.
-        suspended: whether it is to be at zero.
-        stopped: whether it is at zero.
+        problem: why it is not applied or not ready, as text; empty if it only takes time.
+        reason: the problem's reason, if it prevents readiness.
+        suspended: whether it is to be scaled to zero.
+        stopped: whether it is scaled to zero.
     """
 
     instance: str
@@ -57,7 +57,7 @@ class InstanceProgress:
 
 
 def together(services: Sequence[InstanceProgress]) -> InstanceProgress:
-    """What several instances, at least one, have given to a task that means them all."""
+    """The combined progress of several instances, at least one, for a task for all instances."""
     return InstanceProgress(
         instance=", ".join(sorted(each.instance for each in services)),
         applied=all(each.applied for each in services),
@@ -72,10 +72,10 @@ def together(services: Sequence[InstanceProgress]) -> InstanceProgress:
 def task_status(
     task: ApplicationTask, verdict: Verdict, service: InstanceProgress | None, now: float, generation: int
 ) -> ApplicationTaskStatus:
-    """The task's status as it is now; `service` is that of the verdict's instance.
+    """The task's status; `service` is the progress of the verdict's instance.
 
-    `generation`: of the task, that the verdict is about: the task may have changed since. A finished task has no
-    condition Applied or Ready: nothing is done for it any more.
+    `generation`: the generation of the task that the verdict is based on: the task may have changed since. A finished
+    task has no condition Applied or Ready: no more work is done for it.
     """
     old = task.status or ApplicationTaskStatus()
     since = format_seconds(now)
@@ -106,7 +106,7 @@ def task_status(
         states.append(ConditionState("Ready", False, verdict.reason, verdict.message))
         if verdict.kind is VerdictKind.REFUSED:
             states.append(ConditionState(STALLED, True, verdict.reason, verdict.message))
-    # A task that counts keeps what is known of its service while nothing newer is.
+    # A task that counts keeps its known progress until there is a newer one.
     only_while = (STALLED,) if verdict.kind is VerdictKind.COUNTS else ("Applied", "Ready", STALLED)
     conditions = updated(old.conditions, states, generation, now, only_while=only_while)
     instance = old.instance_name or verdict.instance if finished else verdict.instance
@@ -122,7 +122,7 @@ def task_status(
 
 
 def finished_since(task: ApplicationTask) -> float | None:
-    """Since when the task's status has it as finished, in seconds since 1970; None where it is not."""
+    """Since when the task is finished according to its status, in seconds since 1970; None if it is not."""
     condition = find(task.status.conditions, "Finished") if task.status else None
     return parse_seconds(condition.last_transition_time) if condition and condition.status == "True" else None
 
@@ -182,8 +182,8 @@ def instance_status(
 ) -> ApplicationInstanceStatus:
     """The instance's status.
 
-    `applied`, `ready` and `suspended` are its conditions, the last of which is None where it was never suspended;
-    `spec_hash` is that of what was last applied; `generation`: of the instance, that was applied.
+    `applied`, `ready` and `suspended` are its conditions; `suspended` is None if it was never suspended. `spec_hash`:
+    the digest of the last applied rendering.
     """
     old = instance.status or ApplicationInstanceStatus()
     lingering = decision.release_time is not None
@@ -239,7 +239,7 @@ def suspended_condition(
 def _stalled(
     phase: InstancePhase, applied: ConditionState, ready: ConditionState, decision: Decision
 ) -> list[ConditionState]:
-    """The condition Stalled, where more than time is needed: the objects are refused, or were not ready in time."""
+    """The condition Stalled, if waiting does not help: the objects are refused, or were not ready in time."""
     if not applied.holds and phase is InstancePhase.FAILED and applied.reason not in _PASSING:
         return [ConditionState(STALLED, True, applied.reason, applied.message)]
     if decision.overdue and not ready.holds and phase is not InstancePhase.SUSPENDED:
@@ -265,12 +265,12 @@ def _instance_message(
 
 
 def _short(message: str) -> str | None:
-    """The message as a column shows it; None where it is empty."""
+    """The message, shortened for a column; None if it is empty."""
     return cut(message, 512) or None
 
 
 def demands(decision: Decision) -> Demands:
-    """How many tasks the instance serves, and the first of them."""
+    """The number of tasks that the instance serves, and the first of them."""
     return Demands(count=len(decision.tasks), names=list(decision.tasks[:_NAMES_SHOWN]))
 
 
@@ -282,7 +282,7 @@ def template_status(
     now: float,
     manager: TemplateManager | None = None,
 ) -> ApplicationTemplateStatus:
-    """The template's status, with why it cannot be rendered, if it cannot."""
+    """The template's status, with the reason if it cannot be rendered."""
     if findings.problems:
         accepted = ConditionState("Accepted", False, TEMPLATE_INVALID, "; ".join(findings.problems))
     else:
@@ -297,7 +297,7 @@ def template_status(
 
 
 def difference(old: Json, new: Json) -> Json:
-    """The JSON merge patch that makes `old` of `new`, on the first level: empty where they are equal."""
+    """The JSON merge patch from `old` to `new`, on the first level: empty if they are equal."""
     patch: Json = {key: value for key, value in new.items() if old.get(key) != value}
     patch |= {key: None for key in old if key not in new}
     return patch

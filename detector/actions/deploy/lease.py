@@ -88,8 +88,8 @@ class HolderLease:
         Args:
             client: for the API server.
             namespace: the detector's.
-            holder: whose sign of life it is.
-            identity: which process this is. Default: found out.
+            holder: the holder of the Lease.
+            identity: the identity of this process. Default: `ProcessIdentity.of_this_process`.
             duration: seconds for which a renewal holds; whole, at least 3. Renewed after each third of it.
             monotonic: seconds, for observing.
             now: seconds since the epoch, only for the written times; nothing is computed from it.

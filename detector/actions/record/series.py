@@ -22,7 +22,7 @@ Begin = Callable[[Description, int | None], Recording]
 
 
 class RecordedSeries:
-    """Receives the samples of an episode, and tracks what became of them."""
+    """Receives the samples of an episode, and tracks their outcome."""
 
     def __init__(self, begin: Begin, description: Description, *, start: int | None, renew_after: int | None) -> None:
         """`start` of the window; `renew_after` in nanoseconds. Raises NoRoomError, OSError without `renew_after`."""

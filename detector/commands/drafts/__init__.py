@@ -12,7 +12,7 @@ STREAM = "odom"
 
 
 class DraftError(InputError, ValueError):
-    """There is no such draft; the text lists those that there are."""
+    """There is no such draft; the text lists the existing ones."""
 
 
 def drafts() -> Mapping[str, str]:

@@ -54,13 +54,13 @@ def list_live_topics(connect: Sequence[str], seconds: float, *, as_yaml: bool) -
     """Print the topics that receive samples over Zenoh within some seconds, or a Detector for them.
 
     Args:
-        connect: endpoints; none: those that scouting finds on the local network.
+        connect: endpoints; none: discover them in the local network.
         seconds: how long to listen.
         as_yaml: print a Detector.
 
     Raises:
         NetworkError: no endpoint can be reached.
-        NoSamplesError: nothing came.
+        NoSamplesError: no samples were received.
     """
     config = Zenoh(mode=ZenohMode.CLIENT, connect=[*connect], scouting=False) if connect else Zenoh()
     found = listen(config, seconds)

@@ -1,4 +1,4 @@
-"""Doubts that a recording raises about Detectors and rules before anything runs: misspelt fields, unmatched streams."""
+"""Findings from a recording about Detectors and rules before the replay: misspelt fields, unmatched streams."""
 
 from __future__ import annotations
 

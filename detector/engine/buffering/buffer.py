@@ -238,7 +238,7 @@ class Buffer:
                     self.bytes -= lane.expire(now)
 
     def latest(self, client: str) -> int:
-        """The greatest time of what came from the client on any stream; NEVER where nothing did."""
+        """The greatest time of the client's samples on any stream; NEVER if it has none."""
         return max([lane.latest for lane in self._lanes.get(client, {}).values()], default=NEVER)
 
     def forget(self, client: str, streams: Collection[str] | None = None) -> None:

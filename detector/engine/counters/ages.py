@@ -53,7 +53,7 @@ class StreamUse:
 
     @property
     def period(self) -> int | None:
-        """The median time between two samples of a client, in nanoseconds; None where no client sent two."""
+        """The median time between two samples of a client, in nanoseconds; None if no client sent two."""
         left = self.periods.total() / 2
         for period, count in sorted(self.periods.items()):
             left -= count

@@ -9,7 +9,7 @@ HOUR = 3_600 * 10**9
 """Nanoseconds."""
 
 _FLEET = ""
-"""Stands in for a client where a subject names none: no client has an empty name."""
+"""Stands in for a client if a subject names none: no client has an empty name."""
 
 
 class Budget:

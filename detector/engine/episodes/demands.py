@@ -69,7 +69,7 @@ class DemandChange(NamedTuple):
 
 
 def holder_label(holder: str) -> str:
-    """The value of the label `wayside.dev/holder`: the holder, shortened with a digest where a label has no room."""
+    """The value of the label `wayside.dev/holder`: the holder, shortened with a digest if it is too long."""
     if len(holder) <= _LABEL_LIMIT:
         return holder
     return f"{holder[:46]}-{_digest(holder)}"

@@ -109,7 +109,7 @@ def _text_once(constant: Mapping[str, JsonValue]) -> str:
 
 
 class OrderedEvent(NamedTuple):
-    """An event, and where it belongs in the order of all."""
+    """An event, and its position in the order of all."""
 
     time: int
     order: int

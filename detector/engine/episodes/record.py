@@ -1,4 +1,4 @@
-"""The record of an episode: what is known of it from its start on. Events, demands and actions share it."""
+"""The data about an episode that are known from its start on. Events, demands and actions share the record."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ class Statistic:
     """The sum of the infinite numbers."""
 
     def take(self, aggregate: Aggregate, time: int, value: Value | Unknown) -> bool:
-        """Take a value into account; False where the aggregate cannot use it."""
+        """Take a value into account; False if the aggregate cannot use it."""
         if aggregate is Aggregate.COUNT:
             self.count += 1
         elif aggregate in _OF_ONE:

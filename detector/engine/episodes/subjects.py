@@ -13,7 +13,7 @@ FLEET: Final = ""
 
 
 class Subject(NamedTuple):
-    """Clients, and the element of `each` where the rule has one."""
+    """Clients, and the element of `each` if the rule has one."""
 
     clients: tuple[str, ...]
     """One client, the two of a pair (a, then b), or none for the fleet."""

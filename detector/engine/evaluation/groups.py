@@ -1,4 +1,4 @@
-"""Rules about clients or the fleet that are due at the same ticks: brings observations into episodes."""
+"""Rules about clients or the fleet that are due at the same ticks: applies their observations to episodes."""
 
 from __future__ import annotations
 
@@ -300,6 +300,6 @@ def _with_effect(subjects: Integers, effects: Codes, timed: Truths, watched: Tru
 
 
 def _shifted(subjects: Integers, effects: Codes, first: NDArray[Any]) -> NDArray[Any]:
-    """The effect before each one of the same subject; `first` where it is the subject's first."""
+    """The effect before each one of the same subject; `first` for its first."""
     begins = np.concatenate(([True], subjects[1:] != subjects[:-1]))
     return np.where(begins, first, np.roll(effects, 1))
