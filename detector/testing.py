@@ -36,7 +36,7 @@ def run(rules: Paths, detector: str | Path, recording: Paths, *, as_one: bool = 
     Args:
         rules: files or folders with EventRules.
         detector: the file with the Detector that evaluates them.
-        recording: whatever `detector replay` reads. Several are replayed one after another, each on its own;
+        recording: of any kind that `detector replay` reads. Several are replayed one after another, each on its own;
             `as_one`: as one, merged by time.
 
     Raises:

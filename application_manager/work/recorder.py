@@ -221,9 +221,9 @@ class Recorder:
     def transitions(self, regarding: Kind, old: Sequence[Condition], new: Sequence[Condition], now: float) -> None:
         """Post an Event for each condition that changed, if it deserves one.
 
-        Not for a condition that is not True yet, and not for one that follows from another: Stalled, Ready of an object
-        that is not applied or not accepted, Applied of an object that is immediately ready. The status shows that a
-        task was accepted immediately, and its later conditions have their own Events.
+        Not for a condition that is False as expected at the start, and not for one that follows from another: Stalled,
+        Ready of an object that is not applied or not accepted, Applied of an object that is immediately ready. Nor for
+        a task that was accepted immediately: its status shows that, and its later conditions have their own Events.
         """
         was_true = {each.type for each in old if each.status == "True"}
         is_false = {each.type for each in new if each.status == "False"}

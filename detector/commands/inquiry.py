@@ -110,7 +110,7 @@ def _show_total(
 def _inquire_all(
     detector: Path | None, connect: list[str] | None, timeout: float
 ) -> tuple[list[bytes], dict[str, str]]:
-    """The statuses of the file's detectors, or of every one; and the file's detectors without response, with the reasons.
+    """The statuses of the file's detectors, else of every detector; and why detectors of the file did not respond.
 
     Each network of the file's Detectors is queried separately: regions may have separate networks.
 

@@ -108,10 +108,9 @@ def detector_findings(detector: Detector) -> Findings:
 
 
 def newly_wrong(rule: EventRule, new: Detector, old: Detector | None) -> tuple[Finding, ...]:
-    """The new problem of a rule, otherwise valid, with the changed Detector `new`.
+    """The problems of a rule with the changed Detector `new` that it did not have with `old`.
 
-    None if the Detector does not select it, or if the rule had problems with `old` as well, which is None for a new
-    Detector.
+    Empty if the Detector does not select the rule. `old` is None for a new Detector.
     """
     if not selects(new, rule):
         return ()

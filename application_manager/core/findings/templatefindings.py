@@ -154,7 +154,7 @@ def _rendered(template: ApplicationTemplate, renderer: Renderer, example: Exampl
 
 
 def _no_objects(_: ChartRequest) -> ChartOutcome:
-    """# Of a chart, only the values can be checked without fetching it."""
+    """No objects for a chart: without fetching it, only its values can be checked."""
     return ChartObjects(())
 
 

@@ -82,7 +82,7 @@ def serving(found: NamespaceSnapshot, task: ApplicationTask, now: float) -> str 
 
 
 def _outcome(found: NamespaceSnapshot, now: float) -> NamespaceOutcome:
-    """The verdict; if the manager reported its own limit of instances, that verdict."""
+    """The demand; a task that waits for a place keeps the verdict of its status: the limit is an option."""
     outcome = demand(found.templates, found.tasks, found.instances, _written_leases(found.tasks), now)
     limited = {each.name: verdict for each in found.tasks if (verdict := _written_limit(each)) is not None}
     verdicts = {
@@ -93,7 +93,7 @@ def _outcome(found: NamespaceSnapshot, now: float) -> NamespaceOutcome:
 
 
 def _written_limit(task: ApplicationTask) -> Verdict | None:
-    """The verdict of a task without a place, as reported by the manager: the namespace's limit is an option of it."""
+    """The verdict of a task without a place, from its status; None if it has a place, or its status is outdated."""
     accepted = find(task.status.conditions, "Accepted") if task.status else None
     if accepted is None or accepted.reason not in (LIMIT_REACHED, PREEMPTED):
         return None
