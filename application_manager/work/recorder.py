@@ -225,6 +225,7 @@ class Recorder:
         Ready of an object that is not applied or not accepted, Applied of an object that is immediately ready. Nor for
         a task that was accepted immediately: its status shows that, and its later conditions have their own Events.
         """
+        known = {each.type for each in old}
         was_true = {each.type for each in old if each.status == "True"}
         is_false = {each.type for each in new if each.status == "False"}
         concludes = not is_false.isdisjoint(("Applied",)) or any(each.type == "Accepted" for each in new)
@@ -233,7 +234,7 @@ class Recorder:
         for each in changes:
             if each.type == STALLED or (each.type == READY and concludes) or (each.type == "Applied" and at_once):
                 continue
-            if (regarding.kind, each.reason) == ("ApplicationTask", EventReason.ACCEPTED) and not old:
+            if (regarding.kind, each.reason) == ("ApplicationTask", EventReason.ACCEPTED) and each.type not in known:
                 continue
             reason = _OF_CONDITION.get((each.type, each.status))
             if each.reason in _OWN_REASONS:

@@ -161,7 +161,7 @@ class TestStatus:
         }
         stored = api.create(VALID[kind] | {"status": {"conditions": [condition]}})
         name = stored["metadata"]["name"]
-        assert "conditions" not in stored.get("status", {})
+        assert [each["type"] for each in stored["status"]["conditions"]] == ["Ready"]  # the default
 
         patched = api.patch(kind, name, {"status": {"conditions": [condition]}}, subresource="status")
         assert patched["status"]["conditions"] == [condition]

@@ -12,6 +12,7 @@ import yaml
 from application_manager.core.claims.claims import instance_name
 from tests.cluster.api import Api, Object
 from tests.cluster.expected_objects import condition, start_manager, task, template
+from tests.cluster.manifests import VALID
 from tests.cluster.pods import kubelet as playing_kubelet
 from tests.cluster.processes import Process, Processes
 from tests.kstatus import judged
@@ -44,7 +45,7 @@ def _wait_judged(api: Api, health: Path, kind: str, name: str, verdict: str) -> 
     """Wait until kstatus' own code, and Argo CD's script with it, judge the object so; return it."""
 
     def judges(raw: Object) -> bool:
-        return "status" in raw and judged([raw], health) == [(verdict, HEALTH[verdict])]
+        return bool(raw["status"].get("observedGeneration")) and judged([raw], health) == [(verdict, HEALTH[verdict])]
 
     found = api.wait_for(kind, name, judges, what=f"kstatus takes {kind} {name} as {verdict}")
     ready = condition(found, "Ready")
@@ -71,6 +72,13 @@ def detector(**stream: str) -> Object:
         "metadata": {"name": "town"},
         "spec": {"streams": streams},
     }
+
+
+def test_a_new_object_is_in_progress_until_the_manager_has_seen_it(api: Api, health: Path) -> None:
+    for each in VALID.values():
+        made = api.create(each)
+        assert judged([made], health) == [("InProgress", "Progressing")], made
+        assert (condition(made, "Ready")["status"], condition(made, "Ready")["reason"]) == ("Unknown", "Pending")
 
 
 @pytest.mark.usefixtures("manager")

@@ -94,7 +94,7 @@ def test_the_tasks_of_another_namespace_are_served_meanwhile(
     other.create(template())
     other.create(task("north"))
     other.wait_for("Deployment", instance_name("app", "north"), lambda _: True, what="the Deployment exists")
-    other.wait_for("ApplicationTask", "north", lambda raw: "status" in raw, what="the task has a status")
+    other.wait_for("ApplicationTask", "north", lambda raw: bool(condition(raw, "Accepted")), what="it is accepted")
     for index in range(8):
         applied(api, instance_name(f"bomb-{index}", "north"), "ExpressionLimit")
     wait_settled(other)

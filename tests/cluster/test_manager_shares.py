@@ -41,18 +41,14 @@ def test_a_flood_in_one_namespace_delays_neither_what_another_applies_nor_its_st
     assert len(before) < AHEAD
 
     reported = small.wait_for(
-        "ApplicationTask", "refused-000", lambda raw: "status" in raw, what="the task has a status"
+        "ApplicationTask", "refused-000", lambda raw: bool(condition(raw, "Accepted")), what="the task has a status"
     )
     others = api.wait_list(
         "ApplicationTask",
-        lambda found: all("status" in each for each in found if each["metadata"]["name"].startswith("refused")),
+        lambda found: all(condition(each, "Accepted") for each in found if _is_refused(each)),
         what="all tasks that are refused have a status",
     )
-    ahead = [
-        each
-        for each in others
-        if each["metadata"]["name"].startswith("refused") and _version(each) < _version(reported)
-    ]
+    ahead = [each for each in others if _is_refused(each) and _version(each) < _version(reported)]
     assert len(ahead) < AHEAD
 
 
@@ -108,3 +104,7 @@ def _version(raw: dict[str, dict[str, str]]) -> int:
 
 def _is_ours(raw: dict[str, dict[str, str]]) -> bool:
     return raw["metadata"]["name"].endswith("-config")
+
+
+def _is_refused(raw: dict[str, dict[str, str]]) -> bool:
+    return raw["metadata"]["name"].startswith("refused")

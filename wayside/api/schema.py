@@ -26,6 +26,21 @@ _KEPT = {
 }  # fmt: skip
 
 
+_PENDING: dict[str, Any] = {
+    "conditions": [
+        {
+            "type": "Ready",
+            "status": "Unknown",
+            "reason": "Pending",
+            "message": "waiting for the application manager",
+            "observedGeneration": 0,
+            "lastTransitionTime": "1970-01-01T00:00:00Z",
+        }
+    ]
+}
+"""The status of a new object, until the manager writes it: tools take an object without conditions as current."""
+
+
 def crd(kind: type[Kind]) -> dict[str, Any]:
     """The CustomResourceDefinition of a kind."""
     name = kind.__name__
@@ -105,6 +120,7 @@ def _object_schema(kind: type[Kind], generator: type[GenerateJsonSchema] = _Desc
     source = kind.model_json_schema(by_alias=True, schema_generator=generator)
     definitions = source.get("$defs", {})
     properties = {field: _structural(source["properties"][field], definitions) for field in ("spec", "status")}
+    properties["status"]["default"] = _PENDING
     return {
         "type": "object",
         "description": (kind.__doc__ or "").strip(),

@@ -70,7 +70,8 @@ def overdue(instance: ApplicationInstance, template: TemplateState, now: float) 
     conditions = instance.status.conditions if instance.status else []
     was, ready = holds(conditions, TIMED_OUT), find(conditions, "Ready")
     is_ready = ready is not None and ready.status == "True"
-    since = ready.last_transition_time if ready is not None else instance.metadata.creation_timestamp
+    written = ready is not None and ready.status != "Unknown"  # Unknown is the default of a new object
+    since = ready.last_transition_time if ready is not None and written else instance.metadata.creation_timestamp
     applied = find(conditions, "Applied")
     # The objects of the last successful apply stay when an update is refused: they may well be ready.
     refused = applied is not None and applied.status == "False" and bool(instance.status and instance.status.spec_hash)

@@ -11,6 +11,7 @@ import yaml
 
 from tests.guides import ROOT
 from wayside.api.__main__ import crd_files
+from wayside.api.base import Condition
 from wayside.api.classification import Classification
 
 CRDS = ROOT / "crds"
@@ -151,6 +152,14 @@ def test_kinds_have_their_short_names_status_and_selectable_fields() -> None:
     }
     names = {kind: schema_of(kind)["properties"]["metadata"]["properties"]["name"]["maxLength"] for kind in KINDS}
     assert names == dict.fromkeys(KINDS, 63) | {"applicationtemplates": 40}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_new_object_is_not_known_to_be_ready(kind: str) -> None:
+    """Without a condition, kstatus takes it as current."""
+    (condition,) = schema_of(kind)["properties"]["status"]["default"]["conditions"]
+    parsed = Condition.model_validate(condition)
+    assert (parsed.type, parsed.status, parsed.reason) == ("Ready", "Unknown", "Pending")
 
 
 @pytest.mark.parametrize("name", sorted(FILES))

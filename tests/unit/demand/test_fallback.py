@@ -75,6 +75,7 @@ def of(*tasks: ApplicationTask, **more: Any) -> NamespaceOutcome:
     ("since", "beyond", "change"),
     [
         ({}, True, None),  # it has no condition yet: since its creation
+        ({"Ready": ("Unknown", 0)}, True, None),  # as the API server creates it
         ({"Ready": ("False", 59)}, False, NOW + 1),
         ({"Ready": ("False", 60)}, True, None),
         ({"Ready": ("True", 9999)}, False, None),
