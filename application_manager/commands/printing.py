@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -183,26 +183,25 @@ def detector_rbac(
     """Print the service account and the minimal roles of a detector that you run yourself."""
     with importing():
         from application_manager.core.objects.detectors import detector_roles, sidecar_roles
+        from wayside.api.base import ObjectName, SubdomainName
         from wayside.manifests import to_yaml
 
-    _check_name(name, "Detector", "NAME")
+    _check_name(name, ObjectName, "Detector name of at most 63 lower-case letters, digits and -", "NAME")
     for account in pod_account or ():
-        _check_name(account, "service account", "--pod-account")
+        _check_name(
+            account, SubdomainName, "service account name of lower-case letters, digits, - and .", "--pod-account"
+        )
     made = sidecar_roles(namespace, name, pod_account) if pod_account else detector_roles(namespace, name)
     sys.stdout.write(to_yaml(made))
 
 
-def _check_name(name: str, what: str, option: str) -> None:
+def _check_name(name: str, type_: Any, what: str, option: str) -> None:
     from pydantic import TypeAdapter, ValidationError
 
-    from wayside.api.base import ObjectName
-
     try:
-        TypeAdapter(ObjectName).validate_python(name)
+        TypeAdapter(type_).validate_python(name)
     except ValidationError:
-        raise typer.BadParameter(
-            f"must be a {what} name of at most 63 lower-case letters, digits and -; got {name!r}", param_hint=option
-        ) from None
+        raise typer.BadParameter(f"must be a {what}; got {name!r}", param_hint=option) from None
 
 
 def inject(

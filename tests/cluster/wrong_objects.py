@@ -126,6 +126,22 @@ WRONG: list[tuple[str, str, Changes, str]] = [
         r"spec\.actions\[0\]: Invalid value: .*give exactly one of deploy, record",
     ),
     ("EventRule", "a name that is too long", {"metadata.name": "x" * 64}, r"metadata\.name: .*63"),
+    *(
+        (kind, "a name with a dot", {"metadata.name": "a.b"}, r"metadata\.name: .*should match '\^\[a-z0-9\]")
+        for kind in ("ApplicationInstance", "ApplicationTask", "ApplicationTemplate", "Detector", "EventRule")
+    ),
+    (
+        "Detector",
+        "a volume with a reserved name",
+        {"spec.mode": "Sidecar", "spec.pod": {"volumes": [{"name": "token", "emptyDir": {}}]}},
+        r"spec\.pod\.volumes\[0\]\.name: Forbidden: the names scratch, metrics, token",
+    ),
+    (
+        "Detector",
+        "a volume with a long name",
+        {"spec.mode": "Sidecar", "spec.pod": {"volumes": [{"name": "v" * 56, "emptyDir": {}}]}},
+        r"spec\.pod\.volumes\[0\]\.name: Too long: may not be (more|longer) than 55",
+    ),
     ("Detector", "no streams", {"spec.streams": []}, r"spec\.streams: .*at least 1 items"),
     (
         "Detector",

@@ -9,7 +9,7 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field
 
-from wayside.api.base import Model, ObjectName
+from wayside.api.base import Model, SubdomainName
 from wayside.api.constraints import Constraint, constraint, exactly_one, not_both
 
 FilePath = Annotated[str, Field(min_length=1, max_length=1024)]
@@ -65,9 +65,9 @@ class Access(Model):
 
     tls: Tls | None = None
     """TLS certificates from files."""
-    tls_secret_name: ObjectName | None = None
+    tls_secret_name: SubdomainName | None = None
     """A Secret with the keys ca.crt and, if the detector authenticates with a certificate, tls.crt and tls.key."""
     credentials: Credentials | None = None
     """A username, and the source of its password."""
-    credentials_secret_name: ObjectName | None = None
+    credentials_secret_name: SubdomainName | None = None
     """A Secret with the keys username and password."""

@@ -10,6 +10,7 @@ from pydantic.config import JsonDict
 
 from wayside.api.base import (
     ATOMIC_LIST,
+    SUBDOMAIN,
     Conditions,
     Identifier,
     Kind,
@@ -31,7 +32,8 @@ RULE_DIGEST_ANNOTATION = "wayside.dev/rule-digest"
 TRACEPARENT_ANNOTATION = "wayside.dev/traceparent"
 """The position of the task in a trace, in the format of W3C's header `traceparent`; absent if tracing is off."""
 
-Holder = Annotated[str, Field(min_length=1, max_length=253, pattern=r"^[a-z0-9]([-a-z0-9.]*[a-z0-9])?$")]
+Holder = Annotated[str, Field(min_length=1, max_length=253 - len("wayside-"), pattern=f"^{SUBDOMAIN}$")]
+"""The name of a holder, from which its Lease has its name."""
 
 
 class Requester(Model):

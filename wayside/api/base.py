@@ -14,6 +14,7 @@ from pydantic import (
     Field,
     GetCoreSchemaHandler,
     GetJsonSchemaHandler,
+    field_validator,
     model_validator,
 )
 from pydantic.alias_generators import to_camel
@@ -195,11 +196,20 @@ class PositiveQuantity(Quantity):
 Expression = Annotated[str, Field(min_length=1, max_length=2048)]
 """CEL source text."""
 
-ObjectName = Annotated[str, Field(min_length=1, max_length=63, pattern=r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?$")]
-"""The name of a Kubernetes object (an RFC 1123 label)."""
+LABEL = r"[a-z0-9]([-a-z0-9]*[a-z0-9])?"
+"""The pattern of an RFC 1123 label, which has at most 63 characters."""
 
-TemplateName = Annotated[str, Field(min_length=1, max_length=40, pattern=r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?$")]
+SUBDOMAIN = rf"{LABEL}(\.{LABEL})*"
+"""The pattern of an RFC 1123 subdomain, which has at most 253 characters."""
+
+ObjectName = Annotated[str, Field(min_length=1, max_length=63, pattern=f"^{LABEL}$")]
+"""The name of an object of our kinds, or of an entry of a list: names of Services and values of labels contain it."""
+
+TemplateName = Annotated[str, Field(min_length=1, max_length=40, pattern=f"^{LABEL}$")]
 """The name of a template. It is shorter, because the names of instances and their objects are derived from it."""
+
+SubdomainName = Annotated[str, Field(min_length=1, max_length=253, pattern=f"^{SUBDOMAIN}$")]
+"""The name of an object of another kind, e.g. of a Secret: Kubernetes allows dots in it."""
 
 ClientName = Annotated[str, Field(min_length=1, max_length=63, pattern=r"^[A-Za-z0-9._:-]+$")]
 """The name of a vehicle or station."""
@@ -288,6 +298,17 @@ class Kind(Model):
     api_version: str = API_VERSION
     kind: str
     metadata: Metadata
+
+    @field_validator("metadata")
+    @classmethod
+    def _is_named_by_a_label(cls, metadata: Metadata) -> Metadata:
+        named = len(metadata.name) <= cls.name_limit and re.fullmatch(LABEL, metadata.name)
+        if cls is not Kind and not named:  # Kind itself stands for objects of any kind
+            raise ValueError(
+                f"name must have at most {cls.name_limit} lower-case letters, digits and -, with a letter or digit at "
+                f"both ends; got {metadata.name!r}"
+            )
+        return metadata
 
     @property
     def name(self) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import StrEnum
 
 from wayside.api.access import FilePath, Variable
-from wayside.api.base import Model, ObjectName, PositiveQuantity
+from wayside.api.base import Model, PositiveQuantity, SubdomainName
 from wayside.api.constraints import exactly_one
 
 
@@ -42,7 +42,7 @@ class DatabaseConnection(Model):
 
     constraints = (exactly_one("uri_secret_name", "uri_variable", "uri_file"),)
 
-    uri_secret_name: ObjectName | None = None
+    uri_secret_name: SubdomainName | None = None
     """A Secret whose key `uri` contains the connection string, mongodb://… with credentials."""
     uri_variable: Variable | None = None
     """The environment variable that contains the connection string."""

@@ -19,6 +19,7 @@ from wayside.api.base import (
     ObjectName,
     PositiveDuration,
     PositiveQuantity,
+    SubdomainName,
     map_list,
 )
 from wayside.api.constraints import GIVEN_TWICE, constraint, unique
@@ -120,7 +121,7 @@ class DetectorSpec(Model):
     Default: the detector is run by other means."""
     pod: DetectorPod | None = None
     """The detector's pod (Standalone), or its container in other pods (Sidecar). Only with a mode."""
-    service_account_names: list[ObjectName] | None = Field(default=None, max_length=64, json_schema_extra=SET_LIST)
+    service_account_names: list[SubdomainName] | None = Field(default=None, max_length=64, json_schema_extra=SET_LIST)
     """The service accounts whose pods may run the detector. Only these accounts get the detector's permissions. Only
     with mode Sidecar."""
     zenoh: Zenoh = Zenoh()

@@ -11,18 +11,25 @@ from pydantic.alias_generators import to_snake
 
 from wayside.api.base import (
     ATOMIC_LIST,
+    LABEL,
     SET_LIST,
     Identifier,
     Model,
-    ObjectName,
     PositiveQuantity,
     Quantity,
+    SubdomainName,
     map_list,
 )
 from wayside.api.constraints import GIVEN_TWICE, constraint, exactly_one, unique
 from wayside.api.freedata import of_bounded_size
 
-_OWN_VOLUMES = "^(scratch|folder-[0-9]+|secret-[0-9]+)$"
+_OWN_VOLUMES = "^(scratch|metrics|token|folder-[0-9]+|secret-[0-9]+)$"
+
+VOLUME_PREFIX = "wayside-"
+"""Of the names of the detector's volumes in others' pods."""
+
+VolumeName = Annotated[str, Field(min_length=1, max_length=63 - len(VOLUME_PREFIX), pattern=f"^{LABEL}$")]
+"""The name of a volume: with the prefix, it is still a label."""
 
 RESERVED_VARIABLES = frozenset({"POD_NAME", "POD_NAMESPACE", "POD_UID"})
 """Environment variables that identify the detector's pod."""
@@ -59,14 +66,14 @@ class DetectorVolume(Model):
         exactly_one("persistent_volume_claim", "ephemeral", "empty_dir", "config_map", "secret", "projected", "csi"),
         constraint(
             f"!self.name.matches('{_OWN_VOLUMES}')",
-            "the names scratch, folder-<n> and secret-<n> are reserved: choose another name",
+            "the names scratch, metrics, token, folder-<n> and secret-<n> are reserved: choose another name",
             ".name",
             "Forbidden",
             holds=lambda volume: re.match(_OWN_VOLUMES, volume.name) is None,
         ),
     )
 
-    name: ObjectName
+    name: VolumeName
     """The name of the volume."""
     persistent_volume_claim: Embedded | None = None
     """A PersistentVolumeClaim in the namespace: claimName, readOnly."""
@@ -87,7 +94,7 @@ class DetectorVolume(Model):
 class DetectorVolumeMount(Model):
     """The mount of a volume, as in a PodSpec."""
 
-    name: ObjectName
+    name: VolumeName
     """The name of the volume."""
     mount_path: MountPath
     """The path in the container, e.g. /var/lib/wayside."""
@@ -133,7 +140,7 @@ _RESOURCES = ("cpu", "memory", "ephemeral-storage")
 class KeySelector(Model):
     """A key of a Secret or ConfigMap, as in a PodSpec."""
 
-    name: ObjectName
+    name: SubdomainName
     """The name of the object, in the namespace of the Detector."""
     key: Annotated[str, Field(min_length=1, max_length=253, pattern=r"^[-._A-Za-z0-9]+$")]
     """The key in the object."""
@@ -197,7 +204,7 @@ class DetectorVariable(Model):
 class ObjectNameReference(Model):
     """A reference to an object of the same namespace."""
 
-    name: ObjectName
+    name: SubdomainName
     """The name of the object."""
 
 
@@ -267,9 +274,9 @@ class DetectorPod(Model):
     """The affinity to nodes and other pods, as in a PodSpec. Not with mode Sidecar."""
     tolerations: list[DetectorToleration] = Field(default_factory=list, max_length=16, json_schema_extra=ATOMIC_LIST)
     """The node taints that the pod tolerates. Not with mode Sidecar."""
-    priority_class_name: Annotated[str, Field(min_length=1, max_length=253)] | None = None
+    priority_class_name: SubdomainName | None = None
     """The PriorityClass of the pod. Not with mode Sidecar."""
-    runtime_class_name: Annotated[str, Field(min_length=1, max_length=253)] | None = None
+    runtime_class_name: SubdomainName | None = None
     """The RuntimeClass of the pod. Not with mode Sidecar."""
     image_pull_secrets: list[ObjectNameReference] = Field(
         default_factory=list, max_length=16, json_schema_extra=map_list("name")
@@ -288,7 +295,7 @@ class DetectorPod(Model):
     )
     """The mounts of the volumes, e.g. for the folders of the state, the recordings, the database spool and the database
     files. A folder of the Detector outside all mounts gets a volume that is removed with the pod."""
-    secret_names: list[ObjectName] = Field(default_factory=list, max_length=32, json_schema_extra=SET_LIST)
+    secret_names: list[SubdomainName] = Field(default_factory=list, max_length=32, json_schema_extra=SET_LIST)
     """The Secrets that rules may use. A Secret that the Detector itself refers to is available to rules only if it is
     listed here as well. Anyone who can write rules can send the contents of these Secrets elsewhere."""
 

@@ -18,7 +18,7 @@ from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core.core_schema import ModelSchema
 
 from wayside.api import API_VERSION, GROUP, KINDS
-from wayside.api.base import VERSION, Kind, Model
+from wayside.api.base import LABEL, VERSION, Kind, Model
 
 _KEPT = {
     "type", "description", "pattern", "minLength", "maxLength", "minimum", "maximum", "exclusiveMinimum",
@@ -128,7 +128,10 @@ def _object_schema(kind: type[Kind], generator: type[GenerateJsonSchema] = _Desc
         "properties": {
             "apiVersion": {"type": "string"},
             "kind": {"type": "string"},
-            "metadata": {"type": "object", "properties": {"name": {"type": "string", "maxLength": kind.name_limit}}},
+            "metadata": {
+                "type": "object",
+                "properties": {"name": {"type": "string", "maxLength": kind.name_limit, "pattern": f"^{LABEL}$"}},
+            },
             **properties,
         },
         **({"x-kubernetes-validations": list(kind.object_validations)} if kind.object_validations else {}),

@@ -10,10 +10,13 @@ from typing import Any
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
+from wayside.api.base import LABEL, SUBDOMAIN
+
 FieldPath = tuple[str | int, ...]
 
 _PATTERNS = {
-    r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?$": "lower-case letters, digits and -, with a letter or digit at both ends",
+    f"^{LABEL}$": "lower-case letters, digits and -, with a letter or digit at both ends",
+    f"^{SUBDOMAIN}$": "lower-case letters, digits, - and ., with a letter or digit at both ends and beside each .",
     r"^([A-Za-z0-9._:-]{1,63}|.*[$][{].*)$": "a name of up to 63 letters, digits, . _ : -, or a template such as "
     "its-${msg.id}",
     r"^[A-Za-z0-9._:-]+$": "letters, digits and . _ : -",

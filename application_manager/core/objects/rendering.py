@@ -20,10 +20,11 @@ from application_manager.core.claims.claims import unknown_members
 from application_manager.core.objects.charts import ChartRequest, Charts, ChartSource, no_charts
 from application_manager.core.objects.configuration import CONFIG_MAP, Configuration, config_map, config_map_name
 from application_manager.core.objects.ownership import ApplyProblem, Manifest, ObjectKey, labelled, object_key
-from application_manager.core.objects.policy import Policy
+from application_manager.core.objects.policy import KindKey, Policy
 from application_manager.core.objects.suspension import stated_replicas, stopped, yielded
 from wayside.api import ApplicationInstance, ApplicationTemplate
 from wayside.api.applicationtemplate import Helm
+from wayside.api.base import LABEL, SUBDOMAIN
 from wayside.expressions import CelType, CompiledTemplate, Embedded, Environment, InterpolationError, compile_template
 
 _INSTANCE_VARIABLES = ("name", "key", "namespace")
@@ -31,10 +32,9 @@ _WITH_CONFIGURATION = (*_INSTANCE_VARIABLES, "configMap")
 _ENVIRONMENT = Environment({"parameters": CelType.MAP, "instance": CelType.MAP})
 _RESERVED_METADATA = ("ownerReferences", "generateName", "uid", "resourceVersion", "managedFields", "finalizers")
 
-_NAME = re.compile(
-    r"[a-z0-9]([-a-z0-9]*[a-z0-9])?(\.[a-z0-9]([-a-z0-9]*[a-z0-9])?)*"
-)  # RFC 1123 subdomain, for all kinds
 _LONGEST_NAME = 253  # characters
+_SERVICE: KindKey = ("v1", "Service")
+_LONGEST_NAMES: dict[KindKey, int] = {_SERVICE: 63, ("batch/v1", "Job"): 63, ("batch/v1", "CronJob"): 52}
 
 MOST_EXPRESSIONS = 1000
 """In one template: each takes about a millisecond to compile, and no template may block the manager."""
@@ -207,12 +207,8 @@ class Renderer:
         name = metadata.get("name")
         if not isinstance(name, str) or not name:
             yield "metadata.name", f"must be a string, e.g. ${{instance.name}}; got {values.shown(name)}"
-        elif len(name) > _LONGEST_NAME or not _NAME.fullmatch(name):
-            yield (
-                "metadata.name",
-                f"must have at most {_LONGEST_NAME} lower-case letters, digits, - and ., with a letter or digit at "
-                f"both ends; got {values.shown(name)}",
-            )
+        elif problem := _name_problem((manifest["apiVersion"], manifest["kind"]), name):
+            yield "metadata.name", problem
         elif self._keyed and instance.name not in name:
             yield (
                 "metadata.name",
@@ -234,6 +230,18 @@ class Renderer:
             if texts is not None and not isinstance(texts, dict):
                 yield f"metadata.{member}", f"must be a map of strings; got {values.shown(texts)}"
         yield from self._policy.pod_problems(manifest)
+
+
+def _name_problem(kind: KindKey, name: str) -> str:
+    """Why an object of the kind may not have the name; empty where it may."""
+    longest = _LONGEST_NAMES.get(kind, _LONGEST_NAME)
+    pattern, characters = (LABEL, "digits and -") if kind == _SERVICE else (SUBDOMAIN, "digits, - and .")
+    if len(name) <= longest and re.fullmatch(pattern, name):
+        return ""
+    return (
+        f"must have at most {longest} lower-case letters, {characters}, with a letter or digit at both ends; got "
+        f"{values.shown(name)}"
+    )
 
 
 def error_texts(error: InterpolationError) -> list[str]:

@@ -26,14 +26,14 @@ from application_manager.core.objects.detectors import (
 )
 from application_manager.core.objects.poddefaults import PodDefaults
 from wayside.api import Detector
+from wayside.api.pod import VOLUME_PREFIX
 
 SIDECAR_LABEL = "wayside.dev/detector"
 """On pods: the Detector that they request."""
 CONTAINER = "wayside-detector"
 """The name of the container. A pod with a container of this name already has its detector."""
 
-_PREFIX = "wayside-"
-_TOKEN = f"{_PREFIX}token"
+_TOKEN = f"{VOLUME_PREFIX}token"
 _TOKEN_FOLDER = "/var/run/secrets/kubernetes.io/serviceaccount"  # noqa: S105  a folder
 _TOKEN_SECONDS = 3607  # the kubelet renews it in time; the value that Kubernetes itself uses
 _METRICS = "wayside-metrics"  # scrapers find ports by their names, over all containers of a pod
@@ -59,7 +59,7 @@ def addition(spec: Mapping[str, Any], detector: Detector, defaults: PodDefaults)
     """
     if has_sidecar(spec):
         return None
-    volumes, mounts = volumes_of(detector, defaults, _PREFIX)
+    volumes, mounts = volumes_of(detector, defaults, VOLUME_PREFIX)
     volumes.append(_token())
     mounts.append({"name": _TOKEN, "mountPath": _TOKEN_FOLDER, "readOnly": True})
     paths = [each["mountPath"].rstrip("/") for each in mounts]

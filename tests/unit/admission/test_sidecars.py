@@ -5,6 +5,8 @@ from __future__ import annotations
 import base64
 import copy
 import json
+import re
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -342,6 +344,20 @@ def test_the_condition_reports_the_number_of_running_pods_and_the_reasons_of_oth
         "it runs in 0 of 1 pods with its label",
     )
     assert carried(detector(serviceAccountNames=[]), []).reason == "NoAccounts"
+
+
+def test_the_names_of_its_volumes_are_labels_and_unique_beside_those_of_a_user() -> None:
+    longest = "v" * 55
+    given = {"volumes": [{"name": longest, "emptyDir": {}}], "volumeMounts": [{"name": longest, "mountPath": "/data"}]}
+    of = detector(pod={**given, "secretNames": ["pager.site-a"]}, state={"path": "/state"})
+    found = addition(pod()["spec"], of, replace(DEFAULTS, metrics_secret="metrics"))
+    assert found is not None
+    names = [each["name"] for each in found.items["volumes"]]
+    assert len(set(names)) == len(names) == 6
+    assert all(re.fullmatch("[a-z0-9]([-a-z0-9]{0,61}[a-z0-9])?", each) for each in names)
+    for reserved in ("scratch", "metrics", "token", "folder-0", "secret-0"):
+        with pytest.raises(ValidationError, match="are reserved"):
+            detector(pod={"volumes": [{"name": reserved, "emptyDir": {}}]})
 
 
 def test_finished_pods_are_ignored() -> None:

@@ -30,6 +30,13 @@ def problems(tmp_path: Path, text: str | bytes) -> list[str]:
     return [str(problem).removeprefix(f"{tmp_path}/") for problem in caught.value.problems]
 
 
+@pytest.mark.parametrize("name", ["a.b", "A", "-a", "a" * 64])
+def test_the_name_of_an_object_of_ours_is_a_label(tmp_path: Path, name: str) -> None:
+    (problem,) = problems(tmp_path, f"{HEAD.replace('name: r', f'name: {name}')}  when: 'true'\n")
+    assert problem.startswith("f.yaml:3:11: metadata: name must have at most 63 lower-case letters, digits and -")
+    assert problem.endswith(f"; got {name!r}")
+
+
 @pytest.mark.parametrize(
     ("text", "start", "parts"),
     [

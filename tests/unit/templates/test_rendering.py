@@ -148,6 +148,23 @@ def test_what_a_template_may_not_do_is_reported_with_its_place(path: str, value:
         assert part in message
 
 
+@pytest.mark.parametrize(
+    ("api_version", "kind", "name", "allowed"),
+    [
+        ("v1", "Service", "a" * 64, "at most 63 lower-case letters, digits and -,"),
+        ("v1", "Service", "${instance.name}.site", "at most 63 lower-case letters, digits and -,"),
+        ("batch/v1", "Job", "a" * 64, "at most 63 lower-case letters, digits, - and .,"),
+        ("batch/v1", "CronJob", "a" * 53, "at most 52 lower-case letters, digits, - and .,"),
+        ("v1", "ConfigMap", "a..b", "at most 253 lower-case letters, digits, - and .,"),
+    ],
+)
+def test_a_name_that_the_kind_may_not_have_is_reported_before_anything_is_applied(
+    api_version: str, kind: str, name: str, allowed: str
+) -> None:
+    message = refusal({"apiVersion": api_version, "kind": kind, "metadata": {"name": name}})
+    assert f"spec.manifests[0].metadata.name: must have {allowed}" in message
+
+
 ANYWHERE = [
     ("apps/v1", "ReplicaSet", "spec.template.spec"),
     ("argoproj.io/v1alpha1", "Rollout", "spec.template.spec"),

@@ -11,7 +11,7 @@ from typing import Annotated, ClassVar
 from pydantic import Field, model_validator
 
 from wayside.api.access import Access, Tls
-from wayside.api.base import Model, ObjectName, PositiveDuration, map_list
+from wayside.api.base import Model, PositiveDuration, SubdomainName, map_list
 from wayside.api.constraints import Constraint, exactly_one, not_both
 
 _VARIABLE = r"^WAYSIDE_[A-Z0-9_]+$"
@@ -25,7 +25,7 @@ HttpUrl = Annotated[str, Field(max_length=2048, pattern=r"^https?://[^\s/?#@\\]+
 class SecretKey(Model):
     """A key of a Secret that is mounted for the detector."""
 
-    name: ObjectName
+    name: SubdomainName
     """The name of the Secret."""
     key: str = Field(min_length=1, max_length=253, pattern=r"^[A-Za-z0-9_-][A-Za-z0-9._-]*$")
     """The key in the Secret."""
@@ -63,9 +63,9 @@ class HttpAccess(Model):
     """The total timeout of one attempt, from name resolution to the end of the response."""
     tls: Tls | None = None
     """TLS certificates from files."""
-    tls_secret_name: ObjectName | None = None
+    tls_secret_name: SubdomainName | None = None
     """A Secret with the keys ca.crt and, if the detector authenticates with a certificate, tls.crt and tls.key."""
-    credentials_secret_name: ObjectName | None = None
+    credentials_secret_name: SubdomainName | None = None
     """A Secret with the keys username and password, for HTTP Basic authentication."""
 
     @model_validator(mode="after")
