@@ -79,7 +79,14 @@ class LastDecision:
 
 @dataclass(frozen=True, slots=True)
 class WorkRecord:
-    """The result of the last work on an instance."""
+    """The result of the last work on an instance.
+
+    Attributes:
+        uid: of the instance; the record of another instance with the same name is ignored.
+        generation: of the instance at that time.
+        digest: of the last completely applied rendering.
+        since: when this process first worked on the instance, in seconds since 1970.
+    """
 
     uid: str
     generation: int
@@ -94,13 +101,13 @@ class ClusterCache:
     """The objects of the cluster with their indexes. Only the thread of the event loop uses it.
 
     Attributes:
-        served: by instance; empty until it was reconciled for the first time.
-        records: by instance; ahead of its status, and empty likewise.
-        deadlines: by instance, its uid and the release time last decided; ahead of its status as well, since a status
-            may be written long after its decision.
-        limit: how many instances a namespace may have; None: any number.
-        full: whether there is no memory for further tasks.
-        tasks: what limits tasks; None: nothing.
+        served: by instance; without an entry until it was reconciled for the first time.
+        records: by instance; newer than its status; without an entry until then as well.
+        deadlines: by instance, its uid and the last decided release time; newer than its status, which may be written
+            long after the decision.
+        limit: the maximum number of instances in a namespace; None: no limit.
+        full: whether memory is short, so that no new tasks are accepted.
+        tasks: the limits of tasks; None: no limits.
         exceeded: by template, the instances whose rendering exceeds its limit, and the message.
     """
 
@@ -128,14 +135,14 @@ class ClusterCache:
         self.claims = ClaimIndex(policy=tasks or TaskPolicy())
 
     def template(self, name: Name) -> TemplateState:
-        """The template, also where it is not valid; None where there is none."""
+        """The template, even if it is not valid; None if there is none."""
         entry = self.store.get(TEMPLATE, name)
         if entry is None:
             return None
         return entry.model if isinstance(entry.model, ApplicationTemplate) else InvalidTemplate(name[1], entry.problem)
 
     def instance(self, name: Name) -> ApplicationInstance | None:
-        """The instance; None where there is none that is valid, as for tasks and Detectors."""
+        """The instance; None if there is no valid one. Tasks and Detectors likewise."""
         return self._model(INSTANCE, ApplicationInstance, name)
 
     def task(self, name: Name) -> ApplicationTask | None:
@@ -151,7 +158,7 @@ class ClusterCache:
         return entry.model if entry is not None and isinstance(entry.model, model) else None
 
     def models(self, kind: KindKey, model: type[Model], namespace: str) -> list[Model]:
-        """The objects of a kind in a namespace, as far as they are valid."""
+        """The valid objects of a kind in a namespace."""
         return [
             entry.model
             for name, entry in self.store.all(kind)
@@ -159,7 +166,7 @@ class ClusterCache:
         ]
 
     def invalid(self, kind: KindKey, namespace: str) -> list[str]:
-        """The names of the objects of a kind in a namespace that `models` leaves out."""
+        """The names of the invalid objects of a kind in a namespace, which `models` leaves out."""
         return [name[1] for name, entry in self.store.all(kind) if name[0] == namespace and entry.model is None]
 
     def instances_of(self, template: Name) -> list[Name]:
@@ -168,12 +175,12 @@ class ClusterCache:
         return [(each.namespace, each.name) for each in found if each.spec.template_name == template[1]]
 
     def record_of(self, instance: ApplicationInstance) -> WorkRecord | None:
-        """How the last work on the instance went; None where this process did none."""
+        """The result of the last work on the instance; None if this process has not worked on it."""
         record = self.records.get((instance.namespace, instance.name))
         return record if record is not None and record.uid == instance.metadata.uid else None
 
     def decide(self, name: Name, now: float) -> Decided:
-        """What should become of the instance as of `now`, in seconds since 1970, and which others to enqueue."""
+        """The decision about the instance at `now`, in seconds since 1970, and the other instances to enqueue."""
         decided = decide(name[1], _NamespaceIndexes(self, name[0]), now)
         moved = self.turns.moved(name, _fallback(decided))
         if decided.placement is not None:
@@ -198,7 +205,7 @@ class ClusterCache:
         self.turns.note(name, fallback)
 
     def note_task(self, name: Name) -> set[Name]:
-        """Determine the claim of a task again; returns the instances that it claims and claimed, if that is a change.
+        """Compute the claim of a task again; returns the previous and new instances that it claims, if that changed.
 
         A task of which only the status changed, mostly by our own writes, concerns no instance.
         """
@@ -213,9 +220,9 @@ class ClusterCache:
         return set() if same else touched
 
     def touch(self, instances: Iterable[Name]) -> set[Name]:
-        """Note that something about the instances changed; returns those to decide again.
+        """Note a change of the instances; returns the instances to decide again.
 
-        A name that means all instances of a template means each of these.
+        A name that stands for all instances of a template is replaced by these.
         """
         found = {each for name in instances for each in self.meant(name)}
         for each in found:
@@ -223,12 +230,12 @@ class ClusterCache:
         return found
 
     def is_unsettled(self, instance: Name) -> bool:
-        """Whether claims of tasks that were there at the beginning, and may demand the instance, are not known yet."""
+        """Whether unknown claims of tasks that existed at the start may concern the instance."""
         known = self.instance(instance)
         return known is not None and self.claims.unsettled((instance[0], known.spec.template_name))
 
     def note_limits(self, template: Name) -> None:
-        """Note how many instances a template may have now, and what it falls back to, should it be there."""
+        """Note the template's maximum number of instances, and its fallback, if any."""
         found = self.template(template)
         self.turns.note_template(template, fallback_of(found))
         own = limits([found], None).templates if found is not None else {}
@@ -236,7 +243,7 @@ class ClusterCache:
         self._limits[template[0]] = {**others, **own}
 
     def falling_back_to(self, template: Name) -> set[Name]:
-        """The instances whose tasks turn to this template when they are not ready."""
+        """The instances whose tasks use this template as the fallback while they are not ready."""
         return {each for name in self.turns.falling_to(template) for each in self.instances_of(name)}
 
     def known_instances(self, namespace: str) -> set[str]:
@@ -246,11 +253,11 @@ class ClusterCache:
         return {name for of, name in known if of == namespace}
 
     def limits(self, namespace: str) -> Limits:
-        """How many instances there may be in a namespace."""
+        """The maximum numbers of instances in a namespace."""
         return Limits(self._limits.get(namespace, {}), self.limit)
 
     def meant(self, name: Name) -> set[Name]:
-        """The instances that a name means, which may mean all of a template; that name is among them."""
+        """The instances that a name stands for, which may be all of a template; the name itself is included."""
         of = template_of_all(name[1])
         if of is None:
             return {name}
@@ -264,23 +271,23 @@ class ClusterCache:
         return {each: self.leases.view((namespace, each)) for each in set(holders) if each is not None}
 
     def known_findings(self, template: ApplicationTemplate) -> Findings | None:
-        """What was noted of this generation of the template; None where nothing was yet."""
+        """The findings about this generation of the template; None if it was not checked yet."""
         known = self._findings.get((template.namespace, template.name))
         return known[1] if known is not None and known[0] == _version(template) else None
 
     def note_findings(self, template: ApplicationTemplate, findings: Findings) -> None:
-        """Note what is wrong with this generation of the template."""
+        """Note the findings about this generation of the template."""
         self._findings[template.namespace, template.name] = (_version(template), findings)
 
     def forget_work(self) -> None:
-        """Drop what was decided and done here: another manager has acted since, and the statuses show what it did."""
+        """Forget the decisions and results of this manager: another one has acted since, as the statuses show."""
         self.served.clear()
         self.records.clear()
         self.deadlines.clear()
         self.places.forget()
 
     def forget_template(self, name: Name) -> None:
-        """Drop what was found of a template."""
+        """Forget the findings about a template."""
         self._findings.pop(name, None)
         self.exceeded.pop(name, None)
         self.overlap.forget(name)
@@ -343,7 +350,7 @@ def _version(template: ApplicationTemplate) -> _Version:
 
 
 def rule_context(cache: ClusterCache, rule: EventRule) -> RuleContext:
-    """As far as they matter to the rule: other rules where it names any, templates where it deploys."""
+    """The objects that matter to the rule: other rules if it names any, templates if it deploys any."""
     namespace = rule.namespace
     deploys = any(each.deploy is not None for each in rule.spec.actions)
     templates = cache.models(TEMPLATE, ApplicationTemplate, namespace) if deploys else []

@@ -72,7 +72,7 @@ class FallbackIndex:
         return {other for name, other in self._templates.items() if name[0] == namespace}
 
     def moved(self, instance: Name, to: Fallback | None) -> set[str]:
-        """The instances that get or lose tasks if those of this instance turn to `to` now."""
+        """The instances that get or lose tasks if the fallback of this instance's tasks becomes `to`."""
         before = self._turned.get(instance)
         if before == to:
             return set()

@@ -28,15 +28,15 @@ class Processed:
 
 @dataclass
 class DetectorIndex:
-    """By the Detector's namespace and name, and its objects by the uid of the Detector that controls them, and by kind.
+    """The Detectors by namespace and name, their objects by the uid of the controlling Detector, and by kind.
 
-    Labels find what may be a Detector's; anybody can copy them. So an object counts by its controller, and a pod by the
-    ReplicaSet of the Deployment that does.
+    Labels select the objects, but anybody can copy a label. So an object belongs to the Detector that controls it, and
+    a pod to the Deployment whose ReplicaSet controls it.
 
     Attributes:
-        defaults: what holds for all pods; None: no detector is run.
-        processed: the condition Running, and the version of the Detector that it is about.
-        requesting: the pods that request it as a sidecar.
+        defaults: for all pods; None: the manager runs no detectors.
+        processed: the condition Running, and the version of the Detector on which it is based.
+        requesting: the pods that request a Detector as a sidecar.
     """
 
     defaults: PodDefaults | None = None
@@ -46,7 +46,7 @@ class DetectorIndex:
     _troubles: dict[Name, list[Trouble]] = field(default_factory=dict)
 
     def replace(self, objects: Iterable[Object], pods: Iterable[Object], requesting: Iterable[Object] = ()) -> None:
-        """Replace all objects, their pods, and the pods that request detectors, by those just listed."""
+        """Replace all objects, their pods, and the pods that request detectors, by the lists."""
         self.objects = MembersByGroup()
         deployments: set[tuple[str, str]] = set()
         for raw in objects:
@@ -77,7 +77,7 @@ class DetectorIndex:
         return self.objects.get(uid, {})
 
     def troubles(self, name: Name) -> list[Trouble]:
-        """The different troubles of the detector's pods, the most important first."""
+        """The distinct problems of the detector's pods, the most important first."""
         return self._troubles.get(name, [])
 
 

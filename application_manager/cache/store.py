@@ -1,7 +1,7 @@
 """The store of the cache: the newest version of each object that the manager has received.
 
-Fed by watch events, by the answers to our own writes and by lists, in any order. An older version never replaces a
-newer one, and what was seen deleted does not come back from a list that is older than its deletion.
+Watch events, responses to our own writes and lists update it, in any order. An older version never replaces a newer
+one, and a list that is older than a deletion does not restore the deleted object.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ _TOMBSTONES = 10_000  # uids of deleted objects to remember; the oldest are forg
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """An object as it was seen, without what nobody reads (see `trimming`): raw, and for our own kinds as a model.
+    """An object without the fields that nothing reads (see `trimming`): raw, and for our own kinds as a model.
 
-    `problem`: why it is no model, or has a part that is too large: then the model is without that part.
+    `problem`: why there is no model, or why a part of it is missing: the part is too large.
     """
 
     raw: Object
@@ -65,12 +65,12 @@ class MembersByGroup(dict[Group, dict[Member, Value]]):
 
 
 class Store:
-    """Objects by kind, then by namespace and name. `shed`: the uids of tasks not taken in for want of memory."""
+    """Objects by kind, then by namespace and name. `shed`: the uids of tasks that were left out for lack of memory."""
 
     def __init__(self, modelled: Iterable[KindKey], full: Callable[[], bool] = lambda: False) -> None:
-        """Make an empty one, with models of the kinds `modelled`.
+        """Create an empty store, with models of the kinds `modelled`.
 
-        `full`: whether there is no memory for further tasks; those that were served before are always taken in.
+        `full`: whether memory is short, so that no new tasks are accepted; tasks that were served before always are.
         """
         self._modelled = frozenset(modelled)
         self._full = full
@@ -83,7 +83,7 @@ class Store:
         return self._objects.get(kind, {}).get(name)
 
     def all(self, kind: KindKey) -> Iterator[tuple[Name, Entry]]:
-        """All objects of the kind, as of now."""
+        """All current objects of the kind."""
         yield from list(self._objects.get(kind, {}).items())
 
     def put(self, raw: Object) -> Entry | None:

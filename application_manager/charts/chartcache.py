@@ -3,8 +3,8 @@
     <folder>/charts/<sha256>.tgz        an archive
     <folder>/sources/<sha256>           a source, by its hash → the digest of its archive
 
-A version of a chart is assumed not to change, so a source that is known is not fetched again, also not after a restart.
-An archive whose content does not match its name is fetched again. What was not used for longest goes first.
+A version of a chart is assumed not to change, so a known source is not fetched again, even after a restart. An archive
+whose content does not match its name is fetched again. The least recently used archives are deleted first.
 """
 
 from __future__ import annotations

@@ -59,7 +59,7 @@ class _Injector:
     refusals: list[str] = field(default_factory=list)
 
     def manifest(self, raw: Manifest) -> Manifest:
-        """The manifest with its detector, where it requests one."""
+        """The manifest with its detector, if it requests one."""
         if raw.get("kind") == "List":
             return raw | {"items": [self.manifest(each) for each in raw.get("items") or ()]}
         return with_pod_template(raw, lambda pod: self._pod(raw, pod))

@@ -1,4 +1,4 @@
-"""Reads from the cluster what `application-manager explain` needs. Never writes."""
+"""Reads the objects for `application-manager explain` from the cluster. Never writes."""
 
 from __future__ import annotations
 

@@ -85,10 +85,10 @@ async def entitled(
     *,
     detectors: bool = False,
 ) -> None:
-    """Look whether the account has the rights that it needs, and report those that are missing.
+    """Check that the account has the permissions that it needs, and report the missing ones.
 
-    Of all namespaces it needs to read: in which ones it may write, is queried when something is to be written there.
-    `detectors`: whether the manager runs detectors too. Raises ConfigurationError where nothing works without.
+    For all namespaces, only reading is checked: writing is checked per namespace when it is needed. `detectors`:
+    whether the manager runs detectors. Raises ConfigurationError if the manager cannot work without a missing one.
     """
     plurals = {kind: resources[kind].plural for kind in policy.kinds if kind in resources}
     needed_there = rights(plurals, detectors=detectors)

@@ -48,8 +48,8 @@ async def serve(options: Options) -> None:
     """Run the manager until SIGTERM or SIGINT.
 
     Raises:
-        ConfigurationError: there is no cluster, it lacks our CRDs, or refuses what the manager needs, such as listing;
-            or the port for metrics is taken.
+        ConfigurationError: there is no cluster, its CRDs are missing, it refuses a request that the manager needs, or
+            the port for metrics is in use.
     """
     measures, traced = Measures(), tracing("wayside-application-manager")
     client = manager_client(await load_configuration(), measures, pacing=Pacing(share=CongestionWindow()))

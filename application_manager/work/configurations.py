@@ -66,7 +66,7 @@ class ConfigurationWork:
             try:
                 await self.client.annotate(PODS, name[0], pod, uid, {ANNOTATION: content})
             except ApiError as error:
-                if error.code not in (404, 409):  # gone, or another pod of that name
+                if error.code not in (404, 409):  # deleted, or another pod of that name
                     raise
             else:
                 count += 1

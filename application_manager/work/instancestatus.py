@@ -51,7 +51,7 @@ class InstanceStatusWork:
     again: Callable[[Name, float], None]
 
     async def reconcile(self, name: Name) -> None:
-        """Write the instance's status if it differs. Raises RequestError for what may pass."""
+        """Write the instance's status if it differs. Raises RequestError for a temporary error."""
         instance = self.cache.instance(name)
         if instance is None or (record := self.cache.record_of(instance)) is None:
             return

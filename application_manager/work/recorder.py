@@ -34,7 +34,7 @@ from wayside.times import format_seconds
 
 COMPONENT = "wayside.dev/application-manager"
 _WAITING = 1000  # Events of a namespace that may wait; further ones are dropped and counted
-_SERIES = 360.0  # s after which a repetition is an Event of its own: as client-go has it
+_SERIES = 360.0  # s after which a repetition is a new Event, like in client-go
 _REFRESHED = 60.0  # s between two changes of a series
 _KEPT = 4096  # Events that are remembered, since they may be repeated
 

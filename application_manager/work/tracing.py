@@ -1,7 +1,8 @@
 """The spans of the work for tasks that have a trace, if tracing is on (see `wayside.process.tracing`).
 
-A task that an instance serves for the first time gets `reconcile`, with `apply` in it, and `ready` once its workloads
-are. Each is in the task's own trace; where an instance serves several tasks, `reconcile` is linked to the others.
+A task that an instance serves for the first time gets the span `reconcile` with its child `apply`, and `ready` once the
+workloads are ready. All are in the task's own trace; if the instance serves several tasks, `reconcile` is linked to the
+others.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ class _Known:
 
 
 class TaskTraces:
-    """Emits the spans of tasks. Only the event loop's thread."""
+    """Emits the spans of tasks. Only the event loop's thread uses it."""
 
     def __init__(self, tracing: Tracing, cache: ClusterCache) -> None:
         self.tracing = tracing

@@ -1,8 +1,8 @@
-"""A cache of the worker processes' answers, filled in the background.
+"""A cache of the worker processes' results, filled in the background.
 
-A caller whose answer is missing gets None, and a callback once it is there. Nobody waits, so a slow expression holds no
-worker of a queue. Each key has one entry, for its latest question. Beyond a number of bytes, the cache drops the least
-recently used entries, and computes them again when they are next requested.
+A caller whose result is missing gets None, and a callback once it is available. No caller waits, so a slow expression
+blocks no worker of a queue. Each key has one entry, for its latest input. Beyond a number of bytes, the cache drops the
+least recently used entries, and computes them again when they are next requested.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from application_manager.workers.pool import ExceededError, JobError, Pool, unpi
 from application_manager.workers.process import Job
 from wayside.process.backoff import pause_after
 
-KEPT = 64 * 1024 * 1024  # bytes of answers
-FIRST_PAUSE = 60.0  # s until what was ended is tried again, doubled with each further time
+KEPT = 64 * 1024 * 1024  # bytes of results
+FIRST_PAUSE = 60.0  # s until a stopped job is tried again, doubled with each further time
 LONGEST_PAUSE = 3600.0  # s
 
 log = logging.getLogger(__name__)

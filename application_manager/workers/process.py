@@ -25,7 +25,7 @@ LENGTH = struct.Struct("<I")
 MEMORY = 256 * 1024 * 1024
 """Bytes of data that the process may have; it has 40 MB when it starts."""
 
-_NICENESS = 10  # where there is no idle class
+_NICENESS = 10  # if there is no idle class
 
 Result = TypeVar("Result")
 Job = Callable[[], Result]

@@ -69,7 +69,7 @@ class Claim:
 
     @property
     def operation(self) -> Operation:
-        """What the task does to it."""
+        """The operation of the task."""
         return self.task.spec.operation
 
 

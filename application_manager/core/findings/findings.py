@@ -1,6 +1,6 @@
 """The findings about a template, rule or Detector: errors, errors that may resolve by themselves, and remarks.
 
-The same findings make the condition Accepted, the answer of admission, and what `application-manager check` prints.
+The condition Accepted, the webhook's response and the output of `application-manager check` contain the same findings.
 """
 
 from __future__ import annotations

@@ -58,7 +58,7 @@ class Trouble:
 
     Attributes:
         message: names the image or container, and the cause; equal for all pods with the same trouble.
-        hint: where to look further, which names the pod; empty where the message is complete.
+        hint: the command that shows more, with the name of the pod; empty if the message is complete.
     """
 
     reason: TroubleReason

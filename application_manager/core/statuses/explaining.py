@@ -82,7 +82,7 @@ def serving(found: NamespaceSnapshot, task: ApplicationTask, now: float) -> str 
 
 
 def _outcome(found: NamespaceSnapshot, now: float) -> NamespaceOutcome:
-    """The demand; a task that waits for a place keeps the verdict of its status: the limit is an option."""
+    """The demand. Only the manager knows its limits, so a waiting task keeps the verdict of its status."""
     outcome = demand(found.templates, found.tasks, found.instances, _written_leases(found.tasks), now)
     limited = {each.name: verdict for each in found.tasks if (verdict := _written_limit(each)) is not None}
     verdicts = {
