@@ -46,7 +46,7 @@ def one_by_one(detector: Detector, rules: Iterable[Any], arrivals: Iterable[Any]
     return lines(events + engine.advance([], at(until)))
 
 
-def test_ticks_hours_before_the_next_sample_see_the_ones_before() -> None:
+def test_ticks_hours_before_the_next_sample_see_earlier_samples() -> None:
     detector = a_detector(a_stream("speed", staleAfter="Never"), clientTimeout="48h")
     engine = an_engine(detector, speeding(evaluation={"every": "10s"}))
     events = engine.advance([speed(1, 20), speed(12 * 3600, 5)], at(12 * 3600))
@@ -74,7 +74,7 @@ def test_a_condition_that_columns_cannot_take_sees_the_sign_of_zero() -> None:
     assert reported(events) == ["r car started 2", "r car Until 3"]
 
 
-def test_what_a_cap_pushes_out_is_gone_and_nothing_else() -> None:
+def test_a_cap_evicts_only_the_samples_beyond_it() -> None:
     """The buffer forgets what is old at whole seconds, while ticks that saw it still wait to be evaluated."""
     detector = a_detector(
         a_stream("speed", staleAfter="Never"), clientTimeout="1m", buffer={"duration": "3s", "bytes": "4k"}
@@ -121,7 +121,7 @@ GEARS = a_rule(
 
 
 @pytest.mark.parametrize("limit", ["MAXIMUM_CLIENTS", "_MAXIMUM_TEXTS"])
-def test_numbers_and_texts_that_run_out_restart(limit: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_numbering_of_clients_and_texts_restarts_at_its_limit(limit: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ingest, "MAXIMUM_LOST", 3)
     detector = a_detector(clientTimeout="1s")
     rules = [speeding("fast", evaluation=OFTEN, **{"for": "300ms"}), GEARS]
@@ -139,7 +139,7 @@ def test_numbers_and_texts_that_run_out_restart(limit: str, monkeypatch: pytest.
         versions.clear()
 
 
-def test_what_is_left_out_for_a_while_leaves_nothing_behind() -> None:
+def test_skipped_evaluations_leave_no_state() -> None:
     engine = an_engine(a_detector(), speeding(evaluation={"every": "100ms", "priority": 1}))
     for second in range(1, 20):
         engine.set_level(second % 3)
@@ -157,7 +157,7 @@ def tasks_of(rule: Any, arrivals: list[Any], cut: int) -> dict[str, Any]:
     return {name: task.model_dump(mode="json")["spec"] for name, task in sorted(outcome.tasks.items())}
 
 
-def test_a_replay_writes_tasks_that_begin_and_end_within_one_call() -> None:
+def test_a_replay_writes_tasks_that_start_and_end_within_one_call() -> None:
     follow = {"name": "f", "deploy": {"templateName": "app", "follow": True, "parameters": {"v": "${speed}"}}}
     rule = speeding(actions=[a_deploy("a"), follow], evaluation=OFTEN)
     arrivals = [
@@ -173,7 +173,7 @@ def test_a_replay_writes_tasks_that_begin_and_end_within_one_call() -> None:
     assert {str(task["parameters"]) for task in whole.values()} == {"{}", "{'v': 22.0}"}
 
 
-def test_events_of_a_tick_are_in_the_order_of_rules_whichever_way_those_are_evaluated() -> None:
+def test_events_of_a_tick_are_in_rule_order_with_and_without_columns() -> None:
     detector = a_detector(
         a_stream("speed"), a_stream("mode", latched=True), a_stream("capped", buffer={"count": 3}), clientTimeout="5s"
     )
@@ -216,7 +216,7 @@ def test_events_of_a_tick_are_in_the_order_of_rules_whichever_way_those_are_eval
     )
 
 
-def test_columns_of_rules_that_are_gone_are_not_read_for_ever() -> None:
+def test_columns_of_removed_rules_are_no_longer_read() -> None:
     engine = an_engine(a_detector(), speeding())
     for number in range(100):
         changed = a_rule(signals=[{**SPEED, "value": f"msg.v + {number}.5"}], when="speed > 10")
@@ -225,7 +225,7 @@ def test_columns_of_rules_that_are_gone_are_not_read_for_ever() -> None:
     assert engine._inputs.tables.readers["speed"].count < 20
 
 
-def test_a_stream_whose_samples_a_cap_pushed_out_is_as_old_as_its_last_one_until_the_next() -> None:
+def test_the_age_of_a_stream_is_that_of_its_last_sample_even_if_evicted() -> None:
     """A tick that waits while the next sample comes does not see it, and still knows of the one that is gone."""
     detector = a_detector(
         a_stream("speed", staleAfter="Never"),
@@ -241,7 +241,7 @@ def test_a_stream_whose_samples_a_cap_pushed_out_is_as_old_as_its_last_one_until
     assert one_by_one(detector, [rule], arrivals, 6) == in_one_go(detector, [rule], arrivals, 6) == []
 
 
-def test_pairs_are_evaluated_before_anybody_came_where_not_everybody_has_a_stream() -> None:
+def test_pairs_are_evaluated_before_the_first_client_if_not_all_have_the_stream() -> None:
     lights = {**a_stream("speed"), "key": "lights/speed", "client": "light"}
     rule = near(signals=[SPEED], when="distance < 150 && a.speed > 10", evaluation=SECONDLY)
     engine = an_engine(a_detector(a_stream("pose"), lights), rule)

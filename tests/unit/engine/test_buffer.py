@@ -27,7 +27,7 @@ def held(buffer: Buffer) -> int:
 
 
 @given(st.lists(st.integers(0, 20)))
-def test_samples_stand_in_order_of_time_and_ties_in_order_of_arrival(times: list[int]) -> None:
+def test_samples_are_ordered_by_time_and_ties_by_arrival(times: list[int]) -> None:
     lane = a_lane()
     for number, time in enumerate(times):
         lane.insert(a_sample(time, number))
@@ -39,7 +39,7 @@ def test_samples_stand_in_order_of_time_and_ties_in_order_of_arrival(times: list
 
 
 @given(st.lists(st.integers(0, 30)), st.integers(0, 40), st.integers(1, 40))
-def test_a_window_leaves_out_its_beginning_and_takes_in_its_end(times: list[int], now: int, over: int) -> None:
+def test_a_window_excludes_its_start_and_includes_its_end(times: list[int], now: int, over: int) -> None:
     lane = a_lane()
     for number, time in enumerate(times):
         lane.insert(a_sample(time, number))
@@ -48,7 +48,9 @@ def test_a_window_leaves_out_its_beginning_and_takes_in_its_end(times: list[int]
 
 
 @given(st.lists(st.integers(0, 50), min_size=1), st.integers(0, 60), st.integers(1, 60))
-def test_what_is_older_than_the_duration_goes_but_the_newest_never(times: list[int], now: int, duration: int) -> None:
+def test_samples_older_than_the_duration_are_evicted_but_never_the_newest(
+    times: list[int], now: int, duration: int
+) -> None:
     lane = a_lane(duration=duration)
     for number, time in enumerate(times):
         lane.insert(a_sample(time, number))
@@ -58,7 +60,7 @@ def test_what_is_older_than_the_duration_goes_but_the_newest_never(times: list[i
     assert freed == (len(times) - len(lane.samples)) * SAMPLE_OVERHEAD
 
 
-def test_beyond_its_bytes_a_lane_forgets_the_oldest() -> None:
+def test_a_lane_beyond_its_bytes_evicts_the_oldest_samples() -> None:
     lane = a_lane(maximum_bytes=2 * (SAMPLE_OVERHEAD + 10))
     for time in range(4):
         lane.insert(a_sample(time, payload=b"x" * 10))
@@ -66,14 +68,14 @@ def test_beyond_its_bytes_a_lane_forgets_the_oldest() -> None:
     assert lane.evicted == 2
 
 
-def test_a_sample_bigger_than_the_lane_may_hold_is_held_alone() -> None:
+def test_a_sample_larger_than_the_lanes_limit_is_kept_alone() -> None:
     lane = a_lane(maximum_bytes=5)
     for time in range(3):
         lane.insert(a_sample(time, payload=b"x" * 10))
     assert [sample.time for sample in lane.samples] == [2]
 
 
-def test_the_cap_over_all_pushes_out_the_oldest_wherever_it_is() -> None:
+def test_the_total_cap_evicts_the_oldest_sample_of_any_lane() -> None:
     buffer = Buffer(6 * SAMPLE_OVERHEAD)
     lanes = [buffer.add(a_lane(client)) for client in ("a", "b", "c")]
     for time in (5, 1, 4, 2, 6, 3):
@@ -86,7 +88,7 @@ def test_the_cap_over_all_pushes_out_the_oldest_wherever_it_is() -> None:
     assert buffer.evicted == 2
 
 
-def test_of_equal_times_the_cap_over_all_takes_by_client_and_stream_whichever_came_first() -> None:
+def test_at_equal_times_the_total_cap_evicts_by_client_and_stream() -> None:
     buffer = Buffer(6 * SAMPLE_OVERHEAD)
     lanes = [buffer.add(a_lane(*place)) for place in (("c", "s"), ("a", "t"), ("a", "s"), ("b", "s"))]
     for number in range(7):
@@ -105,7 +107,7 @@ OFTEN = a_rule("often", signals=[{"name": "v", **V}], when="v > 99", evaluation=
 
 
 @pytest.mark.parametrize("others", [(), (OFTEN,)])
-def test_what_is_older_than_the_duration_is_not_seen_at_any_tick_whatever_other_rules_there_are(
+def test_samples_older_than_the_duration_are_invisible_at_every_tick_with_any_other_rules(
     others: tuple[EventRule, ...],
 ) -> None:
     first = {"name": "first", "aggregate": "First", **V}
@@ -116,7 +118,7 @@ def test_what_is_older_than_the_duration_is_not_seen_at_any_tick_whatever_other_
 
 
 @pytest.mark.parametrize("others", [(), (OFTEN,)])
-def test_a_rule_does_not_change_what_the_cap_over_all_leaves_to_another(others: tuple[EventRule, ...]) -> None:
+def test_a_rule_does_not_change_what_the_total_cap_leaves_to_another(others: tuple[EventRule, ...]) -> None:
     first = {"name": "first", "stream": "pose", "value": "msg.x", "aggregate": "First"}
     brief = a_stream("speed", buffer={"duration": "200ms"})
     rule = a_rule(signals=[first], when="first == 1", until="false", evaluation={"every": "2s"})
@@ -126,7 +128,7 @@ def test_a_rule_does_not_change_what_the_cap_over_all_leaves_to_another(others: 
     assert drive.take(*kept, *many, until=2) == []  # 18 samples of 169 bytes are held: the place at 0.1 gave way
 
 
-def test_the_newest_of_all_stays_when_the_cap_leaves_room_for_one() -> None:
+def test_the_newest_sample_stays_when_the_cap_has_room_for_one() -> None:
     buffer = Buffer(2 * SAMPLE_OVERHEAD)
     lane = buffer.add(a_lane())
     for time in range(50):
@@ -164,7 +166,7 @@ doings = st.one_of(
 
 @settings(max_examples=200)
 @given(st.lists(doings, max_size=60), st.integers(400, 5_000), st.one_of(st.none(), st.integers(200, 1_500)))
-def test_the_bytes_are_those_of_what_is_held_and_within_the_cap(
+def test_the_byte_count_matches_the_contents_and_the_cap(
     steps: list[BufferStep], cap: int, lane_cap: int | None
 ) -> None:
     buffer = Buffer(cap)

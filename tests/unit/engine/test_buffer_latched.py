@@ -52,7 +52,7 @@ def test_the_newest_sample_of_each_key_outlives_the_duration(came: list[tuple[in
     assert lane.bytes == before - freed == len(kept) * (SAMPLE_OVERHEAD + 1)
 
 
-def test_the_cap_over_all_empties_latched_lanes_last() -> None:
+def test_the_total_cap_evicts_latched_samples_last() -> None:
     buffer = Buffer(4 * (SAMPLE_OVERHEAD + 1))
     latched, plain = buffer.add(a_latched_lane()), buffer.add(Lane("car", "speed", 10))
     buffer.grew(latched.insert(a_sample(1)))
@@ -64,7 +64,7 @@ def test_the_cap_over_all_empties_latched_lanes_last() -> None:
     assert buffer.bytes == latched.bytes <= buffer.maximum_bytes
 
 
-def test_when_time_steps_back_what_was_latched_holds_since_then() -> None:
+def test_when_time_steps_back_latched_samples_are_valid_from_then() -> None:
     buffer = Buffer(10_000)
     latched, plain = buffer.add(a_latched_lane()), buffer.add(Lane("car", "speed", 10))
     for lane in (latched, plain):
@@ -78,7 +78,7 @@ def test_when_time_steps_back_what_was_latched_holds_since_then() -> None:
     assert latched.expire(100) == SAMPLE_OVERHEAD + 1  # replaced at 20
 
 
-def test_samples_that_are_equal_to_the_byte_and_of_one_time_are_separate_samples() -> None:
+def test_identical_samples_of_the_same_time_are_separate_samples() -> None:
     lane = LatchedLane("car", "map", 10, None, 2, topic=by_key)
     logged = arrival(1, "car", {}, "map")
     for _ in range(3):
@@ -88,7 +88,7 @@ def test_samples_that_are_equal_to_the_byte_and_of_one_time_are_separate_samples
 
 
 @given(st.lists(st.integers(0, 30)), st.integers(1, 5))
-def test_beyond_its_number_a_lane_forgets_the_oldest(times: list[int], count: int) -> None:
+def test_a_lane_beyond_its_sample_count_evicts_the_oldest(times: list[int], count: int) -> None:
     lane = Lane("car", "s", 100, None, count)
     for number, time in enumerate(times):
         lane.insert(a_sample(time, number=number))
@@ -97,7 +97,7 @@ def test_beyond_its_number_a_lane_forgets_the_oldest(times: list[int], count: in
     assert lane.bytes == len(lane.samples) * (SAMPLE_OVERHEAD + 1)
 
 
-def test_a_detectors_count_holds_for_what_comes_in() -> None:
+def test_the_detectors_sample_count_applies_to_received_samples() -> None:
     drive = Drive(a_detector(a_stream("speed", buffer={"count": 2})))
     drive.take(*(arrival(0.1 * n, "a", {"v": n}) for n in range(1, 6)), until=0.6)
     assert [json.loads(sample.payload)["v"] for lane in drive.engine.buffer for sample in lane.samples] == [4, 5]
@@ -106,7 +106,7 @@ def test_a_detectors_count_holds_for_what_comes_in() -> None:
     assert lane.bytes == drive.engine.buffer.bytes
 
 
-def test_what_is_latched_is_known_for_ever_and_each_key_for_itself() -> None:
+def test_latched_samples_never_expire_and_are_kept_for_each_key() -> None:
     drive = Drive(a_detector(a_stream("speed"), MAP, buffer={"duration": "5s"}), ICY)
     tiles = [_tile(0.1, "t1", ice=True), _tile(0.2, "t2", ice=False)]
     assert drive.take(*tiles, arrival(0.5, "a", {"v": 0}), until=20) == []
@@ -114,7 +114,7 @@ def test_what_is_latched_is_known_for_ever_and_each_key_for_itself() -> None:
 
 
 @pytest.mark.parametrize("clock", ["Wall", "Data"])
-def test_a_replay_takes_first_what_is_latched_wherever_it_was_recorded(tmp_path: Path, clock: str) -> None:
+def test_a_replay_delivers_latched_samples_first_wherever_they_were_recorded(tmp_path: Path, clock: str) -> None:
     streams = a_stream("speed", stamp="msg.t"), {**MAP, "stamp": "msg.t"}
     detector = a_detector(*streams, clock=clock, lateness="0s", maxAhead="1s")
     recording = tmp_path / "drive.jsonl"

@@ -13,7 +13,7 @@ from tests.unit.engine.scenes import a_scene, driven
 
 @settings(max_examples=int(os.environ.get("WAYSIDE_EQUIVALENCE", "15")))
 @given(st.integers(0, 10**6), st.sampled_from([(10**9,), (10**9,), (1, 3, 40)]))
-def test_any_cut_and_a_look_at_each_evaluation_give_the_same_events_demands_and_counts(
+def test_any_batching_with_or_without_tracing_gives_the_same_events_demands_and_counts(
     seed: int, sizes: tuple[int, ...]
 ) -> None:
     scene, random = a_scene(seed), Random(seed)

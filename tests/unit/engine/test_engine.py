@@ -20,7 +20,7 @@ def test_an_episode_reports_when_its_condition_began_to_hold_and_when_it_started
     assert last.values == {"speed": 5}
 
 
-def test_two_detectors_that_see_the_same_have_episodes_of_their_own() -> None:
+def test_two_detectors_with_the_same_input_have_separate_episodes() -> None:
     episodes = set()
     for holder in ("north", "south"):
         engine = make_engine(a_detector(), stream_readers(a_detector()), holder=holder, start=at(0))
@@ -42,7 +42,7 @@ def test_a_condition_may_use_the_clients_name_labels_and_streams() -> None:
     assert reported == ["r rsu OutOfScope 7"]  # speed is stale, the client is not lost
 
 
-def test_a_pair_is_looked_at_once_with_the_smaller_name_first() -> None:
+def test_a_pair_is_evaluated_once_with_the_smaller_name_first() -> None:
     drive = Drive(a_detector(), near(when="a.position.x > b.position.x"))
     assert drive.take(place(0.5, "car2", 0), place(0.6, "car10", 100), place(0.7, "b", -9), until=1) == [
         "near car10+car2 started 1"
@@ -73,7 +73,7 @@ def test_where_turning_false_ends_a_pairs_episode_as_out_of_scope() -> None:
     assert drive.take(*sorted(heard), until=8) == ["near a+b started 2", "near a+b OutOfScope 4"]
 
 
-def test_a_position_that_is_unknown_for_no_longer_than_for_does_not_restart_the_onset() -> None:
+def test_a_position_unknown_for_at_most_the_hold_time_keeps_the_onset() -> None:
     detector = a_detector(a_stream("pose", staleAfter="1s"))
     drive = Drive(detector, near(**{"for": "3s"}))
     reported = drive.take(
@@ -96,7 +96,7 @@ def test_a_pair_in_three_dimensions() -> None:
     assert reported == ["near a+b started 1"]
 
 
-def test_events_of_a_tick_come_by_rule_and_then_by_subject_whatever_the_order_of_arrival() -> None:
+def test_events_of_a_tick_are_ordered_by_rule_and_subject_not_by_arrival() -> None:
     rules = [speeding("b"), speeding("a", until="speed < 5"), near("ab")]
     drive = Drive(a_detector(), *rules)
     reported = drive.take(
@@ -111,7 +111,7 @@ def test_events_of_a_tick_come_by_rule_and_then_by_subject_whatever_the_order_of
     ]
 
 
-def test_lost_starting_and_ending_subjects_of_one_tick_come_in_order() -> None:
+def test_lost_starting_and_ending_subjects_of_a_tick_are_in_order() -> None:
     drive = Drive(a_detector(clientTimeout="3s"), speeding())
     drive.take(*(speed(0.5, 20, client) for client in ("b", "d")), until=1)
     reported = drive.take(speed(3.9, 1, "d"), speed(3.9, 20, "c"), speed(3.9, 20, "a"), until=4)
@@ -128,14 +128,14 @@ def test_a_client_gone_longer_than_the_timeout_ends_its_episodes_and_pairs() -> 
     assert list(drive.engine.clients) == ["b"]
 
 
-def test_a_lost_client_that_was_pending_is_forgotten() -> None:
+def test_a_pending_onset_of_a_lost_client_is_forgotten() -> None:
     drive = Drive(a_detector(a_stream("speed", staleAfter="Never"), clientTimeout="3s"), speeding(**{"for": "4s"}))
     assert drive.take(speed(0.5, 20), until=4) == []
     assert drive.take(speed(4.5, 20), speed(7, 20), until=8) == []  # it would have started at 5
     assert drive.take(until=9) == ["r car started 9"]
 
 
-def test_a_latched_sample_of_a_lost_client_is_there_when_it_returns() -> None:
+def test_a_latched_sample_of_a_lost_client_is_valid_when_it_returns() -> None:
     detector = a_detector(a_stream("pose"), a_stream("speed", staleAfter="Never"), clientTimeout="3s")
     drive = Drive(detector, speeding())
     assert drive.take(speed(0.5, 20), until=9) == ["r car started 1", "r car ClientLost 4"]

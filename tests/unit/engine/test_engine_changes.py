@@ -21,7 +21,7 @@ from tests.unit.engine.rules import change, demanded, near, speeding
         {"enabled": False},
     ],
 )
-def test_a_rule_that_means_something_else_ends_its_episodes(spec: dict[str, Any]) -> None:
+def test_a_rule_with_a_changed_meaning_ends_its_episodes(spec: dict[str, Any]) -> None:
     drive = Drive(a_detector(), speeding(actions=[a_deploy("x")]), speeding("other"))
     drive.take(speed(0.5, 20), until=1.5)
     version = drive.engine.demands_version
@@ -30,7 +30,7 @@ def test_a_rule_that_means_something_else_ends_its_episodes(spec: dict[str, Any]
     assert drive.engine.demands_version != version
 
 
-def test_a_rule_that_is_gone_ends_its_episodes() -> None:
+def test_a_removed_rule_ends_its_episodes() -> None:
     drive = Drive(a_detector(), speeding(), speeding("other"))
     drive.take(speed(0.5, 20), speed(0.6, 20, "bus"), until=1.5)
     assert change(drive, speeding("other")) == ["r bus RuleChanged 1.5", "r car RuleChanged 1.5"]
@@ -56,7 +56,7 @@ def test_other_changes_leave_open_episodes_open(spec: dict[str, Any]) -> None:
     assert drive.take(speed(3.5, 5), until=4) == ["r car Until 4"]
 
 
-def test_changed_actions_are_applied_to_open_episodes_with_what_was_seen_at_their_start() -> None:
+def test_changed_actions_are_rendered_for_open_episodes_with_the_values_of_their_start() -> None:
     fast = {"fast": "${speed}"}
     drive = Drive(
         a_detector(),
@@ -89,7 +89,7 @@ def test_changed_actions_are_applied_to_open_episodes_with_what_was_seen_at_thei
     assert all(name in after for name in same)  # the same demand keeps its name
 
 
-def test_a_dry_run_publishes_events_and_demands_nothing_until_it_is_over() -> None:
+def test_a_dry_run_publishes_events_without_demands_until_it_is_disabled() -> None:
     drive = Drive(a_detector(), speeding(dryRun=True, actions=[a_deploy("x")]))
     assert drive.take(speed(0.5, 20), until=1) == ["r car started 1"]
     assert drive.engine.demands() == {}
@@ -99,7 +99,7 @@ def test_a_dry_run_publishes_events_and_demands_nothing_until_it_is_over() -> No
     assert drive.engine.demands() == {}
 
 
-def test_a_disabled_rule_is_not_evaluated_and_its_ticks_do_not_come() -> None:
+def test_a_disabled_rule_is_not_evaluated_and_has_no_ticks() -> None:
     drive = Drive(a_detector(), speeding(enabled=False, evaluation={"every": "100ms"}))
     assert drive.take(speed(0.5, 20), until=3) == []
     assert drive.engine.next_tick() == at(4)
@@ -125,7 +125,7 @@ def test_parameters_that_cannot_be_rendered_at_the_start_are_rendered_as_soon_as
     assert demanded(drive)["late"] == ("app", {"x": 7, "v": 30})  # rendered once
 
 
-def test_a_demand_is_held_from_the_start_of_its_episode_to_its_end() -> None:
+def test_a_demand_lasts_from_the_start_of_its_episode_to_its_end() -> None:
     drive = Drive(
         a_detector(),
         near(actions=[a_deploy("x", priority=3, operation="Suspend", parameters={"v": "${[a.client, b.client]}"})]),

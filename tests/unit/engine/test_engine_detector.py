@@ -37,7 +37,7 @@ def test_samples_and_episodes_stay_where_nothing_of_theirs_changed() -> None:
     assert drive.take(until=6) == ["r car Until 6"]
 
 
-def test_samples_that_would_be_read_in_another_way_are_forgotten() -> None:
+def test_samples_whose_decoding_changed_are_dropped() -> None:
     drive = started()
     moved = a_stream("speed") | {"key": "v2/${client:*}/speed"}
     assert change(drive, a_stream("pose"), moved) == []
@@ -47,7 +47,7 @@ def test_samples_that_would_be_read_in_another_way_are_forgotten() -> None:
     assert drive.engine.counters.unnamed == {"speed": 1}
 
 
-def test_a_stream_that_is_gone_takes_its_samples_along_and_what_still_comes_is_counted() -> None:
+def test_removing_a_stream_drops_its_samples_and_later_ones_are_counted() -> None:
     drive = started()
     near = a_rule("near", scope={"pairs": {"position": POSITION, "within": 9}}, when="distance < 5")
     assert change(drive, a_stream("pose"), rules=(near,)) == ["r car RuleChanged 1"]
@@ -56,7 +56,7 @@ def test_a_stream_that_is_gone_takes_its_samples_along_and_what_still_comes_is_c
     assert list(drive.engine.buffer) == []
 
 
-def test_another_duration_holds_for_samples_that_are_there() -> None:
+def test_a_changed_duration_applies_to_buffered_samples() -> None:
     drive = Drive(a_detector())
     drive.take(*(arrival(n / 10, "car", {"v": 1}) for n in range(1, 60)), until=6)
     change(drive, a_stream("pose"), a_stream("speed", buffer={"duration": "2s"}), rules=())
@@ -65,7 +65,7 @@ def test_another_duration_holds_for_samples_that_are_there() -> None:
     assert lane.samples[0].time == at(5.1)
 
 
-def test_labels_and_timeouts_are_those_of_the_new_detector() -> None:
+def test_labels_and_timeouts_of_the_new_detector_apply() -> None:
     rule = a_rule(when='has(labels.role) && labels.role == "bus"')
     drive = Drive(a_detector(), rule)
     assert drive.take(arrival(0.5, "car", {}), until=1) == []
@@ -73,7 +73,7 @@ def test_labels_and_timeouts_are_those_of_the_new_detector() -> None:
     assert drive.take(until=4) == ["r car started 2", "r car ClientLost 4"]
 
 
-def test_another_clock_is_another_time_and_open_episodes_hold() -> None:
+def test_open_episodes_continue_when_the_clock_changes() -> None:
     drive = started()
     stamped = a_stream("speed", stamp="msg.t")
     assert change(drive, stamped, clock="Data", maxAhead="10s") == []
@@ -115,7 +115,7 @@ def of_data(**spec: Any) -> Drive:
     return drive
 
 
-def test_a_changed_client_timeout_decides_when_one_client_alone_is_believed_that_time_jumped() -> None:
+def test_a_changed_client_timeout_decides_when_one_client_alone_can_advance_the_time() -> None:
     alone = [stamped("a", seconds) for seconds in (3600, 3601, 3602, 3603)]
     for timeout, jumps in (("30s", 0), ("2s", 1)):
         drive = of_data()
@@ -124,7 +124,7 @@ def test_a_changed_client_timeout_decides_when_one_client_alone_is_believed_that
         assert drive.engine.timeline.jumps == jumps  # type: ignore[union-attr]
 
 
-def test_a_changed_cap_of_the_buffer_holds_for_what_waits_for_its_time() -> None:
+def test_a_changed_buffer_cap_applies_to_samples_awaiting_their_tick() -> None:
     drive = of_data(lateness="10s", buffer={"bytes": "1Mi"})
     change(drive, STAMPED, rules=(), clock="Data", lateness="10s", buffer={"bytes": "2Ki"})
     drive.take(*(stamped("b", 2 + number / 10, size=500) for number in range(8)), until=1)

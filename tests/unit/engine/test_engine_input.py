@@ -83,7 +83,7 @@ def of_the_good_ones_alone() -> list[str]:
 @settings(max_examples=40, deadline=None)
 @given(st.lists(st.tuples(st.integers(1, 5999), names, st.sampled_from(["pose", "speed"]), messages), max_size=30))
 @example([(n * 10, f"bad{n % 2 + 1}", "pose", b'{"x": 1e308, "y": -1e308, "z": 0}') for n in range(30)])
-def test_bad_input_of_one_client_changes_no_event_of_another(
+def test_bad_input_of_a_client_changes_no_event_of_others(
     bad: list[tuple[int, str, str, bytes]],
 ) -> None:
     hostile = [arrival(time / 1000, name, payload, stream) for time, name, stream, payload in bad]
@@ -93,7 +93,7 @@ def test_bad_input_of_one_client_changes_no_event_of_another(
     assert all("good" in name or "bad" in name for name in drive.engine.clients)
 
 
-def test_forty_clients_at_impossible_places_are_near_nobody() -> None:
+def test_clients_at_invalid_positions_are_near_no_other() -> None:
     drive = Drive(a_detector(), *RULES)
     impossible = [
         arrival(0.1 + n / 100, f"bad{n}", {"x": 1e308 * (-1) ** n, "y": 1e13, "z": 0}, "pose") for n in range(40)
@@ -107,7 +107,7 @@ NAN, INF = float("nan"), float("inf")
 
 
 @pytest.mark.parametrize(("x", "y"), [(NAN, 0.0), (0.0, NAN), (INF, 0.0), (-INF, INF)])
-def test_coordinates_that_are_no_numbers_are_unknown(x: float, y: float) -> None:
+def test_coordinates_that_are_not_numbers_are_unknown(x: float, y: float) -> None:
     detector = a_detector(a_stream("pose", encoding="cdr", type="geometry_msgs/msg/PoseStamped"))
     position = {"stream": "pose", "x": "msg.pose.position.x", "y": "msg.pose.position.y"}
     rule = a_rule(scope={"pairs": {"position": position, "within": 1e6}}, when="distance >= 0")
@@ -119,7 +119,7 @@ def test_coordinates_that_are_no_numbers_are_unknown(x: float, y: float) -> None
     assert drive.engine.counters.rules["r"].unknowns == 1
 
 
-def test_infinite_and_undefined_values_do_not_enter_events_that_json_cannot_carry() -> None:
+def test_infinities_and_nan_do_not_enter_events() -> None:
     signals = [
         {"name": "inf", "stream": "speed", "value": "1.0 / msg.zero"},
         {"name": "nan", "stream": "speed", "value": "0.0 / msg.zero"},
@@ -133,7 +133,7 @@ def test_infinite_and_undefined_values_do_not_enter_events_that_json_cannot_carr
     assert "JSON cannot represent" in drive.engine.counters.rules["r"].last_error
 
 
-def test_what_cannot_be_read_is_counted_by_its_stream_with_the_last_reason() -> None:
+def test_unreadable_payloads_are_counted_by_stream_with_the_last_reason() -> None:
     drive = Drive(a_detector(), *RULES)
     drive.take(arrival(0.1, "car", b"{"), arrival(0.2, "bus", b"\xff"), arrival(0.3, "car", b"", "pose"), until=1)
     counters = drive.engine.counters
@@ -143,7 +143,7 @@ def test_what_cannot_be_read_is_counted_by_its_stream_with_the_last_reason() -> 
     assert sorted(drive.engine.clients) == ["bus", "car"]  # they are there, though nobody understands them
 
 
-def test_an_expression_that_fails_on_what_is_there_is_an_error_and_what_is_missing_is_not() -> None:
+def test_a_failing_expression_is_an_error_and_a_missing_input_is_not() -> None:
     rule = a_rule(signals=[{"name": "v", "stream": "speed", "value": "msg.v + 1"}], when="v > 3")
     drive = Drive(a_detector(), rule)
     drive.take(
@@ -156,7 +156,7 @@ def test_an_expression_that_fails_on_what_is_there_is_an_error_and_what_is_missi
     assert [event.episode.subject for event in drive.events] == ["good"]
 
 
-def test_keys_that_name_no_client_are_counted_and_leave_nothing_behind() -> None:
+def test_keys_without_a_client_are_counted_and_leave_no_state() -> None:
     drive = Drive(a_detector(), *RULES)
     bad = [
         *("vehicles/speed", "vehicles/a/b/speed", "vehicles/a b/speed", "vehicles//speed", "vehicles/ü/speed", ""),
@@ -169,7 +169,7 @@ def test_keys_that_name_no_client_are_counted_and_leave_nothing_behind() -> None
     assert list(drive.engine.buffer) == []
 
 
-def test_a_sample_of_a_stream_that_is_not_there_is_counted() -> None:
+def test_a_sample_of_an_unknown_stream_is_counted() -> None:
     for clock in ("Wall", "Data"):
         drive = Drive(a_detector(clock=clock))
         drive.engine.advance([Arrival(at(0.1), "gone", "vehicles/car/gone", b"{}")], at(1))
@@ -177,7 +177,7 @@ def test_a_sample_of_a_stream_that_is_not_there_is_counted() -> None:
 
 
 @pytest.mark.parametrize("clock", ["Wall", "Data"])
-def test_made_up_clients_beyond_the_limit_are_dropped_and_the_known_ones_stay(
+def test_clients_beyond_the_limit_are_dropped_and_known_clients_stay(
     monkeypatch: pytest.MonkeyPatch, clock: str
 ) -> None:
     monkeypatch.setattr(ingest, "MAXIMUM_CLIENTS", 3)
@@ -196,7 +196,7 @@ def test_made_up_clients_beyond_the_limit_are_dropped_and_the_known_ones_stay(
     assert sorted(drive.engine.clients) == ["car", "new"]  # the others timed out and gave room
 
 
-def test_of_lost_clients_a_bounded_number_is_remembered(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bounded_number_of_lost_clients_is_remembered(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ingest, "MAXIMUM_LOST", 2)
     drive = Drive(a_detector(clientTimeout="2s"), *RULES)
     for n in range(9):
@@ -210,7 +210,7 @@ def test_of_lost_clients_a_bounded_number_is_remembered(monkeypatch: pytest.Monk
     assert sorted(lane.client for lane in drive.engine.buffer) == ["later2", "later3", "made7"]
 
 
-def test_new_keys_of_one_client_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_keys_of_a_client_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ingest, "MAXIMUM_KEYS", 10)
     detector = a_detector({"name": "s", "key": "v/${client:*}/${part:*}", "encoding": "json"})
     rule = a_rule(signals=[{"name": "n", "stream": "s", "aggregate": "Count", "over": "9s"}], when="n == 100")
@@ -221,7 +221,7 @@ def test_new_keys_of_one_client_are_bounded(monkeypatch: pytest.MonkeyPatch) -> 
     assert len(known) <= 10
 
 
-def test_the_states_of_subjects_that_are_gone_are_forgotten() -> None:
+def test_the_states_of_removed_subjects_are_forgotten() -> None:
     detector = a_detector(clientTimeout="2s")
     rule = a_rule(signals=[{"name": "v", "stream": "speed", "value": "msg.v"}], when="v > 10", cooldown="4s")
     drive = Drive(detector, rule)
@@ -241,7 +241,7 @@ FAST = a_rule(signals=[{"name": "v", "stream": "speed", "value": "msg.v"}], when
     "rest",
     [b'"\xff"', b'"\\ud800"', b"1e999", b"01", b"[1,]", b"NaN", b"tru", b"[" * 70 + b"]" * 70, b'1}, {"v": 1'],
 )
-def test_json_that_is_broken_where_no_rule_reads_it_is_no_message_at_all(rest: bytes) -> None:
+def test_json_broken_outside_the_read_fields_is_still_a_decode_error(rest: bytes) -> None:
     drive = Drive(a_detector(), FAST)
     whole, broken = b'{"v": 20, "w": 1}', b'{"v": 20, "w": ' + rest + b"}"
     reported = drive.take(arrival(0.5, "car", whole), arrival(0.5, "bus", broken), until=1)
@@ -249,7 +249,7 @@ def test_json_that_is_broken_where_no_rule_reads_it_is_no_message_at_all(rest: b
     assert drive.engine.counters.undecodable == {"speed": 1}
 
 
-def test_a_message_that_no_rule_reads_is_not_looked_at() -> None:
+def test_a_message_that_no_rule_reads_is_not_decoded() -> None:
     drive = Drive(a_detector(), FAST)
     broken = [arrival(0.4, "car", b"{"), arrival(0.6, "car", b"{", "pose")]
     assert drive.take(*broken, arrival(0.9, "car", {"v": 20}), until=1) == ["r car started 1"]

@@ -24,7 +24,7 @@ def held_by(rule: Any, client: str = "car", **fields: Any) -> Demand:
 RECORD = speeding(actions=[a_deploy("x", parameters={"v": "${speed}"})])
 
 
-def test_a_restored_episode_holds_its_demand_as_it_was_and_keeps_its_times() -> None:
+def test_a_restored_episode_keeps_its_demand_and_times() -> None:
     demand = held_by(RECORD)
     drive = Drive(a_detector(), RECORD)
     assert drive.note(drive.engine.restore([demand], at(0))) == []
@@ -46,7 +46,7 @@ def test_a_restored_episode_does_not_start_again() -> None:
     assert drive.take(*(speed(n + 0.5, 20) for n in range(5)), until=5) == []
 
 
-def test_of_several_restored_episodes_one_client_may_be_heard_before_the_others() -> None:
+def test_clients_of_restored_episodes_may_return_one_by_one() -> None:
     rule = speeding(evaluation={"onSample": "speed"}, actions=[a_deploy("x")])
     drive = Drive(a_detector(), rule)
     drive.engine.restore([held_by(rule, client) for client in ("a", "b", "c")], at(0))
@@ -66,7 +66,7 @@ def test_only_a_restored_episode_keeps_the_demand_of_a_pair_between_the_threshol
     assert [each.name for each in drive.engine.demands().values()] == [demand.name]
 
 
-def test_a_restored_client_that_is_not_heard_is_lost_after_the_timeout_from_the_start() -> None:
+def test_a_silent_restored_client_is_lost_one_timeout_after_the_start() -> None:
     drive = Drive(a_detector(clientTimeout="10s"), RECORD)
     drive.engine.restore([held_by(RECORD)], at(0.5))
     assert drive.take(until=10.5) == []
@@ -107,7 +107,7 @@ def test_actions_that_changed_while_the_detector_was_away_are_applied_at_the_nex
     assert {demand.episode.start_time for demand in drive.engine.demands().values()} == {at(-999)}
 
 
-def test_actions_that_change_after_a_restart_let_no_demand_go_before_it_is_rendered_again() -> None:
+def test_actions_changed_after_a_restart_keep_demands_until_they_are_rendered_again() -> None:
     drive = Drive(a_detector(), RECORD)
     drive.engine.restore([held_by(RECORD)], at(0))
     drive.take(speed(0.5, 15), until=1)
@@ -118,7 +118,7 @@ def test_actions_that_change_after_a_restart_let_no_demand_go_before_it_is_rende
 
 
 @pytest.mark.parametrize("clients", [(), ("a", "b"), ("a", "a", "b")])
-def test_a_task_whose_subjects_are_none_of_its_rule_is_no_open_episode(clients: tuple[str, ...]) -> None:
+def test_a_task_with_subjects_outside_its_rule_restores_no_episode(clients: tuple[str, ...]) -> None:
     drive = Drive(a_detector(), RECORD)
     demand = held_by(RECORD, clients=clients)
     assert [event.reason for event in drive.engine.restore([demand], at(0))] == ["RuleChanged"]
@@ -134,7 +134,7 @@ def test_restored_episodes_of_pairs_need_two_clients_in_order() -> None:
         assert drive.take(place(0.5, "car", 0), place(0.5, "zz", 175), until=1) == []
 
 
-def test_the_two_tasks_of_one_episode_restore_one_episode() -> None:
+def test_two_tasks_of_an_episode_restore_one_episode() -> None:
     rule = speeding(actions=[a_deploy("x"), a_deploy("y")])
     drive = Drive(a_detector(), rule, start=-1_000)
     drive.take(speed(-999.5, 20), until=-999)
@@ -145,7 +145,7 @@ def test_the_two_tasks_of_one_episode_restore_one_episode() -> None:
     assert again.take(speed(0.5, 1), until=1) == ["r car Until 1"]
 
 
-def test_of_two_episodes_of_one_subject_the_second_is_no_episode() -> None:
+def test_a_second_episode_of_a_subject_is_not_restored() -> None:
     first, second = held_by(RECORD), held_by(RECORD, id="zzz", start_time=at(-5))
     drive = Drive(a_detector(), RECORD)
     reported = drive.engine.restore([second, first], at(0))

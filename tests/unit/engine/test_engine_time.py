@@ -99,7 +99,7 @@ def in_one_go(detector: Any, arrivals: list[Arrival], until: float) -> list[str]
 
 @settings(max_examples=30, deadline=None)
 @given(drives(), st.lists(st.integers(1, 110), max_size=12), st.sampled_from(["wall", "drained", "data"]))
-def test_however_the_arrivals_are_split_the_events_are_the_same_to_the_byte(
+def test_any_split_of_the_arrivals_gives_byte_identical_events(
     drive: list[tuple[float, str, str, dict[str, float]]], cuts: list[int], how: str
 ) -> None:
     """Drained: the shell reads the clock, then takes what is queued, so samples are later than the time it gives."""
@@ -118,7 +118,7 @@ def test_however_the_arrivals_are_split_the_events_are_the_same_to_the_byte(
 
 @settings(max_examples=20, deadline=None)
 @given(drives(), st.data())
-def test_with_clock_data_the_order_of_arrival_makes_no_difference_within_the_lateness(
+def test_with_clock_data_the_order_of_arrival_does_not_matter_within_the_lateness(
     drive: list[tuple[float, str, str, dict[str, float]]], data: st.DataObject
 ) -> None:
     arrivals = arrivals_of(drive)
@@ -156,7 +156,7 @@ def test_with_clock_data_a_tick_runs_once_a_stamp_of_lateness_beyond_it_was_seen
     assert drive.take(sent(11.5), until=0) == ["r car started 11"]
 
 
-def test_a_tick_sees_no_sample_beyond_it() -> None:
+def test_a_tick_sees_no_later_sample() -> None:
     newest = a_rule(signals=[{"name": "t", "stream": "speed", "value": "msg.t"}], when="t > 0")
     age = a_rule("s", signals=[{"name": "age", "stream": "speed", "aggregate": "Age"}], when="age < 0.25")
     drive = data_drive(newest, age)
@@ -168,7 +168,7 @@ def test_a_tick_sees_no_sample_beyond_it() -> None:
     ]
 
 
-def test_a_sample_later_than_the_lateness_enters_in_its_place_while_it_is_inside_the_buffer() -> None:
+def test_a_sample_beyond_the_lateness_is_inserted_in_order_if_the_buffer_covers_it() -> None:
     four = a_rule(signals=COUNT.to_json()["spec"]["signals"], when="n >= 4")
     drive = data_drive(four)
     drive.take(sent(10.1), sent(10.9), sent(11.6), until=0)
@@ -185,7 +185,7 @@ def test_a_sample_later_than_the_lateness_enters_in_its_place_while_it_is_inside
     assert late.take(sent(14.5), until=0) == ["r car started 14"]
 
 
-def test_a_stamp_from_the_future_is_dropped_and_counted_and_time_continues() -> None:
+def test_a_stamp_in_the_future_is_dropped_and_counted_and_time_continues() -> None:
     drive = data_drive()
     ahead = sent(3_600, "liar")
     assert drive.take(sent(10.2), ahead, sent(10.6), sent(11.1), ahead, sent(11.6), until=0) == ["r car started 11"]
@@ -193,7 +193,7 @@ def test_a_stamp_from_the_future_is_dropped_and_counted_and_time_continues() -> 
     assert "liar" not in drive.engine.clients
 
 
-def test_time_that_really_jumped_holds_once_two_clients_agree() -> None:
+def test_a_jump_of_time_is_accepted_once_two_clients_agree() -> None:
     drive = data_drive()
     drive.take(*(sent(10 + n / 5, client) for n in range(10) for client in ("a", "b")), until=0)
     assert drive.take(sent(500.1, "a"), sent(500.2, "b"), until=0) == []
@@ -206,7 +206,7 @@ def test_time_that_really_jumped_holds_once_two_clients_agree() -> None:
     assert [event.episode.subject for event in drive.events] == ["a", "b"]
 
 
-def test_one_client_alone_jumps_with_its_second_sample() -> None:
+def test_a_single_client_jumps_with_its_second_sample() -> None:
     drive = data_drive()
     drive.take(sent(10.1), sent(10.2), until=0)
     assert drive.take(sent(3.7), sent(3.8), sent(3.9), sent(4.5), until=0) == []  # inside the buffer: just late
@@ -216,7 +216,7 @@ def test_one_client_alone_jumps_with_its_second_sample() -> None:
     assert timeline(drive).dropped_late == 1
 
 
-def test_one_of_two_clients_must_keep_it_up_while_the_other_is_silent() -> None:
+def test_a_client_must_confirm_a_jump_for_the_timeout_while_another_is_silent() -> None:
     drive = data_drive(clientTimeout="3s")
     drive.take(sent(10, "a"), sent(10, "b"), until=0)
     drive.take(*(sent(500 + n / 2, "a") for n in range(6)), until=0)
@@ -228,7 +228,7 @@ def test_one_of_two_clients_must_keep_it_up_while_the_other_is_silent() -> None:
     assert timeline(drive).jumps == 1
 
 
-def test_the_time_of_the_data_begins_with_its_first_stamp_whatever_the_wall_clock_is() -> None:
+def test_data_time_begins_with_the_first_stamp_independently_of_the_wall_clock() -> None:
     """A restored client is lost no sooner than clientTimeout after that, and its age is no wall's age."""
     drive = data_drive(clientTimeout="3s")
     drive.engine.clients.heard("known", at(10**6))
@@ -238,7 +238,7 @@ def test_the_time_of_the_data_begins_with_its_first_stamp_whatever_the_wall_cloc
     assert "known" not in drive.engine.clients
 
 
-def test_a_stream_slower_than_max_ahead_is_no_stream_from_the_future() -> None:
+def test_a_stream_slower_than_max_ahead_is_not_ahead() -> None:
     drive = data_drive()
     assert drive.take(*(sent(10.2 + 3 * n, received=3 * n) for n in range(4)), until=0) == []
     assert drive.take(sent(21.6, received=11.6), sent(22, received=11.8), sent(22.9, received=12.7), until=0) == [
@@ -250,14 +250,14 @@ def test_a_stream_slower_than_max_ahead_is_no_stream_from_the_future() -> None:
     assert timeline(drive).jumps == 1
 
 
-def test_what_waits_for_its_tick_is_bounded() -> None:
+def test_samples_awaiting_their_tick_are_bounded() -> None:
     drive = data_drive(lateness="900ms", buffer={"bytes": "1k"})
     drive.take(*(sent(10 + n / 100) for n in range(20)), until=0)
     assert 0 < timeline(drive).dropped_full < 20
     assert drive.take(sent(10.9), sent(11.8), sent(11.9), until=0) == ["r car started 11"]
 
 
-def test_a_detector_that_changes_its_lateness_keeps_what_waited() -> None:
+def test_a_changed_lateness_keeps_samples_awaiting_their_tick() -> None:
     detector = a_detector(a_stream("speed", stamp="msg.t"), clock="Data", lateness="500ms")
     drive = Drive(detector, COUNT)
     drive.take(sent(10.8), sent(10.9), until=0)
@@ -269,7 +269,7 @@ def test_a_detector_that_changes_its_lateness_keeps_what_waited() -> None:
     assert len([sample for lane in drive.engine.buffer for sample in lane.samples]) == 2
 
 
-def test_after_a_gap_windows_are_empty_and_open_episodes_hold() -> None:
+def test_after_a_gap_windows_are_empty_and_open_episodes_continue() -> None:
     pending = a_rule("p", signals=COUNT.to_json()["spec"]["signals"], when="n >= 1", **{"for": "3s"})
     drive = Drive(a_detector(), COUNT, pending)
     assert drive.take(arrival(0.5, "car", {}), arrival(0.6, "car", {}), until=2) == ["r car started 1"]
@@ -283,7 +283,7 @@ def test_after_a_gap_windows_are_empty_and_open_episodes_hold() -> None:
     assert drive.take(until=66) == ["p car Until 66", "r car Until 66"]
 
 
-def test_a_client_is_not_lost_because_the_detector_stood_still() -> None:
+def test_a_client_is_not_lost_while_the_detector_is_suspended() -> None:
     drive = Drive(a_detector(clientTimeout="5s"), COUNT)
     drive.take(arrival(0.5, "car", {}), arrival(0.6, "car", {}), until=1)
     drive.engine.gap(at(100))
@@ -293,7 +293,7 @@ def test_a_client_is_not_lost_because_the_detector_stood_still() -> None:
     assert "car" not in drive.engine.clients
 
 
-def test_after_a_step_back_of_the_clock_the_past_is_forgotten_and_time_continues_from_there() -> None:
+def test_after_a_clock_step_back_the_past_is_forgotten_and_time_continues() -> None:
     age = a_rule("age", signals=[{"name": "age", "stream": "speed", "aggregate": "Age"}], when="age < 0")
     again = a_rule("again", signals=COUNT.to_json()["spec"]["signals"], when="n == 1", until="n == 3", cooldown="10s")
     drive = Drive(a_detector(), COUNT, age, again)
@@ -306,7 +306,7 @@ def test_after_a_step_back_of_the_clock_the_past_is_forgotten_and_time_continues
     assert drive.take(arrival(20.9, "car", {}), until=21) == ["again car started 21"]
 
 
-def test_windows_do_not_reach_behind_a_gap_after_the_detector_has_changed() -> None:
+def test_windows_do_not_reach_across_a_gap_after_a_detector_change() -> None:
     from detector.assembly import stream_readers
 
     drive = Drive(a_detector(), a_rule(signals=COUNT.to_json()["spec"]["signals"], when="n >= 2"))

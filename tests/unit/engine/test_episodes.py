@@ -165,7 +165,7 @@ ENDS = seen(until=True)
 @example(second_by_second(SEEN, LASTS, LASTS, SEEN, LASTS, LASTS, LASTS), Timing(0, 0, 2))
 @example(second_by_second(SEEN, SEEN, ENDS, *[SEEN] * 5), Timing(1, 3, 9))
 @example(second_by_second(*[ENDS] * 3), Timing(0, 0, 9))
-def test_episodes_are_those_of_the_rules_read_over_the_whole_history(history: list[Moment], timing: Timing) -> None:
+def test_episodes_match_the_definition_over_the_whole_history(history: list[Moment], timing: Timing) -> None:
     assert run(history, timing) == read(history, timing)
 
 
@@ -174,7 +174,7 @@ def test_an_episode_from_its_onset_to_the_end_of_its_cooldown() -> None:
     assert run(history, Timing(1, 3, 9)) == [(1, "started 0"), (2, "Until"), (6, "started 5")]
 
 
-def test_after_a_gap_what_was_pending_restarts_and_what_is_open_stays_open() -> None:
+def test_after_a_gap_pending_onsets_restart_and_open_episodes_stay_open() -> None:
     timing = Timing(2, 0, 2)
     state = SubjectState()
     state.step(0, timing, SEEN)
@@ -189,6 +189,6 @@ def test_after_a_gap_what_was_pending_restarts_and_what_is_open_stays_open() -> 
 
 @pytest.mark.parametrize("first", TRUTHS)
 @pytest.mark.parametrize("second", TRUTHS)
-def test_and_and_not_are_kleenes(first: Truth, second: Truth) -> None:
+def test_and_and_not_follow_kleene(first: Truth, second: Truth) -> None:
     assert worth(both(first, second)) == min(worth(first), worth(second))
     assert worth(negation(first)) == 1 - worth(first)

@@ -84,7 +84,7 @@ def what_is_left(state: SubjectState) -> tuple[object, ...]:
 @given(
     _runs, st.lists(st.integers(1, 3), min_size=1, max_size=80), st.data(), st.builds(Timing, _times, _times, _times)
 )
-def test_a_run_of_ticks_is_the_same_as_each_tick(
+def test_a_run_of_ticks_equals_single_ticks(
     runs: list[tuple[Observation, int]], between: list[int], data: st.DataObject, timing: Timing
 ) -> None:
     seen = [observation for observation, count in runs for _ in range(count)]
@@ -113,7 +113,7 @@ def test_a_run_of_ticks_is_the_same_as_each_tick(
 
 @settings(max_examples=300)
 @given(_runs, _observations, st.builds(Timing, _times, _times, _times))
-def test_nothing_happens_before_the_wake_of_a_run(
+def test_nothing_happens_before_the_wake_time_of_a_run(
     runs: list[tuple[Observation, int]], last: Observation, timing: Timing
 ) -> None:
     state, now = SubjectState(), 100

@@ -195,7 +195,7 @@ _RETURNING = Scene(
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
 )
 @given(scenes(), st.sampled_from([1, 1, 4, 1000]))
-def test_the_engine_does_what_the_reference_does(scene: Scene, cut: int) -> None:
+def test_the_engine_agrees_with_the_reference(scene: Scene, cut: int) -> None:
     rules = [a_rule(name, **spec) for name, spec in scene.rules.items()]
     assert dependency_problems(rules) == {}
     reported = by_the_reference(scene)

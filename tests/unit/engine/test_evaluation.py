@@ -48,7 +48,7 @@ def test_with_on_sample_a_rule_is_evaluated_at_the_time_of_each_sample() -> None
     assert drive.engine.counters.rule("r").evaluations == 3
 
 
-def test_with_on_sample_others_are_not_looked_at() -> None:
+def test_with_on_sample_other_clients_are_not_evaluated() -> None:
     drive = Drive(
         a_detector(), fast(signals=[{"name": "age", "stream": "speed", "aggregate": "Age"}], when="age > 0.1")
     )
@@ -56,18 +56,18 @@ def test_with_on_sample_others_are_not_looked_at() -> None:
     assert drive.engine.counters.rule("r").evaluations == 2
 
 
-def test_a_for_that_is_over_wakes_a_rule_with_on_sample() -> None:
+def test_the_end_of_for_wakes_a_rule_with_on_sample() -> None:
     drive = Drive(a_detector(), fast(**{"for": "2s"}))
     assert drive.take(speed(0.3, 20), until=5) == ["r car started 2.3"]
 
 
-def test_a_cooldown_that_is_over_wakes_a_rule_with_on_sample() -> None:
+def test_the_end_of_a_cooldown_wakes_a_rule_with_on_sample() -> None:
     drive = Drive(a_detector(), fast(cooldown="3s", until="speed > 30"))
     reported = drive.take(speed(0.3, 20), speed(0.5, 40), speed(0.6, 20), until=6)
     assert reported == ["r car started 0.3", "r car Until 0.5", "r car started 3.5"]
 
 
-def test_an_unknown_timeout_that_is_over_wakes_a_rule_with_on_sample() -> None:
+def test_the_end_of_the_unknown_timeout_wakes_a_rule_with_on_sample() -> None:
     drive = Drive(a_detector(), fast(unknownTimeout="2s"))
     reported = drive.take(speed(0.3, 20), speed(0.5, 20), arrival(1.2, "car", {}), until=6)
     assert reported == ["r car started 0.3", "r car Unknown 3.2"]
@@ -78,13 +78,13 @@ def test_a_lost_client_ends_the_episodes_of_a_rule_with_on_sample() -> None:
     assert drive.take(speed(0.3, 20), until=9) == ["r car started 0.3", "r car ClientLost 6"]
 
 
-def test_who_is_lost_and_who_wakes_at_one_tick_are_reported_in_order_of_the_subjects() -> None:
+def test_lost_and_woken_subjects_of_a_tick_are_reported_in_order() -> None:
     drive = Drive(a_detector(clientTimeout="4s"), fast(unknownTimeout="2s"))
     reported = drive.take(speed(0.1, 20, "b"), speed(0.2, 20, "a"), arrival(3, "a", {}), until=5)
     assert reported[2:] == ["r a Unknown 5", "r b ClientLost 5"]
 
 
-def test_a_subject_that_was_lost_when_its_time_was_over_is_not_looked_at_with_the_samples_of_others() -> None:
+def test_a_lost_subject_is_not_evaluated_with_samples_of_others() -> None:
     drive = Drive(a_detector(clientTimeout="2s"), fast(cooldown="20s", until="speed < 10"))
     drive.take(speed(0.3, 20, "a"), speed(0.5, 5, "a"), until=20.9)
     counters = drive.engine.counters.rule("r")
@@ -93,7 +93,7 @@ def test_a_subject_that_was_lost_when_its_time_was_over_is_not_looked_at_with_th
     assert counters.evaluations == before + 1
 
 
-def test_with_on_sample_all_pairs_of_the_samples_client_are_evaluated_and_no_others() -> None:
+def test_with_on_sample_only_the_pairs_of_the_samples_client_are_evaluated() -> None:
     scope = {"pairs": {"position": POSITION, "within": 100}}
     rule = a_rule("near", scope=scope, when="distance < 50", evaluation={"onSample": "pose"})
     drive = Drive(a_detector(), rule)
@@ -115,7 +115,7 @@ def test_with_clock_data_a_sample_is_evaluated_at_its_stamp_once_lateness_has_pa
     assert drive.note(drive.engine.advance([stamped(2.0, 5)], 0)) == ["r car started 0.9", "r car Until 1.2"]
 
 
-def test_how_arrivals_are_parcelled_changes_nothing() -> None:
+def test_the_batching_of_arrivals_does_not_matter() -> None:
     arrivals = [speed(0.3 * n, 20 if n % 7 > 2 else 5, "ab"[n % 2]) for n in range(1, 60)]
     rules = [fast(**{"for": "500ms"}), fast("p", evaluation={"every": "1s"})]
     whole = Drive(a_detector(), *rules)
@@ -153,7 +153,7 @@ def test_only_rules_with_on_demand_can_be_evaluated_on_demand() -> None:
         drive.engine.evaluate_now("q")
 
 
-def test_a_paused_rule_keeps_its_open_episodes_and_forgets_what_was_pending() -> None:
+def test_a_paused_rule_keeps_open_episodes_and_drops_pending_onsets() -> None:
     drive = Drive(a_detector(a_stream("speed", staleAfter="30s")), fast(**{"for": "2s"}, evaluation={"every": "1s"}))
     assert drive.take(speed(0.1, 20, "a"), speed(1.1, 20, "b"), until=3) == ["r a started 3"]
     drive.engine.set_paused({"r"})
@@ -162,7 +162,7 @@ def test_a_paused_rule_keeps_its_open_episodes_and_forgets_what_was_pending() ->
     assert drive.take(until=10) == ["r a Until 7", "r b started 9"]
 
 
-def test_more_episodes_than_a_client_may_start_within_an_hour_are_left_out_and_counted() -> None:
+def test_episodes_beyond_the_hourly_limit_of_a_client_are_skipped_and_counted() -> None:
     drive = Drive(a_detector(clientTimeout="2h"), fast(evaluation={"every": "1s"}, maxEpisodesPerHour=2))
     blinks = [
         speed(n + 0.5, 20 if n % 2 else 5, client) for n in range(8) for client in ("a", "b") if client == "a" or n < 3
@@ -185,7 +185,7 @@ def test_an_episode_of_a_dry_run_reports_it() -> None:
     assert "dryRun" not in real
 
 
-def test_under_load_rules_of_lowest_priority_are_left_out_first_and_visibly() -> None:
+def test_under_load_rules_of_lowest_priority_are_skipped_first_and_reported() -> None:
     rules = [
         fast("low", evaluation={"every": "1s", "priority": -1}),
         fast("high", evaluation={"every": "1s"}),
@@ -205,7 +205,7 @@ def test_under_load_rules_of_lowest_priority_are_left_out_first_and_visibly() ->
     assert counts["low"].evaluations == 5
 
 
-def test_levels_thin_out_class_by_class() -> None:
+def test_load_levels_thin_out_priority_by_priority() -> None:
     assert [dict(thinning(level, [5, 0, 5])) for level in (0, 1, 3, 4, 6)] == [
         {0: 1, 5: 1},
         {0: 2, 5: 1},
@@ -216,7 +216,7 @@ def test_levels_thin_out_class_by_class() -> None:
     assert highest_level([5, 0, 5]) == 6
 
 
-def test_the_level_rises_with_each_long_look_and_falls_in_calm() -> None:
+def test_the_load_level_rises_with_each_slow_evaluation_and_falls_when_idle() -> None:
     overload = Overload()
     assert [overload.observe(n, LONG + 1, 2) for n in (0, 1, 2)] == [True, True, False]
     assert overload.level == 2
@@ -224,7 +224,7 @@ def test_the_level_rises_with_each_long_look_and_falls_in_calm() -> None:
     assert overload.level == 0
 
 
-def test_the_replay_of_pauses_questions_and_left_out_evaluations_gives_the_same_events() -> None:
+def test_a_replay_with_pauses_requests_and_skipped_evaluations_gives_the_same_events() -> None:
     rules = [fast(), fast("q", evaluation={"onDemand": True}), fast("p", evaluation={"every": "1s"})]
     live = Live(a_detector(), rules)
     slow = itertools.count(0, SECOND)
@@ -254,7 +254,7 @@ def test_the_replay_of_pauses_questions_and_left_out_evaluations_gives_the_same_
         ({"every": "1ms"}, "every: must be 10ms or more; got 1ms"),
     ],
 )
-def test_what_an_evaluation_cannot_be(evaluation: Any, message: str) -> None:
+def test_invalid_evaluation_settings_are_rejected(evaluation: Any, message: str) -> None:
     with pytest.raises(ValidationError, match=message):
         fast(evaluation=evaluation)
 
@@ -266,7 +266,7 @@ def test_on_sample_names_a_stream_of_the_detector() -> None:
         compiled(a_detector(), fast(evaluation={"onSample": "sped"}))
 
 
-def test_a_sample_that_rules_are_evaluated_with_is_looked_at_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_sample_that_triggers_rules_is_evaluated_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Evaluator, "pause", lambda _: 3600.0)
     live = Live(a_detector(), [fast(evaluation={"onSample": "speed"})])
     live.now += SECOND // 4

@@ -49,7 +49,7 @@ def test_count_sequence_escalation_and_absence() -> None:
     }, reported
 
 
-def test_the_ways_to_evaluate() -> None:
+def test_the_evaluation_modes_of_the_guide_work() -> None:
     rules = [EventRule.model_validate(each) for each in documents("When a rule is evaluated")]
     drive = Drive(detector(), *rules)
     samples = [arrival(seconds, "car", {"v": v}, "speed") for seconds, v in ((0.05, 5), (0.25, 40), (0.95, 5))]

@@ -164,17 +164,17 @@ def outcome(make: Callable[[], str]) -> str | type[Exception]:
 
 
 @given(events(TIMES, VALUES))
-def test_the_text_is_what_an_encoder_makes_of_the_cloud_event(event: Event) -> None:
+def test_the_text_equals_the_encoded_cloud_event(event: Event) -> None:
     assert outcome(event.to_json) == outcome(lambda: reference_text(event))
 
 
 @given(events(TIMES | BEYOND, VALUES))
-def test_a_time_that_has_no_text_is_the_same_error(event: Event) -> None:
+def test_a_time_out_of_range_raises_the_same_error(event: Event) -> None:
     assert outcome(event.to_json) == outcome(lambda: reference_text(event))
 
 
 @given(events(TIMES, st.dictionaries(TEXTS, UNKNOWN_TO_JSON | st.lists(UNKNOWN_TO_JSON, max_size=1), max_size=2)))
-def test_a_value_that_json_does_not_have_is_the_same_error(event: Event) -> None:
+def test_a_value_without_json_form_raises_the_same_error(event: Event) -> None:
     assert outcome(event.to_json) == outcome(lambda: reference_text(event))
 
 

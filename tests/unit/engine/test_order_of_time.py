@@ -114,7 +114,7 @@ def test_a_tick_sees_all_samples_of_its_time_and_each_subject_is_evaluated_once(
     assert [event.values for event in outcome.events] == [{"n": 3.0, "v": 3.0}] * 2
 
 
-def test_equal_times_are_in_the_order_of_recordings_then_of_places_in_them(tmp_path: Path) -> None:
+def test_equal_times_are_ordered_by_recording_and_position(tmp_path: Path) -> None:
     signals = [
         {"name": "all", "stream": "speed", "value": "msg.v", "aggregate": "Distinct", "over": "1s"},
         {"name": "v", "stream": "speed", "value": "msg.v"},
@@ -128,9 +128,7 @@ def test_equal_times_are_in_the_order_of_recordings_then_of_places_in_them(tmp_p
 
 
 @pytest.mark.parametrize("by_intake", [False, True])
-def test_what_has_one_time_is_taken_in_together_however_much_it_is(
-    monkeypatch: pytest.MonkeyPatch, by_intake: bool
-) -> None:
+def test_all_samples_of_a_time_are_taken_in_together(monkeypatch: pytest.MonkeyPatch, by_intake: bool) -> None:
     monkeypatch.setattr(replaying, "_BATCH", 4)
     monkeypatch.setattr(batches, "_ARRIVALS", 4)
     monkeypatch.setattr(batches, "_STEP", 4)
@@ -146,7 +144,7 @@ def test_what_has_one_time_is_taken_in_together_however_much_it_is(
     assert [event.values for event in outcome.events] == [{"n": 10.0}]
 
 
-def test_what_came_during_a_stall_is_not_evaluated_and_time_does_not_go_back() -> None:
+def test_samples_of_a_stall_are_not_evaluated_and_time_stays_monotonic() -> None:
     on_sample = a_rule(
         "sample",
         signals=[{"name": "v", "stream": "speed", "value": "msg.v"}],
@@ -211,7 +209,7 @@ def test_the_task_of_an_episode_within_the_last_lateness_is_there(tmp_path: Path
     assert task.spec.end_time == "2026-01-01T00:00:01.700000000Z"
 
 
-def test_at_the_end_all_that_waits_is_in_the_buffer() -> None:
+def test_at_the_end_all_waiting_samples_are_in_the_buffer() -> None:
     drive = Drive(detector_of(LATE))
     drive.note(drive.engine.advance([arrival(n / 10, "car", {"t": at(n / 10) / SECOND}) for n in range(1, 16)], 0))
     assert drive.finish() == []
@@ -245,7 +243,7 @@ def stamped(step: int, value: float) -> Arrival:
     return Arrival(time, "speed", "vehicles/car/speed", json.dumps({"t": time / SECOND, "v": value}).encode())
 
 
-def test_an_intake_file_that_does_not_contain_its_order_replays_as_it_was() -> None:
+def test_an_intake_file_without_order_replays_as_recorded() -> None:
     arrivals = [stamped(step, value) for step, value in SENT]
     for number, each in enumerate(arrivals):
         arrivals[number] = replace(each, received=each.received + number)
@@ -260,7 +258,7 @@ def test_an_intake_file_that_does_not_contain_its_order_replays_as_it_was() -> N
     assert recorded_before(detector_of({}), [sample], stamped(5, 1), gap, stamped(30, 20)) == ["sample car started 3"]
 
 
-def test_an_intake_file_that_does_not_contain_its_order_has_closing_speeds_that_end_now() -> None:
+def test_an_intake_file_without_order_has_closing_speeds_that_end_now() -> None:
     """The one in front falls silent; once, that counted as closing in."""
     rule = a_rule(scope=APART["scope"], when="closingSpeed > 3.0", until="false", evaluation={"every": "500ms"})
     arrivals = [
@@ -273,7 +271,7 @@ def test_an_intake_file_that_does_not_contain_its_order_has_closing_speeds_that_
     assert replay_arrivals([arrivals], a_detector(), [rule]).events == []
 
 
-def test_an_intake_file_that_does_not_contain_its_order_has_the_distances_of_then_to_the_last_digit() -> None:
+def test_an_intake_file_without_order_has_the_former_distances_to_the_last_digit() -> None:
     rule = a_rule(scope=APART["scope"], when="closingSpeed == 0.0", evaluation={"every": "500ms"})
     a, b = (8.1, 0.6183689966753316), (4.3, 0.9170189691149498)
     arrivals = [

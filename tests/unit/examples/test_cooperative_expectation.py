@@ -27,7 +27,7 @@ from cooperative_recording.seeds import (  # noqa: E402
 from cooperative_recording.vehicles import LIDAR_VEHICLES, Drive, Track, simulate  # noqa: E402
 
 
-def test_the_judge_shares_no_code_with_what_it_judges() -> None:
+def test_the_expectation_shares_no_code_with_the_programs() -> None:
     for file in (EXAMPLE / "cooperative_recording").glob("*.py"):
         for node in ast.walk(ast.parse(file.read_text())):
             names = [each.name for each in node.names] if isinstance(node, ast.Import) else []
@@ -37,7 +37,7 @@ def test_the_judge_shares_no_code_with_what_it_judges() -> None:
 
 
 @pytest.mark.parametrize("seed", CLEAR_SEEDS)
-def test_episodes_are_what_looking_at_every_hundredth_of_a_second_finds(seed: int) -> None:
+def test_expected_episodes_match_a_scan_of_every_hundredth_of_a_second(seed: int) -> None:
     drive = simulate(seed, 25)
     times = np.arange(0, 25, 0.01)
     where = {vehicle.name: drive.poses(vehicle.name, times)[:, :2] for vehicle in LIDAR_VEHICLES}
@@ -129,7 +129,7 @@ def test_a_pause_about_as_long_as_the_linger_is_doubtful(linger: float, doubtful
     assert all("at 4.0 s: a pause of 3.2 s is about the linger" in doubt for doubt in doubts)
 
 
-def test_a_recorder_lingers_and_one_that_is_wanted_again_meanwhile_stays() -> None:
+def test_a_recorder_lingers_and_stays_if_demanded_again_meanwhile() -> None:
     pair, other = ("a", "b"), ("a", "c")
     found = [Episode(pair, 1, 4, "west"), Episode(pair, 5, 8, "west"), Episode(other, 2, None, "west")]
     assert recorders(found, linger_s=0) == {pair: [Span(1, 4), Span(5, 8)], other: [Span(2, None)]}

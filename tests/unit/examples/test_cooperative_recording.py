@@ -95,7 +95,7 @@ def test_vehicles_move_as_vehicles_can(seed: int) -> None:
         assert ahead.max() < 0.1  # it goes where it looks
 
 
-def test_every_way_through_the_network_is_without_a_gap_or_a_kink() -> None:
+def test_every_route_through_the_network_is_smooth() -> None:
     for lane, here in lanes().items():
         assert choices(lane), f"{lane} is a dead end"
         for follower, _ in choices(lane):
@@ -146,7 +146,7 @@ def test_messages_decode_to_the_simulated_drive() -> None:
             assert np.isfinite(decoded.data.view("<f4")).all()
 
 
-def test_what_arrives_over_zenoh_is_the_drive_byte_for_byte() -> None:
+def test_the_messages_over_zenoh_are_the_drive_byte_for_byte() -> None:
     endpoint, drive = free_endpoint(), simulate(DEMO_SEED, 1)
     arrived: list[tuple[str, bytes]] = []
     expected = [(message.key, message.payload) for message in messages(drive, START_NS, 1.0)]
@@ -169,14 +169,14 @@ def test_what_arrives_over_zenoh_is_the_drive_byte_for_byte() -> None:
     assert arrived == expected
 
 
-def test_nobody_to_connect_to_is_reported_with_the_endpoint() -> None:
+def test_an_unreachable_endpoint_is_reported() -> None:
     with pytest.raises(UnreachableError, match=r"--connect tcp/127\.0\.0\.1:\d+: no Zenoh session within 0.2 s"):
         publish(simulate(1, 1), 1.0, connect=[free_endpoint()], wait_s=0.2)
     with pytest.raises(UnreachableError, match="--listen here: no Zenoh session"):
         publish(simulate(1, 1), 1.0, listen=["here"])
 
 
-def test_sigterm_ends_the_drive_in_good_order() -> None:
+def test_sigterm_ends_the_drive_gracefully() -> None:
     endpoint = free_endpoint()
     first: queue.SimpleQueue[None] = queue.SimpleQueue()
     with session("peer", listen__endpoints=[endpoint]) as there:
@@ -222,7 +222,7 @@ def test_the_expectation_has_the_numbers_of_the_files() -> None:
 
 
 @pytest.mark.parametrize("x", [-300.0, -1.0, 1.0, 300.0])
-def test_the_rules_place_and_the_expected_one_are_the_same(x: float) -> None:
+def test_the_rule_and_the_expectation_use_the_same_place(x: float) -> None:
     compiled = compile_rule(only(EventRule, "lidar-vehicles-close"), only(Detector, "town"))
     ends = [
         {"client": name, "position": {"x": x + shift, "y": 0.0, "z": 0.0}} for name, shift in (("p", -60), ("q", 60))

@@ -52,7 +52,7 @@ def test_a_use_case_is_reported_with_its_picture_and_files(ran: CaseResult) -> N
 
 
 @pytest.mark.parametrize("name", use_cases())
-def test_its_files_are_accepted_without_a_word(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_files_of_a_use_case_have_no_findings(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     files = sorted(map(str, folder_of(name).glob("*.yaml")))
     assert commandline.run_cli(cli.app, "detector", (), ["check", *files]) == 0
     logged = capsys.readouterr()
@@ -67,7 +67,7 @@ def test_the_guide_describes_all_of_them() -> None:
     assert set(re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE)) <= fields
 
 
-def test_what_differs_is_reported(tmp_path: Path) -> None:
+def test_differences_are_reported(tmp_path: Path) -> None:
     scenario = scenario_of("battery-health")
     recording = tmp_path / "drive.mcap"
     write_recording(scenario.messages(), recording)
@@ -88,7 +88,7 @@ def test_what_differs_is_reported(tmp_path: Path) -> None:
     ]
 
 
-def test_what_runs_otherwise_is_reported() -> None:
+def test_differing_applications_are_reported() -> None:
     moment = Moment(3, {"driving/a": {"maxSpeed": 4}, "driving/b": {}})
     right = {
         "driving/a": RunningTask(("Deployment",), {"maxSpeed": 4, "vehicle": "a"}),
@@ -106,7 +106,7 @@ def test_what_runs_otherwise_is_reported() -> None:
     assert list(unlike(dataclasses.replace(moment, suspended=["driving/b"]), asleep)) == []
 
 
-def test_the_command_reports_what_differs_with_its_exit_code(
+def test_the_command_reports_differences_by_its_exit_code(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def command(*arguments: str) -> int:

@@ -43,7 +43,7 @@ def test_pods_that_do_not_mount_it_or_are_over_are_left_alone() -> None:
     assert list(behind(others, "app", "x")) == []
 
 
-def test_pods_are_sought_by_what_their_workload_selects() -> None:
+def test_pods_are_listed_by_their_workloads_selector() -> None:
     template = {"metadata": {"labels": {"app": "x", "version": "2"}}, "spec": {}}
     deployment = {"kind": "Deployment", "spec": {"selector": {"matchLabels": {"app": "x"}}, "template": template}}
     cron_job = {"kind": "CronJob", "spec": {"jobTemplate": {"spec": {"template": template}}}}
@@ -53,7 +53,7 @@ def test_pods_are_sought_by_what_their_workload_selects() -> None:
     assert selectors([deployment, bare]) == ("",)
 
 
-def test_the_same_files_have_one_fingerprint_in_any_order() -> None:
+def test_the_fingerprint_does_not_depend_on_the_order_of_files() -> None:
     assert fingerprint({"a": "1", "b": "2"}) == fingerprint({"b": "2", "a": "1"}) != fingerprint({"a": "1"})
 
 
@@ -68,7 +68,7 @@ def example() -> ModuleType:
     return module
 
 
-def test_a_file_that_is_late_does_not_take_back_what_zenoh_brought(example: ModuleType) -> None:
+def test_a_late_file_does_not_override_a_newer_zenoh_message(example: ModuleType) -> None:
     latest = example.Latest()
     assert latest.by_file("old", 0.0)
     assert latest.by_zenoh("new", 1.0)
@@ -77,7 +77,7 @@ def test_a_file_that_is_late_does_not_take_back_what_zenoh_brought(example: Modu
     assert latest.content == "new"
 
 
-def test_the_file_has_the_last_word_once_zenoh_is_silent(example: ModuleType) -> None:
+def test_the_file_wins_once_zenoh_is_silent(example: ModuleType) -> None:
     latest = example.Latest()
     latest.by_zenoh("one", 0.0)
     latest.by_zenoh("two", 1.0)
@@ -87,7 +87,7 @@ def test_the_file_has_the_last_word_once_zenoh_is_silent(example: ModuleType) ->
     assert latest.content == "three"
 
 
-def test_what_comes_back_over_zenoh_counts_again(example: ModuleType) -> None:
+def test_zenoh_counts_again_when_it_returns(example: ModuleType) -> None:
     latest = example.Latest()
     for content in ("one", "two", "one"):
         assert latest.by_zenoh(content, 0.0)

@@ -71,7 +71,7 @@ def found(events: list[Event]) -> dict[str, list[Span]]:
 
 
 @pytest.mark.parametrize("rule", TRUTHS)
-def test_a_rule_finds_what_numpy_finds(rule: str, found: dict[str, list[Span]]) -> None:
+def test_a_rule_finds_the_episodes_that_numpy_finds(rule: str, found: dict[str, list[Span]]) -> None:
     expected = TRUTHS[rule]()
     assert expected
     assert [each[:2] for each in found[rule]] == [each[:2] for each in expected]
@@ -80,7 +80,7 @@ def test_a_rule_finds_what_numpy_finds(rule: str, found: dict[str, list[Span]]) 
     ]
 
 
-def test_the_least_time_to_collision_of_an_episode_is_that_of_numpy(events: list[Event]) -> None:
+def test_the_minimum_time_to_collision_of_an_episode_matches_numpy(events: list[Event]) -> None:
     ended = [each for each in events if each.episode.rule == "least-time-to-collision" and each.end_time is not None]
     assert ended
     for event in ended:
@@ -92,7 +92,7 @@ def test_the_least_time_to_collision_of_an_episode_is_that_of_numpy(events: list
         assert event.values["leastAt"] == pytest.approx((START_NS + (first + np.nanargmin(times)) * TICK) / 1e9)
 
 
-def test_the_nearest_that_did_not_happen_are_those_of_numpy(events: list[Event], tracer: Tracer) -> None:
+def test_near_misses_match_numpy(events: list[Event], tracer: Tracer) -> None:
     trace = tracer.trace()
     rules = {name: run.rule for name, run in tracer.engine.rules.items()} if tracer.engine is not None else {}
     moments = nearest_moments("", rules, trace.subjects, episodes_of("", events, trace))

@@ -24,7 +24,7 @@ def training() -> Any:
         sys.path.remove(str(FOLDER))
 
 
-def test_the_file_computes_what_the_trained_weights_do_and_is_right_on_other_data(training: Any) -> None:
+def test_the_model_file_matches_the_trained_weights_and_generalizes(training: Any) -> None:
     session = onnxruntime.InferenceSession(training.MODEL, providers=["CPUExecutionProvider"])
     samples, labels = training.windows(500, np.random.default_rng(training.SEED + 7))
     found = session.run(None, {"shaking": samples.astype(np.float32)})[0][:, 0]

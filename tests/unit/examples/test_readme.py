@@ -56,7 +56,7 @@ def run(command: list[str]) -> str:
     return output
 
 
-def test_the_first_rule_is_as_the_readme_shows_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_readme_shows_the_results_of_its_first_rule(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     for text, name in re.findall(r"^```\w+\n(# (\w+\.\w+).*?)^```", FIRST_RULE, re.MULTILINE | re.DOTALL):
         Path(name).write_text(text)
@@ -74,7 +74,7 @@ OTHERS = [step.command for step in steps(README) if step not in [*steps(FIRST_RU
 
 
 @pytest.mark.parametrize("command", OTHERS, ids=" ".join)
-def test_a_command_that_needs_a_cluster_has_its_files_and_its_options(command: list[str]) -> None:
+def test_commands_that_need_a_cluster_have_existing_files_and_options(command: list[str]) -> None:
     assert command[0] in {"docker", "helm", "kubectl", *APPS}, "a command of another kind: run it in this test"
     for word in command[1:]:
         if re.match(r"(examples|charts|crds)\b", word):
@@ -87,7 +87,7 @@ def test_a_command_that_needs_a_cluster_has_its_files_and_its_options(command: l
             assert option in shown.output
 
 
-def test_the_targets_of_make_are_there() -> None:
+def test_the_make_targets_exist() -> None:
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
     named = set(re.findall(r"`make ([a-z-]+)", README))
     assert {"demo", "test"} <= named <= targets

@@ -25,7 +25,7 @@ points = st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), max_size=4)
 
 @settings(deadline=None)  # the first call imports scipy
 @given(points, points, st.integers(1, 4))
-def test_as_many_pairs_as_there_can_be_and_of_these_the_nearest(first: Any, second: Any, gate: int) -> None:
+def test_the_matching_has_the_most_pairs_and_of_these_the_nearest(first: Any, second: Any, gate: int) -> None:
     found = assigned(first, second, gate)
     assert len(set(found.values())) == len(found)
     assert all(math.dist(first[a], second[b]) <= gate for a, b in found.items())
@@ -40,7 +40,7 @@ def test_as_many_pairs_as_there_can_be_and_of_these_the_nearest(first: Any, seco
     assert sum(math.dist(first[a], second[b]) for a, b in found.items()) == pytest.approx(cost)
 
 
-def test_a_point_lasts_while_it_is_followed_and_restarts_after_a_gap() -> None:
+def test_a_track_lasts_while_it_is_matched_and_restarts_after_a_gap() -> None:
     tracks = Tracks(1.0, 10.0, 3)
     tracks.follow([(0.0, 0.0), (50.0, 0.0)], 1)
     tracks.follow([(0.5, 0.0)], 2)
@@ -76,7 +76,7 @@ def drive(rule: EventRule, *streams: Any) -> PluginDrive:
     return PluginDrive(a_detector(*(streams or STAMPED), clientTimeout="1h"), rule, host=LocalHost())
 
 
-def test_what_the_other_does_not_see_for_long_enough_is_reported() -> None:
+def test_objects_missed_by_the_other_perception_for_long_enough_are_reported() -> None:
     driven = drive(rule(counterparts=LIDAR, persist=1))
     for n in range(6):
         seconds = 0.3 + n / 2
@@ -88,7 +88,7 @@ def test_what_the_other_does_not_see_for_long_enough_is_reported() -> None:
     assert driven.events[0].values["unmatched"] == [{"x": 30.0, "y": 3.0, "seconds": 1.0}]
 
 
-def test_a_counterpart_that_comes_ends_it_and_lists_that_are_not_of_one_time_are_not_compared() -> None:
+def test_a_new_counterpart_ends_the_episode_and_lists_of_different_times_are_not_compared() -> None:
     driven = drive(rule(counterparts=LIDAR, persist=0))
     driven.take(a_list(0.2, "a", "camera", (0, 0)), a_list(0.35, "a", "lidar", (50, 0)), until=0.5)
     assert not driven.events
@@ -110,7 +110,7 @@ def odometry(seconds: float, client: str, x: float, yaw: float) -> Arrival:
 
 
 @pytest.mark.parametrize(("of", "expected"), [("a", (15.0, 0.0)), ("b", (40.0, 0.0))])
-def test_between_two_clients_places_are_brought_into_one_frame_by_their_poses(of: Any, expected: Any) -> None:
+def test_positions_of_two_clients_are_transformed_by_their_poses(of: Any, expected: Any) -> None:
     streams = STAMPED[0], a_stream("pose", encoding="cdr", type="geometry_msgs/msg/PoseStamped")
     placed = {"stream": "camera", "pose": {"stream": "pose"}}
     driven = drive(rule(PAIRS, objects=placed, persist=0, of=of), *streams)
@@ -123,7 +123,7 @@ def test_between_two_clients_places_are_brought_into_one_frame_by_their_poses(of
     assert (found["x"], found["y"]) == pytest.approx(expected)
 
 
-def test_with_a_frame_tf_brings_places_into_it_once_it_is_known() -> None:
+def test_with_a_frame_positions_are_transformed_by_tf_once_it_is_known() -> None:
     objects = {"stream": "camera", "frame": "map"}
     counterparts = {"stream": "lidar", "frame": "map"}
     driven = drive(rule(objects=objects, counterparts=counterparts, persist=0), *STAMPED, tf_stream("tf"))
@@ -136,7 +136,7 @@ def test_with_a_frame_tf_brings_places_into_it_once_it_is_known() -> None:
     assert driven.events[0].values["unmatched"][0]["x"] == pytest.approx(15)
 
 
-def test_objects_without_a_place_are_left_out_and_a_message_without_a_list_is_an_error() -> None:
+def test_objects_without_a_position_are_skipped_and_a_message_without_a_list_is_an_error() -> None:
     driven = drive(rule(counterparts=LIDAR, persist=0))
     driven.take(a_list(0.2, "a", "camera", (1, None)), a_list(0.2, "a", "lidar"), until=1)
     assert not driven.events
@@ -163,6 +163,6 @@ def test_while_a_stream_is_stale_nothing_is_known() -> None:
         ({"objects": {"stream": "camera"}, "of": "c"}, "'a' or 'b'"),
     ],
 )
-def test_parameters_that_make_no_sense_are_refused(parameters: dict[str, Any], reported: str) -> None:
+def test_invalid_parameters_are_rejected(parameters: dict[str, Any], reported: str) -> None:
     with pytest.raises(PluginError, match=reported):
         prepare_plugin("unmatched-objects", parameters, ["camera", "lidar"])

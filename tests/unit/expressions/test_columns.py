@@ -94,7 +94,7 @@ INNER = [
 
 @pytest.mark.parametrize("source", INNER)
 @pytest.mark.parametrize("others", [(), ({"a": None, "b": 1.0, "c": 1.0},)], ids=["numbers", "absent"])
-def test_numbers_where_others_are_required_are_unknown_or_nan_as_in_cel(source: str, others: Sequence[Row]) -> None:
+def test_numbers_of_the_wrong_type_are_unknown_or_nan_as_in_cel(source: str, others: Sequence[Row]) -> None:
     table = Table([*({"a": a, "b": b, "c": 1.0} for a in (0.0, 1.0, -1.0) for b in (1.0, -1.0)), *others])
     expression = ENVIRONMENT.compile(source)
     found, expected = table.by_columns(expression), table.by_cel(expression)
@@ -103,7 +103,7 @@ def test_numbers_where_others_are_required_are_unknown_or_nan_as_in_cel(source: 
     assert all(map(same, found, expected)), (found, expected)
 
 
-def test_equal_parts_of_two_rules_are_one_node() -> None:
+def test_equal_subexpressions_of_two_rules_share_a_node() -> None:
     graph = Graph()
     one = graph.add(ENVIRONMENT.compile("m.a * 2 > m.b && m.c == 'x'"), by_path)
     count = len(graph.nodes)
@@ -127,7 +127,7 @@ REFUSED = (
 
 
 @pytest.mark.parametrize("source", REFUSED)
-def test_what_only_cel_evaluates_leaves_nothing_in_the_graph(source: str) -> None:
+def test_expressions_only_for_cel_leave_no_nodes_in_the_graph(source: str) -> None:
     graph = Graph()
     kept = graph.add(ENVIRONMENT.compile("m.a > 1"), by_path)
     before = list(graph.nodes)
@@ -140,7 +140,7 @@ def test_a_path_without_a_column_is_left_to_cel() -> None:
     assert Graph().add(ENVIRONMENT.compile("m.a > 1 && m.b > 1"), lambda path: "a" if path[-1] == "a" else None) is None
 
 
-def test_leaves_are_shared_by_name_and_only_those_of_the_roots_are_wanted() -> None:
+def test_leaves_are_shared_by_name_and_only_those_of_the_roots_are_requested() -> None:
     graph = Graph()
     root = graph.add(ENVIRONMENT.compile("m.a > m.b"), lambda _: "same")
     other = graph.add(ENVIRONMENT.compile("m.a > m.c"), by_path)
@@ -151,7 +151,7 @@ def test_leaves_are_shared_by_name_and_only_those_of_the_roots_are_wanted() -> N
 
 
 @pytest.mark.parametrize("value", [2.0, True, "x"])
-def test_a_constant_stands_in_place_of_a_leaf(value: bool | float | str) -> None:
+def test_a_constant_can_replace_a_leaf(value: bool | float | str) -> None:
     def leaf(path: Path) -> str | Constant:
         return Constant(value) if path[-1] == "b" else str(path[-1])
 
@@ -183,7 +183,7 @@ def test_results_have_a_value_for_each_row(source: str, count: int) -> None:
     assert [part.shape for part in results.truths([graph.truth(root)] * 2)] == [(2, count)] * 2
 
 
-def test_has_distinguishes_a_missing_field_from_one_without_a_map_to_be_in() -> None:
+def test_has_distinguishes_a_missing_field_from_a_missing_parent() -> None:
     expression = ENVIRONMENT.compile("has(m.a.b)")
     messages: list[object] = [{"a": {"b": 1.0}}, {"a": {"b": [2.0]}}, {"a": {}}, {"a": {"b": None}}, {"a": 1.0}, {}]
     leaves = [1.0, [2.0], MISSING, None, NOWHERE, NOWHERE]
@@ -232,7 +232,7 @@ def test_only_rows_that_columns_cannot_decide_are_foreign(source: str, row: Row,
     assert ([False] * 3 if foreign is None else foreign.tolist()) == [False, expected, False]
 
 
-def test_a_leaf_of_two_names_is_foreign_to_both() -> None:
+def test_a_foreign_value_of_a_leaf_with_two_names_is_foreign_under_both() -> None:
     table, graph = Table([{"x": 1.0}, {"x": 2**60}, {"x": "y"}]), Graph()
     roots = [graph.add(ENVIRONMENT.compile(source), lambda _: "x") for source in ("m.a > 1", "d > 1", "m.a > m.b")]
     results = table.run(graph, [root for root in roots if root is not None])
@@ -257,7 +257,7 @@ def test_results_outlive_later_runs_of_their_program() -> None:
     assert column.values.tolist() == [3.0] * 1000
 
 
-def test_a_program_stays_as_it_is_when_its_graph_grows() -> None:
+def test_a_program_is_unchanged_when_its_graph_grows() -> None:
     graph = Graph()
     root = graph.add(ENVIRONMENT.compile("m.a > 1"), by_path)
     assert root is not None
@@ -267,7 +267,7 @@ def test_a_program_stays_as_it_is_when_its_graph_grows() -> None:
 
 
 @given(st.lists(ANYTHING))
-def test_columns_give_back_the_values_that_they_are_made_of(values: list[object]) -> None:
+def test_columns_return_the_values_they_are_made_of(values: list[object]) -> None:
     texts, expression = Texts(), ENVIRONMENT.compile("m.a")
     column = column_of(values, texts)
     for row, value in enumerate(values):
@@ -284,7 +284,7 @@ def test_columns_of_integers_keep_each_digit(value: int) -> None:
     assert same(value_at(column, 1, Texts()), expected)
 
 
-def test_columns_of_doubles_alone_have_no_tags() -> None:
+def test_columns_of_only_doubles_have_no_tags() -> None:
     assert column_of([1.0, math.inf], Texts()).tags is None
     column = column_of(
         [1.0, math.nan, UNKNOWN, MISSING, NOWHERE, np.float32(0.5), np.int64(3), np.bool_(True)], Texts()

@@ -42,11 +42,11 @@ def evaluate(source: str, **values: object) -> object:
         ("size(l)", {"l"}),
     ],
 )
-def test_names_are_the_variables_it_reads(source: str, names: set[str]) -> None:
+def test_names_are_the_variables_that_are_read(source: str, names: set[str]) -> None:
     assert ENVIRONMENT.compile(source).names == names
 
 
-def test_paths_are_the_literal_fields_it_reads() -> None:
+def test_paths_are_the_literal_fields_that_are_read() -> None:
     assert ENVIRONMENT.compile('msg.p[2].x > msg["q"].y && has(a.z) && size(l) > 0').paths == {
         ("msg", "p", 2, "x"),
         ("msg", "q", "y"),
@@ -55,7 +55,7 @@ def test_paths_are_the_literal_fields_it_reads() -> None:
     }
 
 
-def test_compiling_again_costs_nothing() -> None:
+def test_compilations_are_cached() -> None:
     assert ENVIRONMENT.compile("distance < 1") is ENVIRONMENT.compile("distance < 1")
     assert ENVIRONMENT.compile("distance < 1", result=CelType.BOOL) is not ENVIRONMENT.compile("distance < 1")
 
@@ -108,7 +108,7 @@ def test_maps_come_back_sorted_in_every_process() -> None:
         ("int", "yields a value of type Type, which is not data"),
     ],
 )
-def test_failures_report_what_is_wrong(source: str, message: str) -> None:
+def test_failures_report_the_cause(source: str, message: str) -> None:
     with pytest.raises(EvaluationError, match=f"^{message}"):
         evaluate(source, a={"region": "north", "none": None}, msg=b"ab", l=[1])
 
@@ -135,7 +135,7 @@ def test_decoded_messages_need_no_conversion() -> None:
     assert ENVIRONMENT.compile("msg.point.y > 3").evaluate_or_unknown({"msg": msg}) is UNKNOWN
 
 
-def test_only_what_is_read_is_touched() -> None:
+def test_only_the_read_fields_are_accessed() -> None:
     class Untouchable(dict[str, object]):
         def __getitem__(self, key: str) -> object:
             assert key == "x"
@@ -145,7 +145,7 @@ def test_only_what_is_read_is_touched() -> None:
     assert evaluate("msg.x > 3 && has(msg.x)", msg=message) is True
 
 
-def test_what_an_expression_is_given_stays_as_it_was() -> None:
+def test_an_expression_does_not_change_its_inputs() -> None:
     values = {"msg": {"a": [1, None, {"b": 2}], "c": (1, 2)}}
     evaluate("[msg, msg.a[2].b, msg.c]", **values)
     assert values == {"msg": {"a": [1, None, {"b": 2}], "c": (1, 2)}}
@@ -171,7 +171,7 @@ def test_what_an_expression_is_given_stays_as_it_was() -> None:
         (b"x", None),
     ],
 )
-def test_normalise_yields_what_cel_takes(value: object, expected: object) -> None:
+def test_normalise_yields_values_that_cel_accepts(value: object, expected: object) -> None:
     result = normalise(value)
     assert result == expected
     assert type(result) is type(expected)
@@ -185,11 +185,11 @@ _JSON = st.recursive(
 
 
 @given(_JSON)
-def test_a_value_goes_through_an_expression_unharmed(value: object) -> None:
+def test_a_value_passes_through_an_expression_unchanged(value: object) -> None:
     assert evaluate("[msg]", msg=value) == [normalise(value)]
 
 
-def test_values_nested_without_end_are_an_error_not_a_crash() -> None:
+def test_endlessly_nested_values_are_an_error_not_a_crash() -> None:
     nested: list[object] = []
     for _ in range(100_000):
         nested = [nested]
@@ -200,7 +200,7 @@ def test_values_nested_without_end_are_an_error_not_a_crash() -> None:
 
 
 @pytest.mark.parametrize("name", ["in", "a-b", "1x", "", "null"])
-def test_a_variable_must_be_one_that_an_expression_can_name(name: str) -> None:
+def test_a_variable_must_have_a_valid_name(name: str) -> None:
     with pytest.raises(ValueError, match="variable"):
         Environment({name: CelType.DYN})
 

@@ -36,7 +36,7 @@ def refusal(source: object) -> ExpressionError:
         ("(" * 100 + "1" + ")" * 100, 1, 1, "the expression is nested too deeply"),
     ],
 )
-def test_the_place_is_that_in_the_authors_text(source: str, line: int, column: int, message: str) -> None:
+def test_errors_are_located_in_the_authors_text(source: str, line: int, column: int, message: str) -> None:
     error = refusal(source)
     assert (error.message, error.line, error.column, error.source) == (message, line, column, source)
     assert str(error).startswith(f"line {line}, column {column}: {message}")
@@ -85,7 +85,7 @@ def test_all_errors_are_reported_in_the_order_of_the_text() -> None:
 
 @given(st.text(alphabet="ab1.[](){}\"'<>=!&|?:+-*/% \n$speed", max_size=30))
 @settings(max_examples=300)
-def test_any_text_compiles_or_is_refused_within_itself(source: str) -> None:
+def test_any_text_compiles_or_is_rejected_with_a_position_inside_it(source: str) -> None:
     try:
         expression = ENVIRONMENT.compile(source)
     except ExpressionError as error:

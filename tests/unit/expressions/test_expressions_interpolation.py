@@ -51,7 +51,7 @@ def refusal(template: Json) -> InterpolationError:
         ("${parameters.huge}", 2.0**80),
     ],
 )
-def test_alone_a_value_keeps_its_type(template: str, expected: Json) -> None:
+def test_a_single_expression_keeps_the_type_of_its_value(template: str, expected: Json) -> None:
     result = render(template)
     assert result == expected
     assert type(result) is type(expected)
@@ -138,7 +138,7 @@ def test_keys_become_text() -> None:
     assert refusal({"${instance.name}": 1, "fusion-1": 2}).message == "two keys render to 'fusion-1'"
 
 
-def test_names_and_paths_are_those_of_all_expressions() -> None:
+def test_names_and_paths_cover_all_expressions() -> None:
     compiled = compile_template({"a": ["${instance.name}"], "${parameters.region}": "x"}, ENVIRONMENT)
     assert compiled.names == {"instance", "parameters"}
     assert compiled.paths == {("instance", "name"), ("parameters", "region")}
@@ -214,7 +214,7 @@ def test_any_text_can_be_written_literally(text: str) -> None:
 
 @given(st.text().filter(lambda text: "\0" not in text))
 @settings(max_examples=100)
-def test_any_value_comes_out_as_it_went_in(value: str) -> None:
+def test_any_value_is_rendered_unchanged(value: str) -> None:
     for template, expected in (("${parameters.v}", value), ("<${parameters.v}>", f"<{value}>")):
         assert compile_template(template, ENVIRONMENT).render({"parameters": {"v": value}}) == expected
 

@@ -44,7 +44,7 @@ def test_a_literal_pattern_matches_and_a_long_string_is_unknown(source: str) -> 
         ('s.matches("([ab]*a[ab]{50}){30}z")', "must take at most 1000 steps"),
     ],
 )  # fmt: skip
-def test_a_pattern_that_is_no_literal_or_too_large_does_not_compile(source: str, logged: str) -> None:
+def test_a_pattern_that_is_not_literal_or_is_too_large_does_not_compile(source: str, logged: str) -> None:
     with pytest.raises(ExpressionError) as refused:
         ENVIRONMENT.compile(source)
     assert logged in str(refused.value)
@@ -65,7 +65,7 @@ def test_a_pattern_that_is_no_literal_or_too_large_does_not_compile(source: str,
         (".{100}", 1000),
     ],
 )
-def test_the_size_of_a_pattern_counts_what_it_repeats(pattern: str, least: int) -> None:
+def test_the_size_of_a_pattern_counts_repetitions(pattern: str, least: int) -> None:
     assert pattern_size(pattern) >= least
 
 
@@ -83,7 +83,7 @@ def test_the_size_of_a_pattern_counts_what_it_repeats(pattern: str, least: int) 
         "\\",
     ],
 )
-def test_patterns_that_people_write_and_broken_ones_are_within_the_bound(pattern: str) -> None:
+def test_usual_and_invalid_patterns_are_within_the_bound(pattern: str) -> None:
     assert pattern_size(pattern) <= LARGEST_PATTERN
 
 

@@ -41,7 +41,7 @@ def frozen() -> Iterator[None]:
         ("msg.x * 2.5", {"x": 2.5}),
     ],
 )
-def test_nothing_is_left_behind(source: str, values: dict[str, Any]) -> None:
+def test_evaluations_leak_no_memory(source: str, values: dict[str, Any]) -> None:
     expression = Environment({"msg": CelType.DYN}).compile(source)
 
     def evaluate(times: int) -> None:
@@ -60,7 +60,7 @@ def test_nothing_is_left_behind(source: str, values: dict[str, Any]) -> None:
     assert min(left_behind() for _ in range(3)) < 100
 
 
-def test_arguments_and_results_stay_whole_for_those_who_keep_them() -> None:
+def test_kept_arguments_and_results_stay_valid() -> None:
     expression = Environment({"msg": CelType.DYN}).compile("utf8(msg.data)")
     texts = [expression.evaluate({"msg": {"data": f"text number {number}".encode()}}) for number in range(1000)]
     gc.collect()

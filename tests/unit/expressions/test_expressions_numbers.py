@@ -78,7 +78,7 @@ def test_strings_are_left_alone(text: str) -> None:
 
 
 @given(st.text())
-def test_text_in_quotes_is_left_alone_whatever_it_is(content: str) -> None:
+def test_text_in_quotes_is_never_changed(content: str) -> None:
     quoted = '"' + "".join("\\" + c if c in '"\\' else c for c in content if c not in "\r\n") + '"'
     assert doubled(quoted).text == quoted
     assert [token.kind for token in tokens(quoted)] == [TokenKind.STRING]
@@ -90,7 +90,7 @@ def test_the_tokens_of_any_text_are_the_text(text: str) -> None:
 
 
 @given(st.text(alphabet="ab12.[]()\"'\n,+-%size", max_size=40))
-def test_every_character_that_stays_points_at_itself(source: str) -> None:
+def test_unchanged_characters_map_to_their_own_position(source: str) -> None:
     result = doubled(source)
     assert len(result.origin) == len(result.text)
     assert list(result.origin) == sorted(result.origin)
@@ -117,7 +117,7 @@ _MEANING = {"d": 3, "x.n": 5, "l[2]": 3, "x.l[i]": 20, "size(l)": 3, "s.size()":
     st.sampled_from(["<", ">", "==", "<=", "!="]),
 )
 @settings(max_examples=150)
-def test_arithmetic_means_what_it_means_in_doubles(steps: list[tuple[str, str]], first: str, comparison: str) -> None:
+def test_arithmetic_is_that_of_doubles(steps: list[tuple[str, str]], first: str, comparison: str) -> None:
     source, expected = first, float(_MEANING.get(first) or int(first))
     for operator, term in steps:
         value = float(_MEANING.get(term) or int(term))
@@ -195,7 +195,7 @@ def test_whole_numbers_are_written_with_all_their_digits(source: str, text: str)
 
 
 @pytest.mark.parametrize("value", [b"ab", [1], {"a": 1}])
-def test_what_has_no_text_is_named_as_the_author_wrote_it(value: object) -> None:
+def test_values_without_text_are_named_by_their_source(value: object) -> None:
     with pytest.raises(EvaluationError, match="`string` does not take a"):
         ENVIRONMENT.compile("string(x)").evaluate(VALUES | {"x": value})
     with pytest.raises(ExpressionError, match="`string` does not take"):

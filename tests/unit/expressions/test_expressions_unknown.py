@@ -117,7 +117,7 @@ def test_nan_deep_inside_a_message_is_unknown_not_false() -> None:
     assert evaluate("has(msg.pose.x)", msg=message) is False
 
 
-def test_nan_in_a_list_shifts_no_index_and_leaves_the_rest_known() -> None:
+def test_nan_in_a_list_keeps_indices_and_other_elements_known() -> None:
     ranges = [float("nan"), 2.0, None, 4.0]
     assert evaluate("l[1] == 2 && l[3] == 4 && size(l) == 4", l=ranges) is True
     assert evaluate("l[0] > 1", l=ranges) is UNKNOWN
@@ -141,7 +141,7 @@ def test_nan_in_a_list_shifts_no_index_and_leaves_the_rest_known() -> None:
         ("msg.data > 3", {"msg": {"data": b"\0"}}),
     ],
 )
-def test_an_input_that_is_not_there_is_distinguished_from_a_fault(source: str, values: dict[str, object]) -> None:
+def test_a_missing_input_is_distinguished_from_a_fault(source: str, values: dict[str, object]) -> None:
     assert reasons(source, **values) == [Reason.ABSENT]
 
 
@@ -164,7 +164,7 @@ def test_a_fault_of_the_expression_is_distinguished_from_an_absent_input(
     assert reasons(source, **values) == [Reason.ERROR]
 
 
-def test_a_boolean_that_turns_out_to_be_none_is_a_fault() -> None:
+def test_a_condition_that_is_not_boolean_is_a_fault() -> None:
     expression = ENVIRONMENT.compile("p", result=CelType.BOOL)
     reported: list[tuple[Reason, str]] = []
     assert expression.evaluate_or_unknown({"p": 3}, lambda *why: reported.append(why)) is UNKNOWN
@@ -172,13 +172,13 @@ def test_a_boolean_that_turns_out_to_be_none_is_a_fault() -> None:
     assert expression.evaluate_or_unknown({"p": True}) is True
 
 
-def test_nothing_is_reported_about_what_is_known() -> None:
+def test_known_values_have_no_reasons() -> None:
     reported: list[object] = []
     assert ENVIRONMENT.compile("d < 3 || p").evaluate_or_unknown({"d": 1.0}, lambda *why: reported.append(why)) is True
     assert reported == []
 
 
-def test_unknown_has_no_truth_and_only_one_instance() -> None:
+def test_unknown_is_a_singleton_without_a_truth_value() -> None:
     assert repr(UNKNOWN) == "unknown"
     assert Unknown() is UNKNOWN
     assert pickle.loads(pickle.dumps(UNKNOWN)) is UNKNOWN

@@ -52,7 +52,7 @@ def test_other_loops_stay(source: str, left: int) -> None:
     assert loops(rest.tree) == left
 
 
-def test_a_fold_is_named_like_no_variable() -> None:
+def test_the_name_of_a_fold_differs_from_declared_variables() -> None:
     environment = Environment({"members": CelType.LIST, "fold0": CelType.DOUBLE})
     rest, folds = folded(environment.compile("size(members) > fold0", result=CelType.BOOL), "members")
     assert list(folds) == ["fold0_"]

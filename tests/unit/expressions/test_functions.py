@@ -40,7 +40,7 @@ def test_the_distance_on_wgs_84_is_karneys_and_a_metric(la1: float, lo1: float, 
 
 
 @given(latitudes, longitudes, st.floats(-1, 1), st.floats(-1, 1))
-def test_the_distance_to_the_other_side_of_the_globe_is_right_to_the_percent(
+def test_the_distance_between_antipodes_is_right_to_one_percent(
     latitude: float, longitude: float, north: float, east: float
 ) -> None:
     opposite = (max(-90.0, min(90.0, -latitude + north)), math.remainder(longitude + 180 + east, 360))
@@ -49,7 +49,7 @@ def test_the_distance_to_the_other_side_of_the_globe_is_right_to_the_percent(
 
 
 @given(st.floats(-85, 85), longitudes, st.floats(0, 360), st.floats(1, 50_000))
-def test_the_bearing_is_the_way_that_was_taken(latitude: float, longitude: float, way: float, metres: float) -> None:
+def test_the_bearing_is_the_direction_travelled(latitude: float, longitude: float, way: float, metres: float) -> None:
     there = Geodesic.WGS84.Direct(latitude, longitude, way, metres)
     assume(abs(there["lat2"]) < 89)
     bearing = wgs84_bearing(latitude, longitude, there["lat2"], there["lon2"])
@@ -69,7 +69,7 @@ def test_a_turn_is_wrapped_and_leads_from_one_heading_to_the_other(start: float,
     )
 
 
-def test_the_turn_across_north_is_the_short_one_and_half_a_turn_is_positive() -> None:
+def test_the_turn_across_north_is_the_shorter_one_and_half_a_turn_is_positive() -> None:
     assert heading_difference(350, 10) == 20
     assert heading_difference(10, 350) == -20
     assert heading_difference(0, 180) == heading_difference(180, 0) == 180
@@ -87,7 +87,7 @@ def test_yaw_pitch_and_roll_are_the_rotations_that_made_the_quaternion(
 
 
 @given(st.lists(grid_points, min_size=3, max_size=8), grid_points, st.integers(0, 7))
-def test_inside_does_not_depend_on_where_and_in_which_direction_the_polygon_begins(
+def test_inside_does_not_depend_on_the_first_corner_or_direction_of_the_polygon(
     polygon: list[tuple[float, float]], point: tuple[float, float], start: int
 ) -> None:
     found = inside(*point, polygon)
@@ -118,7 +118,7 @@ def test_inside_a_triangle_is_on_the_same_side_of_all_its_edges(
 
 
 @given(st.floats(-80, 80), longitudes, st.integers(-1, 1))
-def test_inside_of_degrees_knows_no_seam(latitude: float, longitude: float, turns: int) -> None:
+def test_inside_works_across_the_antimeridian(latitude: float, longitude: float, turns: int) -> None:
     def wrapped(degrees: float) -> float:
         return math.remainder(degrees, 360)
 
@@ -165,7 +165,7 @@ def test_time_to_collision_of_a_gap() -> None:
 
 
 @given(places, places, st.floats(0, 2e4))
-def test_unmatched_items_are_those_without_any_neighbour(
+def test_unmatched_items_have_no_neighbour(
     items: list[tuple[float, float]], others: list[tuple[float, float]], within: float
 ) -> None:
     obvious = [i for i, here in enumerate(items) if not any(math.dist(here, there) <= within for there in others)]
@@ -190,7 +190,7 @@ def test_objects_differ_in_height_too() -> None:
 
 
 @given(st.binary(max_size=50) | st.integers(0, 10_000).map(bytes))
-def test_bytes_are_what_they_are(data: bytes) -> None:
+def test_bytes_functions_return_the_exact_bytes(data: bytes) -> None:
     assert all_zero(data) == all_zero(memoryview(data)) == (not any(data))
     assert checksum(data) == zlib.crc32(data)
     assert byte_count(data) == len(data)
@@ -208,5 +208,5 @@ def test_numbers_are_read_where_they_were_packed(integer: int, double: float, be
 
 
 @given(st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0")))
-def test_a_text_comes_back_from_its_bytes(text: str) -> None:
+def test_a_text_round_trips_through_bytes(text: str) -> None:
     assert utf8(text.encode()) == text

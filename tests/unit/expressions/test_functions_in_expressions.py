@@ -42,7 +42,7 @@ def test_a_polygon_may_be_written_or_come_from_a_value_in_any_shape() -> None:
     assert evaluate("msg.areas.exists(p, inside(1, 2, p))", msg={"areas": [[[0, 0], [1, 0], [0, 1]], SQUARE]}) is True
 
 
-def test_what_is_only_an_argument_is_not_converted_and_what_is_read_otherwise_is() -> None:
+def test_values_used_only_as_arguments_are_not_converted() -> None:
     untouched = [{"x": 1.0, "y": 0.0, "no data": object()}, {"x": 9.0, "y": 0.0}]
     assert evaluate("size(msg.items)", msg={"items": untouched}) is UNKNOWN
     assert evaluate("countUnmatched(msg.items, [[1, 0]], 0.5)", msg={"items": untouched}) == 1.0
@@ -118,7 +118,7 @@ def test_a_wrong_call_does_not_compile(source: str, column: int, message: str, h
         ("wgs84Distance(91, 0, 0, 0)", {}, Reason.ERROR, "latitude must be between -90 and 90"),
     ],
 )  # fmt: skip
-def test_what_has_no_answer_is_unknown_and_reports_why(
+def test_functions_without_a_result_are_unknown_with_a_reason(
     source: str, values: dict[str, object], reason: Reason, text: str
 ) -> None:
     found, message = why_unknown(source, **values)
@@ -162,7 +162,7 @@ likely = st.lists(st.tuples(numbers, numbers).map(list) | places, max_size=5) | 
 
 @settings(max_examples=200, deadline=None)
 @given(st.sampled_from(calls()), st.lists(likely, min_size=5, max_size=5))
-def test_whatever_the_arguments_are_there_is_a_value_or_a_reason(call: tuple[str, int], arguments: list[Any]) -> None:
+def test_any_arguments_give_a_value_or_a_reason(call: tuple[str, int], arguments: list[Any]) -> None:
     source, count = call
     reported: list[str] = []
     result = ARGUMENTS.compile(source).evaluate_or_unknown(
@@ -174,7 +174,7 @@ def test_whatever_the_arguments_are_there_is_a_value_or_a_reason(call: tuple[str
         assert isinstance(result, float | bool | str | list)
 
 
-def test_the_tables_in_the_guides_are_those_of_the_code() -> None:
+def test_the_tables_in_the_guides_match_the_code() -> None:
     for page, of_page in tables().items():
         text = guide(page.removesuffix(".md"))
         assert with_tables(text, of_page) == text, "run `make crds`"

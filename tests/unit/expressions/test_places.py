@@ -91,7 +91,7 @@ def test_headings_are_against_the_line_and_positive_to_the_left() -> None:
     assert at("lane", "heading", 3.0, 0.0) is UNKNOWN
 
 
-def test_on_the_earth_metres_are_those_of_the_ellipsoid() -> None:
+def test_on_the_earth_distances_are_those_of_the_ellipsoid() -> None:
     north = Geodesic.WGS84.Inverse(52.01, 10.005, 52.015, 10.005)["s12"]
     east = Geodesic.WGS84.Inverse(52.0, 10.01, 52.0, 10.02)["s12"]
     assert at("town", "distance", 52.015, 10.005) == pytest.approx(north, rel=1e-3)
@@ -103,7 +103,7 @@ def test_on_the_earth_metres_are_those_of_the_ellipsoid() -> None:
 
 @settings(max_examples=30)
 @given(st.lists(st.tuples(coordinates | st.just(math.inf), coordinates, coordinates), min_size=1, max_size=40))
-def test_columns_have_the_very_numbers_of_single_positions(rows: list[tuple[float, float, float]]) -> None:
+def test_columns_give_the_same_numbers_as_single_positions(rows: list[tuple[float, float, float]]) -> None:
     axes = ("x", "y", "yaw")
     for source in (f'at(p, "{name}").{field}' for name in ("star", "lane", "both") for field in SHAPES[name].fields):
         graph, texts = Graph(), Texts()
@@ -127,7 +127,7 @@ def test_columns_have_the_very_numbers_of_single_positions(rows: list[tuple[floa
 @given(
     *[st.floats(-50, 50) for _ in range(4)], *[st.floats(-7, 7) for _ in range(2)], st.floats(0, 30), st.floats(0, 30)
 )
-def test_another_road_user_in_the_frame_of_ones_own(
+def test_another_road_user_is_located_in_the_own_frame(
     x: float, y: float, u: float, v: float, yaw: float, other: float, speed: float, faster: float
 ) -> None:
     a = {"position": {"x": x, "y": y}, "yaw": yaw, "speed": speed}
@@ -145,7 +145,7 @@ def test_another_road_user_in_the_frame_of_ones_own(
     assert math.cos(math.radians(heading)) == pytest.approx(math.cos(other - yaw), abs=1e-9)
 
 
-def test_another_road_user_on_the_earth() -> None:
+def test_another_road_user_is_located_on_the_earth() -> None:
     a = {"position": {"latitude": 52.0, "longitude": 10.0}, "heading": 90.0, "speed": 10.0}
     b = {"position": {"latitude": 52.001, "longitude": 10.002}, "heading": 0.0, "speed": 5.0}
     found = [compiled(f"seenFrom(a, b).{f}", geographic=True).evaluate({"a": a, "b": b}) for f in FIELDS_SEEN]
@@ -184,7 +184,7 @@ DETECTOR = a_detector(
         ("pose", 'at(position, "crossing").inside + 1', "does not take (bool, double)"),
     ],
 )  # fmt: skip
-def test_what_is_wrong_with_the_use_of_a_place_is_located(stream: str, value: str, message: str) -> None:
+def test_invalid_uses_of_a_place_are_located(stream: str, value: str, message: str) -> None:
     rule = a_rule(signals=[{"name": "s", "stream": stream, "value": value}], when="true")
     with pytest.raises(RuleError, match="signals") as error:
         compile_rule(rule, DETECTOR)
@@ -221,7 +221,7 @@ def test_a_pair_has_no_direction_to_compare_with_a_line() -> None:
         compile_rule(a_rule(scope=pairs, when='1 < at(a.position, "stop").heading'), DETECTOR)
 
 
-def test_problems_of_a_rule_alone_are_none_of_places() -> None:
+def test_problems_of_a_rule_are_not_attributed_to_places() -> None:
     for when in ('at(a.position, "anywhere").inside', "seenFrom(a, b).ahead > 3"):
         assert own_problems(a_rule(scope={"pairs": {"position": {"stream": "x"}, "within": 5}}, when=when)) == ()
 
@@ -242,13 +242,13 @@ def test_problems_of_a_rule_alone_are_none_of_places() -> None:
         ),
     ],
 )
-def test_what_is_wrong_with_a_place_is_located(place: dict[str, Any], message: str) -> None:
+def test_invalid_places_are_located(place: dict[str, Any], message: str) -> None:
     detector = a_detector(a_stream("pose"), places=[{"name": "p", **place}])
     (problem,) = place_problems(detector)
     assert message in str(problem)
 
 
-def test_another_place_of_the_same_name_makes_another_rule() -> None:
+def test_a_changed_place_of_the_same_name_changes_the_rule() -> None:
     rule = a_rule(signals=[{"name": "s", "stream": "pose", "value": 'at(position, "stop").across'}], when="s > 0")
     pose = a_stream("pose", position={"x": "msg.x", "y": "msg.y"})
     digests = [
@@ -262,7 +262,7 @@ def test_every_field_is_a_field_of_some_place() -> None:
     assert {field for shape in SHAPES.values() for field in shape.fields} == FIELDS_AT.keys()
 
 
-def test_the_guide_is_in_step() -> None:
+def test_the_guides_examples_and_tables_match_the_code() -> None:
     text = guide("places")
     detector, rule, maps, pair = (yaml.safe_load(block) for block in yaml_blocks(text))
     known = a_detector(*detector["spec"]["streams"], places=detector["spec"]["places"])

@@ -73,7 +73,7 @@ def test_modules_and_folders_that_architecture_engine_and_decisions_name_exist()
     assert [each for each in named if not any((folder / each[1]).exists() for folder in PACKAGES)] == []
 
 
-def test_what_troubleshooting_quotes_occurs_in_the_code() -> None:
+def test_quotes_in_troubleshooting_occur_in_the_code() -> None:
     """A quoted word is a whole string or a member of an enum; a quote with spaces or … is a part of one string."""
     strings = set(_strings())
     quotes = [

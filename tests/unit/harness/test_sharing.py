@@ -37,7 +37,7 @@ def worker(folder: Path) -> subprocess.Popen[str]:
     return started
 
 
-def test_it_is_started_once_stopped_after_the_last_and_started_again_for_one_that_comes_later(tmp_path: Path) -> None:
+def test_a_shared_server_starts_once_stops_after_the_last_user_and_restarts_for_later_ones(tmp_path: Path) -> None:
     log = tmp_path / "log"
     first, second = worker(tmp_path), worker(tmp_path)
     assert first.stdin is not None
@@ -51,7 +51,7 @@ def test_it_is_started_once_stopped_after_the_last_and_started_again_for_one_tha
     assert log.read_text() == "started\nstopped\n" * 2
 
 
-def test_a_worker_that_is_killed_holds_up_no_other(tmp_path: Path) -> None:
+def test_a_killed_worker_blocks_no_other(tmp_path: Path) -> None:
     first, second = worker(tmp_path), worker(tmp_path)
     second.kill()
     second.communicate()

@@ -34,12 +34,12 @@ def test_open_tasks_are_counted_at_their_most() -> None:
     assert most_open(np.array([0.0, 10, 20, 30]), np.array([15.0, 25, 26, 40])) == 2
 
 
-def test_a_manager_serves_one_task_after_the_other() -> None:
+def test_a_simulated_manager_serves_tasks_one_by_one() -> None:
     found = waits(np.array([0.0, 1, 1, 10]), 2.0, 1, np.random.default_rng(SEED))
     assert sorted(found) == [0, 0, 0, 1, 3]  # the first 0 is of nobody: an empty queue
 
 
-def test_an_assumption_that_does_not_exist_or_is_no_number_is_refused() -> None:
+def test_an_unknown_or_non_numeric_assumption_is_rejected() -> None:
     assert assumptions(["episodes=2"]).episodes == 2
     for given, problem in (
         ("episode=2", "there are load, "),

@@ -34,7 +34,7 @@ def test_an_attempt_is_repeated_until_it_succeeds_and_after_the_pause_that_its_f
     assert pauses == [1.0, 2.0]
 
 
-def test_another_error_than_the_expected_one_is_raised_at_once() -> None:
+def test_an_unexpected_error_is_raised_at_once() -> None:
     def attempt() -> None:
         raise ValueError("a defect")
 

@@ -47,7 +47,7 @@ def refused(code: int, seconds: int | None) -> web.Response:
 
 
 @pytest.mark.parametrize("code", [429, 503])
-def test_what_the_api_server_did_not_look_at_is_sent_again_after_its_time_and_nothing_meanwhile(code: int) -> None:
+def test_rejected_requests_are_resent_after_retry_after_and_none_is_sent_meanwhile(code: int) -> None:
     came: list[float] = []
 
     async def handle(_: web.Request) -> web.Response:
@@ -69,7 +69,7 @@ def test_what_the_api_server_did_not_look_at_is_sent_again_after_its_time_and_no
     assert came[1] - came[0] >= 1.0
 
 
-def test_a_refusal_without_a_time_is_the_callers_matter() -> None:
+def test_a_rejection_without_retry_after_is_raised_to_the_caller() -> None:
     async def handle(_: web.Request) -> web.Response:
         return refused(503, None)
 
@@ -97,7 +97,7 @@ def test_an_api_server_that_always_requests_a_wait_is_reported_in_the_end(monkey
     asyncio.run(scenario())
 
 
-def test_no_more_requests_are_under_way_than_allowed() -> None:
+def test_concurrent_requests_are_bounded() -> None:
     under_way, most = 0, 0
 
     async def handle(_: web.Request) -> web.Response:
@@ -116,7 +116,7 @@ def test_no_more_requests_are_under_way_than_allowed() -> None:
     assert most == 3
 
 
-def test_one_that_may_not_act_reads_but_writes_nothing() -> None:
+def test_a_client_that_may_not_act_reads_but_does_not_write() -> None:
     methods: list[str] = []
 
     async def handle(request: web.Request) -> web.Response:
@@ -135,7 +135,7 @@ def test_one_that_may_not_act_reads_but_writes_nothing() -> None:
 
 
 @pytest.mark.parametrize("looks", [1, 2])
-def test_a_write_whose_time_ends_before_it_is_sent_is_not_sent(looks: int) -> None:
+def test_a_write_whose_deadline_passes_before_it_is_sent_is_not_sent(looks: int) -> None:
     """As if the process is suspended during a request and resumes when another one is active."""
     answers = [10.0] * looks
     methods: list[str] = []
@@ -155,7 +155,7 @@ def test_a_write_whose_time_ends_before_it_is_sent_is_not_sent(looks: int) -> No
     assert fence.writing.get() is None
 
 
-def test_a_write_is_given_up_when_its_time_is_over_and_the_api_server_knows_it() -> None:
+def test_a_write_is_aborted_at_its_deadline_which_the_api_server_knows() -> None:
     queries: list[str] = []
 
     async def handle(request: web.Request) -> web.Response:

@@ -42,7 +42,7 @@ def test_the_server_is_that_of_the_file(monkeypatch: pytest.MonkeyPatch, tmp_pat
         (VALID.replace("server:", "certificate-authority: /nope, server:").encode(), "/nope"),
     ],
 )
-def test_what_cannot_be_used_is_reported_with_file_reason_and_remedy(
+def test_an_unusable_kubeconfig_is_reported_with_file_reason_and_remedy(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, content: bytes | None, reason: str
 ) -> None:
     file = tmp_path / "config"

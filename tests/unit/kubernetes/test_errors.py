@@ -64,7 +64,7 @@ def error_of(response: web.Response) -> ApiError:
         (503, "ServiceUnavailable", False),
     ],
 )
-def test_each_answer_is_its_kind_of_error(code: int, reason: str, permanent: bool) -> None:
+def test_each_response_maps_to_its_error_class(code: int, reason: str, permanent: bool) -> None:
     error = error_of(web.json_response({"reason": reason, "message": "so it is"}, status=code))
     assert (error.code, error.reason, error.permanent) == (code, reason, permanent)
     assert error.exists == (reason == "AlreadyExists")
@@ -72,7 +72,7 @@ def test_each_answer_is_its_kind_of_error(code: int, reason: str, permanent: boo
 
 
 @pytest.mark.parametrize("body", [b"<html>bad gateway</html>", b"", b"[1]", b"\xff", b'"text"'])
-def test_an_answer_that_is_no_status_is_still_an_error(body: bytes) -> None:
+def test_a_response_without_a_status_object_is_still_an_error(body: bytes) -> None:
     error = error_of(web.Response(body=body, status=502))
     assert (error.code, error.permanent) == (502, False)
 

@@ -146,7 +146,7 @@ def test_a_lease_that_vanishes_is_not_taken_before_its_manager_must_have_noticed
     assert second.may_take(5.0 + DURATION)
 
 
-def test_one_whose_lease_was_taken_may_not_act_however_much_time_it_thinks_it_has() -> None:
+def test_a_candidate_whose_lease_was_taken_may_not_act() -> None:
     server, first, second = two_candidates()
     stored(first, server, 0.0)
     second.observe(server.lease, 0.0)
@@ -176,6 +176,6 @@ def test_the_lease_of_a_pod_is_in_its_namespace(monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.mark.parametrize("given", ["wayside-town", "system/wayside-town", "system/"])
-def test_a_name_that_is_a_detectors_is_refused(given: str) -> None:
+def test_an_invalid_lease_name_is_rejected(given: str) -> None:
     with pytest.raises(ValueError, match="must be NAME or NAMESPACE/NAME"):
         lease_key(given, ())

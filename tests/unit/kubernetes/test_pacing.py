@@ -36,7 +36,7 @@ def test_the_share_stays_where_few_requests_wait() -> None:
     assert set(served(share, cores=3, others=0, writes=500)) == {4}
 
 
-def test_a_server_that_has_become_slower_for_good_is_the_new_measure_after_a_while() -> None:
+def test_a_permanently_slower_server_becomes_the_new_baseline() -> None:
     share = CongestionWindow()
     served(share, cores=2, others=0, writes=100)
     assert served(share, cores=2, others=16, writes=100, began=PERIOD)[-1] == 1
@@ -71,7 +71,7 @@ def test_namespaces_take_turns_and_none_has_more_than_its_share() -> None:
 
 
 @pytest.mark.parametrize("waits", [True, False])
-def test_one_that_is_cancelled_leaves_its_place_to_the_next(waits: bool) -> None:
+def test_a_cancelled_request_leaves_its_place_to_the_next(waits: bool) -> None:
     async def scenario() -> None:
         pacing = Pacing(1, CongestionWindow())
 

@@ -48,7 +48,7 @@ def test_while_the_file_is_away_the_last_token_serves_and_that_is_reported_once(
 
 
 @pytest.mark.parametrize(("file", "text"), [("token", ""), ("token", None), ("ca.crt", ""), ("ca.crt", None)])
-def test_a_file_that_lacks_is_named(folder: Path, file: str, text: str | None) -> None:
+def test_a_missing_file_is_named(folder: Path, file: str, text: str | None) -> None:
     (folder / file).unlink()
     if text is not None:
         (folder / file).write_text(text)
@@ -56,7 +56,7 @@ def test_a_file_that_lacks_is_named(folder: Path, file: str, text: str | None) -
         use_pod_account(Configuration(), folder)
 
 
-def test_an_environment_that_is_no_pods_is_reported(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_environment_outside_a_pod_is_reported(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("KUBERNETES_SERVICE_PORT")
     with pytest.raises(AccountError, match="KUBERNETES_SERVICE_PORT"):
         use_pod_account(Configuration(), folder)

@@ -79,7 +79,7 @@ async def test_a_key_requested_while_it_runs_is_worked_on_once_more_and_never_tw
 
 
 @in_a_loop
-async def test_it_is_idle_only_when_no_key_waits_and_none_is_worked_on() -> None:
+async def test_the_queue_is_idle_only_without_waiting_and_running_keys() -> None:
     begun, more = asyncio.Event(), asyncio.Event()
 
     async def work(key: str) -> None:
@@ -101,7 +101,7 @@ async def test_it_is_idle_only_when_no_key_waits_and_none_is_worked_on() -> None
 
 
 @pytest.mark.parametrize("error", [Unreachable("gone"), ApiError(503, "busy"), ValueError("a defect")])
-def test_a_failure_is_tried_again_and_stops_nobody_else(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_key_is_retried_and_blocks_no_other(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(workqueue, "FIRST_PAUSE", 0.01)
     done: list[str] = []
 
@@ -125,7 +125,7 @@ def test_a_failure_is_tried_again_and_stops_nobody_else(error: Exception, monkey
     assert done == ["bad", "good", "bad", "bad"]
 
 
-def test_what_the_api_server_requests_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_retry_after_of_the_api_server_is_honoured(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(workqueue, "FIRST_PAUSE", 0.01)
     at: list[float] = []
 
@@ -163,7 +163,7 @@ async def test_the_earliest_time_requested_counts() -> None:
 
 
 @in_a_loop
-async def test_a_queue_that_comes_after_another_waits_while_that_has_work() -> None:
+async def test_a_subordinate_queue_waits_while_the_other_has_work() -> None:
     done: list[str] = []
     finished = asyncio.Event()
 
@@ -186,7 +186,7 @@ async def test_a_queue_that_comes_after_another_waits_while_that_has_work() -> N
 
 
 @in_a_loop
-async def test_a_worker_whose_cancellation_is_lost_to_an_error_ends_all_the_same() -> None:
+async def test_a_worker_whose_cancellation_is_masked_by_an_error_still_ends() -> None:
     begun = asyncio.Event()
     times = 0
 
@@ -270,7 +270,7 @@ def test_no_namespace_has_more_workers_than_its_share() -> None:
 
 
 @in_a_loop
-async def test_a_queue_yields_to_the_one_before_it_in_the_same_namespace_alone() -> None:
+async def test_a_subordinate_queue_waits_only_within_the_same_namespace() -> None:
     done: list[tuple[str, str]] = []
     both = asyncio.Event()
 

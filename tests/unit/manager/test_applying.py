@@ -53,7 +53,7 @@ def applied(
 
 
 @pytest.mark.parametrize("owner", [None, OTHER])
-def test_an_object_that_is_not_the_instances_own_is_left_alone_and_nothing_is_pruned(owner: Any) -> None:
+def test_a_foreign_object_is_left_alone_and_nothing_is_pruned(owner: Any) -> None:
     server = MemoryServer(there("taken", owner), there("old", APP, "uid-old"))
     found = applied(server, "taken", "free", known=LastApplied("before", {key("old"): "uid-old"}))
     assert (found.state.holds, found.state.reason, found.complete) == (False, "ObjectExists", False)
@@ -61,14 +61,14 @@ def test_an_object_that_is_not_the_instances_own_is_left_alone_and_nothing_is_pr
     assert {each.name for each in found.objects} == {"taken", "free", "old"}
 
 
-def test_an_object_that_was_replaced_since_it_was_looked_at_is_no_victim() -> None:
+def test_an_object_replaced_since_it_was_read_is_left_alone() -> None:
     server = MemoryServer(there("a", APP, "uid-old"))
     found = applied(server, "a", meanwhile=there("a", OTHER, "uid-new"))
     assert found.state.reason == "Waiting"
     assert server.written == []
 
 
-def test_what_the_rendering_has_no_more_is_pruned_where_it_is_still_the_instances_own() -> None:
+def test_objects_no_longer_rendered_are_pruned_if_still_owned() -> None:
     server = MemoryServer(there("old", APP, "uid-old"), there("taken-over", OTHER, "uid-taken"))
     known = LastApplied("before", {key("old"): "uid-old", key("taken-over"): "uid-taken", key("gone"): "uid-gone"})
     found = applied(server, "new", known=known)
@@ -90,7 +90,7 @@ def reconciled(*manifests: Object) -> tuple[MemoryServer, ClusterCache]:
     return server, cache
 
 
-def test_the_status_names_what_will_belong_to_the_instance_before_it_is_applied() -> None:
+def test_the_status_lists_new_objects_before_they_are_applied() -> None:
     server, cache = reconciled(config("a"), config("b"))
     assert server.written[-3:] == [
         ("status", "ApplicationInstance", "app"),
@@ -104,7 +104,7 @@ def test_the_status_names_what_will_belong_to_the_instance_before_it_is_applied(
     assert cache.records[NAME].applied.complete
 
 
-def test_while_a_template_cannot_be_rendered_what_runs_stays_as_it_is_and_is_not_forgotten() -> None:
+def test_objects_stay_and_remain_listed_while_their_template_cannot_be_rendered() -> None:
     server, cache = reconciled(config("a", x="${parameters.nothing}"))
     assert [each for each in server.written if each[1] == "ConfigMap"] == []
     record = cache.records[NAME]

@@ -46,7 +46,7 @@ def samples(measures: Measures) -> dict[tuple[str, ...], float]:
     }
 
 
-def test_tasks_instances_and_templates_are_counted_by_what_they_are() -> None:
+def test_tasks_instances_and_templates_are_counted_by_state() -> None:
     cache, measures = ClusterCache(Policy()), Measures()
     measures.registry.register(Overview(cache, lambda: [("task", 3, 1)]))
     cache.store.put(raw(task("a"), phase="Ready"))
@@ -83,7 +83,7 @@ def test_requests_events_and_times_are_counted() -> None:
     assert found["refusals_total", "Conflict"] == 1
 
 
-def test_a_queue_reports_how_long_its_work_took_and_what_failed() -> None:
+def test_a_queue_reports_durations_and_failures() -> None:
     measures, failures = Measures(), [ApiError(503, "busy")]
 
     async def scenario() -> None:
@@ -111,7 +111,7 @@ def test_a_queue_reports_how_long_its_work_took_and_what_failed() -> None:
     assert found["reconcile_seconds_count", "task"] >= 2
 
 
-def test_pages_are_served_and_what_is_missing_is_503() -> None:
+def test_pages_are_served_with_503_while_not_ready() -> None:
     async def scenario() -> None:
         lacks: list[str] = ["not yet"]
         measures = Measures()
@@ -137,7 +137,7 @@ def test_pages_are_served_and_what_is_missing_is_503() -> None:
     asyncio.run(scenario())
 
 
-def test_an_object_that_changes_all_the_time_is_reported_now_and_then() -> None:
+def test_a_frequently_changing_object_is_reported_at_a_limited_rate() -> None:
     buckets = TokenBuckets()
     assert [buckets.take("a", 0.0) for _ in range(BURST + 2)] == [True] * BURST + [False] * 2
     assert buckets.take("b", 0.0)

@@ -103,7 +103,7 @@ def answers(session: zenoh.Session, key: str) -> list[bytes]:
     return [reply.ok.payload.to_bytes() for reply in session.get(key) if reply.ok is not None]
 
 
-def test_what_changes_while_the_connection_is_lost_is_published_once_it_is_back() -> None:
+def test_changes_during_a_lost_connection_are_published_after_it_is_restored() -> None:
     endpoint = free_endpoint()
     wire = TcpProxy(int(endpoint.rpartition(":")[2]))
     with router(listen__endpoints=[endpoint]) as network:
@@ -154,7 +154,7 @@ def test_the_key_names_namespace_and_instance() -> None:
 
 
 @pytest.mark.parametrize("given", [["zenoh:7447"], ["tcp/zenoh:7447", "nowhere"], ["/no/such/file.json5"]])
-def test_what_is_neither_endpoint_nor_file_is_refused(given: list[str]) -> None:
+def test_a_value_that_is_neither_endpoint_nor_file_is_rejected(given: list[str]) -> None:
     with pytest.raises(ConfigurationError, match="--zenoh"):
         settings(given)
 

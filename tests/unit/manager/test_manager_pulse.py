@@ -41,7 +41,7 @@ async def read(settings: kopf.OperatorSettings, pause: float) -> int:
     return count
 
 
-def test_kopfs_own_timeout_cancels_who_reads_and_ours_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_our_watch_timeout_does_not_cancel_the_reader_as_kopfs_does(monkeypatch: pytest.MonkeyPatch) -> None:
     async def kopfs() -> int:
         settings = kopf.OperatorSettings()
         settings.watching.inactivity_timeout = 0.01

@@ -65,7 +65,7 @@ def lines(caplog: pytest.LogCaptureFixture) -> list[str]:
     return [each.getMessage() for each in caplog.records if " Events since" in each.getMessage()]
 
 
-def test_thousands_that_do_not_fit_are_two_lines_with_their_count(caplog: pytest.LogCaptureFixture) -> None:
+def test_thousands_of_dropped_events_are_two_log_lines_with_their_count(caplog: pytest.LogCaptureFixture) -> None:
     server = RejectingServer()
     events = Recorder(cast("Client", server))
 
@@ -82,7 +82,7 @@ def test_thousands_that_do_not_fit_are_two_lines_with_their_count(caplog: pytest
     assert last.startswith("dropped 999 Events since the last report; the last one: Accepted about t999: ")
 
 
-def test_what_is_dropped_later_is_reported_when_its_time_has_come_though_no_further_event_comes(
+def test_later_drops_are_reported_after_a_minute_without_a_further_event(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(recorder, "_REPORT_EVERY", 0.2)

@@ -37,7 +37,7 @@ class GoingServer:
         self.written.append(of)
 
 
-def test_an_instance_that_goes_while_its_release_is_checked_stays_gone_while_its_holder_is_lost() -> None:
+def test_an_instance_deleted_during_its_release_check_is_not_recreated() -> None:
     lost = task("a", {"place": "west"}, holder="town", accepted_condition=("False", "HolderLost", NOW - 100))
     going = instance(NAME[1], key="west", release_at=NOW - 1e8)
     cache = a_cache(raw(template(**KEYED), 1), raw(going, 2), task=lost)

@@ -41,12 +41,12 @@ def test_an_api_server_that_is_away_or_overloaded_is_waited_for_and_it_is_report
 
 
 @pytest.mark.parametrize("code", [401, 403, 400])
-def test_what_waiting_cannot_change_is_reported_at_once(code: int) -> None:
+def test_permanent_errors_are_reported_at_once(code: int) -> None:
     with pytest.raises(ApiError, match="no"):
         requested(ApiError(code, "no"))
 
 
-def test_an_answer_at_once_is_not_commented(caplog: pytest.LogCaptureFixture) -> None:
+def test_an_immediate_answer_is_not_logged(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
     assert requested() == "answer"
     assert caplog.records == []

@@ -28,13 +28,13 @@ def test_the_newest_version_wins_in_any_order(order: list[int]) -> None:
     assert entry.version == 4
 
 
-def test_the_same_version_again_is_no_event() -> None:
+def test_a_known_version_is_not_an_event() -> None:
     store = Store([])
     assert store.put(raw(1)) is not None
     assert store.put(raw(1)) is None
 
 
-def test_what_was_deleted_does_not_come_back_from_an_old_list() -> None:
+def test_a_deleted_object_does_not_return_from_an_old_list() -> None:
     store = Store([])
     store.put(raw(1))
     assert store.remove(raw(5)) is not None
@@ -42,14 +42,14 @@ def test_what_was_deleted_does_not_come_back_from_an_old_list() -> None:
     assert store.put(raw(7, uid="another")) is not None
 
 
-def test_the_end_of_a_predecessor_leaves_the_successor() -> None:
+def test_deleting_a_former_object_keeps_its_successor() -> None:
     store = Store([])
     store.put(raw(7, uid="successor"))
     assert store.remove(raw(8, uid="predecessor")) is None
     assert store.get(KIND, NAME) is not None
 
 
-def test_a_list_shows_what_is_gone_but_nothing_that_is_newer_than_itself() -> None:
+def test_a_list_removes_missing_objects_but_none_newer_than_itself() -> None:
     store = Store([])
     for each in (raw(1, "a", "gone"), raw(2, "b", "kept"), raw(9, "c", "newer"), raw(1, "d", "other", "elsewhere")):
         store.put(each)
@@ -57,7 +57,7 @@ def test_a_list_shows_what_is_gone_but_nothing_that_is_newer_than_itself() -> No
     assert [entry.raw["metadata"]["name"] for entry in missing] == ["gone"]
 
 
-def test_an_object_that_is_no_model_is_kept_with_the_reason() -> None:
+def test_an_invalid_object_is_kept_with_the_reason() -> None:
     kind = ("wayside.dev/v1alpha1", "ApplicationTask")
     store = Store([kind])
     task = {**raw(1), "apiVersion": kind[0], "kind": kind[1], "spec": {"templateName": 7}}

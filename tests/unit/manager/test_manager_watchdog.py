@@ -40,16 +40,16 @@ def test_an_event_loop_that_hangs_is_ended() -> None:
     assert "the event loop has not run for" in str(ended_by(lambda: None, hangs=True, silent=0.2))
 
 
-def test_what_has_stalled_is_ended_if_it_lasts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stall_that_persists_ends_the_process(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(watchdog, "PERSISTENT", 0.2)
     assert ended_by(lambda: "no resync has completed for 300 s") == "no resync has completed for 300 s"
 
 
-def test_one_that_works_is_left_alone() -> None:
+def test_a_working_manager_is_left_alone() -> None:
     assert ended_by(lambda: None) is None
 
 
-def test_the_process_ends_with_a_line_and_where_it_hangs() -> None:
+def test_the_process_ends_with_a_log_line_and_the_stack_trace() -> None:
     program = """
 import asyncio, time
 from application_manager.running.watchdog import watchdog
@@ -68,7 +68,7 @@ asyncio.run(main())
     assert "in hanging" in done.stderr
 
 
-def test_a_worker_that_is_at_one_key_for_too_long_has_stalled() -> None:
+def test_a_worker_that_exceeds_its_time_for_a_key_has_stalled() -> None:
     async def scenario() -> tuple[str | None, str | None, str | None]:
         begun = asyncio.Event()
 

@@ -10,7 +10,7 @@ from tests.driving import a_deploy, a_detector, a_rule, a_stream
 SIGNALS = [{"name": "v", "stream": "odom", "value": "msg.v"}]
 
 
-def test_a_rule_has_another_key_with_what_it_depends_on_and_with_nothing_else(tmp_path: Path) -> None:
+def test_the_cache_key_of_a_rule_covers_exactly_its_dependencies(tmp_path: Path) -> None:
     map_file = tmp_path / "map.geojson"
     map_file.write_text("{}")
     detector = a_detector(a_stream("odom"), maps=[{"file": str(map_file)}])
