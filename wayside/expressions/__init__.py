@@ -1,4 +1,4 @@
-"""CEL for both programs: numbers are doubles, unknowns follow Kleene, and texts may hold `${…}`."""
+"""CEL for both programs: numbers are doubles, unknown values follow Kleene's logic, and strings may contain `${…}`."""
 
 from wayside.expressions.cel import RESERVED_WORDS, CelType, Environment, Expression, Value
 from wayside.expressions.errors import EvaluationError, ExpressionError, InterpolationError

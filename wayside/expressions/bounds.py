@@ -1,13 +1,12 @@
-"""Bounds of what an expression may cost: the size of its result, and of the regular expressions in it.
+"""Bounds on the cost of an expression: the size of its values, and of the regular expressions in it.
 
-A short expression could fill the memory. CEL bounds how often a loop runs, and how deep an expression is nested, but
-not how large a value becomes: `[text].map(a, a + a)[0]`, within itself and again, doubles it each time. So each literal
-and each variable counts as one, what is put together counts as its parts do, and a loop's variable as what the loop
-runs over.
+A short expression could fill the memory. CEL bounds the iterations of loops and the nesting of expressions, but not the
+size of values: each nesting of `[text].map(a, a + a)[0]` in itself doubles the value. So a literal or variable has size
+one, a composed value has the sum of the sizes of its parts, and the variable of a loop has the size of the list.
 
-RE2's time is linear in the text, but also in its program, and the program grows with counted repetitions:
-`([ab]{50}){3}` is 150 classes. So the pattern of `matches` must be a literal, whose size is estimated here from its
-text, and its input is bounded. One match then takes some 0.1 s at the very worst.
+RE2's time is linear in the input and in the size of its program, and the program grows with counted repetitions:
+`([ab]{50}){3}` has 150 classes. So the pattern of `matches` must be a literal, whose size is estimated here, and its
+input is bounded. In the worst case, one match takes about 0.1 s.
 """
 
 from __future__ import annotations
@@ -20,23 +19,23 @@ from typing import Final
 from wayside.expressions.syntax import Call, Collection, Loop, Name, Node, Scalar, Select
 
 LARGEST_PATTERN: Final = 1000
-"""The most instructions of a pattern: a name of Kubernetes with its lengths takes some 200."""
+"""The maximum number of instructions of a pattern. A pattern for a Kubernetes name with its lengths has about 200."""
 
 LONGEST_INPUT: Final = 4096
-"""Bytes (UTF-8) of a text that `matches` takes."""
+"""The maximum length of the input of `matches`, in bytes (UTF-8)."""
 
 BOUNDED: Final = "bounded"
-"""Not for authors: the function that `matches` is given its text by."""
+"""An internal function that checks the input of `matches`."""
 
 _REPEAT: Final = re.compile(r"\{([0-9]+)(,([0-9]*))?\}")
 _NAMED: Final = re.compile(r"\{\^?\w*\}|.", re.DOTALL)
 _CODE: Final = re.compile(r"\{[0-9A-Fa-f]*\}|[0-9A-Fa-f]{2}")
 _GROUP: Final = re.compile(r"\?(P?<\w+>|[a-zA-Z-]*:?)")
-_ANY: Final = 10  # instructions of a class with most of Unicode in it, in UTF-8
-_PROPERTY: Final = 300  # of a class like \pL, the largest of which have some 600
+_ANY: Final = 10  # instructions of a class that contains most of Unicode, in UTF-8
+_PROPERTY: Final = 300  # instructions of a class like \pL; the largest classes have about 600
 
 MOST = 1000
-"""The maximum number of copies of its parts in a value. Expressions in practice have a handful."""
+"""The maximum size of a value, as the number of copies of its parts. Real expressions have a handful."""
 
 _ONE_OF = ("_?_:_", "_[_]", "_[?_]")
 _SCALARS = frozenset(
@@ -45,11 +44,11 @@ _SCALARS = frozenset(
         "_*_", "_/_", "_%_", "size", "bool", "double", "int", "uint", "contains", "startsWith", "endsWith", "matches",
     }
 )  # fmt: skip
-"""Operators and functions whose result is always a number or a truth."""
+"""Operators and functions whose result is always a number or a boolean."""
 
 
 def growth(node: Node) -> int:
-    """The most copies of literals and variables that any value on the way may hold."""
+    """The maximum size of any value of the evaluation, as the number of copies of literals and variables."""
     largest = 0
 
     def copies(node: Node, known: Mapping[str, int]) -> int:
@@ -85,7 +84,7 @@ def growth(node: Node) -> int:
 
 @dataclass
 class _Group:
-    """A group that is still open: the size of what it holds, and of its last part, which a repetition repeats."""
+    """An open group: its size, and the size of its last part, to which a repetition applies."""
 
     size: int = 2
     last: int = 0
@@ -102,7 +101,7 @@ class _Group:
 
 
 def pattern_size(pattern: str) -> int:
-    """About how many instructions RE2 makes of the pattern; of one that is none, any number."""
+    """The approximate number of RE2 instructions of the pattern; any number for an invalid pattern."""
     groups, at = [_Group()], 0
     while at < len(pattern):
         char = pattern[at]
@@ -136,7 +135,7 @@ def pattern_size(pattern: str) -> int:
 
 
 def _escape(pattern: str, at: int) -> tuple[int, int]:
-    """The size of what stands behind a backslash, and where it ends."""
+    """The size of the escape sequence after a backslash, and the offset of its end."""
     char = pattern[at : at + 1]
     if char in ("p", "P"):
         found = _NAMED.match(pattern, at + 1)
@@ -152,7 +151,7 @@ def _escape(pattern: str, at: int) -> tuple[int, int]:
 
 
 def _class(pattern: str, at: int) -> tuple[int, int]:
-    """The size of a class whose bracket is open, and where it ends."""
+    """The size of a class after its opening bracket, and the offset of its end."""
     size = 1
     if pattern.startswith("^", at):
         size, at = _ANY, at + 1

@@ -1,10 +1,10 @@
 """The one interface to CEL: declare variables, compile an expression, evaluate it on values.
 
-An `Environment` holds the declared variables and compiles; an `Expression` is evaluated as often as wanted, from any
-thread. Unknown values follow Kleene's logic: CEL carries an error through `&&`, `||`, `!` and `?:` exactly as Kleene
-carries the unknown, so what is unknown is left out of the values (see `projection`) and an error means unknown.
-(A NaN that arises inside an expression, by 0/0 or inf − inf, takes part in the evaluation: it compares false, as in
-IEEE 754, and is unknown only as the result.)
+An `Environment` has the declared variables and compiles expressions; an `Expression` can be evaluated any number of
+times, from any thread. Unknown values follow Kleene's logic: CEL propagates an error through `&&`, `||`, `!` and `?:`
+exactly as Kleene's logic propagates the unknown. So unknown values are left out of the input (see `projection`), and an
+error means unknown. (A NaN that results inside an expression, from 0/0 or inf − inf, takes part in the evaluation:
+comparisons with it are false, as in IEEE 754, and it is unknown only as the result.)
 """
 
 from __future__ import annotations
@@ -51,12 +51,12 @@ Value = None | bool | int | float | str | bytes | list["Value"] | dict[str | int
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _CACHE_SIZE = 1024
 _SHARED = 256
-"""Maximum number of environments and programs that are shared; the oldest are forgotten."""
+"""The maximum number of shared environments and programs; the least recently used are dropped."""
 _ORDERING = frozenset({"_<_", "_<=_", "_>_", "_>=_"})
 
 
 class CelType(enum.Enum):
-    """The type of a variable or a result; DYN is checked only at evaluation."""
+    """The type of a variable or a result. DYN is checked only at evaluation."""
 
     DYN = "any value"
     DOUBLE = "a number"
@@ -74,7 +74,7 @@ _TYPES: Final[Mapping[CelType, tuple[cel.Type, type | tuple[type, ...]]]] = {
     CelType.MAP: (cel.Type.Map(cel.Type.STRING, cel.Type.DYN), dict),
     CelType.LIST: (cel.Type.List(cel.Type.DYN), list),
 }
-"""In CEL and in Python."""
+"""Each type in CEL and in Python."""
 _NAMED_KINDS: Final = {
     "BOOL": CelType.BOOL,
     "DOUBLE": CelType.DOUBLE,
@@ -87,7 +87,7 @@ _WORDS: Final = (
     " while"
 )
 RESERVED_WORDS: Final = frozenset(_WORDS.split())
-"""Words that CEL's grammar keeps for itself: no variable can have one as its name."""
+"""The reserved words of CEL's grammar: no variable can have one as its name."""
 
 
 _LITERAL: Final = "write it in quotes; parameters, fields and sums are not allowed"
@@ -103,9 +103,9 @@ class Environment:
         members: Mapping[str, CelType] | None = None,
         places: NamedPlaces | None = None,
     ) -> None:
-        """`members` are those of maps whose kind is known, by their paths, such as `parameters.maxSpeed`.
+        """`members` has the known types of members of maps, by their paths, such as `parameters.maxSpeed`.
 
-        They serve to find wrong types when compiling, and change nothing in what an expression yields.
+        They help to find wrong types at compilation, and do not change the result of an expression.
         """
         self._places = places or NamedPlaces()
         for name in variables:
@@ -121,18 +121,18 @@ class Environment:
         self._cache: dict[tuple[str, CelType], Expression] = {}
 
     def knowing(self, members: Mapping[str, CelType]) -> Environment:
-        """The same, with the kinds of more members known."""
+        """The same environment, with the types of more members."""
         return Environment(self.variables, {**self._members, **members}, self._places) if members else self
 
     def naming(self, places: NamedPlaces) -> Environment:
-        """The same, with places that expressions can name."""
+        """The same environment, with places that expressions can name."""
         return Environment(self.variables, self._members, places)
 
     def compile(self, source: str, *, result: CelType = CelType.DYN) -> Expression:
-        """Compiles `source`; if its type is known only at evaluation, `result` is checked then.
+        """Compiles `source`. If its type is known only at evaluation, `result` is checked then.
 
-        Raises ExpressionError, pointing into `source`, for what does not parse, has the wrong type or names what is
-        not declared.
+        Raises ExpressionError, with a position in `source`, if it does not parse, has the wrong type or uses an
+        undeclared name.
         """
         if not isinstance(source, str):
             raise _not_text(source)
@@ -160,12 +160,13 @@ class Environment:
         _check_static(typed.return_type(), result, source)
         expression = Expression(source, program, read, leaves, result, self.variables, whole.shapes)
         if len(self._cache) >= _CACHE_SIZE:
-            self._cache.clear()  # a bound against rules that come and go for months; refilling costs 50 µs each
+            self._cache.clear()  # bounds the memory if rules change for months; each recompilation costs 50 µs
         self._cache[source, result] = expression
         return expression
 
     def _reads(self, node: Node) -> tuple[frozenset[Path], Mapping[Path, Leaf]]:
-        """The paths that are read, and how; a path goes into a function unread only where CEL knows no type of it."""
+        """The paths that are read, and how each is read. A path can become a handle only if CEL knows no type for
+        it."""
         names = frozenset(self.variables)
         leaves = dict.fromkeys(arguments(node, names, _ORDERING), Leaf.ORDERED)
         for path in nothing_but_arguments(node, names, TAKING_HANDLES):
@@ -176,20 +177,20 @@ class Environment:
 
 @lru_cache(maxsize=_SHARED)
 def _cel_environment(variables: tuple[tuple[str, CelType], ...]) -> cel.Env:
-    """Rules with equal variables share one: making it costs as much as compiling an expression."""
+    """Rules with equal variables share one environment: its creation takes as long as compiling an expression."""
     return cel.NewEnv(variables={name: _TYPES[kind][0] for name, kind in variables}, functions=list(DECLARATIONS))
 
 
 @lru_cache(maxsize=_SHARED)
 def _program(environment: cel.Env, text: str) -> cel.Expression:
-    """Rules mostly read the same fields of a stream. Raises what the binding raises."""
+    """Rules often read the same fields of a stream, so programs are shared. Raises the errors of the binding."""
     return environment.compile(text)
 
 
 class Expression:
-    """A compiled expression. `paths` are the literal paths it reads, `names` and `kinds` those of their variables.
+    """A compiled expression. `paths` are the literal paths that it reads; `names` and `kinds` describe their variables.
 
-    `places` are those that it names.
+    `places` are the places that it names.
     """
 
     __slots__ = ("_program", "_read", "kinds", "names", "paths", "places", "result", "source")
@@ -218,20 +219,20 @@ class Expression:
 
     @property
     def tree(self) -> Node:
-        """The syntax tree as CEL runs it: macros unfolded, numbers as doubles. Decoded at each call."""
+        """The syntax tree that CEL evaluates: macros are expanded, numbers are doubles. Decoded at each call."""
         return parse(self._program.serialize())
 
     @property
     def path(self) -> Path | None:
-        """The literal path that the whole expression is; None: it is something else. Decoded at each call."""
+        """The literal path, if the whole expression is one; otherwise None. Decoded at each call."""
         tree = self.tree
         return None if isinstance(tree, Select) and tree.test_only else path_of(tree, self.names)
 
     def evaluate(self, values: Mapping[str, object]) -> Value:
-        """The result on `values`, in which null stays null; integral results are doubles, maps are sorted by key.
+        """The result on `values`, in which null stays null. Integral results are doubles, maps are sorted by key.
 
-        Raises EvaluationError where the expression fails, reads a variable or key that is not there, or yields
-        another type than it was compiled for.
+        Raises EvaluationError if the expression fails, reads an absent variable or key, or yields another type than
+        it was compiled for.
         """
         try:
             return self._run(values, known=False)
@@ -244,9 +245,9 @@ class Expression:
     def evaluate_or_unknown(
         self, values: Mapping[str, object], on_unknown: Callable[[Reason, str], None] | None = None
     ) -> Value | Unknown:
-        """The result on `values`, or UNKNOWN where it depends on what is absent, null or NaN, or the expression fails.
+        """The result on `values`, or UNKNOWN if it depends on an absent value, null or NaN, or the expression fails.
 
-        `on_unknown` receives the reason and a message. Never raises because of the values. Null being unknown,
+        `on_unknown` receives the reason and a message. Never raises because of the values. Since null is unknown,
         `x == null` is never true: use `has(msg.x)`, which is false for an absent, null or NaN field.
         """
         value, why = self.explained(values)
@@ -255,7 +256,7 @@ class Expression:
         return value
 
     def explained(self, values: Mapping[str, object]) -> tuple[Value | Unknown, tuple[Reason, str] | None]:
-        """The same, and why the result is UNKNOWN: the reason and a message; None where it is known."""
+        """The same, with the reason and a message if the result is UNKNOWN; None if it is known."""
         try:
             value = self._run(values, known=True)
         except EvaluationError as error:
@@ -319,7 +320,7 @@ def _check_static(actual: cel.Type, wanted: CelType, source: str) -> None:
 
 
 def _check_patterns(node: Node, source: str) -> None:
-    """Raise ExpressionError where the pattern of `matches` is no literal, or a large one."""
+    """Raise ExpressionError if the pattern of `matches` is not a literal, or is too large."""
     found = list(calls(node, "matches"))
     names = [each.start for each in tokens(source) if each.text == "matches"] if found else []
     for index, call in enumerate(found):

@@ -1,6 +1,6 @@
-"""Turns CEL's diagnostics into errors that point into the author's text and name the remedy.
+"""Turns CEL's compiler errors into errors with a position in the author's text and a remedy.
 
-And its errors of a failed evaluation into messages in the words of the documentation.
+Errors of a failed evaluation become messages in the terms of the documentation.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ EMPTY = "YAML interprets a leading `!`, `#` or quote itself: put the whole expre
 
 
 def diagnose(report: str, source: str, compiled: Rewritten, names: Collection[str]) -> ExpressionError:
-    """The first error of CEL's report, the further ones in its `others`."""
+    """The first error of CEL's report, with the further errors in its `others`."""
     errors: list[ExpressionError] = []
     lines = [0, *(match.end() for match in re.finditer("\n", compiled.text))]
     for line, column, text in _ENTRY.findall(report):
@@ -56,7 +56,7 @@ def diagnose(report: str, source: str, compiled: Rewritten, names: Collection[st
         offset = start + max(int(column), 1) - 1
         at = compiled.origin[offset] if offset < len(compiled.origin) else len(source)
         if source[at : at + 1] == "." and (undeclared := _UNDECLARED.search(text)):
-            at = source.rfind(undeclared[1].split(".")[0], 0, at)  # of `x.y`, CEL points at the dot
+            at = source.rfind(undeclared[1].split(".")[0], 0, at)  # for `x.y`, CEL reports the position of the dot
         message, hint = _explain(text.removesuffix("[INVALID_ARGUMENT]").strip(), source, at, names)
         errors.append(ExpressionError(message, source=source, offset=at, hint=hint))
     if not errors:
@@ -125,12 +125,13 @@ def _takes(function: str) -> str:
 
 
 def _is_call(source: str, at: int, name: str) -> bool:
-    """CEL points at the bracket of a call that it cannot resolve, and at the name of anything else."""
+    """CEL reports the position of the bracket for an unresolved call, and that of the name otherwise."""
     return source[at : at + 1] == "(" or source[at : at + len(name) + 1] == f"{name}("
 
 
 def _after(source: str, at: int) -> str | None:
-    """The remedy where the cause is what stands before: CEL takes `not` for a name, and stumbles over what follows."""
+    """The remedy for an error whose cause is the token before: CEL parses `not` as a name, and reports the next
+    token."""
     before = [token for token in tokens(source) if token.end <= at and token.kind is not TokenKind.SPACE]
     if not before:
         return None
@@ -146,11 +147,11 @@ def _stray_sign(source: str) -> str | None:
     return None
 
 
-# Of a failed evaluation
+# Errors of a failed evaluation
 
 _NO_MEMBERS: Final = "cannot read a field of a value without fields"
 NO_MEMBERS: Final = frozenset({_NO_MEMBERS})
-"""The message of `clean` for reading a member of a number, a string or a list."""
+"""The messages of `clean` for reading a member of a number, a string or a list."""
 
 _ABSENT = ("no value for ", "no key ", "no index ")
 _NO_OVERLOAD: Final = re.compile(r"^\w+: No matching overloads found : (.*)$")
@@ -178,7 +179,7 @@ _TYPES: Final = {
 
 
 def clean(message: str) -> str:
-    """The message without CEL's codes, and in the words of the documentation."""
+    """The message without CEL's codes, in the terms of the documentation."""
     message = _OF_A_FIELD.sub(lambda found: f"{_WRITTEN[found[1]]}(…).{found[2]}", message)
     overload = _NO_OVERLOAD.search(message)
     if overload is not None:
@@ -195,7 +196,8 @@ def reports_absent(message: str) -> bool:
 
 
 def _no_overload(operation: str) -> str:
-    """Of a function of ours, what it takes and was given; of CEL's operations, those on bytes have a remedy."""
+    """The message for wrong argument types: for a Wayside function, the types that it takes and those given. For an
+    operation of CEL on bytes, it names the functions to use instead."""
     if operation.startswith(f"{DIGITS}("):
         operation = operation.replace(DIGITS, "string", 1)
     call = _CALL.search(operation)
@@ -214,6 +216,6 @@ def _no_overload(operation: str) -> str:
 
 
 def _a(kind: str) -> str:
-    """The type as it stands in a sentence."""
+    """The type with its article."""
     name = _TYPES.get(kind, kind)
     return name if name == "null" else f"{'an' if name[0] in 'aeiou' else 'a'} {name}"

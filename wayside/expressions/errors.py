@@ -1,4 +1,4 @@
-"""The errors of expressions: it does not compile, it fails on its values, or a field cannot be rendered."""
+"""The errors of expressions: one does not compile, fails on its values, or a field cannot be rendered."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from typing import Self
 
 
 class _LocatedError(Exception):
-    """An error at a place in the author's text.
+    """An error at a position in the author's text.
 
-    `source` is that text, and `offset` the place; `line` and `column` count from 1, in characters. `path` is that of
-    its field, or empty. `hint` is the remedy where one is known. `others` holds the further errors of the same text.
+    `source` is the text, and `offset` the position in it; `line` and `column` count from 1, in characters. `path` is
+    the path of the field, or empty. `hint` is the remedy, if one is known. `others` are further errors of the text.
     """
 
     def __init__(
@@ -31,11 +31,11 @@ class _LocatedError(Exception):
 
 
 class ExpressionError(_LocatedError):
-    """An expression, `source`, that does not compile."""
+    """The expression `source` does not compile."""
 
 
 class EvaluationError(Exception):
-    """An expression that failed on the values it was given.
+    """An expression failed on the given values.
 
     `absent` distinguishes an absent value (a variable, map key or list index) from a fault of the expression.
     """
@@ -47,9 +47,9 @@ class EvaluationError(Exception):
 
 
 class InterpolationError(_LocatedError):
-    """A field whose `${…}` does not compile or cannot be rendered.
+    """The `${…}` of a field does not compile or cannot be rendered.
 
-    `path` is the field's, such as `spec.manifests[0].spec.replicas`.
+    `path` is the path of the field, such as `spec.manifests[0].spec.replicas`.
     """
 
 

@@ -1,11 +1,11 @@
-"""Values with fields: writes a call of numbers in place of a field that an expression reads of one.
+"""Values with fields: replaces each field that an expression reads of such a value by a call with numbers.
 
     at(a.position, "crossing").inside  →  (at_inside((a.position).x, (a.position).y, r'crossing#…') > 0.0)
     seenFrom(a, b).ahead               →  seen_ahead((a).position.x, (a).position.y, (a).yaw, …)
     position.x                         →  (msg.pose.position.x), as the stream's `position` has it
     positionBefore.x                   →  (before.pose.position.x), that of the sample before
 
-So what is read is plain paths and numbers, for CEL as for columns, and no field costs what another needs.
+So CEL and columns read only plain paths and numbers, and a field does not compute the inputs of another one.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _POSITIONS: Final = (POSITION, POSITION_BEFORE)
 _BEFORE: Final = "before"
 _OF_A_SAMPLE: Final = frozenset({"msg", "item", "sample"})
 AXES: Final = {False: ("x", "y", "yaw"), True: ("latitude", "longitude", "heading")}
-"""What a position has in metres, and on the Earth: two coordinates and a direction."""
+"""The axes of a position in metres (False) and on the Earth (True): two coordinates and a direction."""
 FIELDS_AT: Final = {
     "inside": "whether the position is inside the area or lane, or on its edge",
     "distance": "metres to the place; 0 inside",
@@ -46,11 +46,11 @@ FIELDS_SEEN: Final = {
 
 @dataclass(frozen=True)
 class NamedPlaces:
-    """The places that expressions can name, and where the positions come from."""
+    """The places that expressions can name, and the source of the positions."""
 
     shapes: Mapping[str, Shape] = field(default_factory=dict)
     known: bool = True
-    """Whether there are no others; else any name will do, and what it yields means nothing."""
+    """Whether the places are complete. If not, any name compiles, and the compiled expression must not be evaluated."""
     geographic: bool | None = None
     """Whether the positions of a pair are on the Earth; None: the expression is not about pairs."""
     position: Mapping[str, str] | None = None
@@ -62,7 +62,7 @@ class NamedPlaces:
 
 
 class Expanded(NamedTuple):
-    """The text, the offset in the author's text that each character stems from, and the shapes that it names."""
+    """The new text, the offset of each of its characters in the author's text, and the shapes that it names."""
 
     text: str
     origin: tuple[int, ...]
@@ -70,7 +70,7 @@ class Expanded(NamedTuple):
 
 
 def expanded(source: str, places: NamedPlaces) -> Expanded:
-    """Rewrites `source`. Raises ExpressionError, which points into it, for a place or a field that is not there."""
+    """Rewrites `source`. Raises ExpressionError, with a position in `source`, for an unknown place or field."""
     return _Expansion(source, places).expanded()
 
 
@@ -94,7 +94,7 @@ class _Expansion:
         return Expanded(text, tuple(at for piece in pieces for at in piece.origin), tuple(self._shapes.values()))
 
     def _range(self, first: int, last: int, begin: int, end: int) -> Iterator[_Piece]:
-        """The tokens from first to last, which lie between these offsets, expanded."""
+        """The tokens from index `first` to `last`, between the offsets `begin` and `end`, expanded."""
         at, done = first, begin
         while at < last:
             token, after = self._tokens[at], at + 1
@@ -112,7 +112,7 @@ class _Expansion:
         yield _Piece(self._source[done:end], tuple(range(done, end)))
 
     def _call(self, at: int, last: int) -> tuple[str, int]:
-        """A call of `at` or `seenFrom` with its field, and the index of the token behind it."""
+        """The replacement of a call of `at` or `seenFrom` with its field, and the index of the token after it."""
         name = self._tokens[at].text
         arguments, after = self._arguments(at + 1, last)
         usage = f'{AT}(position, "place")' if name == AT else f"{SEEN_FROM}(a, b)"
@@ -163,7 +163,7 @@ class _Expansion:
         return f"({call} > 0.0)" if chosen == "inside" else call
 
     def _axis(self, argument: tuple[int, int], axis: str, shape: Shape) -> Callable[[], str]:
-        """Writes an axis of the position where it is needed."""
+        """Returns a function that writes an axis of the position, to be called only if the axis is needed."""
         first, last = argument
         if last - first == 1 and self._text(first) in _POSITIONS and self._places.position is not None:
             of = f"place {shape.name} is in {'degrees' if shape.geographic else 'metres'}"
@@ -193,7 +193,7 @@ class _Expansion:
         return f"{{{', '.join(pairs)}}}", at + 1
 
     def _of_stream(self, at: int, axis: str, why: str) -> str:
-        """The stream's expression for an axis; of no axis, it only checks that there is a position."""
+        """The stream's expression for an axis. With an empty axis, it only checks that there is a position."""
         given = self._places.position or {}
         if not given and not self._places.known:
             return "(0.0 + 0.0)"
@@ -211,7 +211,7 @@ class _Expansion:
         return f"({given[axis] if self._text(at) == POSITION else self._before(at, given[axis])})"
 
     def _before(self, at: int, source: str) -> str:
-        """The expression of the stream's position, over the message or item before."""
+        """The expression of the stream's position, over the previous message or item."""
         found: list[str] = []
         last = ""
         for token in tokens(source):
@@ -227,7 +227,7 @@ class _Expansion:
         return "".join(found)
 
     def _arguments(self, opening: int, last: int) -> tuple[list[tuple[int, int]], int]:
-        """The arguments of a call as ranges of tokens, and the index of the token behind its bracket."""
+        """The arguments of a call as ranges of tokens, and the index of the token after its closing bracket."""
         found: list[tuple[int, int]] = []
         depth, begin = 0, opening + 1
         for at in range(opening, last):

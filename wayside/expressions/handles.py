@@ -1,8 +1,8 @@
-"""Handles for values that CEL passes on unread: bytes always, lists and maps if a function takes them as they are.
+"""Handles for values that CEL passes on without reading them: bytes, and lists and maps that are function arguments.
 
-CEL cuts bytes at NUL and converts lists item by item, which an image or a thousand objects do not survive in time. So
-they enter an expression as a handle: a uint that no field can be taken of, that has no size, and that only the
-functions of `functions` turn back into the value. Handles are good for the evaluation that made them.
+CEL truncates bytes at NUL, and converts lists item by item, which takes too long for an image or a thousand objects. So
+such a value enters an expression as a handle: a uint without fields and size, which only the functions of `functions`
+resolve to the value. A handle is valid only in the evaluation that created it.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ import threading
 from typing import Final
 
 _FIRST: Final = 2**63 + 2**62
-"""Beyond every integer that a double holds: expressions yield no other uint of this size."""
+"""Greater than every exact integer of a double: no expression yields another uint of this size."""
 
 
 class _Held(threading.local):
-    """The values of the evaluation that runs on this thread; None while none does."""
+    """The values of the current evaluation on this thread; None outside of one."""
 
     values: list[object] | None = None
 
@@ -24,16 +24,16 @@ _held = _Held()
 
 
 def begin() -> list[object] | None:
-    """An evaluation begins: `hand` hands out handles, `value_of` takes them. Returns what `end` is to be given.
+    """Begin an evaluation: `hand` creates handles, `value_of` resolves them. Returns the argument for `end`.
 
-    Two functions and no context manager: this is the path of every evaluation.
+    Two functions instead of a context manager, since every evaluation calls them.
     """
     before, _held.values = _held.values, []
     return before
 
 
 def end(before: list[object] | None) -> None:
-    """The evaluation has ended; an enclosing one continues."""
+    """End the evaluation; an enclosing one continues."""
     _held.values = before
 
 
@@ -47,7 +47,7 @@ def hand(value: object) -> int | None:
 
 
 def value_of(handle: object) -> object:
-    """The value behind a handle; whatever is none is itself."""
+    """The value of a handle; any other value is returned unchanged."""
     values = _held.values
     if values and isinstance(handle, int) and _FIRST <= handle < _FIRST + len(values):
         return values[handle - _FIRST]

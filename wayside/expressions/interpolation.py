@@ -1,9 +1,9 @@
-"""`${…}` in the texts of a field: compiled once, rendered often.
+"""Strings with `${…}` in fields: compiled once, rendered for each set of values.
 
-A text that is one `${…}` alone takes the expression's value with its type; null drops the field, that is its key or
-list item. Inside other text the value becomes text: a text as it is, integral numbers without a point, `true` and
-`false`, lists and maps as JSON; null is an error there. `$${` is a literal `${`. Braces are matched with CEL's strings
-respected, and values are never evaluated again. Keys of maps are texts like others, and always become text.
+A string that consists of one `${…}` becomes the value of the expression, with its type; null drops the field: its key
+or list item. Within other text, the value becomes text: strings unchanged, integral numbers without a decimal point,
+`true` and `false`, lists and maps as JSON; null is an error there. `$${` is a literal `${`. Braces within CEL strings
+do not count, and rendered values are never evaluated. Keys of maps are templates as well, and always become strings.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ LITERAL: Final = "write `$${` for a literal `${`"
 
 @dataclass(frozen=True, slots=True)
 class Embedded:
-    """An expression in the text of the field at `path`; it begins at `offset`, behind its `${`."""
+    """An expression in the text of the field at `path`. It begins at `offset`, after its `${`."""
 
     expression: Expression
     path: str
@@ -36,7 +36,7 @@ class Embedded:
     offset: int
 
     def error(self, message: str, hint: str | None = None) -> InterpolationError:
-        """An error at its place."""
+        """An error at the position of the expression."""
         return InterpolationError(message, source=self.text, offset=self.offset, path=self.path, hint=hint)
 
 
@@ -47,7 +47,7 @@ class _Literal:
 
 @dataclass(frozen=True, slots=True)
 class _Mixed:
-    """Text with expressions inside, in turn."""
+    """Text with expressions; `parts` has both in their order."""
 
     parts: tuple[str | Embedded, ...]
 
@@ -75,7 +75,7 @@ _DROPPED: Final = _Dropped()
 
 @dataclass(frozen=True, slots=True)
 class CompiledTemplate:
-    """A field, or a tree of fields, whose expressions, `embedded`, are compiled."""
+    """A compiled field, or tree of fields. `embedded` has its expressions."""
 
     root: _Node
     embedded: tuple[Embedded, ...]
@@ -91,10 +91,10 @@ class CompiledTemplate:
         return frozenset(path for each in self.embedded for path in each.expression.paths)
 
     def render(self, values: Mapping[str, object], *, integers: bool = False) -> Json:
-        """The fields with the values filled in; None where the whole was dropped.
+        """The fields with the values filled in; None if the whole value was dropped.
 
-        With `integers`, integral doubles become integers throughout, as manifests need them. Raises
-        InterpolationError where an expression fails, is null inside a string, or yields what JSON cannot represent.
+        With `integers`, all integral doubles become integers, as manifests need them. Raises InterpolationError if
+        an expression fails, is null inside a string, or yields a value that JSON cannot represent.
         """
         result = _render(self.root, values, integers)
         return None if isinstance(result, _Dropped) else result
@@ -106,9 +106,9 @@ Check = Callable[[Embedded], Iterable[InterpolationError]]  # what else is wrong
 def compile_template(
     value: Json, environment: Environment, *, path: str = "", check: Check = lambda _: ()
 ) -> CompiledTemplate:
-    """Compiles all texts and keys of `value`, which stands at `path`.
+    """Compiles all strings and keys of `value`; `path` is its path.
 
-    Raises InterpolationError for the first expression that is wrong, with all further ones in its `others`.
+    Raises InterpolationError for the first invalid expression, with all further ones in its `others`.
     """
     compiler = _Compiler(environment, check)
     root = compiler.node(value, path)
@@ -203,7 +203,7 @@ def _closing(text: str, start: int) -> int | None:
 
 
 def _relocated(error: ExpressionError, text: str, path: str, start: int) -> InterpolationError:
-    """The error of an expression, as one of the text around it; a shell's `${HOME}` is the usual mistake."""
+    """The error of an expression, with its position in the whole text. The usual mistake is a shell's `${HOME}`."""
     if not error.source.strip():
         hint = f"write an expression between the braces; {LITERAL}"
     else:
@@ -291,7 +291,7 @@ def _numbers(value: Json, integers: bool) -> Json:
 
 
 def _join(path: str, key: str) -> str:
-    """The path of a member; keys with signs of their own are quoted, as in `metadata.labels["wayside.dev/x"]`."""
+    """The path of a member. Keys with special characters are quoted, as in `metadata.labels["wayside.dev/x"]`."""
     if key.replace("_", "").replace("-", "").isalnum():
         return f"{path}.{key}" if path else key
     return f"{path}[{json.dumps(key, ensure_ascii=False)}]"

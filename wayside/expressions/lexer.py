@@ -1,6 +1,6 @@
 """CEL's tokens with their positions in the text, for the number pass and the `${…}` scanner.
 
-The lexer never fails: what is no token of CEL becomes `OTHER`, and CEL's own parser then reports it.
+The lexer never fails: a text that is not a token of CEL becomes `OTHER`, and CEL's parser reports it later.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class TokenKind(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class Token:
-    """A piece of the text: `text` stands at `start` (an offset in characters)."""
+    """A part of the text: `text` begins at the offset `start`, in characters."""
 
     kind: TokenKind
     text: str
@@ -36,12 +36,12 @@ class Token:
 
     @property
     def end(self) -> int:
-        """The offset behind the last character."""
+        """The offset after the last character."""
         return self.start + len(self.text)
 
 
 # Order matters: raw strings before plain ones before names, triple quotes before single, floats before integers.
-# An unterminated string is OTHER for its quote alone, so scanning continues after it.
+# Of an unterminated string, only the quote is OTHER, so scanning continues after it.
 _TOKENS = re.compile(
     r"""
     (?P<space>\s+)
@@ -64,7 +64,7 @@ _TOKENS = re.compile(
 
 
 def tokens(text: str, start: int = 0) -> Iterator[Token]:
-    """The tokens of `text` from `start` on, spaces and comments included: joined they are the text again."""
+    """The tokens of `text` from `start`, including spaces and comments: joined, they are the text."""
     for match in _TOKENS.finditer(text, start):
         kind = match.lastgroup
         assert kind is not None  # noqa: S101 (every alternative is a named group)

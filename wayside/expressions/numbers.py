@@ -6,13 +6,12 @@
     string(msg.station)       →  string(digits(msg.station))
     name.matches('a+')        →  bounded(name).matches('a+')
 
-Integer literals become doubles, and so do the results of functions that count, and of `int(x)`, which cuts off the
-fraction. A literal index stays an integer; any other index is wrapped in `dyn()`, because a list takes an integral
-double as its index at run time, but not when types are checked. Integers stay where only integers work: beside `%`,
-as the argument of `timestamp` and of `string`, and beyond 2^53, where a double would be another number. `digits` makes
-a whole double an integer again, since `string` writes large doubles with an exponent; `bounded` (see `bounds`) takes
-part in the same pass. Strings, comments and `3u` are
-left alone.
+Integer literals become doubles, and so do the results of functions that count, and of `int(x)`, which truncates. A
+literal index stays an integer; any other index is wrapped in `dyn()`, because a list accepts an integral double as
+index at run time, but not in the type check. Integers stay where CEL accepts only integers: beside `%`, as the argument
+of `timestamp` and of `string`, and beyond 2^53, where a double would be another number. `digits` turns a whole double
+back into an integer, since `string` writes large doubles with an exponent. The same pass inserts `bounded` (see
+`bounds`). Strings, comments and `3u` do not change.
 """
 
 from __future__ import annotations
@@ -24,10 +23,10 @@ from wayside.expressions.bounds import BOUNDED
 from wayside.expressions.lexer import Token, TokenKind, tokens
 
 MAX_EXACT = 2**53
-"""Up to here every integer is a double as well."""
+"""The largest integer up to which every integer is exact as a double."""
 
 DIGITS = "digits"
-"""Not for authors: the function that `string` is given its argument by."""
+"""An internal function that prepares the argument of `string`."""
 
 _COUNTING_METHODS = frozenset(
     {"size"}
@@ -39,16 +38,16 @@ _PAIRS = {")": "(", "]": "[", "}": "{"}
 
 @dataclass(frozen=True, slots=True)
 class Rewritten:
-    """An expression after the pass; `origin[i]` is the offset in the author's text that character i stems from."""
+    """An expression after the pass; `origin[i]` is the offset of character i in the author's text."""
 
     text: str
     origin: tuple[int, ...]
 
 
 def doubled(source: str, stems: Sequence[int] | None = None) -> Rewritten:
-    """Rewrites `source` as described in the module. Never fails: CEL reports syntax errors.
+    """Rewrites `source` as described in the module's docstring. Never fails: CEL reports syntax errors.
 
-    `stems` are the offsets in the author's text of its characters; None: it is that text.
+    `stems` has the offsets of its characters in the author's text; None: `source` is the author's text.
     """
     scanned = list(tokens(source))
     significant = [token for token in scanned if token.kind not in (TokenKind.SPACE, TokenKind.COMMENT)]
@@ -117,7 +116,7 @@ def _matches(line: list[Token]) -> dict[int, int]:
 
 
 def _first_comma(line: list[Token], matches: dict[int, int], opening: int) -> int:
-    """The comma behind the first argument of a call; 0 where it has only one."""
+    """The index of the comma after the first argument of a call; 0 if there is only one argument."""
     i = opening + 1
     while i < matches[opening]:
         if line[i].text == ",":
@@ -127,7 +126,7 @@ def _first_comma(line: list[Token], matches: dict[int, int], opening: int) -> in
 
 
 def _stays_integer(line: list[Token], matches: dict[int, int], i: int, last: int) -> bool:
-    """Whether the operand from token i to token `last` stands where CEL takes only an integer."""
+    """Whether the operand from token i to token `last` is at a place where CEL accepts only an integer."""
     previous, following = line[i - 1].text if i else "", line[last + 1].text if last + 1 < len(line) else ""
     if "%" in (previous, following):
         return True
@@ -148,7 +147,7 @@ def _is_lone_literal(line: list[Token], first: int, end: int) -> bool:
 
 
 def _ends_operand(line: list[Token], i: int) -> bool:
-    """Whether a bracket behind token i is an index, not a list of its own."""
+    """Whether a bracket after token i is an index, not a list literal."""
     if i < 0:
         return False
     token = line[i]

@@ -1,16 +1,17 @@
-"""Projects a message to the values that an expression reads, in the types of CEL.
+"""Projects a message to the values that an expression reads, converted to the types of CEL.
 
-CEL converts a message as a whole, at a cost that grows with it, and one member that it does not know spoils the rest.
-So the paths that an expression reads form a tree, and only what lies on it is copied out of the values, and converted:
+CEL would convert the whole message, at a cost that grows with its size, and would fail for one unsupported member. So
+the paths that an expression reads form a tree, and only the values on this tree are copied and converted:
 
-* integers become doubles, up to 2^53; beyond, they stay integers, which support only equality, `in` and order;
-* numpy arrays and tuples become lists, numpy scalars plain ones, dataclasses (decoded ROS messages) maps;
-* NUL, at which CEL would cut a string, becomes `␀` (U+2400);
-* bytes, which CEL would cut as well, become handles (see `handles`), and so do the lists and maps that are nothing but
+* integers up to 2^53 become doubles; larger ones stay integers, which support only equality, `in` and order;
+* numpy arrays and tuples become lists, numpy scalars plain values, dataclasses (decoded ROS messages) maps;
+* NUL, at which CEL would truncate a string, becomes `␀` (U+2400);
+* bytes, which CEL would truncate as well, become handles (see `handles`), and so do lists and maps that are only
   arguments of functions.
 
-With `known=True`, null and NaN are absent too: left out of maps, so that a read of them is an error in CEL, which `&&`,
-`||` and `?:` treat as unknown. In lists they become null, so that no index shifts: order and arithmetic are unknown.
+With `known=True`, null and NaN are absent too. They are left out of maps, so that reading them is an error in CEL,
+which `&&`, `||` and `?:` treat as unknown. In lists they become null, so that no index shifts; comparisons of their
+order and arithmetic with them are then unknown.
 """
 
 from __future__ import annotations
@@ -31,16 +32,16 @@ _ABSENT: Final = object()
 
 
 class Leaf(enum.Enum):
-    """The parts of a value that are read, unless all of it is."""
+    """How the value at the end of a path is read, if not as a whole."""
 
     HANDED = "handed"
-    """Its handle, where it is a list, a map or bytes."""
+    """As a handle, if it is a list, a map or bytes."""
     ORDERED = "ordered"
-    """All of it, but bytes are absent: a handle would be greater than every number."""
+    """As a whole, but bytes are absent: a handle would be greater than every number."""
 
 
 Tree = Mapping[Step, "Tree | Leaf | None"]
-"""The parts that are read below a value; None: all of it."""
+"""The parts of a value that are read; None: the whole value."""
 
 _FIELD_NAMES: Final[dict[type, frozenset[str]]] = {}
 
@@ -48,7 +49,7 @@ _FIELD_NAMES: Final[dict[type, frozenset[str]]] = {}
 def tree(paths: Iterable[Path], leaves: Mapping[Path, Leaf]) -> Tree:
     """The tree of the given paths; a path replaces all longer ones. `leaves` defines how some are read."""
     root: dict[Step, Tree | Leaf | None] = {}
-    for path in sorted(paths, key=len):  # the shorter first: it swallows the longer
+    for path in sorted(paths, key=len):  # shorter paths first: they replace the longer ones
         node = root
         for step in path[:-1]:
             below = node.setdefault(step, {})
@@ -61,7 +62,7 @@ def tree(paths: Iterable[Path], leaves: Mapping[Path, Leaf]) -> Tree:
 
 
 def project(read: Tree, values: Mapping[str, object], *, known: bool) -> dict[str, object]:
-    """The part of `values` that is read. Raises EvaluationError for a value of a type that no expression takes."""
+    """The part of `values` that is read. Raises EvaluationError for a value of an unsupported type."""
     result: dict[str, object] = {}
     for name, below in read.items():
         if isinstance(name, str) and name in values:
@@ -72,7 +73,8 @@ def project(read: Tree, values: Mapping[str, object], *, known: bool) -> dict[st
 
 
 def normalise(value: object) -> object:
-    """A decoded value as CEL takes it, the whole of it, null and NaN kept; bytes are null in lists, absent in maps."""
+    """A whole decoded value in the types of CEL. Null and NaN are kept; bytes become null in lists, and absent in
+    maps."""
     result = _convert(value, known=False)
     return None if result is _ABSENT else result
 
@@ -162,7 +164,8 @@ def _members(members: Iterable[tuple[Step, object, Tree | Leaf | None]], known: 
 
 
 def _items(below: Tree, items: list[object], known: bool) -> list[object]:
-    """The list up to the last index that is read, the others null, so that what is read keeps its index."""
+    """The list up to the last index that is read. Items that are not read are null, so that the others keep their
+    index."""
     indices = [step for step in below if isinstance(step, int) and step < len(items)]
     result: list[object] = [None] * (max(indices) + 1 if indices else 0)
     for index in indices:
@@ -195,7 +198,7 @@ def _convert(value: object, known: bool) -> object:
 
 
 def _convert_rare(value: object, known: bool) -> object:
-    if _is_array(value):  # numpy: before the plain types, of which its scalars are subclasses
+    if _is_array(value):  # before the plain types, since some numpy scalars are subclasses of these
         return _convert(value.tolist(), known)  # type: ignore[attr-defined]
     if isinstance(value, (bytes, bytearray, memoryview)):
         handle = hand(value)
@@ -213,7 +216,7 @@ def _convert_rare(value: object, known: bool) -> object:
 
 
 def _hand(value: object, known: bool) -> object:
-    """A handle for what is large, the value itself where it is a number or a text."""
+    """A handle for a list, a map or bytes; any other value is converted."""
     if (
         isinstance(value, (list, tuple, Mapping))
         or (_is_array(value) and hasattr(value, "__len__"))
@@ -226,7 +229,7 @@ def _hand(value: object, known: bool) -> object:
 
 
 def integer(value: int) -> int | float:
-    """An integer as expressions have it: a double, but for those that only an integer holds."""
+    """An integer in the type of expressions: a double, or an integer if a double cannot represent it exactly."""
     if -MAX_EXACT <= value <= MAX_EXACT or not -(2**63) <= value < 2**64:
         try:
             return float(value)
@@ -242,7 +245,7 @@ def _key(key: object) -> object:
 
 
 def _is_array(value: object) -> bool:
-    """Whether it is a numpy array or scalar: detected by its methods, since nothing here needs numpy itself."""
+    """Whether it is a numpy array or scalar. It is detected by its attributes, so that numpy need not be imported."""
     return hasattr(value, "tolist") and hasattr(value, "dtype")
 
 
@@ -251,7 +254,8 @@ def _is_record(value: object) -> bool:
 
 
 def _field_names(record: object) -> frozenset[str]:
-    """The names of a dataclass's fields, looked up once per class: a message is decoded many times a second."""
+    """The names of a dataclass's fields, looked up once per class, since messages are projected many times per
+    second."""
     names = _FIELD_NAMES.get(type(record))
     if names is None:
         names = frozenset(field.name for field in dataclasses.fields(cast("type", type(record))))

@@ -1,7 +1,7 @@
 """The syntax tree of a compiled expression, decoded from the CheckedExpr that CEL serialises, and the paths it reads.
 
-The binding offers the tree only as protobuf; the few messages it takes are decoded here, so protobuf is no dependency.
-Field numbers are those of `cel/expr/syntax.proto`.
+The binding offers the tree only as protobuf. The few message types of the tree are decoded here, so that protobuf is
+not a dependency. Field numbers are those of `cel/expr/syntax.proto`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Name:
 
 @dataclass(frozen=True, slots=True)
 class Select:
-    """`operand.field`, or `has(operand.field)` where `test_only`."""
+    """`operand.field`, or `has(operand.field)` if `test_only`."""
 
     operand: Node
     field: str
@@ -40,7 +40,7 @@ class Select:
 
 @dataclass(frozen=True, slots=True)
 class Call:
-    """A function or operator (`_+_`, `_[_]`, …); `target` where it is called as a method."""
+    """A call of a function or operator (`_+_`, `_[_]`, …). `target` is the operand of a method call."""
 
     function: str
     target: Node | None
@@ -49,7 +49,7 @@ class Call:
 
 @dataclass(frozen=True, slots=True)
 class Collection:
-    """A list or map literal; of a map, keys and values in turn."""
+    """A list or map literal. For a map, keys and values alternate."""
 
     is_map: bool
     elements: tuple[Node, ...]
@@ -57,7 +57,7 @@ class Collection:
 
 @dataclass(frozen=True, slots=True)
 class Loop:
-    """A macro such as `all`, `exists`, `filter` or `map`, unfolded."""
+    """An expanded macro, such as `all`, `exists`, `filter` or `map`."""
 
     over: Node
     variables: tuple[str, ...]
@@ -71,7 +71,7 @@ Node = Scalar | Name | Select | Call | Collection | Loop
 
 
 def parse(serialized: bytes) -> Node:
-    """The tree of an expression, from what `serialize()` of the binding returns (an Any that holds a CheckedExpr)."""
+    """The tree of an expression, from the result of the binding's `serialize()` (an Any with a CheckedExpr)."""
     checked = _fields(_only(_fields(serialized), 2))
     return _node(_only(checked, 4))
 
@@ -82,12 +82,12 @@ def paths(node: Node, variables: frozenset[str]) -> frozenset[Path]:
 
 
 def arguments(node: Node, variables: frozenset[str], functions: frozenset[str]) -> frozenset[Path]:
-    """Of these paths, the ones that are arguments of the functions."""
+    """The longest literal paths that are arguments of the functions."""
     return frozenset(path for path, caller in _paths(node, variables) if caller in functions)
 
 
 def nothing_but_arguments(node: Node, variables: frozenset[str], functions: frozenset[str]) -> frozenset[Path]:
-    """Of these, the ones that are no part of what else is read."""
+    """The paths of `arguments` that overlap with no other path that the tree reads."""
     found = set(_paths(node, variables))
     passed = {path for path, caller in found if caller in functions}
     others = {path for path, caller in found if caller not in functions}
@@ -99,7 +99,7 @@ def nothing_but_arguments(node: Node, variables: frozenset[str], functions: froz
 
 
 def _paths(node: Node, free: frozenset[str], caller: str = "") -> Iterator[tuple[Path, str]]:
-    """The paths, each with the function whose argument it is, if it is one itself."""
+    """The paths, each with the function of which it is an argument; empty if it is not."""
     path = path_of(node, free)
     if path is not None:
         yield path, caller
@@ -124,7 +124,7 @@ def _paths(node: Node, free: frozenset[str], caller: str = "") -> Iterator[tuple
 
 
 def calls(node: Node, function: str) -> Iterator[Call]:
-    """The calls of the function, wherever they stand."""
+    """All calls of the function in the tree."""
     match node:
         case Select(operand):
             yield from calls(operand, function)
@@ -161,7 +161,7 @@ _WIDTHS = {1: 8, 5: 4}
 
 
 def _fields(data: bytes) -> _Fields:
-    """The fields of a protobuf message by number: numbers as they are, the rest as bytes."""
+    """The fields of a protobuf message by number. Varints are numbers, all other values are bytes."""
     result: _Fields = {}
     at = 0
     while at < len(data):

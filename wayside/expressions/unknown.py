@@ -1,6 +1,6 @@
 """The third truth value: `UNKNOWN` is the result of an expression that is neither true nor false.
 
-It has no truth of its own: `if value:` on an unknown raises, so no caller takes it for false by accident.
+It has no truth value in Python: `if value:` raises for it, so no caller treats it as false by accident.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ UNKNOWN: Final = Unknown()
 
 
 class Reason(enum.Enum):
-    """Why an expression is unknown; callers count the two apart."""
+    """The reason why an expression is unknown. Callers count the reasons separately."""
 
     ABSENT = "Absent"
-    """An input is not there: a variable, key or index is missing, or a value is null or NaN."""
+    """An input is absent: a variable, key or index is missing, or a value is null or NaN."""
     ERROR = "Error"
-    """The expression failed on inputs that are there: a wrong type, a division by zero, too many iterations."""
+    """The expression failed on existing inputs: a wrong type, a division by zero, too many iterations."""

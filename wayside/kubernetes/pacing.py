@@ -1,5 +1,4 @@
-"""The pace of requests: a maximum number at once, few writes per namespace, and none while the API server requests a
-pause.
+"""The pace of requests: a maximum in flight, few writes per namespace, and none while the API server requests a pause.
 
 Namespaces take turns, and each has only as many writes in flight as the API server processes without queueing them. So
 many writes in one namespace leave the others both places in this queue and time of the API server. docs/decisions/0029

@@ -1,5 +1,4 @@
-"""A work queue of keys to reconcile: keys are processed concurrently, each by at most one worker, and retried on
-failure.
+"""A work queue of keys: processed concurrently, each by at most one worker at a time, and retried on failure.
 
 Namespaces take turns, and with a `share`, none can occupy all workers. So a flood of keys in one namespace does not
 delay the others.

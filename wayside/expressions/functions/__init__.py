@@ -1,7 +1,7 @@
-"""The functions that complement CEL's own: one table of all, with units.
+"""The functions that complement those of CEL, in one table, with units.
 
-Each module of this package holds functions of one kind, as plain Python that raises ValueError for arguments that have
-no answer; the evaluation is unknown then. `docs/rules.md` lists them for users, and a test compares the two.
+Each module of this package has functions of one kind, in plain Python. They raise ValueError for arguments without a
+result; the expression is then unknown. `docs/rules.md` lists them for users, and a test compares the two.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ FUNCTIONS: Final[Mapping[str, Function]] = MappingProxyType(
         for function in module.FUNCTIONS
     }
 )
-"""By name."""
+"""The functions by name."""
 
 OF_FIELDS: Final[Mapping[str, Function]] = MappingProxyType({each.name: each for each in position_fields.FUNCTIONS})
-"""Not for authors: the functions that fields of `at` and `seenFrom` become (see `expanding`)."""
+"""The internal functions behind the fields of `at` and `seenFrom` (see `expanding`), by name."""
 
 DECLARATIONS: Final = [
     *preparing.DECLARATIONS,
     *(function.declaration() for function in (*FUNCTIONS.values(), *OF_FIELDS.values())),
 ]
-"""As CEL takes them."""
+"""The declarations for CEL."""
 
 TAKING_HANDLES: Final = frozenset(name for name, function in FUNCTIONS.items() if function.takes_handles)
-"""The functions that take lists, maps or bytes, unread."""
+"""The functions that take lists, maps or bytes as handles."""

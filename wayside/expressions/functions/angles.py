@@ -1,4 +1,4 @@
-"""Angles: of quaternions in radians, as ROS has them, and between headings in degrees, as GNSS and ETSI have them.
+"""Angles: of quaternions in radians, as in ROS, and between headings in degrees, as in GNSS and ETSI messages.
 
 Yaw, pitch and roll are those of REP 103: rotations about z, then y, then x, right-handed.
 """
@@ -55,7 +55,7 @@ def _finite(angle: float, what: str) -> float:
 
 
 def _quaternion(arguments: tuple[object, ...]) -> Quaternion:
-    """Of length 1, from a map with x, y, z and w, or from the four."""
+    """The normalised quaternion, from a map with x, y, z and w, or from four numbers."""
     parts = arguments if len(arguments) == 4 else tuple(member(arguments[0], name) for name in "xyzw")
     x, y, z, w = (number(part, f"{name} of the quaternion") for name, part in zip("xyzw", parts, strict=True))
     length = math.hypot(x, y, z, w)

@@ -1,12 +1,13 @@
-"""Calls from CEL into Python, and the references that they lose.
+"""Calls from CEL into Python, and the references that these calls leak.
 
-cel-expr-python 0.1.3 keeps a reference to the arguments' tuple of every call, and one to every result: some 130 bytes
-a call that nothing would ever free, which is gigabytes a day for a fleet. So the tuple and the result are noted while
-the expression is evaluated, and that reference is dropped once the evaluation is over and CEL holds nothing any more.
-Whether they are lost at all is tried when this is imported; a version that loses nothing is left alone.
+cel-expr-python 0.1.3 leaks a reference to the argument tuple of every call, and one to every result: about 130 bytes
+per call, which is gigabytes per day for a fleet. So the tuple and the result are noted during the evaluation of the
+expression, and the leaked references are dropped after it, when CEL has no reference any more. A test at import
+determines whether the installed version leaks references; otherwise nothing is dropped.
 
-Python makes a new tuple of a function's arguments. The one that CEL made is seen only by a C function: CPython's own
-`PyObject_CallOneArg(function, argument)` has the signature of one, and gives the tuple to the function as it is.
+Python creates a new tuple for the arguments of a Python function. Only a C function receives the tuple that CEL
+created: CPython's `PyObject_CallOneArg(function, argument)` has the signature of such a function, and passes the tuple
+on unchanged.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ Arguments = tuple[object, ...]
 _METH_VARARGS = 1
 
 _KEPT = 3
-"""References to an object that is not lost, as `sys.getrefcount` counts them: the note, a variable, its argument."""
+"""The `sys.getrefcount` of an object without a leak: the note, a variable, and the argument of the function."""
 
 
 class _Method(ctypes.Structure):
@@ -69,11 +70,12 @@ def called_by_cel(function: Callable[[Arguments], object]) -> Callable[..., obje
 
 
 def drop_lost_references() -> None:
-    """The outermost evaluation on this thread is over, and its outcome gone: drop the references that CEL lost."""
+    """Drop the references that CEL leaked, after the outermost evaluation on this thread, when its outcome is
+    deleted."""
     noted = _noted
     if not noted.arguments:
         return
-    # Asking each for its references as well: what was not lost after all must never be freed under somebody's feet.
+    # Each count is checked as well: an object that was not leaked must never be freed while it is in use.
     if _arguments_are_lost:
         for arguments in noted.arguments:
             if sys.getrefcount(arguments) > _KEPT:
@@ -86,7 +88,7 @@ def drop_lost_references() -> None:
 
 
 def _lost(implementation: Callable[[Arguments], object], yields: cel.Type) -> tuple[bool, bool]:
-    """Whether a call loses its arguments, and its result."""
+    """Whether a call leaks its arguments, and its result."""
     seen: list[object] = []
 
     def call(arguments: Arguments) -> object:

@@ -1,7 +1,7 @@
-"""Compares lists of objects, such as what two sensors saw of one scene, without CEL's bound on iterations.
+"""Compares lists of objects, such as the detections of two sensors in one scene, without CEL's limit on iterations.
 
-Objects are matched by their places alone. `path` names where an object has its coordinates, such as
-`bbox.center.position`; see `members.place` for where they are looked for without it.
+Objects are matched only by their positions. `path` is the path of an object's coordinates, such as
+`bbox.center.position`; `members.place` describes the default paths.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from wayside.expressions.functions.members import Place, place, sequence
 
 
 def unmatched(items: object, others: object, within: float, path: str = "") -> list[float]:
-    """The indices of the items of one list that have no item of the other within that many metres."""
+    """The indices of the items of one list that have no item of the other list within this distance in metres."""
     if within < 0:
         raise ValueError(f"within must be 0 or more metres; got {within:g}")
     places = _places(items, "items", path)
@@ -24,12 +24,12 @@ def unmatched(items: object, others: object, within: float, path: str = "") -> l
 
 
 def count_unmatched(items: object, others: object, within: float, path: str = "") -> float:
-    """How many of them there are."""
+    """The number of items that `unmatched` returns."""
     return float(len(unmatched(items, others, within, path)))
 
 
 def nearest(items: object, x: float, y: float, path: str = "") -> float:
-    """Metres in the plane from (x, y) to the nearest item; infinite where the list is empty."""
+    """The distance in the plane from (x, y) to the nearest item, in metres; infinite if the list is empty."""
     return min((math.hypot(px - x, py - y) for px, py, _ in _places(items, "items", path)), default=math.inf)
 
 

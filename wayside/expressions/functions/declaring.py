@@ -1,7 +1,7 @@
-"""The declaration of a function: its parameters by name, so that errors can name them.
+"""The declaration of functions: parameters have names, so that errors can name them.
 
-CEL finds the implementation by the types that arrive. A parameter for a list, a map or bytes therefore has two: the
-thing itself, where the expression writes it (`[[0, 0], [4, 0]]`), and its handle, where it comes from a value.
+CEL selects the implementation by the types of the arguments. So a parameter for a list, a map or bytes has two CEL
+types: the value itself for a literal (`[[0, 0], [4, 0]]`), and the handle for a value from the input.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ _YIELDS = {
 
 @dataclass(frozen=True, slots=True)
 class FunctionParameter:
-    """A parameter. Its name contains the unit if its meaning does not imply it."""
+    """A parameter. Its name contains the unit, unless the unit is clear from the meaning."""
 
     name: str
     takes: ArgumentType
@@ -96,7 +96,7 @@ class Function:
         return " or ".join(", ".join(p.takes.value for p in s.parameters) for s in self.signatures)
 
     def declaration(self) -> cel.FunctionDecl:
-        """As CEL takes it."""
+        """The declaration for CEL."""
         return cel.FunctionDecl(self.name, list(self._overloads()))
 
     def _overloads(self) -> Iterator[cel.Overload]:
@@ -108,7 +108,7 @@ class Function:
 
 
 def _called(function: Function, signature: Signature) -> Callable[..., object]:
-    """The implementation, given the values behind handles; NaN, which is unknown, does not get in."""
+    """The implementation, called with the values of handles. A NaN argument, which is unknown, raises ValueError."""
 
     def call(arguments: Arguments) -> object:
         values = [value_of(argument) for argument in arguments]
@@ -127,12 +127,12 @@ def _fits(takes: ArgumentType, value: object) -> bool:
     if takes is ArgumentType.BYTES:
         return isinstance(value, bytes | bytearray | memoryview)
     if takes is ArgumentType.LIST:
-        return isinstance(value, list | tuple) or hasattr(value, "tolist")  # numpy's: a list in all that matters
+        return isinstance(value, list | tuple) or hasattr(value, "tolist")  # a numpy array, which behaves like a list
     return isinstance(value, Mapping) or dataclasses.is_dataclass(value)
 
 
 def function(name: str, yields: ResultType, summary: str, *ways: tuple[Callable[..., object], str]) -> Function:
-    """A function by its ways to be called: an implementation, and the parameters as in `x y polygon:list`."""
+    """A function with its signatures: for each, an implementation, and the parameters as in `x y polygon:list`."""
     return Function(
         name,
         yields,

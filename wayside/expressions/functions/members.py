@@ -1,6 +1,6 @@
-"""Reads numbers out of messages as functions get them: maps, records of decoded messages, lists of coordinates.
+"""Reads numbers from function arguments: maps, records of decoded messages, lists of coordinates.
 
-An absent, null or NaN value raises ValueError with a message that begins with `no value for`: unknown, not wrong.
+An absent, null or NaN value raises ValueError with a message that begins with `no value for`, which means unknown.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ from typing import Final
 _ABSENT: Final = object()
 
 _PLACES: Final = (("position",), ("pose", "position"), ("pose", "pose", "position"), ("center", "position"))
-"""The paths of an object's coordinates, if they are not in the object itself."""
+"""The possible paths of an object's coordinates, if these are not in the object itself."""
 
 Place = tuple[float, float, float]
 """Metres along x, y and z."""
 
 
 def sequence(value: object, what: str) -> Sequence[object]:
-    """A list, a tuple or numpy's array."""
+    """The value as a list or tuple, also from a numpy array."""
     if hasattr(value, "tolist"):
         value = value.tolist()
     if isinstance(value, list | tuple):
@@ -36,14 +36,14 @@ def number(value: object, what: str) -> float:
 
 
 def member(value: object, name: str) -> object:
-    """The field of a map or a record; a sentinel where it has none."""
+    """The field of a map or a record; a sentinel if it does not exist."""
     if isinstance(value, Mapping):
         return value.get(name, _ABSENT)
     return getattr(value, name, _ABSENT) if hasattr(value, "__dataclass_fields__") else _ABSENT
 
 
 def pair(point: object, names: tuple[str, str], what: str) -> tuple[float, float]:
-    """Two coordinates: a list of two numbers, or a map with the names."""
+    """Two coordinates, from a list of two numbers, or from a map with these names."""
     if isinstance(point, list | tuple):
         if len(point) < 2:
             raise ValueError(f"{what} must have two numbers; got {len(point)}")

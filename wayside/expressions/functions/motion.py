@@ -8,17 +8,17 @@ from wayside.expressions.functions.declaring import ResultType, function
 
 
 def time_to_collision(gap: float, closing_speed: float) -> float:
-    """Seconds until a gap (m) is closed at a speed (m/s): 0 where there is none, infinite where it does not close."""
+    """The seconds until a gap (m) is closed at a speed (m/s): 0 without a gap, infinite if it does not close."""
     if gap <= 0:
         return 0.0
     return gap / closing_speed if closing_speed > 0 else math.inf
 
 
 def time_to_contact(dx: float, dy: float, vx: float, vy: float, radius: float) -> float:
-    """Seconds until two on straight ways are `radius` metres apart; infinite where they never are.
+    """The seconds until two bodies on straight paths are `radius` metres apart; infinite if they never are.
 
-    dx, dy (m) and vx, vy (m/s) are the place and the velocity of the one, seen from the other. The first root of
-    |d + v t| = radius, in the form that does not cancel.
+    dx, dy (m) and vx, vy (m/s) are the position and velocity of one body relative to the other. The result is the
+    first root of |d + v t| = radius, in a form without cancellation.
     """
     if radius < 0:
         raise ValueError(f"radius must be 0 or more; got {radius:g}")
@@ -40,13 +40,13 @@ def time_to_contact(dx: float, dy: float, vx: float, vy: float, radius: float) -
 
 
 def closing(dx: float, dy: float, vx: float, vy: float) -> float:
-    """Metres per second at which two come nearer to each other now; at the same place they can only part."""
+    """The speed at which two bodies approach each other now, in m/s. At the same position, they can only separate."""
     apart = math.hypot(dx, dy)
     return -(dx / apart * vx + dy / apart * vy) if apart > 0 else -math.hypot(vx, vy)
 
 
 def closest_approach(dx: float, dy: float, vx: float, vy: float) -> float:
-    """Metres at which two on straight ways will be nearest to each other, from now on."""
+    """The smallest distance that two bodies on straight paths will have from now on, in metres."""
     if vx == vy == 0:
         return math.hypot(dx, dy)
     ux, uy = _direction(vx, vy)
@@ -54,7 +54,7 @@ def closest_approach(dx: float, dy: float, vx: float, vy: float) -> float:
 
 
 def _direction(vx: float, vy: float) -> tuple[float, float]:
-    """The velocity's direction, of length 1. Scaled before, since the length of a tiny one is a rounded number."""
+    """The unit vector of the velocity. The velocity is scaled first, since the length of a tiny one is imprecise."""
     largest = max(abs(vx), abs(vy))
     ux, uy = vx / largest, vy / largest
     length = math.hypot(ux, uy)

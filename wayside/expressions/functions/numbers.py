@@ -1,4 +1,4 @@
-"""Mathematical functions that CEL does not have, on numbers and lists of numbers."""
+"""Mathematical functions on numbers and lists of numbers that CEL does not have."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from wayside.expressions.functions.members import number, sequence
 
 
 def of_list(calculate: Callable[[list[float]], float]) -> Callable[[object], float]:
-    """A calculation over the numbers of a list; null and NaN are left out, and without any there is no value."""
+    """A calculation over the numbers of a list. Null and NaN are ignored; if no number remains, it raises
+    ValueError."""
 
     def calculated(values: object) -> float:
         items = sequence(values, "values")
@@ -27,7 +28,7 @@ def of_list(calculate: Callable[[list[float]], float]) -> Callable[[object], flo
 
 
 def square_root(x: float) -> float:
-    """Of a number that is not negative."""
+    """The square root of a number that is not negative."""
     if x < 0:
         raise ValueError(f"sqrt needs a number of 0 or more; got {x:g}")
     return math.sqrt(x)

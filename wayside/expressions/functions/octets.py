@@ -21,17 +21,17 @@ _FORMATS: Final = {
 
 
 def all_zero(data: bytes) -> bool:
-    """Whether no byte is other than 0; also of no bytes."""
+    """Whether all bytes are 0; true for no bytes."""
     return not bytes(data).strip(b"\0") if len(data) < 4096 else bytes(data).count(0) == len(data)
 
 
 def checksum(data: bytes) -> float:
-    """The CRC-32 of ISO 3309 (as of zip and Ethernet)."""
+    """The CRC-32 of ISO 3309 (as in zip and Ethernet)."""
     return float(zlib.crc32(data))
 
 
 def byte_count(data: bytes) -> float:
-    """How many bytes there are."""
+    """The number of bytes."""
     return float(memoryview(data).nbytes)
 
 
@@ -46,7 +46,7 @@ def number_at(data: bytes, offset: float, form: str) -> float:
 
 
 def utf8(data: bytes) -> str:
-    """The text that the bytes are, in UTF-8."""
+    """The bytes decoded as UTF-8; NUL becomes `␀`."""
     try:
         return bytes(data).decode().replace("\0", "␀")
     except UnicodeDecodeError as error:

@@ -1,7 +1,7 @@
-"""Places: distances in metres, bearings in degrees, and what lies inside a polygon.
+"""Positions: distances in metres, bearings in degrees, and tests whether a position is inside a polygon.
 
-On the Earth the ellipsoid is WGS 84. The edges of a polygon of latitudes and longitudes are straight in these, which
-for edges up to a few kilometres is the straight way on the ground to within centimetres.
+Positions on the Earth refer to the ellipsoid WGS 84. The edges of a polygon in degrees are straight in latitude and
+longitude. Edges of up to a few kilometres differ from straight lines on the ground by centimetres.
 """
 
 from __future__ import annotations
@@ -15,14 +15,15 @@ from wayside.geo.geometry import Point, contains
 
 
 def wgs84_distance(latitude1: float, longitude1: float, latitude2: float, longitude2: float) -> float:
-    """Metres along the ellipsoid between two places given in degrees."""
+    """The distance along the ellipsoid between two positions in degrees, in metres."""
     _check(latitude1, longitude1)
     _check(latitude2, longitude2)
     return geodesy.surface_distance(latitude1, longitude1, latitude2, longitude2)
 
 
 def wgs84_bearing(latitude1: float, longitude1: float, latitude2: float, longitude2: float) -> float:
-    """Degrees in [0, 360), clockwise from north, at the first place, of the great circle: up to 0.2 degrees off."""
+    """The initial bearing of the great circle, in degrees in [0, 360) clockwise from north. The error is up to 0.2
+    degrees."""
     _check(latitude1, longitude1)
     _check(latitude2, longitude2)
     phi1, phi2 = math.radians(latitude1), math.radians(latitude2)
@@ -30,16 +31,16 @@ def wgs84_bearing(latitude1: float, longitude1: float, latitude2: float, longitu
     east = math.sin(difference) * math.cos(phi2)
     north = math.cos(phi1) * math.sin(phi2) - math.sin(phi1) * math.cos(phi2) * math.cos(difference)
     bearing = math.degrees(math.atan2(east, north)) % 360.0
-    return 0.0 if bearing == 360.0 else bearing  # what is just below 0 rounds up
+    return 0.0 if bearing == 360.0 else bearing  # a bearing just below 0 is rounded to 360
 
 
 def inside(x: float, y: float, polygon: object) -> bool:
-    """Whether (x, y) lies in the polygon, a list of corners [x, y] or {x, y}; on its edges and corners counts."""
+    """Whether (x, y) is inside the polygon or on its edge; the polygon is a list of corners [x, y] or {x, y}."""
     return contains([_corners(polygon, ("x", "y"))], (x, y))
 
 
 def inside_wgs84(latitude: float, longitude: float, polygon: object) -> bool:
-    """The same of degrees, with corners [latitude, longitude]; a polygon may lie across the antimeridian."""
+    """The same in degrees, with corners [latitude, longitude]. A polygon may cross the antimeridian."""
     _check(latitude, longitude)
     corners = _corners(polygon, ("latitude", "longitude"))
     for corner in corners:
@@ -55,7 +56,7 @@ def inside_wgs84(latitude: float, longitude: float, polygon: object) -> bool:
 
 
 def count_inside(items: object, polygon: object, path: str = "") -> float:
-    """How many objects of a list lie in the polygon."""
+    """The number of objects of a list that are inside the polygon."""
     corners = _corners(polygon, ("x", "y"))
     places = [place(item, f"items[{i}]", path) for i, item in enumerate(sequence(items, "items"))]
     return float(sum(contains([corners], (x, y)) for x, y, _ in places))

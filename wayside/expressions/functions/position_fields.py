@@ -1,7 +1,7 @@
 """The fields of `at(position, place)` and `seenFrom(a, b)`, each as a function of plain numbers.
 
-Authors write the field (`at(position, "crossing").inside`), and `expanding` makes a call of it. Headings are degrees
-counter-clockwise here, yaws radians counter-clockwise; turns are degrees, positive to the left.
+Authors write a field (`at(position, "crossing").inside`), and `expanding` turns it into a call. Headings are here in
+degrees counter-clockwise, yaws in radians counter-clockwise; turns are in degrees, positive to the left.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ OF_PLACES: Final = {
     "at_across": "u v place:string",
     "at_heading": "u v heading place:string",
 }
-"""The parameters of the functions that `positions` calculates, by name."""
+"""The parameters of the functions that `geo.positions` computes, by name."""
 
 
 def _at(name: str) -> Callable[..., float]:
     def calculated(*given: object) -> float:
-        from wayside.geo.positions import at_one  # noqa: PLC0415  numpy is loaded by those who evaluate
+        from wayside.geo.positions import at_one  # noqa: PLC0415  numpy is loaded only for an evaluation
 
         *numbers, key = given
         return at_one(name, str(key), *numbers)  # type: ignore[arg-type]  # CEL has checked the types
@@ -65,7 +65,7 @@ def _turned(yaw: float, other_yaw: float) -> float:
 
 
 def _metres(latitude: float, longitude: float, other_latitude: float, other_longitude: float) -> tuple[float, float]:
-    """East and north, on the ellipsoid halfway between the two."""
+    """The metres to the east and north, on the ellipsoid at the mean latitude."""
     north, east = geodesy.degrees((latitude + other_latitude) / 2)
     return math.remainder(other_longitude - longitude, 360.0) * east, (other_latitude - latitude) * north
 

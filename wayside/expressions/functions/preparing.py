@@ -1,4 +1,4 @@
-"""What prepares an argument of CEL's own functions: other types pass through unchanged."""
+"""Internal functions that prepare an argument of CEL's functions; other types pass through unchanged."""
 
 from __future__ import annotations
 
@@ -51,8 +51,8 @@ DECLARATIONS: Final = (
     _passing(
         BOUNDED,
         cel.Overload(f"{BOUNDED}_string", cel.Type.STRING, [cel.Type.STRING], False, called_by_cel(_bounded)),
-        (cel.Type.DOUBLE, cel.Type.UINT, *_ALL),  # which `matches` itself refuses with an error
+        (cel.Type.DOUBLE, cel.Type.UINT, *_ALL),  # `matches` itself refuses these with an error
     ),
 )
 """For `string`: a double without a fraction becomes an integer, so that `string(4711000)` is `4711000`. For `matches`:
-a text that is too long has no result, without a search."""
+a string that is too long is an error, without a search."""
