@@ -183,7 +183,7 @@ def test_files_that_cannot_be_used_are_reported_at_the_start(
     assert part in str(error.value)
 
 
-def test_a_port_that_is_taken_is_reported(folder: Path) -> None:
+def test_a_port_in_use_is_reported(folder: Path) -> None:
     async def review(requested: Any) -> dict[str, Any]:
         return {}
 

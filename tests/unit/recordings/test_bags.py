@@ -55,7 +55,7 @@ def bag(tmp_path: Path, noetic: Typestore) -> Path:
     return path
 
 
-def test_messages_of_a_ros_1_bag_read_as_those_of_ros_2(bag: Path) -> None:
+def test_messages_of_a_ros_1_bag_are_read_as_ros_2_messages(bag: Path) -> None:
     messages = list(messages_in([bag], lambda key: key.startswith("vehicles/")))
     assert [(m.time, m.key, m.encoding, m.type) for m in messages] == [
         ((100 + n) * SECOND // 10, f"vehicles/car{n % 2 + 1}/pose", "cdr", POSE) for n in range(10)
@@ -79,7 +79,7 @@ def test_messages_of_equal_times_come_in_the_order_in_which_the_bag_has_them(tmp
     assert [each.key for each in messages] == [f"vehicles/car{car}/pose" for car in cars]
 
 
-def test_a_type_of_ones_own_comes_with_the_bag(tmp_path: Path, noetic: Typestore) -> None:
+def test_custom_types_are_defined_by_the_bag(tmp_path: Path, noetic: Typestore) -> None:
     own = get_types_from_msg("string name\nfloat32[] values\nduration left", "own_msgs/msg/Thing")
     noetic.register(own)
     duration = noetic.types["builtin_interfaces/msg/Duration"](sec=4, nanosec=5)
@@ -102,13 +102,13 @@ def test_a_type_of_ones_own_comes_with_the_bag(tmp_path: Path, noetic: Typestore
     }
 
 
-def test_a_bag_of_common_types_leaves_the_detector_as_it_is(bag: Path) -> None:
+def test_a_bag_of_common_types_does_not_change_the_detector(bag: Path) -> None:
     poses = {"name": "pose", "key": "vehicles/${client:*}/pose", "encoding": "cdr", "type": POSE}
     detector = a_detector(poses)
     assert with_recorded_types(detector, [bag]) is detector
 
 
-def test_a_type_that_ros_2_defines_otherwise_is_refused_if_it_is_requested(bag: Path) -> None:
+def test_a_requested_type_with_another_ros_2_definition_is_rejected(bag: Path) -> None:
     with pytest.raises(RecordingError, match="/other is recorded as sensor_msgs/msg/Range, whose fields differ"):
         list(messages_in([bag]))
 
@@ -118,7 +118,7 @@ def vehicles(key: str) -> bool:
 
 
 @pytest.mark.parametrize("compression", [None, *Writer.CompressionFormat])
-def test_a_bag_that_is_cut_is_read_up_to_there(
+def test_a_truncated_bag_is_read_up_to_the_cut(
     tmp_path: Path, noetic: Typestore, compression: Writer.CompressionFormat | None
 ) -> None:
     path = tmp_path / "drive.bag"
@@ -203,7 +203,7 @@ def test_stopping_does_not_wait_for_a_pause_in_the_recording(tmp_path: Path) -> 
     assert thread.state is SourceState.STOPPED
 
 
-def test_a_recording_that_is_not_there_is_waited_for(bag: Path, tmp_path: Path) -> None:
+def test_a_missing_recording_is_waited_for(bag: Path, tmp_path: Path) -> None:
     arrivals, loss_counter = Arrivals(), LossCounter()
     later = tmp_path / "later.bag"
     thread = playing(arrivals, loss_counter, paths=[str(later)], rate=1000)

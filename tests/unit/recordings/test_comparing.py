@@ -35,7 +35,7 @@ def episodes(rule: str, *spans: tuple[float, float | None], subject: str = "car"
     return events
 
 
-def test_episodes_that_overlap_are_the_same_and_their_times_are_compared() -> None:
+def test_overlapping_episodes_match_and_their_times_are_compared() -> None:
     events = [*episodes("a", (0, 10), (20, 30), (50, 60)), *episodes("b", (1, 12), (40, 45), (49, 60))]
     comparison = compare(events, "a", "b", at(100))
     assert comparison.start_differences == [1.0, -1.0]
@@ -45,14 +45,14 @@ def test_episodes_that_overlap_are_the_same_and_their_times_are_compared() -> No
     assert comparison.agreement == (9 + 10) / (12 + 10 + 5 + 11)
 
 
-def test_one_that_is_open_ends_with_the_recording_and_has_no_end_to_compare() -> None:
+def test_an_open_episode_ends_with_the_recording_and_its_end_is_not_compared() -> None:
     comparison = compare([*episodes("a", (0, None)), *episodes("b", (5, 10))], "a", "b", at(20))
     assert comparison.start_differences == [5.0]
     assert comparison.end_differences == []
     assert comparison.agreement == 5 / 20
 
 
-def test_other_subjects_are_other_episodes_and_of_several_the_longest_shared_is_taken() -> None:
+def test_episodes_match_only_for_the_same_subject_and_by_the_longest_overlap() -> None:
     events = [*episodes("a", (0, 10)), *episodes("b", (0, 10), subject="bus"), *episodes("b", (0, 1), (2, 10))]
     comparison = compare(events, "a", "b", at(10))
     assert [(first.start, second.start) for first, second in comparison.both] == [(at(0), at(2))]
@@ -65,7 +65,7 @@ spans = st.lists(st.tuples(st.integers(0, 50), st.integers(0, 10)), max_size=8).
 
 
 @given(spans, spans)
-def test_each_episode_is_counted_once_and_only_what_overlaps_is_the_same(
+def test_each_episode_is_counted_once_and_only_overlapping_ones_match(
     first: list[tuple[float, float]], second: list[tuple[float, float]]
 ) -> None:
     first, second = [*dict.fromkeys(first)], [*dict.fromkeys(second)]

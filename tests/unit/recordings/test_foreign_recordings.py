@@ -96,7 +96,7 @@ def test_a_recording_of_another_program_replays(recording: Path, clock: str) -> 
     assert events == ["crowd car started 4"]
 
 
-def test_what_is_recorded_reads_in_other_programs(tmp_path: Path) -> None:
+def test_recordings_are_readable_by_other_programs(tmp_path: Path) -> None:
     stream = {"name": "odom", "key": "${client:*}/odom", "encoding": "cdr", "type": "nav_msgs/msg/Odometry"}
     detector = a_detector(stream)
     writer = IntakeWriter(tmp_path / "intake.mcap", detector.spec.streams, stream_readers(detector).types)

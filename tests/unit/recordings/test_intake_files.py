@@ -103,7 +103,7 @@ def test_a_stream_whose_type_changes_continues_in_another_channel(tmp_path: Path
 
 @settings(max_examples=100, deadline=None)
 @given(cut=st.integers(0, 10_000))
-def test_a_cut_file_gives_what_can_be_read_and_reports_that_it_is_cut(
+def test_a_truncated_file_is_read_up_to_the_cut_and_reported(
     cut: int, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     path = tmp_path_factory.getbasetemp() / "whole.mcap"
@@ -125,7 +125,7 @@ def test_a_cut_file_gives_what_can_be_read_and_reports_that_it_is_cut(
     assert read == CONSUMED[: len(read)]
 
 
-def test_a_killed_writer_leaves_what_it_took_in_up_to_the_last_second(tmp_path: Path) -> None:
+def test_a_killed_writer_leaves_all_samples_up_to_the_last_second(tmp_path: Path) -> None:
     path = tmp_path / "intake.mcap"
     program = f"""
 import sys, time
@@ -181,7 +181,7 @@ def test_a_full_disk_ends_the_recording_but_not_the_caller(caplog: pytest.LogCap
 
 
 @pytest.mark.parametrize("content", [b"", b"\x89MCAP0\r\n", b"{}\n", b"\x00" * 100])
-def test_other_files_are_no_intake_files(tmp_path: Path, content: bytes) -> None:
+def test_other_files_are_rejected_as_intake_files(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "other"
     path.write_bytes(content)
     assert not is_intake_file(path)

@@ -92,7 +92,7 @@ def test_both_formats_are_read_in_both_byte_orders(write: object, order: str, tm
     assert [message.time - START for message in messages] == [1_000_000, 2_000_000, 5 * SECOND]
 
 
-def test_packets_go_to_the_keys_of_their_messages_and_other_frames_are_passed_over(tmp_path: Path) -> None:
+def test_packets_get_the_keys_of_their_messages_and_other_frames_are_skipped(tmp_path: Path) -> None:
     denm, _ = random_message("denm", random.Random(1))
     area = EXTENDED["a place (GBC)"]
     frames = [
@@ -107,7 +107,7 @@ def test_packets_go_to_the_keys_of_their_messages_and_other_frames_are_passed_ov
 
 
 @pytest.mark.parametrize("write", [pcap, pcapng])
-def test_a_capture_that_is_cut_is_read_up_to_there(write: object, tmp_path: Path) -> None:
+def test_a_truncated_capture_is_read_up_to_the_cut(write: object, tmp_path: Path) -> None:
     raw = write([(START + index, ethernet(CAM)) for index in range(3)])  # type: ignore[operator]
     path = tmp_path / "capture"
     whole = read(path, raw)

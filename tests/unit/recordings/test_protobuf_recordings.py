@@ -127,7 +127,7 @@ def test_each_item_of_a_list_of_protobuf_is_a_client(recording: Path, tmp_path: 
     assert [(event.episode.subject, event.started) for event in events] == [("car-3", True), ("car-3", False)]
 
 
-def test_a_cut_recording_with_protobuf_is_read_up_to_there(recording: Path) -> None:
+def test_a_truncated_protobuf_recording_is_read_up_to_the_cut(recording: Path) -> None:
     whole = list(messages_in([recording]))
     recording.write_bytes(recording.read_bytes()[:-40])
     read = list(messages_in([recording]))
@@ -136,7 +136,7 @@ def test_a_cut_recording_with_protobuf_is_read_up_to_there(recording: Path) -> N
     assert read[0].decode(read[0].payload)["kind"] == "BIKE"  # type: ignore[index]
 
 
-def test_another_encoding_than_replay_can_give_is_reported_with_those_it_can(recording: Path) -> None:
+def test_an_unsupported_stream_encoding_is_reported_with_the_supported_ones(recording: Path) -> None:
     stream = Stream(name="t", key="vehicles/${client:*}/track", encoding=Encoding.CDR, type="std_msgs/msg/Header")
     with pytest.raises(
         RecordingError, match=r"track is recorded as protobuf.*streams\[t\].encoding is cdr: write json"
@@ -144,7 +144,7 @@ def test_another_encoding_than_replay_can_give_is_reported_with_those_it_can(rec
         next(arrivals_of(MessageRouter([stream]), messages_in([recording])))
 
 
-def test_a_payload_that_is_no_message_is_counted_by_its_stream(recording: Path) -> None:
+def test_an_invalid_protobuf_payload_is_counted_by_its_stream(recording: Path) -> None:
     (message, *_) = messages_in([recording])
     assert message.decode is not None
     with pytest.raises(ValueError, match=r"no lab\.Track"):
@@ -154,7 +154,7 @@ def test_a_payload_that_is_no_message_is_counted_by_its_stream(recording: Path) 
     assert arrival.payload == b"\xff"
 
 
-def test_a_file_that_does_not_define_its_messages_is_an_error(tmp_path: Path) -> None:
+def test_a_file_without_message_definitions_is_an_error(tmp_path: Path) -> None:
     for schema, logged in ((None, "with no schema"), (b"\x00nonsense", "the definition of lab.Track")):
         path = tmp_path / "drive.mcap"
         with path.open("wb") as file:

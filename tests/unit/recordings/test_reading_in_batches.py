@@ -128,7 +128,7 @@ def test_a_damaged_byte_anywhere_has_the_same_error_and_no_other_messages_before
 
 @FILES
 @given(sent=SENT, options=mcap_options(), data=st.data())
-def test_message_indexes_that_lie_are_not_believed(
+def test_wrong_message_indexes_are_not_trusted(
     tmp_path: Path, sent: list[Sent], options: dict[str, object], data: st.DataObject
 ) -> None:
     path = write(tmp_path / "drive.mcap", sent, **{**options, "index_types": IndexType.ALL})
@@ -146,7 +146,7 @@ def test_message_indexes_that_lie_are_not_believed(
 
 @FILES
 @given(sent=SENT, options=mcap_options(), share=st.floats(0, 1))
-def test_a_file_that_is_cut_anywhere_is_read_up_to_there(
+def test_a_file_truncated_anywhere_is_read_up_to_the_cut(
     tmp_path: Path, sent: list[Sent], options: dict[str, object], share: float
 ) -> None:
     path = write(tmp_path / "drive.mcap", sent, **options)
@@ -158,7 +158,7 @@ def test_a_file_that_is_cut_anywhere_is_read_up_to_there(
     assert [cut.messages for cut in cuts] == [len(found)] or (cuts == [] and len(found) == len(sent))
 
 
-def test_sound_message_indexes_are_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_valid_message_indexes_are_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
         raise AssertionError("a chunk was gone through record by record")
 
@@ -256,7 +256,7 @@ RAW = Stream(name="raw", key="${client:*}/raw", encoding=Encoding.RAW)
 JSON = Stream(name="json", key="${client:*}/json", encoding=Encoding.JSON)
 
 
-def test_what_lies_before_an_error_is_handed_over() -> None:
+def test_messages_before_an_error_are_delivered() -> None:
     good = [Message(number, f"car/{'raw' if number % 2 else 'other'}", b"x", "raw", None) for number in range(10)]
 
     def broken() -> Iterator[Message]:

@@ -62,7 +62,7 @@ def test_a_late_sample_is_found_at_its_own_time(tmp_path: Path) -> None:
     assert read_with_mcap(file) == sorted(map(as_recorded, given), key=lambda each: each.time)
 
 
-def test_channels_show_whose_they_are_and_how_they_read(tmp_path: Path) -> None:
+def test_channels_have_the_client_and_the_encoding(tmp_path: Path) -> None:
     given = [tf_static(0.5), pose(1.1), pose(1.1, client="car2"), speed(1.2), a_sample(1.2, "objects", b"\x01")]
     (file,) = mcap_files(Bench(tmp_path, before="1s").record(an_episode(), given))
     with file.open("rb") as stream:
@@ -87,7 +87,7 @@ def test_channels_show_whose_they_are_and_how_they_read(tmp_path: Path) -> None:
     assert len(summary.schemas) == 2
 
 
-def test_latched_topics_are_played_to_who_comes_later(tmp_path: Path) -> None:
+def test_latched_topics_have_the_qos_for_late_joiners(tmp_path: Path) -> None:
     folder = Bench(tmp_path, before="1s").record(an_episode(), [tf_static(0.5), pose(1.1)])
     with Reader(folder) as reader:
         durability = {
@@ -101,7 +101,7 @@ def test_latched_topics_are_played_to_who_comes_later(tmp_path: Path) -> None:
     }
 
 
-def test_a_stamp_is_the_publish_time_and_else_it_is_when_it_was_received(tmp_path: Path) -> None:
+def test_the_publish_time_is_the_stamp_or_else_the_receive_time(tmp_path: Path) -> None:
     stamped = a_stream("speed", stamp="msg.v")
     bench = Bench(tmp_path, *(each for each in STREAMS if each["name"] != "speed"), stamped)
     unread = a_sample(1.4, "pose", b"short")
@@ -112,7 +112,7 @@ def test_a_stamp_is_the_publish_time_and_else_it_is_when_it_was_received(tmp_pat
     assert times == [5_000_000_007, 9_500_000_000, at(1.3), at(1.4)]
 
 
-def test_what_was_latched_before_the_window_stands_at_its_start(tmp_path: Path) -> None:
+def test_samples_latched_before_the_window_are_at_its_start(tmp_path: Path) -> None:
     long_ago, within = tf_static(-1000), tf_static(0.7, "camera")
     folder = Bench(tmp_path, before="500ms").record(an_episode(), [long_ago, within, pose(0.8)])
     assert [(each.topic[-9:], each.time) for each in read_with_mcap(mcap_files(folder)[0])] == [
@@ -122,7 +122,7 @@ def test_what_was_latched_before_the_window_stands_at_its_start(tmp_path: Path) 
     ]
 
 
-def test_every_file_of_a_split_recording_begins_with_what_is_latched(tmp_path: Path) -> None:
+def test_every_file_of_a_split_recording_begins_with_the_latched_samples(tmp_path: Path) -> None:
     bench = Bench(tmp_path, split={"duration": "1s"})
     first, other, newer = tf_static(0.0), tf_static(0.0, "camera"), tf_static(2.5)
     poses = [pose(1 + k / 10, k) for k in range(35)]
@@ -142,7 +142,7 @@ def test_every_file_of_a_split_recording_begins_with_what_is_latched(tmp_path: P
     assert bench.outcome(an_episode()).samples == len(given)
 
 
-def test_a_file_has_about_the_size_that_it_may_have(tmp_path: Path) -> None:
+def test_files_are_split_near_the_size_limit(tmp_path: Path) -> None:
     bench = Bench(tmp_path, split={"bytes": "2500k"})
     given = [a_sample(1 + k / 10, "points", LARGE) for k in range(7)]
     files = mcap_files(bench.record(an_episode(), given))
@@ -195,7 +195,7 @@ def test_name_folder_and_metadata_describe_the_episode(tmp_path: Path) -> None:
     assert bag["message_count"] == 1
 
 
-def test_a_stream_that_reads_otherwise_from_now_on_gets_another_channel(tmp_path: Path) -> None:
+def test_a_stream_whose_type_changes_gets_another_channel(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     episode = an_episode()
     bench.action.started(episode)
@@ -209,7 +209,7 @@ def test_a_stream_that_reads_otherwise_from_now_on_gets_another_channel(tmp_path
     assert found == [("json", b'{"v": 0.0}'), ("cbor", b"\x01")]
 
 
-def test_a_message_on_the_key_of_two_streams_is_written_once_as_what_can_be_read(tmp_path: Path) -> None:
+def test_a_message_of_two_streams_is_written_once_in_a_readable_encoding(tmp_path: Path) -> None:
     twin = {**a_stream("raw-speed", encoding="raw"), "key": "vehicles/${client:*}/speed"}
     bench = Bench(tmp_path, twin, a_stream("speed"))
     sample = speed(1.1)
@@ -227,7 +227,7 @@ def test_an_episode_without_samples_has_an_empty_recording(tmp_path: Path) -> No
     assert bench.outcome(an_episode()).state is OutcomeState.DONE
 
 
-def test_a_resumed_episode_continues_in_a_recording_that_reports_it(tmp_path: Path) -> None:
+def test_a_resumed_episode_continues_in_another_recording_marked_as_such(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     whole = bench.record(an_episode(), [pose(1.1)])
     resumed = an_episode(resumed=True)
@@ -240,7 +240,7 @@ def test_a_resumed_episode_continues_in_a_recording_that_reports_it(tmp_path: Pa
     assert [each.time for each in read_with_mcap(file)] == [7.5, 7.5]
 
 
-def test_what_is_missing_is_reported_by_name_metadata_and_outcome(tmp_path: Path) -> None:
+def test_missing_samples_are_reported_in_name_metadata_and_outcome(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     folder = bench.record(an_episode(), [pose(1.1)], Completion(missing=4))
     assert folder.name.endswith("_cut")

@@ -61,7 +61,7 @@ def test_recordings_report_that_they_continue_and_are_continued(tmp_path: Path) 
     assert (first["wayside/end"].get("continues"), second["wayside/end"].get("continues")) == ("true", None)
 
 
-def test_the_oldest_give_way_while_the_episode_lasts(tmp_path: Path) -> None:
+def test_the_oldest_recordings_are_dropped_while_the_episode_lasts(tmp_path: Path) -> None:
     bench = Bench(tmp_path, renewAfter="1s")
     bench.limit(files=3)
     bench.record(an_episode(), [pose(1 + k / 10, k) for k in range(60)])
@@ -69,7 +69,7 @@ def test_the_oldest_give_way_while_the_episode_lasts(tmp_path: Path) -> None:
     assert bench.outcome(an_episode()).state is OutcomeState.DONE
 
 
-def test_another_recording_is_tried_after_one_that_failed(tmp_path: Path) -> None:
+def test_recording_is_retried_after_a_failure(tmp_path: Path) -> None:
     bench = Bench(tmp_path, renewAfter="1h")
     bench.limit(bytes="1k", whenFull="Stop")
     bench.action.started(an_episode())

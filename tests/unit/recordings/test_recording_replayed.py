@@ -41,7 +41,7 @@ spec:
 """
 
 
-def test_a_replay_finds_the_messages_at_their_times_and_what_is_latched_once(tmp_path: Path) -> None:
+def test_a_replay_reads_messages_at_their_times_and_latched_ones_once(tmp_path: Path) -> None:
     bench = Bench(tmp_path, split={"duration": "1s"})
     given = [tf_static(1.0), *(each for k in range(30) for each in (pose(1 + k / 10, k), speed(1.05 + k / 10, k)))]
     folder = bench.record(an_episode(), given)
@@ -68,7 +68,7 @@ def test_a_replay_of_a_recording_gives_the_event_again(tmp_path: Path) -> None:
     assert events[0].episode.start_time == at(2.0)
 
 
-def test_a_file_that_is_gone_is_reported(tmp_path: Path) -> None:
+def test_a_missing_file_of_a_recording_is_reported(tmp_path: Path) -> None:
     folder = Bench(tmp_path).record(an_episode(), [pose(1.1)])
     (file,) = mcap_files(folder)
     file.unlink()
@@ -82,14 +82,14 @@ def problems(tmp_path: Path, detector: str, rule: str) -> list[str]:
     return [str(each).removeprefix(f"{path}:") for each in findings(load_documents([path])).problems]
 
 
-def test_a_rule_that_records_needs_to_know_where(tmp_path: Path) -> None:
+def test_a_record_action_needs_a_recordings_folder(tmp_path: Path) -> None:
     (found,) = problems(tmp_path, DETECTOR, RULE)
     assert "spec.actions[0].record: Detector d has no spec.recordings: add it" in found
     assert found.startswith("19:15: ")
     assert problems(tmp_path, f"{DETECTOR}  recordings: {{path: /var/lib/wayside}}\n", RULE) == []
 
 
-def test_what_is_wrong_with_metadata_is_found_at_its_place(tmp_path: Path) -> None:
+def test_errors_in_metadata_are_reported_by_field(tmp_path: Path) -> None:
     rule = RULE.replace("{before: 5s}", "{metadata: {fine: '${speed}', wrong: '${sped}'}}")
     (found,) = problems(tmp_path, f"{DETECTOR}  recordings: {{path: /var/lib/wayside}}\n", rule)
     assert found.startswith("20:52: spec.actions[0].record.metadata.wrong: ")
@@ -103,7 +103,7 @@ def test_a_window_that_reaches_further_back_than_the_buffer_is_refused(tmp_path:
     assert found[0].startswith("20:24: ")
 
 
-def test_a_replay_cuts_the_windows_of_record_actions_from_the_recording(command: CommandLine) -> None:
+def test_a_replay_extracts_the_windows_of_record_actions(command: CommandLine) -> None:
     """One episode is whole; the other is still open when the recording ends, so its clip is cut and marked as such."""
     window = {"before": "500ms", "after": "1s"}
     rule = a_rule("fast", **FAST, actions=[{"name": "bag", "record": {**window, "split": {"duration": "1s"}}}])

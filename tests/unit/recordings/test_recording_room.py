@@ -55,7 +55,7 @@ def test_the_limit_is_over_the_recordings_of_all_rules(tmp_path: Path) -> None:
     assert recordings_of(tmp_path) == ["episode2"]
 
 
-def test_stop_keeps_what_there_is_and_reports_it(tmp_path: Path) -> None:
+def test_policy_stop_keeps_existing_recordings_and_reports_it(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     bench.limit(bytes="5M", whenFull="Stop")
     bench.record(an_episode(1), THREE)
@@ -70,7 +70,7 @@ def test_stop_keeps_what_there_is_and_reports_it(tmp_path: Path) -> None:
     assert metadata_of(file)["cut"] == {"reason": outcome.message}
 
 
-def test_room_that_somebody_makes_is_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_space_freed_from_outside_is_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bench = Bench(tmp_path)
     bench.limit(bytes="4M", whenFull="Stop")
     first = bench.record(an_episode(1), THREE)
@@ -116,7 +116,7 @@ def test_files_are_counted(tmp_path: Path) -> None:
     assert [len(read_with_mcap(file)) for file in mcap_files(folder)] == [1, 1]
 
 
-def test_what_is_too_old_is_deleted(tmp_path: Path) -> None:
+def test_recordings_beyond_their_age_are_deleted(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     bench.limit(age="1h", whenFull="Stop")
     for number, hours in ((1, 2.0), (2, 0.5)):
@@ -136,7 +136,7 @@ def test_the_reserve_of_the_disk_is_not_touched(tmp_path: Path) -> None:
     assert taken(tmp_path) == 0
 
 
-def test_what_is_not_a_recording_is_left_alone(tmp_path: Path) -> None:
+def test_other_files_are_left_alone(tmp_path: Path) -> None:
     foreign = tmp_path / "r" / "holiday"
     foreign.mkdir(parents=True)
     (foreign / "metadata.yaml").write_text("mine")

@@ -90,7 +90,7 @@ def test_rosbag2_folders_are_read(tmp_path: Path, storage: StoragePlugin) -> Non
     assert list(messages_in([file])) == MESSAGES
 
 
-def test_json_lines_are_read_with_their_values_as_they_stand(tmp_path: Path) -> None:
+def test_json_lines_are_read_with_unchanged_values(tmp_path: Path) -> None:
     path = write_lines(
         tmp_path / "drive.jsonl",
         '{"t": 5, "key": "vehicles/car7/pose", "value": {"x": 1.50}}',
@@ -158,7 +158,7 @@ def test_a_broken_line_is_reported_with_file_and_line(tmp_path: Path, lines: lis
     assert words in str(caught.value)
 
 
-def test_what_is_no_recording_is_refused_at_once(tmp_path: Path) -> None:
+def test_files_that_are_not_recordings_are_rejected_at_once(tmp_path: Path) -> None:
     def refused(path: Path) -> str:
         with pytest.raises(RecordingError) as caught:
             messages_in([path])
@@ -190,7 +190,7 @@ SHARES = [0.01, 0.1, 0.3, 0.5, 0.8, 0.99]
 
 
 @pytest.mark.parametrize("share", SHARES)
-def test_a_cut_sqlite_bag_is_an_error_that_names_it(tmp_path: Path, share: float) -> None:
+def test_a_truncated_sqlite_bag_is_an_error_that_names_it(tmp_path: Path, share: float) -> None:
     path = write_sqlite(tmp_path / "drive", MESSAGES * 20)
     for file in path.glob("*.db3"):
         damage(file, share)
@@ -221,7 +221,7 @@ def read_up_to_a_cut(path: Path, written: list[Message]) -> int:
     ],
     ids=["zstd", "lz4", "uncompressed", "one chunk", "unchunked"],
 )
-def test_an_mcap_file_that_is_cut_is_read_up_to_there(tmp_path: Path, options: dict[str, Any]) -> None:
+def test_a_truncated_mcap_file_is_read_up_to_the_cut(tmp_path: Path, options: dict[str, Any]) -> None:
     written = MESSAGES * 20
     whole = write_mcap(tmp_path / "whole.mcap", written, **options).read_bytes()
     counts = []
@@ -233,14 +233,14 @@ def test_an_mcap_file_that_is_cut_is_read_up_to_there(tmp_path: Path, options: d
     assert counts[0] == 0 < counts[2] < counts[3] <= counts[-1]
 
 
-def test_an_mcap_file_whose_last_bytes_were_never_written_is_read_up_to_them(tmp_path: Path) -> None:
+def test_an_mcap_file_with_unwritten_last_bytes_is_read_up_to_them(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "drive.mcap", MESSAGES * 20, chunk_size=1000)
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2] + bytes(len(whole) // 2))
     assert read_up_to_a_cut(path, MESSAGES * 20) > 50
 
 
-def test_an_mcap_file_without_an_index_that_was_closed_is_whole(tmp_path: Path) -> None:
+def test_a_closed_mcap_file_without_an_index_is_complete(tmp_path: Path) -> None:
     none = IndexType.NONE
     path = write_mcap(tmp_path / "drive.mcap", MESSAGES, chunk_size=500, index_types=none, use_statistics=False)
     reported: list[Truncation] = []
@@ -248,7 +248,7 @@ def test_an_mcap_file_without_an_index_that_was_closed_is_whole(tmp_path: Path) 
     assert reported == []
 
 
-def test_an_mcap_file_that_is_damaged_inside_is_an_error_with_the_remedy(tmp_path: Path) -> None:
+def test_an_mcap_file_with_damaged_content_is_an_error_with_the_remedy(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "drive.mcap", MESSAGES * 20, chunk_size=1000)
     whole = bytearray(path.read_bytes())
     for place in range(len(whole) // 3, len(whole) // 3 + 400):
@@ -259,7 +259,7 @@ def test_an_mcap_file_that_is_damaged_inside_is_an_error_with_the_remedy(tmp_pat
 
 
 @pytest.mark.parametrize("share", SHARES[1:-1])
-def test_a_rosbag2_whose_recorder_was_killed_is_read_up_to_there(tmp_path: Path, share: float) -> None:
+def test_a_rosbag2_of_a_killed_recorder_is_read_up_to_the_cut(tmp_path: Path, share: float) -> None:
     path = write_bag(tmp_path / "drive", MESSAGES * 20)
     (file,) = path.glob("*.mcap")
     damage(file, share)
@@ -271,7 +271,7 @@ def test_a_rosbag2_whose_recorder_was_killed_is_read_up_to_there(tmp_path: Path,
     assert list(messages_in([file])) == read
 
 
-def test_a_last_line_that_was_not_written_to_its_end_is_a_cut(tmp_path: Path) -> None:
+def test_an_incomplete_last_line_counts_as_truncation(tmp_path: Path) -> None:
     path = write_lines(tmp_path / "drive.jsonl", *({"t": n, "key": "a", "value": n} for n in range(10)))
     whole = path.read_bytes()
     for size in range(len(whole) // 2, len(whole) - 1):
@@ -289,7 +289,7 @@ def stream(name: str, key: str, type_name: str | None = POSE_TYPE) -> Stream:
     return Stream(name=name, key=key, encoding=encoding, type=type_name, client=None if "${" in key else "ego")
 
 
-def test_messages_go_to_every_stream_of_their_key_at_their_time_which_never_goes_back() -> None:
+def test_messages_are_delivered_to_every_stream_of_their_key_in_order_of_time() -> None:
     router = MessageRouter([stream("pose", "${client:*}/pose"), stream("all", "**/${client:*}/pose")])
     assert router.route("car1/pose") == ("pose", "all")
     assert router.route("odom") == ()

@@ -37,9 +37,7 @@ def test_a_key_may_begin_with_the_slash_of_its_ros_topic(command: CommandLine) -
         ("v/${client}/x", ["key", "write ${client:*}"]),
     ],
 )
-def test_a_key_that_is_none_is_explained_by_replay_as_by_check(
-    command: CommandLine, key: str, words: list[str]
-) -> None:
+def test_an_invalid_key_is_explained_by_replay_as_by_check(command: CommandLine, key: str, words: list[str]) -> None:
     detector = a_detector().to_json()
     client = {} if "client" in key else {"client": "ego"}
     detector["spec"]["streams"] = [{"name": "odom", "key": key, "encoding": "json", **client}]
@@ -52,7 +50,7 @@ def test_a_key_that_is_none_is_explained_by_replay_as_by_check(
             assert word in ran.logged
 
 
-def test_an_error_of_a_value_names_client_and_stream_and_what_was_there(command: CommandLine) -> None:
+def test_an_error_of_a_value_names_client_stream_and_value(command: CommandLine) -> None:
     signal = {"name": "x", "stream": "speed", "value": "msg.v.x"}
     command.write(a_detector(a_stream("speed")), a_rule("r", signals=[signal], when="x > 1"))
     ran = command.replay(command.drive("drive.jsonl", (0.5, {"v": 3}), (2.0, {"v": {"x": 3}})))
@@ -92,7 +90,7 @@ def test_an_error_of_a_fleet_condition_names_the_signals_that_it_reads(command: 
         ("stamp", "t", "; for the field t of JSON lines, write sample.received"),
     ],
 )
-def test_what_is_wrong_with_a_stream_has_file_line_and_column_in_replay_as_in_check(
+def test_errors_of_a_stream_have_file_line_and_column_in_replay_as_in_check(
     command: CommandLine, field: str, text: str, logged: str
 ) -> None:
     detector = a_detector().to_json()
@@ -114,13 +112,13 @@ def test_an_error_of_a_condition_names_client_and_stream(command: CommandLine) -
     assert "the last: until of car (v of stream speed): `v` is 30.0, which has no field `low`" in ran.logged
 
 
-def test_samples_that_name_no_client_are_counted_with_a_key(command: CommandLine) -> None:
+def test_samples_without_a_client_are_counted_with_a_key(command: CommandLine) -> None:
     path = command.drive("drive.jsonl", (0.5, {"v": 3}), (2.0, {"v": 3}), key="vehicles/no name/speed")
     logged = "2 samples of stream speed dropped because neither key nor message names a client; the last: vehicles/"
     assert logged in command.replay(path).logged
 
 
-def test_what_a_client_can_never_have_is_not_counted_as_unknown(command: CommandLine) -> None:
+def test_signals_of_streams_a_client_never_sends_are_not_counted_as_unknown(command: CommandLine) -> None:
     """A station sends its own stream alone; vehicles send speeds, under names that begin with v."""
     station = {"name": "station", "key": "station/state", "client": "rsu", "encoding": "json"}
     speed = {"name": "speed", "key": "vehicles/${client:v$*}/speed", "encoding": "json"}
@@ -227,7 +225,7 @@ def test_the_t_of_json_lines_can_be_the_stamp(command: CommandLine) -> None:
     assert "stamp" not in ran.logged
 
 
-def test_that_no_message_belongs_to_a_stream_is_an_error_with_both_keys(command: CommandLine) -> None:
+def test_a_recording_without_messages_of_any_stream_is_an_error_with_both_keys(command: CommandLine) -> None:
     path = command.drive("drive.jsonl", (0.5, {"v": 3}), key="veh/car/speed")
     ran = command.replay(path)
     assert ran.code == 2

@@ -100,14 +100,14 @@ def test_a_split_recording_with_dates_in_its_names_is_one(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("date", ["2023_11_14-22_13_2", "2023-11-14-22-13-2", "2023111422132"])
-def test_recordings_whose_dates_count_on_are_several(tmp_path: Path, date: str) -> None:
+def test_recordings_with_increasing_dates_are_separate(tmp_path: Path, date: str) -> None:
     paths = [tmp_path / f"rosbag2_{date}{number}.mcap" for number in range(2)]
     for number, path in enumerate(paths):
         write_mcap(path, [each._replace(time=each.time + 10**9 * number) for each in MESSAGES])
     assert recordings_of(paths) == [(path,) for path in paths]
 
 
-def test_two_splits_of_one_name_and_two_dates_are_two_recordings(tmp_path: Path) -> None:
+def test_splits_of_the_same_name_and_different_dates_are_separate_recordings(tmp_path: Path) -> None:
     paths = [tmp_path / f"run_2026-05-0{day}-10-20-30_{number}.mcap" for day in (4, 5) for number in range(3)]
     for path, seconds in zip(paths, (0, 1, 2, 100, 101, 102), strict=True):
         write_mcap(path, [each._replace(time=each.time + 10**9 * seconds) for each in MESSAGES])
@@ -116,7 +116,7 @@ def test_two_splits_of_one_name_and_two_dates_are_two_recordings(tmp_path: Path)
     assert recordings_of([paths[number] for number in (1, 4, 0, 5, 2, 3)]) == expected
 
 
-def test_a_folder_stands_for_the_recordings_in_it(tmp_path: Path) -> None:
+def test_a_folder_means_all_recordings_in_it(tmp_path: Path) -> None:
     (tmp_path / "day" / ".hidden").mkdir(parents=True)
     bag = write_bag(tmp_path / "day" / "bag", MESSAGES)
     files = [write_mcap(tmp_path / "day" / name, MESSAGES) for name in ("b.mcap", "a2.mcap", "a10.mcap")]
@@ -134,7 +134,7 @@ def test_a_folder_stands_for_the_recordings_in_it(tmp_path: Path) -> None:
         recordings_of([empty])
 
 
-def test_a_cut_recording_is_replayed_with_a_warning_and_a_count(command: CommandLine) -> None:
+def test_a_truncated_recording_is_replayed_with_a_warning_and_a_count(command: CommandLine) -> None:
     path = command.drive("drive.jsonl", (0.5, {"v": 20}), (4.0, {"v": 20}), (6.0, {"v": 1}))
     path.write_bytes(path.read_bytes()[:-10])
     ran = command.replay(path)
@@ -178,7 +178,7 @@ def test_the_span_of_a_damaged_ros_1_bag_is_an_error_that_names_it(tmp_path: Pat
         span_of(path)
 
 
-def test_what_cannot_be_read_is_an_error_and_the_others_are_replayed(command: CommandLine) -> None:
+def test_an_unreadable_recording_is_an_error_and_the_others_are_replayed(command: CommandLine) -> None:
     command.drive("a_0.jsonl", *LEFT_OPEN)
     (command.folder / "a_1.jsonl").write_text('{"t": "now"}\n')
     (command.folder / "empty.mcap").touch()

@@ -162,7 +162,7 @@ def test_the_csv_file_has_the_rows_of_the_parquet_file(results: Results) -> None
         assert text["subjects"] == "+".join(row["subjects"])
 
 
-def test_what_nearly_happened_is_listed_by_its_margin_at_moments_without_an_episode(results: Results) -> None:
+def test_near_misses_are_listed_by_margin_outside_of_episodes(results: Results) -> None:
     with (results.folder / "out/nearest.csv").open(newline="") as file:
         rows = [*csv.DictReader(file)]
     margins = [float(row["margin"]) for row in rows]
@@ -224,7 +224,7 @@ def test_the_report_loads_nothing_and_is_small(results: Results) -> None:
     assert len(page) < 2_000_000
 
 
-def test_the_report_has_the_rules_the_data_and_what_actions_would_have_done(results: Results) -> None:
+def test_the_report_has_the_rules_the_data_and_the_simulated_actions(results: Results) -> None:
     data = results.report
     assert [rule["name"] for rule in data["rules"]] == ["close", "harsh", "slow-one", "too-fast"]
     rule = data["rules"][-1]
@@ -257,7 +257,7 @@ def test_results_change_neither_events_nor_tasks_and_are_the_same_each_time(tmp_
         assert path.read_bytes() == (results.folder / "out" / path.name).read_bytes(), path.name
 
 
-def test_each_of_several_recordings_has_files_of_its_own(tmp_path: Path) -> None:
+def test_each_of_several_recordings_has_separate_files(tmp_path: Path) -> None:
     recording, detector, rules = write(tmp_path)
     other = tmp_path / "other.jsonl"
     other.write_bytes(recording.read_bytes())
@@ -277,7 +277,7 @@ def test_a_missing_package_is_named_before_the_replay(tmp_path: Path, monkeypatc
     assert not (tmp_path / "out").exists()
 
 
-def test_an_intake_file_whose_rules_change_on_the_way_has_results_too(tmp_path: Path) -> None:
+def test_an_intake_file_with_rule_changes_has_results_too(tmp_path: Path) -> None:
     detector, rules = documents(tmp_path)
     samples = arrivals()
     half = len(samples) // 2

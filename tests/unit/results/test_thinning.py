@@ -31,7 +31,7 @@ def test_each_part_keeps_its_minimum_and_maximum(buckets: int) -> None:
         assert np.nanmax(series.values[inside]) == pytest.approx(np.nanmax(short.values[kept]))
 
 
-def test_what_holds_at_exact_times_and_before_them_stays() -> None:
+def test_values_at_and_before_exact_times_are_kept() -> None:
     series = waving(20_000)
     exact = np.array([12_345, 500_000, 1_777_777], np.int64)
     short = thinned(series, 0, int(series.times[-1]), 5, exact)
@@ -39,13 +39,13 @@ def test_what_holds_at_exact_times_and_before_them_stays() -> None:
     assert np.array_equal(short.at(exact - 100), series.at(exact - 100), equal_nan=True)
 
 
-def test_where_a_series_becomes_unknown_and_known_stays() -> None:
+def test_transitions_between_known_and_unknown_are_kept() -> None:
     series = waving(20_000)
     short = thinned(series, 0, int(series.times[-1]), 5, NOTHING)
     unknown = series.times[np.isnan(series.values)]
     assert np.isnan(short.at(unknown)).all()
 
 
-def test_a_short_series_stays_as_it_is() -> None:
+def test_a_short_series_is_unchanged() -> None:
     series = waving(100)
     assert thinned(series, 0, 10_000, 50, NOTHING) is series

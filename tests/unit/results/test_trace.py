@@ -85,7 +85,7 @@ def test_an_unknown_stretch_begins_when_the_stream_is_stale_and_has_its_reason(
     assert (int(when.times[at + 1]) - START) / SECOND == SILENT[1]
 
 
-def test_a_pair_out_of_reach_is_away_and_has_no_distance(seen: tuple[ReplayResult, Trace]) -> None:
+def test_a_pair_out_of_reach_has_no_distance(seen: tuple[ReplayResult, Trace]) -> None:
     pairs = [each for each in seen[1].subjects if each.rule == "close"]
     away = [each for each in pairs if (each.conditions["when"].codes == AWAY).any()]
     assert away
@@ -95,7 +95,7 @@ def test_a_pair_out_of_reach_is_away_and_has_no_distance(seen: tuple[ReplayResul
         assert np.isnan(each.signals["distance"].at(times)).all()
 
 
-def test_the_cut_into_batches_changes_nothing(tmp_path: Path, seen: tuple[ReplayResult, Trace]) -> None:
+def test_the_batch_size_does_not_matter(tmp_path: Path, seen: tuple[ReplayResult, Trace]) -> None:
     chance = random.Random(7)
 
     def cut() -> Iterator[list[Arrival]]:
@@ -111,7 +111,7 @@ def test_the_cut_into_batches_changes_nothing(tmp_path: Path, seen: tuple[Replay
     assert_alike(tracer.trace(), seen[1])
 
 
-def test_rules_in_columns_and_one_by_one_have_the_same_trace(tmp_path: Path, seen: tuple[ReplayResult, Trace]) -> None:
+def test_column_and_single_evaluation_give_the_same_trace(tmp_path: Path, seen: tuple[ReplayResult, Trace]) -> None:
     tracer = OneByOne()
     replayed(tmp_path, tracer)
     alone = tracer.trace()
@@ -129,7 +129,7 @@ def test_rules_in_columns_and_one_by_one_have_the_same_trace(tmp_path: Path, see
             assert mine == [other.signals[name].plain(value) for value in other.signals[name].at(times).tolist()]
 
 
-def test_nobody_who_looks_on_changes_an_event(tmp_path: Path, seen: tuple[ReplayResult, Trace]) -> None:
+def test_tracing_does_not_change_events(tmp_path: Path, seen: tuple[ReplayResult, Trace]) -> None:
     detector, rules = documents(tmp_path)
     plain = replay_arrivals([arrivals()], detector, rules)
     assert [event.to_json() for event in plain.events] == [event.to_json() for event in seen[0].events]
@@ -149,7 +149,7 @@ def assert_alike(one: Trace, other: Trace) -> None:
     assert one.paths.keys() == other.paths.keys()
 
 
-def test_without_a_rule_about_pairs_the_signals_x_and_y_are_the_ways() -> None:
+def test_without_a_pairs_rule_the_paths_are_the_signals_x_and_y() -> None:
     stream = a_stream("odom", staleAfter="2s")
     signals = [{"name": axis, "stream": "odom", "value": f"msg.{axis}"} for axis in ("x", "y")]
     rule = a_rule("far", signals=signals, when="x > 100", evaluation={"every": "100ms"})

@@ -18,7 +18,7 @@ def started(folder: Path, rule: str) -> list[str]:
     return [e["data"]["startTime"] for e in events if e["data"]["rule"] == rule and e["type"].endswith("started")]
 
 
-def test_a_sweep_plays_all_values_in_one_pass_as_if_each_were_written(
+def test_a_sweep_evaluates_all_values_in_one_pass_as_if_written_separately(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     recording, detector, rules = write(tmp_path)
@@ -42,7 +42,7 @@ def test_a_sweep_plays_all_values_in_one_pass_as_if_each_were_written(
     assert row.split()[1:] == ["13", "13", "+0", "-0", "+0.00", "s", "100.0%"]
 
 
-def test_several_fields_that_are_set_make_one_variant(tmp_path: Path) -> None:
+def test_several_set_fields_make_one_variant(tmp_path: Path) -> None:
     _, rules = documents(tmp_path)
     (variant,) = variants_of(rules, ["harsh.when=fastest - speed > 2", "harsh.signals.fastest.over=2s"], [])
     assert variant.rule.name == "harsh-1"
@@ -64,7 +64,7 @@ def test_a_sweep_takes_a_range_with_both_ends_or_a_list(tmp_path: Path) -> None:
     assert limits("5,7.5") == [5, 7.5]
 
 
-def test_parameters_of_single_clients_hold_for_variants_that_do_not_set_them(tmp_path: Path) -> None:
+def test_client_parameters_apply_to_variants_that_do_not_set_them(tmp_path: Path) -> None:
     detector, rules = documents(tmp_path)
     document = detector.model_dump(mode="json", by_alias=True, exclude_unset=True)
     document["spec"]["clients"] = [{"name": "car1", "parameters": {"too-fast": {"limit": 15}}}]
@@ -87,7 +87,7 @@ def test_parameters_of_single_clients_hold_for_variants_that_do_not_set_them(tmp
         (["harsh.signals.speed.over=x"], [], "harsh with signals.speed.over=x: spec.signals.0.over"),
     ],
 )
-def test_what_cannot_be_changed_is_an_error_that_reports_why(
+def test_a_field_that_cannot_be_varied_is_an_error_with_the_reason(
     tmp_path: Path, sets: list[str], sweeps: list[str], words: str
 ) -> None:
     _, rules = documents(tmp_path)

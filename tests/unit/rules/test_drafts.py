@@ -32,7 +32,7 @@ def drive(path: Path) -> None:
 
 
 @pytest.mark.parametrize("case", drafts())
-def test_a_draft_is_of_a_use_case_passes_the_check_and_finds_something(tmp_path: Path, case: str) -> None:
+def test_each_draft_passes_the_check_and_finds_an_episode(tmp_path: Path, case: str) -> None:
     assert (EXAMPLES / case / "rules.yaml").exists()
     drive(tmp_path / "drive.jsonl")
     detector, rule = tmp_path / "detector.yaml", tmp_path / "rule.yaml"
@@ -50,7 +50,7 @@ def test_a_draft_is_of_a_use_case_passes_the_check_and_finds_something(tmp_path:
     assert {event["data"]["rule"] for event in events} == {"mine"}
 
 
-def test_without_a_case_the_drafts_are_listed_and_a_wrong_one_is_named() -> None:
+def test_without_an_argument_the_drafts_are_listed_and_an_unknown_one_is_named() -> None:
     listed = CliRunner().invoke(app, ["new"])
     assert [line.split()[0] for line in listed.output.splitlines()] == [*drafts()]
     assert "there is no use case potholes; the use cases are battery-health" in str(

@@ -29,7 +29,7 @@ def multiplied(start: str, times: int, levels: int) -> str:
 
 
 @pytest.mark.parametrize("start", ["'" + "a" * 500 + "'", "v", "[1]", "client"])
-def test_an_expression_that_multiplies_a_value_without_end_is_refused(start: str) -> None:
+def test_an_expression_that_grows_a_value_exponentially_is_rejected(start: str) -> None:
     environment = Environment({"v": CelType.DYN, "client": CelType.STRING})
     with pytest.raises(ExpressionError, match="more than 1000 copies") as caught:
         environment.compile(f"size({multiplied(start, 4, 5)}) > 1")
@@ -46,11 +46,11 @@ def test_an_expression_that_multiplies_a_value_without_end_is_refused(start: str
         "'a' + string(v.a) + 'b' + string(v.b) == client",
     ],
 )
-def test_what_people_write_is_not(harmless: str) -> None:
+def test_usual_expressions_are_not_rejected_as_growing(harmless: str) -> None:
     Environment({"v": CelType.DYN, "client": CelType.STRING}).compile(harmless)
 
 
-def test_a_loop_without_end_is_an_error_of_its_rule_and_harms_no_other() -> None:
+def test_an_endless_loop_is_an_error_of_its_rule_only() -> None:
     endless = "true"
     for each in range(8):
         endless = f"{TEN}.all(x{each}, {endless})"
@@ -89,7 +89,7 @@ URL = "https://e.org/"
         ({"url": URL, "tlsSecretName": "own"}, "tlsSecretName"),
     ],
 )
-def test_a_rule_cannot_have_the_detectors_own_secret_sent_anywhere(http: dict[str, Any], place: str) -> None:
+def test_a_rule_cannot_send_the_detectors_own_secret(http: dict[str, Any], place: str) -> None:
     rule = a_rule(when="true", actions=[{"name": "send", "notify": {"http": http}}])
     (problem,) = secret_problems(rule, a_detector(**OWN))
     assert str(problem).startswith(

@@ -158,7 +158,7 @@ def test_rules_name_places_of_maps_and_the_manager_accepts_any(tmp_path: Path) -
         ("a.json", json.dumps({"features": [feature("own", "LineString", RING)]}), "another place has this name"),
     ],
 )
-def test_what_is_wrong_with_a_map_is_located(tmp_path: Path, name: str, content: str | None, message: str) -> None:
+def test_errors_of_a_map_are_located(tmp_path: Path, name: str, content: str | None, message: str) -> None:
     path = tmp_path / name
     if content is not None:
         path.write_text(content)

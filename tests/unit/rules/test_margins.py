@@ -37,7 +37,7 @@ _numbers = st.floats(-5, 5)
 
 @settings(max_examples=20)
 @given(_formulas, st.lists(st.tuples(_numbers, _numbers), min_size=2, max_size=4))
-def test_a_margin_is_what_rtamt_gives(formula: str, rows: list[tuple[float, float]]) -> None:
+def test_a_margin_matches_rtamt(formula: str, rows: list[tuple[float, float]]) -> None:
     rtamt = pytest.importorskip("rtamt", reason="there is no rtamt for this Python")
     reference = rtamt.StlDiscreteTimeSpecification()
     for name in (*NAMES, "c"):
@@ -57,7 +57,7 @@ def test_a_margin_is_what_rtamt_gives(formula: str, rows: list[tuple[float, floa
             assert held.evaluate(dict(zip(NAMES, row, strict=True))) is (margin > 0)
 
 
-def test_what_is_unknown_leaves_the_margin_unknown() -> None:
+def test_unknown_values_make_the_margin_unknown() -> None:
     source = margin_of(a_rule(signals=SIGNALS, when="a > 1 || b > 1", margin={"a": 1, "b": 2}).spec)
     expression = Environment(dict.fromkeys(NAMES, CelType.DYN)).compile(source)
     assert expression.evaluate({"a": 2.0, "b": 7.0}) == 3.0
@@ -103,7 +103,7 @@ def test_the_margin_is_a_value_of_events_and_a_signal_for_others() -> None:
         ({"when": "margin > 1", "margin": {}}, "spec.margin", ["depends on itself"]),
     ],
 )
-def test_a_margin_that_cannot_be_is_refused_at_its_field(spec: dict[str, Any], field: str, parts: list[str]) -> None:
+def test_an_invalid_margin_is_rejected_by_field(spec: dict[str, Any], field: str, parts: list[str]) -> None:
     with pytest.raises(RuleError) as caught:
         compile_rule(a_rule(signals=SIGNALS, **spec), a_detector())
     found = {str(each).partition(": ")[0]: str(each) for each in caught.value.problems}
@@ -116,7 +116,7 @@ def test_comparisons_of_one_quantity_need_no_scale() -> None:
     assert [event.values["margin"] for event in drive.events] == [1.0]
 
 
-def test_what_nearly_happened_is_listed_by_margin_without_the_way_into_an_episode() -> None:
+def test_near_misses_are_listed_by_margin_without_the_approach_to_an_episode() -> None:
     rule = compile_rule(a_rule(signals=[SPEED], when="v > 3", margin={}), a_detector())
     values = [-5.0, -0.5, -2.0, -4.0, -0.25, 1.0, 2.0, -1.0, -3.0, -1.5, math.nan, -2.0]
     series = Series(np.array([at(second) for second in range(len(values))], np.int64), np.array(values))

@@ -29,7 +29,7 @@ def with_values(*clients: tuple[str, dict[str, Any]]) -> Detector:
     return a_detector(clients=[{"name": name, "parameters": {"too-fast": values}} for name, values in clients])
 
 
-def test_a_client_can_have_a_value_of_its_own() -> None:
+def test_a_client_can_override_a_parameter() -> None:
     drive = Drive(with_values(("truck", {"maxSpeed": 5})), too_fast())
     both = [arrival(0.5, client, {"v": 7}) for client in ("car", "truck")]
     assert drive.take(*both, until=1) == ["too-fast truck started 1"]
@@ -38,7 +38,7 @@ def test_a_client_can_have_a_value_of_its_own() -> None:
     ]
 
 
-def test_signals_scopes_and_actions_see_them_too() -> None:
+def test_signals_scopes_and_actions_see_the_overrides_too() -> None:
     rule = too_fast(
         parameters={"maxSpeed": 10, "area": SQUARE, "role": "guest", "limits": {"near": 3}},
         scope={"client": {"where": 'parameters.role == "guest"'}},
@@ -66,7 +66,7 @@ def test_signals_scopes_and_actions_see_them_too() -> None:
     assert demanded["far"] == {"limit": 10, "area": moved}
 
 
-def test_in_a_pair_each_has_its_own_and_the_rule_has_the_shared_ones() -> None:
+def test_in_a_pair_each_client_has_its_parameters_and_the_rule_the_shared_ones() -> None:
     rule = too_fast(
         scope={"pairs": {"position": {**POSITION, "x": "msg.x * parameters.scale"}, "within": 1000}},
         parameters={"gap": 5, "scale": 1},
@@ -79,7 +79,7 @@ def test_in_a_pair_each_has_its_own_and_the_rule_has_the_shared_ones() -> None:
     assert drive.events[0].values["distance"] == 40
 
 
-def test_the_members_of_a_fleet_have_their_own() -> None:
+def test_the_members_of_a_fleet_have_their_own_parameters() -> None:
     rule = too_fast(
         scope={"fleet": {"members": "v > parameters.maxSpeed"}},
         when="size(members) == 1 && members[0].parameters.maxSpeed < parameters.maxSpeed",
@@ -149,7 +149,7 @@ def test_a_change_of_parameters_is_a_change_of_the_rule_wherever_it_is_made() ->
         ),
     ],
 )
-def test_a_parameter_that_is_not_there_or_does_not_fit_is_reported_where_it_is_used(
+def test_a_missing_or_mistyped_parameter_is_reported_at_its_use(
     spec: dict[str, Any], field: str, parts: list[str]
 ) -> None:
     with pytest.raises(RuleError) as caught:
@@ -180,7 +180,7 @@ def test_a_parameter_that_is_not_there_or_does_not_fit_is_reported_where_it_is_u
         ),
     ],
 )
-def test_a_clients_value_that_does_not_fit_is_reported_at_its_place_in_the_detector(
+def test_a_mistyped_client_value_is_reported_by_field_in_the_detector(
     own: dict[str, Any], values: dict[str, Any], field: str, parts: list[str]
 ) -> None:
     with pytest.raises(RuleError) as caught:
@@ -206,7 +206,7 @@ def test_has_checks_a_parameter_as_for_any_member() -> None:
         ("x" * 70_000, "bytes as JSON exceeds the limit of 65536"),
     ],
 )
-def test_what_no_expression_could_take_is_refused(value: object, text: str) -> None:
+def test_values_unusable_in_expressions_are_rejected(value: object, text: str) -> None:
     with pytest.raises(ValidationError) as caught:
         too_fast(parameters={"m": value})
     assert text in str(caught.value)
@@ -214,7 +214,7 @@ def test_what_no_expression_could_take_is_refused(value: object, text: str) -> N
         with_values(("car", {"m": value}))
 
 
-def test_check_locates_a_wrong_value_in_the_detectors_file_and_a_rule_that_is_not_there(tmp_path: Path) -> None:
+def test_check_locates_wrong_values_and_unknown_rules_in_the_detectors_file(tmp_path: Path) -> None:
     detector = tmp_path / "detector.yaml"
     detector.write_text(
         """apiVersion: wayside.dev/v1alpha1

@@ -8,7 +8,7 @@ from tests.driving import a_detector, a_rule
 GOOD = {"signals": [{"name": "fast", "stream": "speed", "value": "msg.v"}], "when": "fast > 10"}
 
 
-def test_a_refused_version_leaves_the_last_good_one_in_place_and_reports_it() -> None:
+def test_a_rejected_version_keeps_the_last_good_one_and_is_reported() -> None:
     index, detector = RuleIndex(), a_detector()
     (first,), refused = index.compile([a_rule("r", **GOOD)], detector, {})
     assert refused == []
@@ -25,13 +25,13 @@ def test_a_refused_version_leaves_the_last_good_one_in_place_and_reports_it() ->
     assert refused == []
 
 
-def test_a_rule_that_was_never_good_is_not_evaluated() -> None:
+def test_a_rule_without_a_good_version_is_not_evaluated() -> None:
     compiled, (refusal,) = RuleIndex().compile([a_rule("r", **GOOD | {"when": "fst > 10"})], a_detector(), {})
     assert compiled == []
     assert str(refusal).startswith("EventRule r is refused: spec.when")
 
 
-def test_a_rule_that_is_gone_is_not_remembered() -> None:
+def test_a_removed_rule_is_forgotten() -> None:
     index, detector = RuleIndex(), a_detector()
     index.compile([a_rule("r", **GOOD)], detector, {})
     index.compile([], detector, {})

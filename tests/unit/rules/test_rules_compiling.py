@@ -173,7 +173,7 @@ def test_all_problems_are_reported_at_once() -> None:
     }
 
 
-def test_fields_that_the_messages_type_does_not_have_are_reported_before_any_message_came() -> None:
+def test_fields_missing_in_the_message_type_are_reported_before_any_message() -> None:
     fields: dict[str, Fields] = {"speed": {"twist": {"linear": {"x": None}}, "list": None}}
     found = problems(
         fields,
@@ -238,7 +238,7 @@ BASE: dict[str, Any] = {"signals": [SPEED], "when": "v > 3"}
         ({"scope": {"client": {}}, "for": "0s"}, True),  # the defaults, spelt out
     ],
 )
-def test_the_digest_is_of_what_decides_which_episodes_there_are(change: dict[str, Any], same: bool) -> None:
+def test_the_digest_covers_all_fields_that_decide_about_episodes(change: dict[str, Any], same: bool) -> None:
     detector = a_detector()
     before = compile_rule(a_rule(**BASE), detector).digest
     assert (compile_rule(a_rule(**{**BASE, **change}), detector).digest == before) is same
@@ -262,7 +262,7 @@ def test_a_streams_stamp_is_checked_like_a_rules_expressions() -> None:
     assert compile_stream(stream, 0).stamp is not None
 
 
-def test_what_the_types_cannot_decide_is_left_to_the_evaluation() -> None:
+def test_types_unknown_at_compile_time_are_checked_at_evaluation() -> None:
     rule = a_rule(signals=[SPEED], when="v > 3 && v.deep[0] == 'x'")
     assert compile_rule(rule, a_detector()).when.evaluate({"v": 1.0}) is False
 
@@ -278,6 +278,6 @@ def test_what_the_types_cannot_decide_is_left_to_the_evaluation() -> None:
         ("key", PAIRS),
     ],
 )
-def test_a_name_that_only_another_scope_gives_is_free(name: str, scope: dict[str, Any]) -> None:
+def test_names_of_other_scopes_are_free(name: str, scope: dict[str, Any]) -> None:
     rule = a_rule(scope=scope, signals=[SPEED | {"name": name}], when="true")
     assert [signal.name for signal in compile_rule(rule, a_detector()).signals] == [name]

@@ -48,7 +48,7 @@ def test_rules_come_by_name_from_all_files(write: Write) -> None:
     assert loaded.warnings == ()
 
 
-def test_one_folder_may_hold_everything(write: Write, tmp_path: Path) -> None:
+def test_a_folder_may_contain_the_detector_and_all_rules(write: Write, tmp_path: Path) -> None:
     template = made("ApplicationTemplate", "t", {}, {"manifests": [{"apiVersion": "v1", "kind": "ConfigMap"}]})
     write("all.yaml", detector(), rule("a"), template)
     loaded = load_rules(tmp_path, [tmp_path])
@@ -74,7 +74,7 @@ def test_a_rule_of_another_namespace_is_left_out_and_reported(write: Write) -> N
     assert "of its own namespace" in loaded.warnings[0]
 
 
-def test_no_detector_and_two_detectors_are_refused(write: Write) -> None:
+def test_a_folder_with_no_or_two_detectors_is_rejected(write: Write) -> None:
     rules = [write("r.yaml", rule("a"))]
     with pytest.raises(DocumentError, match="contains no Detector: give one"):
         load_rules(write("none.yaml", rule("a")), rules)
@@ -82,7 +82,7 @@ def test_no_detector_and_two_detectors_are_refused(write: Write) -> None:
         load_rules(write("two.yaml", detector("d"), detector("e")), rules)
 
 
-def test_two_rules_of_one_name_are_refused_with_both_places(write: Write) -> None:
+def test_two_rules_of_the_same_name_are_rejected_with_both_places(write: Write) -> None:
     with pytest.raises(DocumentError, match=r"2\.yaml:.*'a' is also in .*1\.yaml:1: rename or remove one"):
         load_rules(write("d.yaml", detector()), [write("1.yaml", rule("a")), write("2.yaml", rule("a"))])
 
@@ -97,7 +97,7 @@ def test_all_problems_come_at_once_and_each_once(write: Write) -> None:
     assert any("no such file" in problem.message for problem in caught.value.problems)
 
 
-def test_a_client_that_is_no_name_is_reported_with_the_valid_form(write: Write) -> None:
+def test_an_invalid_client_name_is_reported_with_the_valid_form(write: Write) -> None:
     stream = {"name": "cam", "key": "all/cams", "encoding": "json", "client": "a b"}
     with pytest.raises(
         DocumentError, match=r"must be a name of up to 63 letters, .* or a template such as its-"

@@ -60,7 +60,7 @@ def test_every_section_has_an_example() -> None:
     assert {title for title, _ in examples()} == set(MINE)
 
 
-def test_the_value_that_the_example_sets_for_a_client_is_the_one_it_has() -> None:
+def test_the_example_overrides_the_parameter_of_the_client() -> None:
     (rule,) = [each for title, each in examples() if title == "Parameters" and each["kind"] == "EventRule"]
     (detector,) = [each for title, each in examples() if title == "Parameters" and each["kind"] == "Detector"]
     compiled = compile_rule(

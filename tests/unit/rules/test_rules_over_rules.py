@@ -29,7 +29,7 @@ def speeds(values: str, client: str = "car", start: float = 0.5) -> list[Any]:
     return [arrival(start + n, client, {"v": float(value)}) for n, value in enumerate(values)]
 
 
-def test_a_count_of_starts_within_a_time_starts_a_rule_at_the_very_tick() -> None:
+def test_a_count_of_starts_within_a_window_starts_a_rule_at_the_same_tick() -> None:
     often = a_rule("a-often", signals=[count("braking", "5s")], when="it >= 2")
     drive = Drive(a_detector(), often, braking())
     reported = drive.take(*speeds("50505555555"), until=11)
@@ -91,14 +91,14 @@ def test_escalation_while_an_episode_is_open_and_how_it_began() -> None:
     assert drive.events[1].values == {"it": True, "before": 4, "speed": 3}
 
 
-def test_where_picks_starts_by_what_they_were() -> None:
+def test_where_selects_starts_by_their_values() -> None:
     hard = a_rule("hard", signals=[count("slow", "10s", where="msg.values.speed < 2")], when="it > 0")
     drive = Drive(a_detector(), hard, braking("slow", when="speed < 5"))
     reported = drive.take(*speeds("939919"), until=6)
     assert [each for each in reported if each.startswith("hard")] == ["hard car started 5"]
 
 
-def test_an_episode_of_a_pair_is_one_of_both_its_clients() -> None:
+def test_an_episode_of_a_pair_counts_for_both_clients() -> None:
     near = a_rule("near", scope={"pairs": {"position": POSITION, "within": 50}}, when="distance < 10")
     party = a_rule("party", signals=[over("near", aggregate="Active")], when="it")
     drive = Drive(a_detector(), near, party)
@@ -106,7 +106,7 @@ def test_an_episode_of_a_pair_is_one_of_both_its_clients() -> None:
     assert drive.take(*places, until=1) == ["near a+b started 1", "party a started 1", "party b started 1"]
 
 
-def test_a_dependency_that_is_disabled_is_unknown_and_one_that_comes_later_brings_what_is_open() -> None:
+def test_a_disabled_dependency_is_unknown_and_a_later_one_brings_its_open_episodes() -> None:
     detector = a_detector()
     top = a_rule("top", signals=[over("braking", aggregate="Active")], when="it", until="!it")
     drive = Drive(detector, top, braking(enabled=False))
@@ -119,7 +119,7 @@ def test_a_dependency_that_is_disabled_is_unknown_and_one_that_comes_later_bring
     assert drive.events[-1].episode.onset_time == at(3)
 
 
-def test_a_dependency_that_changes_its_meaning_begins_with_no_starts() -> None:
+def test_a_dependency_with_a_changed_meaning_begins_without_starts() -> None:
     detector = a_detector()
     top = a_rule("top", signals=[count("braking", "10s")], when="it > 0")
     drive = Drive(detector, top, braking())
@@ -129,7 +129,7 @@ def test_a_dependency_that_changes_its_meaning_begins_with_no_starts() -> None:
     assert drive.take(*speeds("9", start=1.5), until=2) == ["top car Until 2"]
 
 
-def test_starts_keep_nobody_alive_and_are_forgotten_with_the_client() -> None:
+def test_starts_do_not_keep_a_client_known_and_are_forgotten_with_it() -> None:
     top = a_rule("top", signals=[count("braking", "1h")], when="it > 0")
     drive = Drive(a_detector(clientTimeout="5s"), top, braking())
     reported = drive.take(*speeds("0"), *speeds("9", start=20.5), until=21)
@@ -164,7 +164,7 @@ def test_rules_are_evaluated_by_depth_then_name() -> None:
     assert sorted(rule.name for rule in in_order(circle)) == ["a", "b", "c"]
 
 
-def test_a_circle_is_reported_with_its_way_and_an_unknown_rule_with_the_nearest() -> None:
+def test_a_cycle_is_reported_with_its_path_and_an_unknown_rule_with_a_similar_name() -> None:
     rules = [
         a_rule("a", signals=[count("b", "1s")], when="it > 0"),
         a_rule("b", signals=[SPEED, count("c", "1s")], when="it > 0"),
@@ -187,7 +187,7 @@ def test_a_circle_is_reported_with_its_way_and_an_unknown_rule_with_the_nearest(
     }
 
 
-def test_a_rule_over_an_unknown_one_is_refused_until_that_one_is_there() -> None:
+def test_a_rule_over_an_unknown_rule_is_rejected_until_it_exists() -> None:
     index, top = RuleIndex(), a_rule("top", signals=[count("braking", "1s")], when="it > 0")
     good, refused = index.compile([top], a_detector(), {})
     assert (good, len(refused)) == ([], 1)
@@ -205,7 +205,7 @@ def test_a_rule_over_an_unknown_one_is_refused_until_that_one_is_there() -> None
         ({"name": "s", "ruleName": "r", "aggregate": "Active", "value": "msg.episode"}, "uses no value"),
     ],
 )
-def test_what_a_signal_over_a_rule_cannot_be(fields: Any, message: str) -> None:
+def test_invalid_signals_over_a_rule_are_rejected(fields: Any, message: str) -> None:
     with pytest.raises(ValidationError, match=message):
         a_rule("r", signals=[fields], when="true")
 
@@ -261,14 +261,14 @@ def test_an_end_by_loss_counts_for_the_other_client_of_a_pair_alone() -> None:
         {"ruleName": "braking", "aggregate": "Active", "samples": "Ends"},
     ],
 )
-def test_ends_are_of_rules_and_never_active(signal: dict[str, Any]) -> None:
+def test_ends_exist_only_for_rules_and_are_never_active(signal: dict[str, Any]) -> None:
     with pytest.raises(
         ValidationError, match="samples: Ends needs a signal with ruleName and an aggregate other than Active"
     ):
         a_rule(signals=[{"name": "s", **signal}], when="s")
 
 
-def test_a_field_that_only_an_end_has_is_refused_of_a_start() -> None:
+def test_a_field_of_ends_is_rejected_for_starts() -> None:
     rule = a_rule(signals=[over("braking", value="msg.reason")], when="it == 'Until'")
     with pytest.raises(
         RuleError, match=r"signals\[0\].value: msg has no field reason; .*\(msg is an episode's start\)"

@@ -27,7 +27,7 @@ ARRIVALS = [arrival(0.1, "a", {"v": 20}), arrival(0.2, "b", {}), arrival(0.3, "c
         ("false && members.exists(m, m.speed > 30)", False),
     ],
 )
-def test_loops_over_members_with_one_unknown(condition: str, expected: bool | None) -> None:
+def test_loops_over_members_with_an_unknown_value(condition: str, expected: bool | None) -> None:
     name = {"name": "name", "stream": "speed", "value": "msg.name"}
     fleet = {"scope": {"fleet": {"members": "true"}}, "signals": [SPEED, name], "parameters": {"known": 2.0}}
     rules = [
@@ -39,7 +39,7 @@ def test_loops_over_members_with_one_unknown(condition: str, expected: bool | No
     assert reported(events) == happened[expected]
 
 
-def test_only_those_that_are_surely_members_count() -> None:
+def test_only_certain_members_count() -> None:
     rule = a_rule(
         scope={"fleet": {"members": "speed > 10"}},
         signals=[SPEED],
@@ -52,7 +52,7 @@ def test_only_those_that_are_surely_members_count() -> None:
     assert engine.counters.rules["r"].absences  # that b was no member for want of a value
 
 
-def test_loops_look_at_members_alone() -> None:
+def test_loops_cover_members_only() -> None:
     fast = "members.exists(m, m.speed > 10)"
     rule = a_rule(scope={"fleet": {"members": "client != 'a'"}}, signals=[SPEED], when=fast, evaluation={"every": "1s"})
     engine = an_engine(a_detector(), rule)
@@ -60,7 +60,7 @@ def test_loops_look_at_members_alone() -> None:
     assert reported(engine.advance([arrival(1.5, "b", {"v": 11})], at(2))) == ["r ~fleet started 2"]
 
 
-def test_a_fleet_of_nobody_is_looked_at_as_well() -> None:
+def test_an_empty_fleet_is_evaluated_too() -> None:
     rule = a_rule(
         scope={"fleet": {"members": "true"}}, when="size(members) == 0 && members.all(m, m.client == 'a')",
         evaluation={"every": "1s"},

@@ -55,7 +55,7 @@ def obvious(requested: Search, within: float, maximum: int) -> Near:
 
 @settings(max_examples=80)
 @given(st.lists(points, max_size=70), st.sampled_from([0.5, 100.0, 250.0, 1e6]), roles)
-def test_the_pairs_within_reach_are_those_that_comparing_all_finds(
+def test_the_pairs_within_reach_match_a_comparison_of_all(
     placed: list[Point], within: float, role: tuple[int, int] | None
 ) -> None:
     requested = search(FLAT, {f"car{index}": place for index, place in enumerate(placed)}, role)
@@ -66,7 +66,7 @@ def test_the_pairs_within_reach_are_those_that_comparing_all_finds(
 
 @settings(max_examples=80)
 @given(st.lists(degrees, max_size=50), st.sampled_from([1.0, 30.0, 5_000.0, 1e6]), roles)
-def test_on_the_earth_neither_the_poles_nor_the_antimeridian_part_a_pair(
+def test_on_the_earth_pairs_are_found_across_poles_and_the_antimeridian(
     placed: list[Point], within: float, role: tuple[int, int] | None
 ) -> None:
     requested = search(EARTH, {f"car{index}": place for index, place in enumerate(placed)}, role)
@@ -83,7 +83,7 @@ MICROMETRES = st.floats(0, 100).map(lambda metres: round(metres, 6))
     st.integers(1, 300),
     roles,
 )
-def test_of_too_many_pairs_the_nearest_are_looked_at_and_then_those_first_by_name(
+def test_beyond_the_maximum_the_nearest_pairs_are_evaluated_then_by_name(
     placed: list[Point], maximum: int, role: tuple[int, int] | None
 ) -> None:
     requested = search(FLAT, {f"car{index:02}": place for index, place in enumerate(placed)}, role)
@@ -92,7 +92,7 @@ def test_of_too_many_pairs_the_nearest_are_looked_at_and_then_those_first_by_nam
     assert found.left_out == expected.left_out
 
 
-def test_thousands_at_one_spot_do_not_make_millions_of_pairs() -> None:
+def test_thousands_of_clients_at_one_position_do_not_make_millions_of_pairs() -> None:
     places = {f"car{index:04}": (5.0, 5.0, 0.0) for index in range(3_000)}
     measured = 0
 
@@ -130,7 +130,7 @@ def test_the_distance_on_the_earth_is_the_same_number_in_both_directions(
 
 
 @given(points, points)
-def test_the_distance_in_a_flat_frame_is_the_number_that_columns_come_to(one: Point, other: Point) -> None:
+def test_the_distance_in_a_flat_frame_equals_that_of_columns(one: Point, other: Point) -> None:
     apart = np.array([one]) - np.array([other])
     squares = apart * apart
     assert distance(FLAT, one, other) == np.sqrt((squares[:, 0] + squares[:, 1]) + squares[:, 2])[0]

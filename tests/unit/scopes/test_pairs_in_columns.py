@@ -56,7 +56,7 @@ def walk(seed: int, clients: int, side: float, steps: int) -> Iterator[Arrival]:
 
 
 @pytest.mark.parametrize(("seed", "clients", "side", "steps"), [(1, 5, 9.0, 60), (2, 6, 6.0, 60), (3, 36, 16.0, 16)])
-def test_all_pairs_at_once_give_the_events_of_each_by_itself(seed: int, clients: int, side: float, steps: int) -> None:
+def test_all_pairs_at_once_give_the_events_of_single_pairs(seed: int, clients: int, side: float, steps: int) -> None:
     together, one_by_one = (Drive(a_detector(clients=CLIENTS, clientTimeout="2s"), *rules()) for _ in range(2))
     for run in one_by_one.engine.rules.values():
         run.witness = lambda evaluation: None  # an observer of each evaluation gets each one separately

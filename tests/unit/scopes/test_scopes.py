@@ -25,7 +25,7 @@ def role(name: str) -> dict[str, str]:
 # Roles
 
 
-def test_with_roles_each_ordered_pair_that_fits_is_a_subject() -> None:
+def test_with_roles_each_matching_ordered_pair_is_a_subject() -> None:
     rule = pairs(scope={"a": role("car"), "b": role("bus")})
     drive = Drive(a_detector(clients=ROLES), rule)
     here = [place(0.5, name, n) for n, name in enumerate(("bus1", "bus2", "car1", "car2", "unlabelled"))]
@@ -39,14 +39,14 @@ def test_with_roles_each_ordered_pair_that_fits_is_a_subject() -> None:
     assert drive.events[0].values["a"]["client"] == "car1"
 
 
-def test_two_clients_that_both_fit_both_roles_are_two_subjects() -> None:
+def test_two_clients_that_match_both_roles_are_two_subjects() -> None:
     rule = pairs(scope={"a": {"where": "true"}}, when="a.position.x < b.position.x || distance < 5")
     drive = Drive(a_detector(), rule)
     assert drive.take(place(0.5, "x", 10), place(0.5, "y", 0), until=1) == ["p y+x started 1"]
     assert drive.take(place(1.5, "y", 9), until=2) == ["p x+y started 2"]
 
 
-def test_a_role_that_is_lost_ends_the_episode_and_one_that_is_unknown_starts_none() -> None:
+def test_a_lost_role_ends_the_episode_and_an_unknown_one_starts_none() -> None:
     detector = a_detector(a_stream("pose"), a_stream("speed", staleAfter="2s"), clients=ROLES)
     rule = pairs(scope={"a": {"where": "'speed' in streams"}, "b": {"where": "labels.role == 'bus'"}})
     drive = Drive(detector, rule)
@@ -58,7 +58,7 @@ def test_a_role_that_is_lost_ends_the_episode_and_one_that_is_unknown_starts_non
     assert any("role" in message for message in drive.engine.counters.rules["p"].absences)
 
 
-def test_a_restored_episode_of_a_pair_with_roles_needs_no_order_of_names() -> None:
+def test_a_restored_pair_with_roles_needs_no_order_of_names() -> None:
     rule = pairs(scope={"a": role("car"), "b": role("bus")}, actions=[a_deploy("x")])
     drive = Drive(a_detector(clients=ROLES), rule)
     drive.take(place(0.5, "car1", 0), place(0.5, "bus1", 0), until=1)
@@ -71,7 +71,7 @@ def test_a_restored_episode_of_a_pair_with_roles_needs_no_order_of_names() -> No
 # Closing speed
 
 
-def test_the_closing_speed_is_how_much_nearer_the_two_came_over_the_last_second() -> None:
+def test_the_closing_speed_is_the_decrease_of_the_distance_over_the_last_second() -> None:
     rule = pairs(when="closingSpeed >= 10.0", until="closingSpeed < 0.0", evaluation={"every": "500ms"})
     drive = Drive(a_detector(), rule)
     moving = [place(n / 10, "a", 100 - n * 1.5 if n <= 30 else 55 + n) for n in range(1, 60)]
@@ -80,13 +80,13 @@ def test_the_closing_speed_is_how_much_nearer_the_two_came_over_the_last_second(
     assert drive.events[0].values["closingSpeed"] == pytest.approx(15)
 
 
-def test_the_closing_speed_of_two_that_keep_their_distance_is_a_zero_without_sign() -> None:
+def test_the_closing_speed_at_constant_distance_is_an_unsigned_zero() -> None:
     drive = Drive(a_detector(), pairs(when="closingSpeed == 0.0", evaluation={"every": "500ms"}))
     drive.take(*(place(t, c, 0) for t in (0.5, 1, 1.5) for c in "ab"), until=1.5)
     assert str(drive.events[0].values["closingSpeed"]) == "0.0"
 
 
-def test_the_closing_speed_is_unknown_while_a_place_a_second_ago_is_not_known() -> None:
+def test_the_closing_speed_is_unknown_without_a_position_a_second_ago() -> None:
     detector = a_detector(a_stream("pose", staleAfter="500ms"))
     rule = pairs(when="closingSpeed > -1000.0", until="false", evaluation={"every": "500ms"})
     drive = Drive(detector, rule)
@@ -101,7 +101,7 @@ def test_the_closing_speed_is_unknown_while_a_place_a_second_ago_is_not_known() 
     assert drive.take(place(1.45, "a", 0), until=1.5) == []
 
 
-def test_the_closing_speed_ends_with_the_newest_place_of_the_one_who_fell_silent() -> None:
+def test_the_closing_speed_ends_with_the_last_position_of_a_silent_client() -> None:
     """Two drive one behind the other at 10 m/s, and the one in front leaves."""
     behind = [place(n / 10, "a", n) for n in range(1, 60)]
     ahead = [place(n / 10, "b", 9 + n) for n in range(1, 31)]
@@ -111,7 +111,7 @@ def test_the_closing_speed_ends_with_the_newest_place_of_the_one_who_fell_silent
     assert drive.take(*sorted(behind + ahead), until=4) == ["met a+b started 3.9", "met a+b Until 4"]
 
 
-def test_the_closing_speed_to_one_whose_place_has_no_age_is_that_of_now() -> None:
+def test_the_closing_speed_to_a_position_that_never_goes_stale_is_current() -> None:
     """A station sends its position once."""
     rule = pairs(scope={"position": EARTH}, when="closingSpeed > 10.0", evaluation={"every": "500ms"})
     drive = Drive(a_detector(a_stream("pose", staleAfter="Never")), rule)
@@ -143,7 +143,7 @@ def test_positions_on_the_earth_work_across_the_antimeridian_and_over_the_pole()
     assert drive.events[0].values["a"]["position"] == {"latitude": 0, "longitude": 179.9999}
 
 
-def test_a_latitude_that_is_none_is_no_place() -> None:
+def test_an_invalid_latitude_is_not_a_position() -> None:
     drive = Drive(a_detector(), pairs(scope={"position": EARTH, "within": 30}))
     assert drive.take(north(0.1, "a", 91, 0), north(0.2, "b", None, 0), north(0.3, "c", 0, 0), until=1) == []
     assert drive.engine.counters.rules["p"].misplaced == 2
@@ -152,7 +152,7 @@ def test_a_latitude_that_is_none_is_no_place() -> None:
 # Too many pairs
 
 
-def test_pairs_beyond_the_maximum_are_left_out_and_counted_while_open_ones_are_always_looked_at() -> None:
+def test_pairs_beyond_the_maximum_are_skipped_and_counted_but_never_open_ones() -> None:
     drive = Drive(a_detector(), pairs(scope={"maxPairs": 2}))
     assert drive.take(*(place(0.5, c, n * n) for n, c in enumerate("abcd")), until=1) == [
         "p a+b started 1",
@@ -171,7 +171,7 @@ def fleet(members: str = "true", **spec: Any) -> Any:
     return a_rule("f", **{"scope": {"fleet": {"members": members}}, "signals": [SPEED], **spec})
 
 
-def test_the_fleet_is_one_subject_and_its_members_are_those_that_are_known_to_be() -> None:
+def test_the_fleet_is_one_subject_with_all_certain_members() -> None:
     drive = Drive(a_detector(), fleet("speed > 0.0", when="size(members) >= 2", until="size(members) < 1"))
     assert drive.take(speed(0.5, 1, "a"), speed(0.5, None, "b"), place(0.5, "c", 0), until=1) == []
     assert drive.take(speed(1.5, 3, "b"), until=2) == ["f ~fleet started 2"]
@@ -183,7 +183,7 @@ def test_the_fleet_is_one_subject_and_its_members_are_those_that_are_known_to_be
     assert drive.take(speed(3.5, -1, "b"), until=4) == ["f ~fleet Until 4"]
 
 
-def test_a_rule_over_the_fleet_is_evaluated_while_nobody_is_there_and_survives_that_clients_go() -> None:
+def test_a_fleet_rule_is_evaluated_without_clients_and_survives_lost_ones() -> None:
     drive = Drive(a_detector(clientTimeout="3s"), fleet(when="size(members) == 0", until="size(members) > 1"))
     assert drive.take(until=1) == ["f ~fleet started 1"]
     assert drive.take(speed(1.5, 1), until=6) == []
@@ -297,7 +297,7 @@ def test_elements_in_every_scope_and_its_conditions() -> None:
     ]
 
 
-def test_an_episode_of_an_element_is_restored_and_one_of_an_element_that_is_gone_ends() -> None:
+def test_an_episode_of_an_element_is_restored_and_ends_with_a_removed_element() -> None:
     rule = a_rule(each=SITES, when="'pose' in streams", actions=[a_deploy("x")])
     drive = Drive(a_detector(), rule)
     drive.take(place(0.5, "car", 0), until=1)

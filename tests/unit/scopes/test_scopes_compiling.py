@@ -87,7 +87,7 @@ def test_a_problem_names_its_field(spec: dict[str, Any], field: str, part: str) 
         ({"each": {"as": "site", "of": [{"name": "a b"}]}}, "pattern"),
     ],
 )
-def test_what_the_schema_forbids_is_refused(spec: dict[str, Any], part: str) -> None:
+def test_values_forbidden_by_the_schema_are_rejected(spec: dict[str, Any], part: str) -> None:
     with pytest.raises(ValidationError, match=part):
         a_rule(**{"when": "true", **spec})
 
@@ -105,7 +105,7 @@ def test_the_closing_speed_needs_more_than_a_second_of_positions() -> None:
     compile_rule(a_rule(**in_pairs()), detector)
 
 
-def test_the_elements_are_part_of_what_the_rule_means() -> None:
+def test_the_elements_are_part_of_the_rules_meaning() -> None:
     one = compile_rule(a_rule(each=EACH, when="true"), a_detector())
     other = compile_rule(a_rule(each={**EACH, "of": EACH["of"][:1]}, when="true"), a_detector())
     assert one.digest != other.digest

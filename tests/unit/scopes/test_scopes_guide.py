@@ -37,7 +37,7 @@ def test_a_part_of_a_detector_is_accepted(section: str) -> None:
     assert spec.clients or spec.state
 
 
-def test_a_tram_and_a_car_that_come_near() -> None:
+def test_a_tram_and_a_car_that_approach_each_other() -> None:
     clients = [{"name": "tram", "labels": {"role": "tram"}}, {"name": "car", "labels": {"role": "car"}}]
     drive = Drive(a_detector(*STREAMS, clients=clients), a_rule(**EXAMPLES["Pairs"]))
     degree = 111_319.49  # metres along the equator
@@ -47,7 +47,7 @@ def test_a_tram_and_a_car_that_come_near() -> None:
     assert drive.events[0].values["closingSpeed"] == pytest.approx(10, abs=0.01)
 
 
-def test_three_buses_that_are_fast() -> None:
+def test_three_fast_buses_start_an_episode() -> None:
     clients = [{"name": f"bus{n}", "labels": {"role": "bus"}} for n in range(4)]
     drive = Drive(a_detector(*STREAMS, clients=clients), a_rule(**EXAMPLES["Fleet"]))
     speeds = [
@@ -58,14 +58,14 @@ def test_three_buses_that_are_fast() -> None:
     assert drive.events[0].values["count"] == 3
 
 
-def test_a_site_that_a_car_passes() -> None:
+def test_a_car_that_passes_a_site_starts_an_episode() -> None:
     drive = Drive(a_detector(*STREAMS), a_rule(**EXAMPLES["Each"]))
     reported = drive.take(*(arrival(n + 0.5, "car", {"x": 100 * n}, "pose") for n in range(7)), until=7)
     assert reported == ["r car~north started 2", "r car~north Until 3", "r car~south started 6", "r car~south Until 7"]
     assert not drive.engine.demands()
 
 
-def test_the_sources_follow_who_is_there() -> None:
+def test_the_sources_follow_the_present_clients() -> None:
     drive = Drive(a_detector(*STREAMS, clientTimeout="3s"), a_rule(**EXAMPLES["Parameters that follow"]))
     seen = []
     for second, clients in enumerate(("a", "ab", "b", "b", "b")):

@@ -125,7 +125,7 @@ def replayed(users: list[User], rule: dict[str, Any], **stream: Any) -> ReplayRe
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 @pytest.mark.parametrize(("rule", "true_pairs"), [(NEAR_MISS, near_misses), (CLOSING, closing_in)])
-def test_a_rule_on_pairs_finds_no_ghosts_of_road_users_that_left(
+def test_a_pairs_rule_finds_no_ghosts_of_road_users_that_left(
     rule: dict[str, Any], true_pairs: Callable[[list[User], float], set[str]], seed: int
 ) -> None:
     """With the README's kind of Detector: a stream with no settings about age."""
@@ -176,7 +176,7 @@ def test_a_position_older_than_max_age_is_unknown(
         assert bool(reported) is known, (after, reported)
 
 
-def test_by_default_a_signal_is_unknown_after_five_seconds_of_silence_or_when_its_client_is_lost() -> None:
+def test_by_default_a_signal_is_unknown_after_five_seconds_or_when_its_client_is_lost() -> None:
     speed = {"name": "v", "stream": "speed", "value": "msg.v"}
     for timeout, last in (("30s", 5), ("2s", 2)):
         rule = a_rule("r", scope={"fleet": {"members": "v > 1"}}, signals=[speed], when="size(members) == 0")

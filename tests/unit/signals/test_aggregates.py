@@ -109,7 +109,7 @@ def test_numbers_at_the_edge_of_doubles(aggregate: Aggregate, values: list[float
 
 
 @pytest.mark.parametrize("aggregate", [Aggregate.MIN, Aggregate.SUM, Aggregate.MEAN, Aggregate.STD_DEV, Aggregate.RATE])
-def test_nothing_has_no_aggregate(aggregate: Aggregate) -> None:
+def test_an_empty_window_has_no_aggregate(aggregate: Aggregate) -> None:
     assert calculated(aggregate, []) is UNKNOWN
 
 
@@ -120,7 +120,7 @@ def test_distinct_keeps_the_first_of_each_value_and_types_apart() -> None:
     assert distinct([]) is UNKNOWN
 
 
-def test_all_aggregates_but_those_of_one_sample_and_age_need_a_window() -> None:
+def test_only_single_sample_aggregates_and_age_need_no_window() -> None:
     for aggregate in set(Aggregate) - {Aggregate.ACTIVE}:
         signal = {"name": "s", "stream": "speed", "aggregate": aggregate.value}
         signal |= {"quantile": 0.5} if aggregate is Aggregate.QUANTILE else {}
@@ -139,7 +139,5 @@ def test_all_aggregates_but_those_of_one_sample_and_age_need_a_window() -> None:
 
 @pytest.mark.parametrize("aggregate", [Aggregate.MIN, Aggregate.MAX])
 @pytest.mark.parametrize("values", [[-0.0], [0.0, -0.0], [-0.0, 0.0], [-0.0, 0.0, -0.0]])
-def test_a_zero_of_min_and_max_has_no_sign_in_whatever_order_the_values_came(
-    aggregate: Aggregate, values: list[float]
-) -> None:
+def test_a_zero_of_min_and_max_is_unsigned_in_any_order_of_values(aggregate: Aggregate, values: list[float]) -> None:
     assert str(calculated(aggregate, timed(values))) == "0.0"

@@ -218,7 +218,7 @@ def streams(draw: st.DrawFn) -> list[Sent]:
 @example(sent=[Sent(0.1, {"v": -1.7e308}), Sent(1.1, {"v": 1.7e308})], gap=None)
 @settings(max_examples=150)
 @given(streams(), st.none() | st.integers(2, 9))
-def test_aggregates_equal_a_look_at_all_samples(sent: list[Sent], gap: int | None) -> None:
+def test_aggregates_match_a_computation_over_all_samples(sent: list[Sent], gap: int | None) -> None:
     drive = Drive(DETECTOR, RULE, start=0.5)
     ticks = range(1, TENTHS // 10 + 1)
     arrivals = [arrival(sample.time, "car", sample.payload) for sample in sent]

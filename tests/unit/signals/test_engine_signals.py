@@ -14,7 +14,7 @@ from detector.engine.samples.sample import Arrival
 from tests.driving import SECOND, Drive, a_detector, a_rule, a_stream, an_engine, arrival, at, compiled, reported
 
 
-def test_what_is_received_exactly_at_a_tick_counts_and_what_comes_a_nanosecond_later_does_not() -> None:
+def test_samples_at_a_tick_count_and_later_ones_do_not() -> None:
     rule = a_rule(signals=[{"name": "n", "stream": "speed", "aggregate": "Count", "over": "2s"}], when="n == 1")
     drive = Drive(a_detector(), rule)
     assert drive.take(arrival(1, "car", {}), until=1) == ["r car started 1"]
@@ -37,7 +37,7 @@ def test_a_signal_of_a_stale_stream_is_unknown_and_the_stream_is_not_among_the_c
     assert drive.engine.counters.rules["stale"].unknowns > 0
 
 
-def test_values_kept_of_a_rule_do_not_outlive_its_change() -> None:
+def test_values_kept_for_a_rule_are_dropped_with_its_change() -> None:
     def rule(value: str) -> Any:
         return a_rule(
             signals=[{"name": "m", "stream": "speed", "value": value, "aggregate": "Max", "over": "9s"}],
@@ -89,7 +89,7 @@ def test_a_stamp_that_cannot_be_read_leaves_the_others_alone() -> None:
     assert drive.take(*hostile, arrival(0.9, "good", {"t": 5}), until=1) == ["r good started 1"]
 
 
-def test_a_signal_of_bytes_travels_as_null() -> None:
+def test_a_signal_of_bytes_is_null_in_events() -> None:
     rule = a_rule(
         signals=[
             {"name": "raw", "stream": "speed", "value": "[bytes(msg.v), 'x']"},
@@ -102,7 +102,7 @@ def test_a_signal_of_bytes_travels_as_null() -> None:
     assert json.loads(drive.events[0].to_json())["data"]["values"] == {"raw": [None, "x"]}
 
 
-def test_values_of_the_wrong_kind_are_left_out_and_counted_as_errors_with_what_was_wanted() -> None:
+def test_values_of_the_wrong_type_are_skipped_and_counted_as_errors_with_the_expected_type() -> None:
     rule = a_rule(
         signals=[
             {"name": "top", "stream": "speed", "value": "msg.v", "aggregate": "Max", "over": "5s"},
@@ -119,7 +119,7 @@ def test_values_of_the_wrong_kind_are_left_out_and_counted_as_errors_with_what_w
     assert counters.last_error == "signal all of car, stream speed: All needs booleans; got [1.0]"
 
 
-def test_first_decodes_only_the_sample_that_it_is() -> None:
+def test_first_decodes_only_its_sample() -> None:
     rule = a_rule(
         signals=[{"name": "first", "stream": "speed", "value": "msg.v", "aggregate": "First", "over": "9s"}],
         when="first == 1",
@@ -145,7 +145,7 @@ ORDERED = a_rule(
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.tuples(st.integers(1, 20), st.integers(0, 9)), min_size=1, max_size=12))
-def test_with_clock_data_samples_count_in_order_of_their_stamps_and_those_of_one_time_as_they_came(
+def test_with_clock_data_samples_are_ordered_by_stamp_and_then_by_arrival(
     sent: list[tuple[int, int]],
 ) -> None:
     detector = a_detector(

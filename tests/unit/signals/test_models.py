@@ -66,7 +66,7 @@ def test_a_models_output_is_a_signal_and_its_sha256_is_in_the_event(tmp_path: Pa
     assert drive.events[-1].cloud_event()["data"]["models"] == {"risk": sha256}
 
 
-def test_all_clients_of_a_tick_are_one_batch_and_those_with_an_unknown_input_are_left_out(
+def test_all_clients_of_a_tick_are_one_batch_without_those_with_unknown_inputs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from detector.onnx.loading import ModelFile
@@ -90,7 +90,7 @@ def test_all_clients_of_a_tick_are_one_batch_and_those_with_an_unknown_input_are
     ]
 
 
-def test_a_model_for_one_client_at_a_time_runs_as_often_as_there_are_clients(tmp_path: Path) -> None:
+def test_a_model_for_a_single_client_runs_once_for_each_client(tmp_path: Path) -> None:
     file = onnx_models.weighted(tmp_path / "m.onnx", [1.0], clients=1)
     drive = ModelDrive(a_detector(), always(SPEED, risk(file, x(signals=["speed"]))))
     drive.take(arrival(0.1, "a", {"v": 1}), arrival(0.2, "b", {"v": 2}), until=1)
@@ -106,7 +106,7 @@ def test_the_last_samples_are_a_window_oldest_first_and_unknown_while_there_are_
     assert drive.values()["risk"] == 123.0
 
 
-def test_a_time_is_drawn_again_at_equal_steps(tmp_path: Path) -> None:
+def test_a_time_window_is_resampled_at_equal_steps(tmp_path: Path) -> None:
     file = onnx_models.same(tmp_path / "m.onnx", [3, 2])
     window = {"signals": ["speed", "gap"], "over": "2s", "samples": 3}
     drive = ModelDrive(
@@ -130,7 +130,7 @@ def test_several_outputs_are_a_map_and_output_names_one(tmp_path: Path) -> None:
     assert drive.values()["h"] == [11.0, 5.0]
 
 
-def test_in_a_pair_each_has_its_own(tmp_path: Path) -> None:
+def test_in_a_pair_each_client_has_its_own_value(tmp_path: Path) -> None:
     file = onnx_models.weighted(tmp_path / "m.onnx", [1.0])
     scope = {"pairs": {"position": {"stream": "pose", "x": "msg.x", "y": "msg.y"}, "within": 100}}
     rule = a_rule("r", scope=scope, signals=[SPEED, risk(file, x(signals=["speed"]))], when="a.risk + b.risk > 5")
@@ -217,14 +217,14 @@ def test_the_usual_encodings_of_pixels(tmp_path: Path, encoding: str, array: Any
     assert (np.ravel(out) if len(expected) > 1 else [out]) == pytest.approx(expected)
 
 
-def test_a_point_cloud_becomes_rows_of_fields_filled_up_without_those_that_are_nan(tmp_path: Path) -> None:
+def test_a_point_cloud_becomes_padded_rows_of_fields_without_nan(tmp_path: Path) -> None:
     rows = [[1, 2, 3, 10], [np.nan, 0, 0, 0], [4, 5, 6, 20]]
     given = {"stream": "lidar", "fields": ["z", "i"], "count": 3, "scale": [1, 0.1]}
     drive = sensed(tmp_path, [3, 2], {"points": given}, a_cloud(rows), "lidar")
     assert np.array(drive.values()["out"]) == pytest.approx(np.array([[3, 1], [6, 2], [0, 0]]))
 
 
-def test_of_too_many_points_every_nth_is_taken(tmp_path: Path) -> None:
+def test_beyond_the_maximum_every_nth_point_is_used(tmp_path: Path) -> None:
     given = {"stream": "lidar", "fields": ["x"], "count": 4}
     drive = sensed(tmp_path, [4, 1], {"points": given}, a_cloud([[n, 0, 0, 0] for n in range(8)]), "lidar")
     assert drive.values()["out"] == [[0.0], [2.0], [4.0], [6.0]]
@@ -238,7 +238,7 @@ def test_of_too_many_points_every_nth_is_taken(tmp_path: Path) -> None:
         (b"\0\1\0\0nonsense", "not a valid sensor_msgs/msg/Image"),
     ],
 )
-def test_what_is_no_image_is_unknown_and_counted_as_an_error(tmp_path: Path, payload: bytes, logged: str) -> None:
+def test_an_invalid_image_is_unknown_and_counted_as_an_error(tmp_path: Path, payload: bytes, logged: str) -> None:
     given = {"stream": "camera", "width": 1, "height": 1}
     drive = sensed(tmp_path, [3, 1, 1], {"image": given}, payload, "camera")
     assert drive.values() == {}
@@ -300,7 +300,7 @@ def problems(tmp_path: Path, signal: dict[str, Any], detector: Detector | None =
         ({"output": "riks"}, "model.output", "the model has no output riks; its outputs are risk [any, 1]"),
     ],
 )
-def test_what_does_not_fit_is_found_by_a_check_with_its_place(
+def test_a_mismatch_of_model_and_rule_is_reported_by_field(
     tmp_path: Path, change: dict[str, Any], where: str, logged: str
 ) -> None:
     file = onnx_models.weighted(tmp_path / "m.onnx", [1.0, 1.0])
@@ -310,7 +310,7 @@ def test_what_does_not_fit_is_found_by_a_check_with_its_place(
     assert any(where in problem and logged in problem for problem in found), found
 
 
-def test_a_fixed_first_axis_a_text_input_and_an_output_that_is_not_by_client_are_refused(tmp_path: Path) -> None:
+def test_models_with_unsupported_axes_inputs_or_outputs_are_rejected(tmp_path: Path) -> None:
     fixed = onnx_models.weighted(tmp_path / "fixed.onnx", [1.0, 1.0], clients=4)
     (problem,) = problems(tmp_path, risk(fixed, x(signals=["speed", "gap"])))
     assert "for exactly 4 clients: export the model with a first axis of variable length" in problem

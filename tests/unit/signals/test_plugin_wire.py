@@ -25,7 +25,7 @@ def framed(*message: object) -> bytes:
     return struct.pack(">I", len(data)) + data
 
 
-def test_a_message_that_comes_in_pieces_is_kept_while_nothing_more_comes_in_time(
+def test_a_partial_message_is_kept_across_timeouts(
     ends: tuple[socket.socket, Wire],
 ) -> None:
     """A busy machine may well leave the reader no time between a message's length and its content."""
@@ -39,13 +39,13 @@ def test_a_message_that_comes_in_pieces_is_kept_while_nothing_more_comes_in_time
     assert wire.receive(60) == ["result", 7]
 
 
-def test_messages_that_come_together_are_reported_one_by_one(ends: tuple[socket.socket, Wire]) -> None:
+def test_messages_received_together_are_returned_one_by_one(ends: tuple[socket.socket, Wire]) -> None:
     sender, wire = ends
     sender.send(framed("query", "newest") + framed("result", None))
     assert [wire.receive(60), wire.receive(60)] == [["query", "newest"], ["result", None]]
 
 
-def test_who_hangs_up_amid_a_message_is_gone(ends: tuple[socket.socket, Wire]) -> None:
+def test_a_connection_closed_within_a_message_is_an_error(ends: tuple[socket.socket, Wire]) -> None:
     sender, wire = ends
     sender.send(framed("ready")[:-1])
     sender.shutdown(socket.SHUT_WR)

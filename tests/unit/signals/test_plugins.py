@@ -45,11 +45,11 @@ def problems(tmp_path: Path, plugin: str, parameters: str, when: str = "p.count 
     return [str(problem).removeprefix(f"{tmp_path}/") for problem in found]
 
 
-def test_what_is_installed_and_what_is_shipped_is_there() -> None:
+def test_installed_and_shipped_plugins_are_found() -> None:
     assert {"counting", "strange", "unmatched-objects"} <= OFFERS.installed().keys()
 
 
-def test_a_plugin_that_is_not_there_is_reported_with_what_is(tmp_path: Path) -> None:
+def test_a_missing_plugin_is_reported_with_the_existing_ones(tmp_path: Path) -> None:
     (problem,) = problems(tmp_path, "countin", "{stream: speed}")
     assert problem.startswith("r.yaml:8:15: spec.signals[0].plugin.name: no plugin countin is installed")
     assert "did you mean counting?" in problem
@@ -68,14 +68,14 @@ def test_a_plugin_that_is_not_there_is_reported_with_what_is(tmp_path: Path) -> 
         ("broken", "{}", "plugin.name: cannot load plugin broken: ModuleNotFoundError"),
     ],
 )
-def test_what_a_plugin_refuses_is_reported_where_it_stands(
+def test_a_rejection_by_a_plugin_is_reported_by_field(
     tmp_path: Path, plugin: str, parameters: str, reported: str
 ) -> None:
     (problem,) = problems(tmp_path, plugin, parameters)
     assert reported in problem
 
 
-def test_a_rule_that_names_its_plugin_rightly_has_no_problems(tmp_path: Path) -> None:
+def test_a_rule_with_a_valid_plugin_has_no_problems(tmp_path: Path) -> None:
     assert problems(tmp_path, "counting", "{stream: speed, raiseAt: 4}") == []
 
 
@@ -93,7 +93,7 @@ def test_a_signal_has_one_source_and_a_plugin_gives_the_value_itself(signal: dic
         plugin_rule(signals=[signal])
 
 
-def test_each_client_has_state_of_its_own_that_goes_with_it() -> None:
+def test_each_client_has_its_own_state_until_it_is_lost() -> None:
     driven = drive(plugin_rule(), clientTimeout="3s")
     assert driven.take(arrival(0.5, "a", {"v": 1}), arrival(1.5, "b", {"v": 1}), until=2) == []
     assert driven.take(arrival(2.5, "b", {"v": 1}), until=3) == ["r a started 3"]
@@ -127,7 +127,7 @@ def test_the_value_is_in_the_event_and_in_the_actions() -> None:
     assert driven.events[0].values == {"p": {"count": 3.0, "clients": ["a"], "v": 1.0}}
 
 
-def test_of_a_pair_the_plugin_has_one_value_and_the_members_have_none() -> None:
+def test_the_plugin_has_one_value_for_a_pair_and_none_for_its_members() -> None:
     pairs = {"pairs": {"position": POSITION, "within": 10}}
     driven = drive(plugin_rule(when='p.count >= 2 && p.clients == ["a", "b"] && distance < 5', scope=pairs))
     for client, x in (("b", 0), ("a", 1), ("c", 100)):
@@ -138,7 +138,7 @@ def test_of_a_pair_the_plugin_has_one_value_and_the_members_have_none() -> None:
         drive(plugin_rule(when="a.p.count > 1", scope=pairs))
 
 
-def test_a_pair_that_is_no_longer_looked_at_loses_its_state() -> None:
+def test_a_pair_that_is_no_longer_evaluated_loses_its_state() -> None:
     pairs = {"pairs": {"position": POSITION, "within": 10}}
     driven = drive(plugin_rule(when="p.count >= 3 && false", scope=pairs, cooldown="0s"))
     instances = driven.host._signals["r", "p"]  # type: ignore[attr-defined]
@@ -149,14 +149,14 @@ def test_a_pair_that_is_no_longer_looked_at_loses_its_state() -> None:
     assert len(instances) == 0
 
 
-def test_of_the_fleet_the_plugin_sees_the_members_at_the_tick() -> None:
+def test_the_plugin_sees_the_members_of_the_fleet_at_the_tick() -> None:
     driven = drive(plugin_rule(when="size(p.clients) == 2", scope={"fleet": {"members": 'client != "c"'}}))
     assert driven.take(arrival(0.5, "a", {"v": 1}), arrival(0.5, "c", {"v": 1}), until=1) == []
     assert driven.take(arrival(1.5, "b", {"v": 1}), until=2) == ["r ~fleet started 2"]
     assert driven.events[0].values["p"]["clients"] == ["a", "b"]
 
 
-def test_one_that_throws_is_unknown_counted_and_reported_and_continues_afterwards() -> None:
+def test_a_plugin_exception_is_counted_and_makes_the_value_unknown_once() -> None:
     other = plugin_rule("other")
     driven = drive(plugin_rule(parameters={"raiseAt": 2}), other)
     driven.take(arrival(0.5, "a", {"v": 1}), arrival(1.5, "a", {"v": 2}), arrival(2.5, "a", {"v": 1}), until=3)
@@ -167,7 +167,7 @@ def test_one_that_throws_is_unknown_counted_and_reported_and_continues_afterward
     assert driven.engine.counters.rule("other").errors == 0
 
 
-def test_no_value_is_unknown_and_no_error() -> None:
+def test_a_plugin_without_a_value_is_unknown_without_an_error() -> None:
     driven = drive(plugin_rule(when="p.count >= 1"))
     assert driven.take(arrival(0.5, "a", {"x": 0, "y": 0}, "pose"), until=4) == []
     counters = driven.engine.counters.rule("r")
@@ -175,13 +175,13 @@ def test_no_value_is_unknown_and_no_error() -> None:
     assert counters.absences["signal p: plugin counting returned no value"] == 4
 
 
-def test_a_value_that_is_no_plain_data_is_an_error() -> None:
+def test_a_plugin_value_that_is_not_plain_data_is_an_error() -> None:
     driven = drive(plugin_rule(plugin="strange", when="size(p) > 0"))
     driven.take(arrival(0.5, "a", {"v": 1}), until=1)
     assert "the value is a set: return None, a boolean" in driven.engine.counters.rule("r").last_error
 
 
-def test_when_time_jumps_all_state_goes() -> None:
+def test_a_jump_of_time_drops_all_plugin_state() -> None:
     driven = drive(plugin_rule())
     driven.take(arrival(0.5, "a", {"v": 1}), until=2)
     driven.note(driven.engine.gap(START + 3 * 10**9))
@@ -189,7 +189,7 @@ def test_when_time_jumps_all_state_goes() -> None:
     assert driven.take(until=6) == ["r a started 6"]
 
 
-def test_other_parameters_are_another_rule() -> None:
+def test_changed_plugin_parameters_change_the_rule() -> None:
     driven = drive(plugin_rule())
     driven.take(arrival(0.5, "a", {"v": 1}), until=3)
     from tests.driving import compiled
@@ -222,13 +222,13 @@ def test_other_values_are_refused(value: Any) -> None:
         plain_value(value)
 
 
-def test_an_endless_value_is_refused() -> None:
+def test_a_recursive_value_is_rejected() -> None:
     loop: list[Any] = []
     loop.append(loop)
     with pytest.raises(TypeError, match="nested more than"):
         plain_value(loop)
 
 
-def test_streams_and_queries_are_there(tmp_path: Path) -> None:
+def test_plugins_get_streams_and_queries(tmp_path: Path) -> None:
     driven = drive(plugin_rule(), streams=[a_stream("speed")])
     assert driven.engine.queries().streams("a") == []

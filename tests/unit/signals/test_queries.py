@@ -39,7 +39,7 @@ def a_scan(tenths: int, client: str, frame: str = "front", stamp: float | None =
 
 @settings(deadline=None)
 @given(sent, st.sampled_from(["a", None]), st.sampled_from(["front", None]), st.integers(0, 5), st.integers(0, 60))
-def test_by_time_client_and_frame_each_query_finds_what_was_sent(
+def test_queries_by_time_client_and_frame_find_the_samples(
     scans: list[tuple[int, str, str]], client: str | None, frame: str | None, count: int, after: int
 ) -> None:
     scans = sorted(scans)
@@ -68,7 +68,7 @@ def test_a_view_sees_nothing_later_than_its_tick() -> None:
     assert queries.tuples("a", ["scan"], 0) == [tuple(queries.last("a", "scan", 9))]
 
 
-def test_what_cannot_be_decoded_is_left_out_and_counted() -> None:
+def test_undecodable_samples_are_skipped_and_counted() -> None:
     drive = Drive(a_detector())
     drive.take(arrival(0.1, "a", {"v": 1}), arrival(0.2, "a", b"no json"), until=0.5)
     assert [sample.message for sample in drive.engine.queries().last("a", "speed", 5)] == [{"v": 1.0}]
@@ -167,7 +167,7 @@ def brute_force(stamps: list[list[int]], slop: int) -> list[tuple[int, ...]]:
 
 
 @given(st.lists(st.lists(st.integers(0, 40), max_size=12).map(sorted), min_size=1, max_size=4), st.integers(0, 10))
-def test_tuples_are_those_of_the_definition_and_share_no_sample(stamps: list[list[int]], slop: int) -> None:
+def test_matched_tuples_follow_the_definition_and_share_no_sample(stamps: list[list[int]], slop: int) -> None:
     tuples = matched(stamps, slop)
     assert tuples == brute_force(stamps, slop)
     for stream in range(len(stamps)):
@@ -176,7 +176,7 @@ def test_tuples_are_those_of_the_definition_and_share_no_sample(stamps: list[lis
 
 
 @given(st.lists(st.integers(0, 40), min_size=1).map(sorted), st.integers(-5, 50))
-def test_the_nearest_stamp_is_the_first_of_those_nearest(stamps: list[int], time: int) -> None:
+def test_the_nearest_stamp_is_the_first_of_equally_near_ones(stamps: list[int], time: int) -> None:
     assert nearest_index(stamps, time) == min(range(len(stamps)), key=lambda i: (abs(stamps[i] - time), stamps[i], i))
 
 

@@ -24,7 +24,7 @@ def objects(*places: tuple[float, float]) -> dict[str, object]:
     return {"objects": [{"id": index, "x": x, "y": y} for index, (x, y) in enumerate(places)]}
 
 
-def test_two_perception_outputs_of_one_scene_are_compared_in_one_rule() -> None:
+def test_two_perception_outputs_of_a_scene_are_compared_in_one_rule() -> None:
     drive = Drive(a_detector(a_stream("camera"), a_stream("lidar")), COMPARED)
     both = [arrival(0.5, "rsu", objects((0, 0), (10, 0)), stream) for stream in ("camera", "lidar")]
     assert drive.take(*both, until=1) == []
@@ -36,7 +36,7 @@ def test_two_perception_outputs_of_one_scene_are_compared_in_one_rule() -> None:
     assert drive.take(arrival(3.5, "rsu", objects((0, 0), (9, 0)), "lidar"), until=4) == ["r rsu Until 4"]
 
 
-def test_what_two_vehicles_see_of_one_scene_is_compared_in_a_pair() -> None:
+def test_object_lists_of_two_vehicles_are_compared_in_a_pair() -> None:
     rule = a_rule(
         scope={"pairs": {"position": POSITION, "within": 100}},
         signals=[{"name": "seen", "stream": "camera", "value": "msg.objects"}],
@@ -49,14 +49,14 @@ def test_what_two_vehicles_see_of_one_scene_is_compared_in_a_pair() -> None:
     assert drive.take(arrival(1.5, "car2", objects((20, 1)), "camera"), until=2) == ["r car1+car2 started 2"]
 
 
-def test_thousands_of_objects_are_beyond_cels_loops_but_not_the_functions() -> None:
+def test_functions_handle_object_lists_too_long_for_cel_loops() -> None:
     many = [(float(x), float(y)) for x in range(120) for y in range(120)]  # more than 10,000
     drive = Drive(a_detector(a_stream("camera"), a_stream("lidar"), buffer={"bytes": "1Gi"}), COMPARED)
     drive.take(arrival(0.5, "rsu", objects(*many, (500, 0)), "camera"), until=0.9)
     assert drive.take(arrival(0.6, "rsu", objects(*many), "lidar"), until=1) == ["r rsu started 1"]
 
 
-def test_an_image_of_a_million_bytes_is_looked_at_without_becoming_a_list() -> None:
+def test_an_image_of_a_million_bytes_is_evaluated_without_becoming_a_list() -> None:
     store = get_typestore(Stores.ROS2_JAZZY)
     types = store.types
     detector = a_detector(

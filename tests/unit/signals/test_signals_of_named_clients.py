@@ -25,7 +25,7 @@ def speed(seconds: float, client: str, value: float) -> Any:
 RED = a_rule("red", signals=[SPEED, LIGHT], when="speed > 1 && light == 'red'", evaluation={"every": "100ms"})
 
 
-def test_who_drives_while_the_light_is_red_is_found_of_every_vehicle() -> None:
+def test_every_vehicle_that_drives_during_a_red_light_is_found() -> None:
     drive = Drive(DETECTOR, RED)
     assert drive.engine.in_columns == {"red"}
     reported = drive.take(
@@ -35,7 +35,7 @@ def test_who_drives_while_the_light_is_red_is_found_of_every_vehicle() -> None:
     assert drive.take(light(0.6, "green"), until=0.7) == ["red a Until 0.6", "red b Until 0.6"]
 
 
-def test_it_is_unknown_while_stale_and_while_that_client_is_not_known() -> None:
+def test_the_signal_is_unknown_while_stale_or_while_its_client_is_unknown() -> None:
     count = {**LIGHT, "name": "reds", "over": "5s", "aggregate": "Count", "where": "msg.v == 'red'"}
     count.pop("value")
     never = a_rule("never", signals=[SPEED, count], when="speed > 1 && reds == 0", evaluation={"every": "1s"})
@@ -48,7 +48,7 @@ def test_it_is_unknown_while_stale_and_while_that_client_is_not_known() -> None:
     assert "light-3" not in drive.engine.clients
 
 
-def test_pairs_fleets_and_episodes_see_it_as_well() -> None:
+def test_pairs_fleets_and_episodes_see_the_signal_too() -> None:
     pairs = {"pairs": {"position": POSITION, "within": 50}}
     near = a_rule("near", scope=pairs, signals=[LIGHT], when="distance < 10 && a.light == 'red' && b.light == 'red'")
     fleet = {"fleet": {"members": "speed > 1"}}
@@ -77,7 +77,7 @@ def test_a_client_is_named_for_a_stream_or_a_rule(signal: dict[str, Any], proble
         a_rule(signals=[signal], when="s")
 
 
-def test_another_client_than_the_only_one_of_a_stream_is_refused_at_its_field() -> None:
+def test_a_client_that_cannot_send_the_stream_is_rejected_by_field() -> None:
     detector = a_detector({"name": "state", "key": "lights/state", "encoding": "json", "client": "light-1"})
     with pytest.raises(
         RuleError, match=r"signals\[0\].client: stream state has only the client light-1: write client: light-1"

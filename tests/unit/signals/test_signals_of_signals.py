@@ -29,7 +29,7 @@ def slow(**spec: Any) -> Any:
     return a_rule(**{"signals": [SPEED, *STATISTICS], "when": "v < 5", "until": "v > 9", **spec})
 
 
-def test_one_then_another_then_not_a_third_is_three_windows_of_one_rule() -> None:
+def test_a_sequence_with_an_absence_is_three_windows_of_one_rule() -> None:
     rule = a_rule(
         signals=[
             SPEED,
@@ -70,7 +70,7 @@ def test_the_least_time_to_collision_of_an_episode_is_in_its_end_and_in_the_para
     assert parameters == [times[0], times[0]]
 
 
-def test_an_end_that_no_evaluation_sees_has_the_statistics_alone() -> None:
+def test_an_end_without_an_evaluation_has_only_the_statistics() -> None:
     drive = Drive(a_detector(clientTimeout="3s"), slow())
     drive.take(speed(1, 4), speed(2, 2), speed(3, 6), until=9)
     assert drive.events[-1].reason == "ClientLost"
@@ -101,7 +101,7 @@ def test_statistics_survive_a_restart_by_the_state_volume(with_task: bool) -> No
     assert after.events[-1].values["mean"] == (4 + 2 + 2.1 + 6 + 10) / 5
 
 
-def test_a_client_that_was_lost_and_time_that_was_skipped_leave_no_past() -> None:
+def test_lost_clients_and_gaps_leave_no_earlier_values() -> None:
     rule = a_rule(signals=[SPEED, {"name": "was", "of": "v", "over": "9s", "aggregate": "Max"}], when="was > 5")
     lost = Drive(a_detector(clientTimeout="2s"), rule)
     assert lost.take(speed(1, 9), speed(5, 1), speed(6, 1), until=7) == ["r car started 1", "r car ClientLost 4"]
@@ -143,6 +143,6 @@ def test_the_replay_of_lags_and_statistics_gives_the_same_events() -> None:
         ({"of": "v", "over": "1s", "aggregate": "Quantile"}, "Quantile needs quantile"),
     ],
 )  # fmt: skip
-def test_what_such_a_signal_cannot_be(signal: dict[str, Any], message: str) -> None:
+def test_invalid_signals_over_signals_are_rejected(signal: dict[str, Any], message: str) -> None:
     with pytest.raises(ValidationError, match=message):
         a_rule(signals=[SPEED, {"name": "s", **signal}], when="true")

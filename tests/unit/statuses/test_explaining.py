@@ -87,7 +87,7 @@ def contributions(explanation: Explanation, parameter: str) -> dict[str, str]:
     return {each.task: each.effect for each in found.contributions}
 
 
-def test_who_gives_a_value_and_who_is_outbid() -> None:
+def test_the_explanation_lists_contributing_and_outranked_tasks() -> None:
     found = explained()
     values = {each.name: (each.value, each.source) for each in found.parameters}
     assert values == {
@@ -101,7 +101,7 @@ def test_who_gives_a_value_and_who_is_outbid() -> None:
     assert contributions(found, "quality") == {"by-anna": "decides"}
 
 
-def test_a_default_and_a_value_that_is_kept_are_distinguished_from_what_tasks_give() -> None:
+def test_defaults_and_kept_values_are_distinguished_from_values_of_tasks() -> None:
     by_default = explained("scene-b", [TASKS[1]])
     assert {each.name: each.source for each in by_default.parameters}["quality"] == "default"
     kept = explained(None, [], instances=[running(rateHz=30)])
@@ -109,14 +109,14 @@ def test_a_default_and_a_value_that_is_kept_are_distinguished_from_what_tasks_gi
     assert {each.name: each.source for each in kept.parameters}["sources"] == "none"
 
 
-def test_a_refused_task_has_no_instance_and_reports_why() -> None:
+def test_a_rejected_task_has_no_instance_and_reports_the_reason() -> None:
     found = explained("wrong")
     assert found.task is not None
     assert (found.task.verdict, found.task.reason, found.instance) == ("Refused", "InvalidParameters", None)
     assert "'fast' is not of type number" in found.task.message
 
 
-def test_a_task_that_differs_where_all_must_agree_is_reported_among_those_of_the_instance() -> None:
+def test_a_conflicting_task_is_listed_with_the_tasks_of_the_instance() -> None:
     spec = {**FUSION, "parameters": {**FUSION["parameters"], "model": {"type": "string"}}}  # type: ignore[dict-item]
     tasks = [
         task("first", {"region": "north", "model": "a"}),
@@ -152,7 +152,7 @@ def test_objects_and_pods_report_why_they_are_not_ready() -> None:
     assert [each.problem for each in found.pods] == ["cannot pull image fusion:9: not found"]
 
 
-def test_the_text_shows_what_each_task_does_and_whose_values_lost_and_why() -> None:
+def test_the_text_shows_the_effect_of_each_task_and_outranked_values() -> None:
     tasks = [
         *TASKS[:2],
         task("thin", {"rateHz": 2}, operation="Reconfigure"),
@@ -169,7 +169,7 @@ def test_the_text_shows_what_each_task_does_and_whose_values_lost_and_why() -> N
     assert "instances: all instances of the template" in of_all
 
 
-def test_who_has_no_place_under_a_limit_waits_though_nobody_has_written_it() -> None:
+def test_an_instance_without_a_place_waits_before_any_status_has_it() -> None:
     one, two = task("one", {"region": "north"}), task("two", {"region": "south"}, created=1)
     found = NamespaceSnapshot([template(**FUSION, maxInstances=1)], [one, two], [running()])
     reported = explanation_of(found, task="two", instance=serving(found, two, NOW), now=NOW)
@@ -177,7 +177,7 @@ def test_who_has_no_place_under_a_limit_waits_though_nobody_has_written_it() -> 
     assert (reported.task.verdict, reported.task.reason) == ("Waiting", "LimitReached")
 
 
-def test_a_sum_that_is_held_at_its_bound_reports_what_it_would_be() -> None:
+def test_a_capped_sum_reports_its_uncapped_value() -> None:
     spec = {"parameters": {"uplink": {"type": "number", "maximum": 100, "merge": "Sum"}}}
     tasks = [task("one", {"uplink": 60}), task("two", {"uplink": 70})]
     found = NamespaceSnapshot([template(**spec)], tasks, [])
@@ -193,7 +193,7 @@ def test_ended_tasks_do_not_push_live_ones_out_of_the_limited_output() -> None:
     assert "  and 11 more: -o json lists all" in reported
 
 
-def test_the_guide_shows_what_is_printed() -> None:
+def test_the_guide_shows_the_printed_explanation() -> None:
     lease = {"spec": {"renewTime": format_seconds(NOW - 2.5)}}
     found = explained(objects={("apps/v1", "Deployment", NAME): DEPLOYMENT}, pods=[POD], leases={"town": lease})
     shown = re.search(r"```console\n\$ application-manager explain scene-a\n(.*?)```", guide("manager"), re.DOTALL)

@@ -56,7 +56,7 @@ def test_a_rule_that_a_detector_can_evaluate_is_accepted() -> None:
     assert (status.conditions[0].status, status.conditions[0].observed_generation) == ("True", 3)
 
 
-def test_what_is_wrong_with_a_rule_is_reported_with_its_place() -> None:
+def test_errors_of_a_rule_are_reported_by_field() -> None:
     status = rule_status(rule(when="sped > 3"), RuleContext([detector()]), NOW)
     condition = status.conditions[0]
     assert (condition.status, condition.reason) == ("False", "RuleInvalid")
@@ -64,7 +64,7 @@ def test_what_is_wrong_with_a_rule_is_reported_with_its_place() -> None:
         assert part in condition.message
 
 
-def test_ready_and_stalled_follow_from_what_is_wrong_and_stalled_goes_with_it() -> None:
+def test_ready_and_stalled_follow_the_errors_and_stalled_is_removed_with_them() -> None:
     wrong = rule_status(rule(when="sped > 3"), RuleContext([detector()]), NOW)
     assert [(each.type, each.status) for each in wrong.conditions] == [
         ("Accepted", "False"),
@@ -90,20 +90,20 @@ def test_a_problem_with_one_detector_names_it() -> None:
     assert condition.message.startswith("with Detector blind: spec.signals[0].stream")
 
 
-def test_a_rule_that_nobody_selects_is_reported_with_the_labels_that_would_help() -> None:
+def test_an_unselected_rule_is_reported_with_the_selecting_labels() -> None:
     condition = rule_status(rule(), RuleContext([detector(site="b")]), NOW).conditions[0]
     assert (condition.status, condition.reason) == ("False", "NotSelected")
     assert "det selects site=b" in condition.message
 
 
-def test_a_detector_counts_its_rules_and_reports_what_is_wrong_with_its_streams() -> None:
+def test_a_detector_counts_its_rules_and_reports_errors_of_its_streams() -> None:
     assert detector_status(detector(), [rule()], NOW).rules == 1
     condition = detector_status(detector(stamp="msg.t +"), [rule()], NOW).conditions[0]
     assert (condition.status, condition.reason) == ("False", "DetectorInvalid")
     assert "spec.streams[0].stamp" in condition.message
 
 
-def test_a_key_that_is_none_is_reported_with_its_place() -> None:
+def test_an_invalid_key_is_reported_by_field() -> None:
     condition = detector_status(detector(key="v//${client:*}/pose"), [], NOW).conditions[0]
     assert (condition.status, condition.reason) == ("False", "DetectorInvalid")
     assert (
@@ -112,19 +112,19 @@ def test_a_key_that_is_none_is_reported_with_its_place() -> None:
     )
 
 
-def test_what_is_accepted_is_so_only_as_far_as_is_known_here() -> None:
+def test_an_accepted_rule_names_the_checks_left_to_the_detector() -> None:
     for status in (rule_status(rule(), RuleContext([detector()]), NOW), detector_status(detector(), [], NOW)):
         assert "message types are checked only by the detector" in status.conditions[0].message
 
 
-def test_a_rule_that_nobody_selects_is_reported_with_invalid_detectors() -> None:
+def test_an_unselected_rule_is_reported_with_invalid_detectors() -> None:
     condition = rule_status(rule(), RuleContext([], ["det"]), NOW).conditions[0]
     assert (condition.status, condition.reason) == ("False", "NotSelected")
     assert "correct Detector det; its status gives the error" in condition.message
 
 
 @pytest.mark.parametrize(("kind", "reason"), [("EventRule", "RuleInvalid"), ("Detector", "DetectorInvalid")])
-def test_what_passed_the_api_server_and_is_invalid_is_reported_in_its_status(kind: str, reason: str) -> None:
+def test_an_invalid_stored_object_is_reported_in_its_status(kind: str, reason: str) -> None:
     cache = ClusterCache(Policy())
     written: list[dict[str, Any]] = []
 
@@ -162,7 +162,7 @@ def test_what_passed_the_api_server_and_is_invalid_is_reported_in_its_status(kin
     assert "spec.odd: unknown field" in condition["message"]
 
 
-def test_what_may_go_wrong_with_a_good_rule_is_reported_and_it_stays_accepted() -> None:
+def test_warnings_about_a_valid_rule_are_reported_and_it_stays_accepted() -> None:
     deploying = rule(actions=[{"name": "go", "deploy": {"templateName": "app"}}])
     condition = rule_status(deploying, RuleContext([detector()]), NOW).conditions[0]
     assert condition.status == "True"

@@ -33,7 +33,7 @@ def test_a_condition_keeps_its_time_while_its_status_stays() -> None:
     assert third[0].last_transition_time == format_seconds(NOW + 9)
 
 
-def test_only_a_change_of_status_or_reason_is_worth_an_event() -> None:
+def test_only_a_changed_status_or_reason_gives_an_event() -> None:
     first = updated((), [ConditionState("Ready", False, "NotReady", "0 of 1")], 1, NOW)
     assert changed((), first) == list(first)
     assert changed(first, updated(first, [ConditionState("Ready", False, "NotReady", "0 of 2")], 2, NOW)) == []
@@ -52,7 +52,7 @@ def test_a_tasks_phases_follow_its_instance() -> None:
     assert phases == [TaskPhase.PENDING, TaskPhase.PENDING, TaskPhase.ACTIVE, TaskPhase.READY]
 
 
-def test_a_task_is_not_ready_while_its_instance_is_not_made_and_keeps_what_was_known_of_it_afterwards() -> None:
+def test_a_task_is_not_ready_before_its_instance_exists_and_keeps_its_state_after_deletion() -> None:
     pending = task_status(task("a"), COUNTS, None, NOW, 0)
     assert logged(pending) == {"Accepted": "True", "Ready": "False"}
     ready = task_status(task("a"), COUNTS, InstanceProgress("app", True, True), NOW, 0)
@@ -60,7 +60,7 @@ def test_a_task_is_not_ready_while_its_instance_is_not_made_and_keeps_what_was_k
     assert logged(later) == {"Accepted": "True", "Applied": "True", "Ready": "True"}
 
 
-def test_a_task_is_no_more_applied_or_ready_than_its_instance_and_keeps_since_when_it_once_was() -> None:
+def test_a_tasks_applied_and_ready_follow_its_instance_and_keep_their_first_time() -> None:
     ready = task_status(task("a"), COUNTS, InstanceProgress("app", True, True), NOW, 0)
     served = task("a").model_copy(update={"status": ready})
     later = task_status(served, COUNTS, InstanceProgress("app", False, False, "broken"), NOW + 1, 0)
@@ -130,7 +130,7 @@ def test_a_finished_task_keeps_its_instance_and_reports_since_when() -> None:
     assert finished_since(served) is None
 
 
-def test_a_task_that_ends_before_its_status_is_written_still_reports_what_served_it() -> None:
+def test_a_task_that_ends_before_its_status_is_written_still_reports_its_instance() -> None:
     index, name = ClaimIndex(), ("site", "a")
     index.note(name, Entry({}, task("a")), template())
     claimed = index.claim(name)
@@ -143,7 +143,7 @@ def test_a_task_that_ends_before_its_status_is_written_still_reports_what_served
     assert (done.phase, done.instance_name) == (TaskPhase.FINISHED, claimed.instance)
 
 
-def test_a_holder_that_returns_takes_back_that_its_task_is_finished() -> None:
+def test_a_returning_holder_reopens_its_finished_task() -> None:
     lost = task_status(task("a"), Verdict(VerdictKind.FINISHED, "DetectorLost", "lost"), None, NOW, 0)
     back = task_status(task("a").model_copy(update={"status": lost}), COUNTS, None, NOW + 1, 0)
     assert logged(back)["Finished"] == "False"

@@ -68,7 +68,7 @@ def server() -> Iterator[StatusServer]:
     server.close()
 
 
-def test_pages_are_served_and_what_is_not_well_is_503(server: StatusServer) -> None:
+def test_pages_are_served_with_503_while_unhealthy(server: StatusServer) -> None:
     def get(path: str) -> tuple[int, str]:
         try:
             with urllib.request.urlopen(f"http://127.0.0.1:{server.port}{path}") as answer:
@@ -81,7 +81,7 @@ def test_pages_are_served_and_what_is_not_well_is_503(server: StatusServer) -> N
     assert get("/") == (404, "unknown page; the pages are /metrics, /readyz\n")
 
 
-def test_a_port_that_is_taken_is_reported_with_the_option(server: StatusServer) -> None:
+def test_a_port_in_use_is_reported_with_the_option(server: StatusServer) -> None:
     with pytest.raises(OSError, match=rf"--metrics-port {server.port}: .*: give another port"):
         StatusServer(PagesAddress(server.port), {})
 

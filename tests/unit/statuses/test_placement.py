@@ -45,7 +45,7 @@ def expression(key: str, operator: str, *values: str) -> dict[str, Any]:
         ),
     ],
 )
-def test_what_no_node_is_like_is_reported(spec: Any, shows: str) -> None:
+def test_constraints_that_match_no_node_are_reported(spec: Any, shows: str) -> None:
     found = misplaced(deployment(**spec), NODES)
     assert found is not None
     assert found.reason == "Unschedulable"
@@ -67,11 +67,11 @@ def test_what_no_node_is_like_is_reported(spec: Any, shows: str) -> None:
         {"affinity": {"nodeAffinity": {"preferredDuringSchedulingIgnoredDuringExecution": [{"weight": 1}]}}},
     ],
 )
-def test_what_a_node_is_like_is_not(spec: Any) -> None:
+def test_constraints_that_match_a_node_are_not_reported(spec: Any) -> None:
     assert misplaced(deployment(**spec), NODES) is None
 
 
-def test_where_there_is_no_node_it_is_reported_only_for_what_requires_one() -> None:
+def test_without_nodes_only_required_constraints_are_reported() -> None:
     found = misplaced(deployment(nodeSelector={"site": "north"}), {})
     assert found is not None
     assert "(there are no nodes)" in found.message
@@ -88,5 +88,5 @@ def test_where_there_is_no_node_it_is_reported_only_for_what_requires_one() -> N
         ({"kind": "Service", "spec": {"selector": {"a": "b"}}}, False),
     ],
 )
-def test_the_pods_of_each_kind_are_looked_at(live: Any, placed: bool) -> None:
+def test_the_pods_of_each_kind_are_checked(live: Any, placed: bool) -> None:
     assert is_placed(live) is placed

@@ -54,11 +54,11 @@ def logged(status: dict[str, Any]) -> tuple[str, str] | None:
         ),
     ],
 )
-def test_an_image_that_cannot_be_pulled_gives_the_same_words_at_each_attempt(status: dict[str, Any]) -> None:
+def test_an_image_pull_failure_has_the_same_message_at_each_attempt(status: dict[str, Any]) -> None:
     assert logged(status) == ("ImagePullFailed", f"cannot pull image app:1: {CAUSE}")
 
 
-def test_an_image_whose_cause_is_not_reported_is_named_with_the_kubelets_word() -> None:
+def test_an_image_without_a_known_cause_is_reported_with_the_kubelets_reason() -> None:
     back_off = waiting("ImagePullBackOff", 'Back-off pulling image "app:1"')
     assert logged(back_off) == ("ImagePullFailed", "cannot pull image app:1: ImagePullBackOff")
 
@@ -79,7 +79,7 @@ ENDED = {"exitCode": 3, "reason": "Error", "finishedAt": "2026-01-01T00:00:00Z"}
         container({"running": {}}, lastState={"terminated": ENDED}, restartCount=4),
     ],
 )
-def test_a_container_that_crashes_gives_the_same_words_between_and_during_its_attempts(status: dict[str, Any]) -> None:
+def test_a_crashing_container_has_the_same_message_between_and_during_its_restarts(status: dict[str, Any]) -> None:
     found = trouble(pod(**status))
     assert found is not None
     assert (found.reason, found.message) == (
@@ -89,11 +89,11 @@ def test_a_container_that_crashes_gives_the_same_words_between_and_during_its_at
     assert found.hint == "its log: kubectl logs -n site app-1 -c main --previous"
 
 
-def test_a_container_that_is_ready_again_is_no_trouble() -> None:
+def test_a_recovered_container_is_not_reported() -> None:
     assert logged(container({"running": {}}, lastState={"terminated": ENDED}, ready=True)) is None
 
 
-def test_want_of_memory_and_a_containers_last_words_are_reported() -> None:
+def test_out_of_memory_and_termination_messages_are_reported() -> None:
     killed = container({"terminated": {"exitCode": 137, "reason": "OOMKilled"}})
     assert "exit code 137, killed for exceeding its memory limit" in str(logged(killed))
     speaks = container({"terminated": {**ENDED, "message": "no\nmap"}})
@@ -120,11 +120,13 @@ def test_want_of_memory_and_a_containers_last_words_are_reported() -> None:
         ({"phase": "Succeeded", **container({"terminated": {"exitCode": 0}})}, None),
     ],
 )
-def test_other_troubles_and_none(status: dict[str, Any], expected: tuple[str, str] | None) -> None:
+def test_other_pod_troubles_are_reported_and_healthy_pods_are_not(
+    status: dict[str, Any], expected: tuple[str, str] | None
+) -> None:
     assert logged(status) == expected
 
 
-def test_what_is_not_restarted_has_failed_and_does_not_crash() -> None:
+def test_a_container_that_is_not_restarted_counts_as_failed_not_crashing() -> None:
     once = pod(phase="Failed", **container({"terminated": ENDED}))
     once["spec"]["restartPolicy"] = "Never"
     found = trouble(once)
@@ -135,7 +137,7 @@ def test_what_is_not_restarted_has_failed_and_does_not_crash() -> None:
     )
 
 
-def test_a_pod_that_goes_is_no_trouble() -> None:
+def test_a_terminating_pod_is_not_reported() -> None:
     going = pod(**waiting("ErrImagePull"))
     going["metadata"]["deletionTimestamp"] = "2026-01-01T00:00:00Z"
     assert trouble(going) is None

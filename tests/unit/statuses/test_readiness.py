@@ -35,11 +35,11 @@ FULL = {"availableReplicas": 2, "updatedReplicas": 2, "replicas": 2}
         (FULL | condition("Progressing", "False"), None),
     ],
 )
-def test_a_deployment(status: dict[str, Any], expected: str | None) -> None:
+def test_a_deployment_is_judged_by_its_rollout(status: dict[str, Any], expected: str | None) -> None:
     assert judged("Deployment", status, replicas=2) == expected
 
 
-def test_what_a_controller_has_not_seen_yet_is_not_judged_by_its_old_status() -> None:
+def test_a_status_of_an_older_generation_is_not_used() -> None:
     assert judged("Deployment", FULL, generation=2, replicas=2) == "has not been processed by its controller yet"
     assert judged("Deployment", FULL | {"observedGeneration": 2}, generation=2, replicas=2) is None
 
@@ -57,7 +57,7 @@ def test_a_workload_that_is_stopped_is_ready() -> None:
         ({"updateStrategy": {"rollingUpdate": {"partition": 1}}}, None),
     ],
 )
-def test_a_stateful_set_that_rolls_out(spec: dict[str, Any], expected: str | None) -> None:
+def test_a_stateful_set_is_judged_by_its_rollout(spec: dict[str, Any], expected: str | None) -> None:
     status = {"availableReplicas": 1, "currentRevision": "a", "updateRevision": "b", "updatedReplicas": 0}
     assert judged("StatefulSet", status, **spec) == expected
     assert judged("StatefulSet", status | {"updateRevision": "a"}, **spec) is None
@@ -72,7 +72,7 @@ def test_a_stateful_set_that_rolls_out(spec: dict[str, Any], expected: str | Non
         ({"desiredNumberScheduled": 1, "numberAvailable": 1, "updatedNumberScheduled": 1}, None),
     ],
 )
-def test_a_daemon_set(status: dict[str, Any], expected: str | None) -> None:
+def test_a_daemon_set_is_judged_by_its_rollout(status: dict[str, Any], expected: str | None) -> None:
     assert judged("DaemonSet", status) == expected
 
 
@@ -86,12 +86,12 @@ def test_a_daemon_set(status: dict[str, Any], expected: str | None) -> None:
         (condition("Failed", "True", message="too many retries"), "has failed: too many retries"),
     ],
 )
-def test_a_job(status: dict[str, Any], expected: str | None) -> None:
+def test_a_job_is_judged_by_its_completion(status: dict[str, Any], expected: str | None) -> None:
     assert judged("Job", status) == expected
     assert judged("Job", suspend=True) == "is suspended (spec.suspend)"
 
 
-def test_pods_claims_and_services() -> None:
+def test_pods_claims_and_services_are_judged_by_their_status() -> None:
     assert judged("Pod", {"phase": "Pending"}) == "is not ready"
     assert judged("Pod", condition("Ready", "True")) is judged("Pod", {"phase": "Succeeded"}) is None
     assert judged("PersistentVolumeClaim", {"phase": "Pending"}) == "is not bound to a volume yet"

@@ -28,7 +28,7 @@ def test_each_refusal_has_its_reason(code: int, message: str, reason: str) -> No
     assert reason_of(code, message) == reason
 
 
-def test_the_pods_of_a_deployment_that_are_refused_are_reported_in_the_same_words_each_time() -> None:
+def test_rejected_pods_of_a_deployment_have_a_constant_message() -> None:
     def reported(message: str, kind: str = "Deployment", status: str = "True") -> str | None:
         conditions = [{"type": "ReplicaFailure", "status": status, "message": message}]
         found = refused_pods({"kind": kind, "metadata": {"name": "app"}, "status": {"conditions": conditions}})
@@ -61,7 +61,7 @@ def test_the_pods_of_a_deployment_that_are_refused_are_reported_in_the_same_word
         ("Deployment", {"replicas": 1}, {}, False),
     ],
 )
-def test_what_lacks_pods_is_reported_from_its_status(kind: str, spec: Any, status: Any, lacks: bool) -> None:
+def test_missing_pods_are_reported_from_the_workloads_status(kind: str, spec: Any, status: Any, lacks: bool) -> None:
     assert lacks_pods({"kind": kind, "metadata": {"name": "app"}, "spec": spec, "status": status}) is lacks
 
 
@@ -72,7 +72,7 @@ def event(note: str, ago: float, **more: Any) -> dict[str, Any]:
     return {"reason": "FailedCreate", "note": note, "eventTime": format_time(round((NOW - ago) * 1e9)), **more}
 
 
-def test_the_last_event_reports_why_pods_are_refused_in_the_same_words_each_time() -> None:
+def test_the_last_event_gives_a_constant_message_for_rejected_pods() -> None:
     older = event("Error creating: " + QUOTA.replace("few", "another"), 30)
     newer = event(f"create Pod app-0 in StatefulSet app failed error: {QUOTA}", 3)
     found = refused_by_events([newer, older], NOW)
@@ -89,19 +89,19 @@ def test_an_event_that_is_repeated_is_as_old_as_its_last_time() -> None:
     assert refused_by_events([event(QUOTA, 9000, series={"count": 9, "lastObservedTime": last})], NOW) is not None
 
 
-def test_what_is_long_past_or_of_another_reason_reports_nothing() -> None:
+def test_old_events_and_other_reasons_are_ignored() -> None:
     assert refused_by_events([], NOW) is None
     assert refused_by_events([event(QUOTA, 3600)], NOW) is None
     assert refused_by_events([event(QUOTA, 1) | {"reason": "BackOff"}], NOW) is None
 
 
-def test_a_refusal_of_a_controllers_right_is_one_of_admission() -> None:
+def test_a_rejection_for_a_controllers_missing_right_counts_as_admission() -> None:
     found = refused_by_events([event('pods is forbidden: User "c" cannot create resource "pods"', 1)], NOW)
     assert found is not None
     assert found.reason.value == "AdmissionRefused"
 
 
-def test_the_same_is_tried_again_ever_later_and_another_at_once() -> None:
+def test_the_same_rejection_is_retried_with_backoff_and_a_changed_object_at_once() -> None:
     attempts, now = Attempts(), 1000.0
     assert attempts.waits_until(("site", "a"), "x", now) is None
     pauses = []

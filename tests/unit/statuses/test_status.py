@@ -66,7 +66,7 @@ def test_streams_are_reported_with_rate_age_buffer_and_latency() -> None:
     assert [(client.name, client.age) for client in status.clients] == [("car", 0.5)]
 
 
-def test_rules_are_reported_with_what_was_unknown_failed_and_is_open() -> None:
+def test_rules_are_reported_with_unknowns_errors_and_open_episodes() -> None:
     kept = ObservedEngine(Drive(a_detector(), FAST))
     status = kept.take(arrival(0.5, "car", {"v": 20}), arrival(0.6, "bus", {}), until=1)
     (rule,) = status.rules
@@ -77,7 +77,7 @@ def test_rules_are_reported_with_what_was_unknown_failed_and_is_open() -> None:
     assert rule.latency.sum == pytest.approx(0.5 + 0.4)
 
 
-def test_the_latency_of_a_rule_counts_a_sample_once_however_long_nothing_follows() -> None:
+def test_the_latency_of_a_rule_counts_a_sample_once_before_a_long_silence() -> None:
     kept = ObservedEngine(Drive(a_detector(), FAST))
     kept.take(arrival(0.5, "car", {"v": 20}), until=1)
     for second in range(2, 20):
@@ -134,7 +134,7 @@ def test_drops_are_reported_by_cause() -> None:
     assert drops == {("undecodable", "speed"): 1, ("unnamed", "speed"): 1}
 
 
-def test_a_status_is_taken_at_most_once_a_second_and_survives_its_journey() -> None:
+def test_a_status_is_taken_at_most_once_a_second_and_round_trips() -> None:
     kept = ObservedEngine(Drive(a_detector(), FAST))
     first = kept.take(arrival(0.5, "car", {"v": 20}), until=1)
     assert kept.take(until=1.9) is first
@@ -152,7 +152,7 @@ class _NullSink:
     def demands(self, demands: object, ended: object) -> None: ...
 
 
-def test_what_is_requested_from_the_evaluation_is_done_on_its_thread_and_errors_are_the_callers() -> None:
+def test_calls_run_on_the_evaluation_thread_and_raise_in_the_caller() -> None:
     failures: list[BaseException] = []
     drive = Drive(a_detector())
     evaluator = Evaluator(
@@ -194,7 +194,7 @@ def answering(endpoint: str) -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("answering")
-def test_questions_reach_a_detector_by_name_or_any_and_refusals_come_back(endpoint: str) -> None:
+def test_queries_reach_one_or_all_detectors_and_errors_are_returned(endpoint: str) -> None:
     config = Zenoh(mode=ZenohMode.CLIENT, connect=[endpoint])
     for holder in ("d", "*"):
         (answer,) = query_detectors(config, holder, "status", {"rule": "r", "subject": "a+b~c"}, 30)
@@ -207,7 +207,7 @@ def test_questions_reach_a_detector_by_name_or_any_and_refusals_come_back(endpoi
 
 
 @pytest.mark.usefixtures("answering")
-def test_the_detectors_file_contains_where_it_listens(endpoint: str, tmp_path: Path) -> None:
+def test_the_detectors_file_has_its_listen_endpoints(endpoint: str, tmp_path: Path) -> None:
     file = tmp_path / "detector.yaml"
     file.write_text(a_detector(zenoh={"listen": [endpoint]}).model_dump_json(by_alias=True, exclude_none=True))
     (answer,) = query_selected("status", {}, file, None, None, 30)
@@ -224,7 +224,7 @@ def explained(
     return watching.future.result(0)
 
 
-def test_an_evaluation_reports_what_it_saw_and_why_a_signal_is_unknown() -> None:
+def test_an_explained_evaluation_reports_values_and_reasons_of_unknowns() -> None:
     gap = {"name": "gap", "stream": "pose", "value": "msg.gap"}
     rule = a_rule("r", signals=[SPEED, gap], when="v > 10 && gap < 5", **{"for": "2s"})
     drive = Drive(a_detector(a_stream("pose", staleAfter="2s"), a_stream("speed")), rule)
@@ -246,7 +246,7 @@ def test_an_evaluation_reports_what_it_saw_and_why_a_signal_is_unknown() -> None
     assert drive.engine.rules["r"].witness is None
 
 
-def test_what_expressions_missed_or_failed_on_is_reported() -> None:
+def test_missing_inputs_and_errors_of_expressions_are_reported() -> None:
     drive = Drive(a_detector(), a_rule("r", signals=[SPEED], when="v.x > 10"))
     explanation = explained(drive, "r", until=1, sent=[arrival(0.1, "a", {"v": 20}), arrival(0.2, "b", {})])
     assert explanation.notes == [
@@ -265,7 +265,7 @@ def test_what_expressions_missed_or_failed_on_is_reported() -> None:
         ("a", "the rule is about pairs: write car1+car2"),
     ],
 )
-def test_a_subject_that_is_not_looked_at_is_reported_with_the_reason(subject: str, why: str) -> None:
+def test_a_subject_that_is_not_evaluated_is_reported_with_the_reason(subject: str, why: str) -> None:
     drive = Drive(a_detector(), a_rule("near", scope={"pairs": {"position": POSITION, "within": 100}}, when="true"))
     sent = [arrival(0.1, "a", {"x": 0, "y": 0}, "pose"), arrival(0.2, "b", {"x": 900, "y": 0}, "pose")]
     (reported,) = explained(drive, "near", subject, until=1, sent=sent).subjects
@@ -273,7 +273,7 @@ def test_a_subject_that_is_not_looked_at_is_reported_with_the_reason(subject: st
     assert reported.why == why
 
 
-def test_of_a_pair_each_ones_signals_are_reported() -> None:
+def test_the_signals_of_both_clients_of_a_pair_are_reported() -> None:
     scope = {"pairs": {"position": POSITION, "within": 100}}
     drive = Drive(a_detector(), a_rule("near", scope=scope, signals=[SPEED], when="a.v + b.v > 1"))
     sent = [arrival(0.1, "a", {"x": 0, "y": 0}, "pose"), arrival(0.2, "b", {"x": 9, "y": 0}, "pose")]
@@ -282,7 +282,7 @@ def test_of_a_pair_each_ones_signals_are_reported() -> None:
     assert reported.unknown == {"a.v": "no sample of stream speed has arrived from a"}
 
 
-def test_a_rule_that_is_gone_is_watched_no_more_and_one_at_a_time() -> None:
+def test_explanations_end_with_their_rule_and_run_one_at_a_time() -> None:
     drive = Drive(a_detector(), FAST)
     watching = RuleWatch(drive.engine, "fast", None)
     with pytest.raises(ValueError, match="another request about rule fast"):
@@ -294,7 +294,7 @@ def test_a_rule_that_is_gone_is_watched_no_more_and_one_at_a_time() -> None:
         RuleWatch(drive.engine, "fast", None)
 
 
-def test_the_status_names_what_is_demanded_and_who_is_missing() -> None:
+def test_the_status_lists_demands_and_missing_clients() -> None:
     detector = a_detector(
         clients=[{"name": "rsu-1", "expected": True}, {"name": "rsu-2", "expected": True}], clientTimeout="4s"
     )

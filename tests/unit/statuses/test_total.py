@@ -76,7 +76,7 @@ def test_losses_are_joined_by_cause_and_their_reasons_name_the_detector(north: S
     assert (drops.count, drops.last) == (5, "north: no JSON")
 
 
-def test_a_list_of_clients_that_was_cut_gives_a_lower_bound(north: Status, center: Status) -> None:
+def test_a_truncated_list_of_clients_gives_a_lower_bound(north: Status, center: Status) -> None:
     cut = msgspec.structs.replace(center, clients=center.clients[:1], client_count=7)
     added = total([north, cut])
     assert (added.client_count, added.shared_client_count, added.clients_complete) == (9, 1, False)
@@ -147,7 +147,7 @@ def test_a_detector_that_does_not_answer_is_an_error_beside_the_sum_of_the_other
     assert ([each.holder for each in added.detectors], added.missing_detectors) == (["center", "north"], ["south"])
 
 
-def test_what_cannot_be_added_up_is_refused_with_the_remedy(answers: Answers, tmp_path: Path) -> None:
+def test_statuses_that_cannot_be_added_are_rejected_with_the_remedy(answers: Answers, tmp_path: Path) -> None:
     file = str(answers.file)
     for options, error in (
         (("--name", "north"), "remove --name"),

@@ -37,7 +37,7 @@ def test_a_jump_and_the_crossing_of_a_line_are_expressions_over_two_samples(eval
     assert drive.engine.counters.rule("crossing").errors == 0
 
 
-def test_the_first_sample_and_one_after_a_pause_have_none_before() -> None:
+def test_the_first_sample_and_one_after_a_pause_have_no_sample_before() -> None:
     drive = Drive(a_detector(a_stream("pose", staleAfter="2s")), jump())
     assert drive.take(place(0.5, "car", 50), until=1) == []
     assert drive.take(place(2.6, "car", 90), until=3) == []  # 2.1 s later
@@ -47,7 +47,7 @@ def test_the_first_sample_and_one_after_a_pause_have_none_before() -> None:
     assert counters.absences["no value for `before`"] >= 2
 
 
-def test_a_message_that_cannot_be_read_is_no_sample_before() -> None:
+def test_an_undecodable_message_does_not_count_as_the_sample_before() -> None:
     drive = Drive(a_detector(a_stream("pose")), jump())
     reported = drive.take(place(0.1, "car", 1), arrival(0.2, "car", b"{", "pose"), place(0.3, "car", 90), until=0.5)
     assert reported == []
@@ -71,7 +71,7 @@ def test_an_item_is_compared_with_the_item_before_of_the_same_client() -> None:
     assert drive.take(sent(3.2, a=99), until=3.3) == ["jump a started 3.2"]
 
 
-def test_a_late_sample_changes_the_one_before_of_no_other() -> None:
+def test_a_late_sample_does_not_change_the_sample_before_of_others() -> None:
     detector = a_detector(a_stream("pose", stamp="msg.t"), clock="Data", lateness="200ms")
     drive = Drive(detector, jump(evaluation={"every": "100ms"}))
 
@@ -106,7 +106,7 @@ def test_messages_of_ros_are_compared_by_their_fields() -> None:
         ),
     ],
 )
-def test_what_is_wrong_with_expressions_over_two_samples_is_found_with_its_field(rule: EventRule, problem: str) -> None:
+def test_errors_of_expressions_over_two_samples_are_reported_by_field(rule: EventRule, problem: str) -> None:
     detector = a_detector(a_stream("pose", encoding="cdr", type="geometry_msgs/msg/PoseStamped"))
     with pytest.raises(RuleError, match=problem):
         compile_rule(rule, detector, stream_readers(detector).fields)

@@ -39,7 +39,7 @@ def test_the_messages_of_one_key_belong_to_the_clients_that_they_name(clock: str
     assert drive.engine.counters.samples["speed"] == 6
 
 
-def test_the_template_sees_what_the_key_captures_as_well() -> None:
+def test_the_template_sees_the_captures_of_the_key_too() -> None:
     stream = a_stream("${key.site}.${msg.id}", key="all/${site:*}/speeds")
     drive = Drive(a_detector(stream), a_rule(**FAST))
     assert drive.take(sent(0.5, '{"id": 4, "v": 11}', "all/north/speeds"), until=1) == ["r north.4 started 1"]

@@ -39,7 +39,7 @@ def test_a_chain_ends_with_the_first_of_its_certificates(ends: list[datetime.dat
 
 
 @given(st.binary(max_size=60), st.integers(0, 300))
-def test_what_is_no_certificate_is_a_value_error(noise: bytes, cut: int) -> None:
+def test_an_invalid_certificate_is_a_value_error(noise: bytes, cut: int) -> None:
     with pytest.raises(ValueError, match="PEM"):
         expiry(noise)
     der = ssl.PEM_cert_to_DER_cert(certificate(datetime.datetime(2030, 1, 1)).decode())
@@ -73,7 +73,7 @@ def test_files_that_change_while_they_are_read_are_read_again(tmp_path: Path, mo
     assert credentials.key == (mounted / "tls.key").read_bytes()
 
 
-def test_files_that_never_hold_still_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_that_change_at_each_read_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     authority, mounted = Authority(tmp_path), tmp_path / "own"
     authority.mount(mounted, "first")
     count = iter(range(1000))
@@ -82,6 +82,6 @@ def test_files_that_never_hold_still_are_reported(tmp_path: Path, monkeypatch: p
         read_credentials(access(mounted), "spec.zenoh")
 
 
-def test_what_is_shown_of_it_holds_no_secret() -> None:
+def test_the_representation_contains_no_secret() -> None:
     shown = repr(LoadedCredentials(b"ca", b"certificate", b"key", login=None, tls=True))
     assert "key" not in shown

@@ -29,13 +29,13 @@ def test_a_silent_station_is_reported_from_the_start_on_and_its_episode_holds_be
     assert drive.take(until=80) == ["silent rsu started 64"]
 
 
-def test_one_that_is_only_known_beforehand_is_not_there_before_its_first_sample() -> None:
+def test_a_listed_but_not_expected_client_is_unknown_before_its_first_sample() -> None:
     drive = Drive(detector(expected=False), silent())
     assert drive.take(until=10) == []
     assert drive.take(arrival(10.5, "rsu", {"v": 1}), until=60) == ["silent rsu started 14", "silent rsu ClientLost 15"]
 
 
-def test_a_client_that_is_expected_from_a_change_on_is_there_then_and_times_out_once_it_no_longer_is() -> None:
+def test_a_client_is_known_while_it_is_expected_and_times_out_afterwards() -> None:
     before, after = detector(expected=False), detector()
     drive = Drive(before, silent(until="false"))
 

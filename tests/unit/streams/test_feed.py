@@ -17,7 +17,7 @@ STREAMS = [
 ]
 
 
-def test_a_key_is_matched_once_whether_it_belongs_to_streams_or_to_none(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_key_is_matched_once_with_or_without_streams(monkeypatch: pytest.MonkeyPatch) -> None:
     delivered: list[tuple[tuple[str, ...], str, bytes]] = []
     unrouted: list[str] = []
     matched: list[tuple[str, str]] = []

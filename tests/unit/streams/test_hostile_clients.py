@@ -25,7 +25,7 @@ def is_harmless(name: str) -> bool:
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_an_invented_name_appears_in_no_file_key_or_object(name: str) -> None:
+def test_a_made_up_name_appears_in_no_file_key_or_object(name: str) -> None:
     drive = Drive(a_detector(), RULE)
     drive.take(arrival(0.5, name, {"v": 20}), arrival(0.6, "car", {"v": 20}), until=1)
     assert "car" in drive.engine.clients
@@ -37,6 +37,6 @@ def test_an_invented_name_appears_in_no_file_key_or_object(name: str) -> None:
 
 @given(st.text(max_size=80))
 @example("..")
-def test_of_any_text_only_a_name_is_taken(name: str) -> None:
+def test_any_text_is_accepted_only_as_a_valid_name(name: str) -> None:
     found = stream_readers(a_detector()).read_key("speed", f"vehicles/{name}/speed")
     assert found is None or is_harmless(found[0])

@@ -71,7 +71,7 @@ def test_each_item_is_a_sample_of_its_own_client(clock: str) -> None:
     assert drive.engine.counters.samples["list"] == 4
 
 
-def test_expressions_see_the_item_the_message_and_what_its_key_captures() -> None:
+def test_expressions_see_the_item_the_message_and_the_captures_of_its_key() -> None:
     stream = a_list(client="${key.station}-${item.id}", stamp="msg.t")
     rule = a_rule(
         signals=[
@@ -86,7 +86,7 @@ def test_expressions_see_the_item_the_message_and_what_its_key_captures() -> Non
     assert drive.take(sent(0.5, item(1), item(2, v=6), scale=2), until=1) == ["r n-2 started 0.5"]
 
 
-def test_a_client_that_is_an_item_is_lost_when_it_is_stale_and_its_name_is_a_new_client_then() -> None:
+def test_an_item_client_is_lost_when_stale_and_its_name_becomes_a_new_client() -> None:
     drive = Drive(a_detector(a_list(staleAfter="2s"), a_stream("speed")), FAST)
     vehicle = Arrival(at(0.1), "speed", "vehicles/2/speed", b"{}")
     assert drive.take(vehicle, sent(0.5, item(1, v=20), item(2, v=20)), until=1) == [
@@ -101,7 +101,7 @@ def test_a_client_that_is_an_item_is_lost_when_it_is_stale_and_its_name_is_a_new
     assert [*drive.engine.clients] == ["2"]
 
 
-def test_what_is_no_item_with_a_name_is_dropped_and_counted_with_the_reason() -> None:
+def test_items_without_a_valid_name_are_dropped_and_counted_with_the_reason() -> None:
     drive = Drive(a_detector(a_list()), FAST)
     counters = drive.engine.counters
     drive.take(sent(0.1, item(1), {"x": 1}), until=0.2)
@@ -264,7 +264,7 @@ def test_items_need_a_client_of_each(stream: Mapping[str, Any], problem: str) ->
         ),
     ],
 )
-def test_what_is_wrong_with_items_is_found_with_its_field(stream: Mapping[str, Any], problem: str) -> None:
+def test_errors_of_items_are_reported_by_field(stream: Mapping[str, Any], problem: str) -> None:
     with pytest.raises(DetectorError, match=r"spec.streams\[0\]\." + problem):
         stream_readers(a_detector(stream, messages=MESSAGES))
 
@@ -292,7 +292,7 @@ def of(value: str, stream: str = "list") -> Sequence[dict[str, Any]]:
         ),
     ],
 )
-def test_what_is_wrong_with_expressions_over_items_is_found_with_its_field(rule: Any, problem: str) -> None:
+def test_errors_of_expressions_over_items_are_reported_by_field(rule: Any, problem: str) -> None:
     detector = a_detector(of_type(), a_stream("speed"), messages=MESSAGES)
     with pytest.raises(RuleError, match=problem):
         compile_rule(rule, detector, stream_readers(detector).fields)

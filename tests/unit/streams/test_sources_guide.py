@@ -14,7 +14,7 @@ SPECS = [yaml.safe_load(block)["spec"] for block in yaml_blocks(guide("sources")
 
 
 @pytest.mark.parametrize("spec", SPECS, ids=["zenoh", "plugins"])
-def test_an_example_has_nothing_wrong(spec: dict[str, Any]) -> None:
+def test_examples_have_no_errors(spec: dict[str, Any]) -> None:
     streams = spec.pop("streams")
     detector = a_detector(*streams, **spec)
     stream_readers(detector)

@@ -99,7 +99,7 @@ def test_a_crd_is_refused_with_its_file_and_a_remedy() -> None:
         (SERVICE * 257, "has 257 objects; at most 256"),
     ],
 )
-def test_what_is_no_application_is_refused(text: str, problem: str) -> None:
+def test_invalid_chart_objects_are_rejected(text: str, problem: str) -> None:
     assert problem in refusal(text)
 
 
@@ -113,7 +113,7 @@ def test_a_charts_objects_are_made_as_manifests_are() -> None:
     assert service["metadata"]["labels"]["wayside.dev/instance"] == "app"
 
 
-def test_what_a_manifest_may_not_be_a_charts_object_may_not_be() -> None:
+def test_restrictions_of_manifests_apply_to_chart_objects() -> None:
     with pytest.raises(RenderError) as caught:
         made(
             SERVICE.replace("kind: Service", "kind: ServiceAccount")
@@ -125,7 +125,7 @@ def test_what_a_manifest_may_not_be_a_charts_object_may_not_be() -> None:
     assert "'x' is not the template's own namespace" in elsewhere
 
 
-def test_a_chart_that_is_still_to_come_is_no_error_and_one_that_cannot_be_had_has_its_own_reason() -> None:
+def test_a_pending_chart_is_not_an_error_and_an_unavailable_one_has_its_own_reason() -> None:
     renderer = Renderer(template(helm=CHART), Policy())
     with pytest.raises(ChartPending):
         renderer.render(instance(), lambda request: None)
@@ -150,7 +150,7 @@ def test_a_wrong_expression_in_the_values_is_found_when_the_template_is_compiled
         ({"chart": "--post-renderer", "version": "1.0.0", "repository": "https://x"}, "chart"),
     ],
 )
-def test_a_chart_is_in_one_place_and_of_one_version(helm: dict[str, Any], problem: str) -> None:
+def test_a_chart_has_one_source_and_one_version(helm: dict[str, Any], problem: str) -> None:
     with pytest.raises(ValidationError, match=problem):
         Helm.model_validate(helm)
 

@@ -61,12 +61,12 @@ def test_a_text_stays_as_it_is_whatever_the_extension() -> None:
     assert files == {"a.json": "rate 5\n", "run": 'cd "${HOME}"'}
 
 
-def test_a_number_needs_no_format_and_a_file_that_is_null_is_left_out() -> None:
+def test_a_number_needs_no_format_and_a_null_file_is_omitted() -> None:
     assert files_of(render({"rate": "${parameters.rate}"}, rate=5.0)) == {"rate": "5"}
     assert files_of(render({"rate": "${parameters.rate}", "other": "x"})) == {"other": "x"}
 
 
-def test_another_configuration_changes_its_config_map_alone() -> None:
+def test_a_changed_configuration_changes_only_its_config_map() -> None:
     one, other = (render({"a.yaml": {"sources": "${parameters.sources}"}}, sources=each) for each in (["a"], ["b"]))
     assert one.manifests[0] != other.manifests[0]
     assert one.manifests[1:] == other.manifests[1:]
@@ -92,16 +92,16 @@ def test_a_file_whose_value_fails_is_named() -> None:
     assert "spec.configuration.a.txt" in refusal({"a.txt": "rate: ${parameters.rate}"})
 
 
-def test_without_a_configuration_there_is_no_name_of_its_config_map() -> None:
+def test_without_a_configuration_the_config_map_name_is_undefined() -> None:
     with pytest.raises(RenderError, match=r"`instance\.configMap` does not exist"):
         Renderer(template(parameters=DECLARED, manifests=[_mounting()]), Policy())
 
 
-def test_files_that_no_config_map_can_hold_are_refused() -> None:
+def test_files_that_do_not_fit_a_config_map_are_rejected() -> None:
     assert "spec.configuration: the files have 1200003 bytes" in refusal({"a.b": "é" * 600_000})
 
 
-def test_where_config_maps_are_not_allowed_there_is_no_configuration() -> None:
+def test_a_configuration_is_rejected_if_config_maps_are_not_allowed() -> None:
     policy = Policy(DEFAULT_KINDS - {("v1", "ConfigMap")})
     with pytest.raises(RenderError, match="becomes a ConfigMap, but v1/ConfigMap is not a kind"):
         render({"a": "b"}, policy)
@@ -113,6 +113,6 @@ def test_a_manifest_of_the_same_name_is_refused() -> None:
         Renderer(template(configuration={"a": "b"}, manifests=[own]), Policy()).render(instance())
 
 
-def test_a_name_that_no_file_can_have_is_refused() -> None:
+def test_an_invalid_file_name_is_rejected() -> None:
     with pytest.raises(ValidationError, match="String should match pattern"):
         template(configuration={"a/b": "c"})

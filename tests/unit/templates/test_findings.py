@@ -44,11 +44,11 @@ def container(**fields: Any) -> dict[str, Any]:
     return made
 
 
-def test_a_rule_that_a_detector_can_evaluate_has_nothing_wrong() -> None:
+def test_a_rule_that_a_detector_can_evaluate_has_no_findings() -> None:
     assert not rule_findings(rule(), [detector()]).all
 
 
-def test_what_the_rule_alone_has_is_a_problem_also_without_a_detector() -> None:
+def test_errors_of_the_rule_alone_are_problems_without_a_detector_too() -> None:
     found = rule_findings(rule(when="sped > 3"), [])
     assert [part in found.problems[0] for part in ("spec.when", "column 1", "sped")] == [True] * 3
     assert "create a Detector" in str(found.doubts[0])
@@ -67,11 +67,11 @@ def test_what_the_rule_alone_has_is_a_problem_also_without_a_detector() -> None:
     ],
     ids=["record", "database", "pairs", "on sample", "a long window"],
 )  # fmt: skip
-def test_what_requires_something_from_a_detector_is_no_problem_of_the_rule_alone(spec: dict[str, Any]) -> None:
+def test_requirements_on_a_detector_are_not_problems_of_the_rule_alone(spec: dict[str, Any]) -> None:
     assert not rule_findings(rule(**spec), []).problems
 
 
-def test_a_stream_that_no_selecting_detector_has_is_a_problem_and_one_that_some_lack_a_doubt() -> None:
+def test_a_stream_missing_in_all_selecting_detectors_is_a_problem_and_in_some_a_warning() -> None:
     blind = detector("blind", stream="odometry")
     assert "no stream pose" in rule_findings(rule(), [blind]).problems[0]
     found = rule_findings(rule(), [detector(), blind])
@@ -79,7 +79,7 @@ def test_a_stream_that_no_selecting_detector_has_is_a_problem_and_one_that_some_
     assert str(found.doubts[0]).startswith("with Detector blind: spec.signals[0].stream")
 
 
-def test_a_rule_that_is_not_there_yet_is_a_doubt_and_a_circle_a_problem() -> None:
+def test_a_missing_rule_is_a_warning_and_a_cycle_a_problem() -> None:
     missing = rule_findings(counting("many", "fast"), [detector()])
     assert not missing.problems
     assert "there is no rule fast" in str(missing.doubts[0])
@@ -89,14 +89,14 @@ def test_a_rule_that_is_not_there_yet_is_a_doubt_and_a_circle_a_problem() -> Non
     assert "cycle" in rule_findings(counting("many", "many"), [detector()]).problems[0]
 
 
-def test_what_stands_in_a_detectors_field_is_no_problem_of_the_rule() -> None:
+def test_errors_in_a_detectors_field_are_not_problems_of_the_rule() -> None:
     client = {"name": "car", "parameters": {"fast": {"limti": 3}}}
     found = rule_findings(rule(parameters={"limit": 2}), [detector(clients=[client])])
     assert not found.problems
     assert str(found.doubts[0]).startswith("Detector det: spec.clients[0].parameters.fast.limti")
 
 
-def test_a_detectors_own_streams_are_looked_at() -> None:
+def test_a_detectors_own_streams_are_checked() -> None:
     wrong = detector().model_copy(deep=True)
     raw = {**wrong.to_json(), "metadata": {"name": "det"}}
     raw["spec"]["streams"][0]["stamp"] = "msg.t +"
@@ -105,7 +105,7 @@ def test_a_detectors_own_streams_are_looked_at() -> None:
     assert not detector_findings(detector()).all
 
 
-def test_a_template_of_the_guide_has_nothing_wrong() -> None:
+def test_templates_of_the_guide_have_no_findings() -> None:
     assert not template_findings(template(parameters=REGION, key="${parameters.region}"), Policy()).all
 
 
@@ -130,14 +130,14 @@ def test_a_template_of_the_guide_has_nothing_wrong() -> None:
          ["args[0]", "no index 3"]),
     ],
 )  # fmt: skip
-def test_what_no_task_can_put_right_is_a_problem_of_the_template(spec: dict[str, Any], parts: list[str]) -> None:
+def test_errors_independent_of_tasks_are_problems_of_the_template(spec: dict[str, Any], parts: list[str]) -> None:
     rate = {"rate": {"type": "number", "default": 10}, "list": {"type": "array", "default": ["a"]}}
     found = template_findings(template(parameters={**REGION, **rate}, **spec), Policy())
     assert len(found.problems) == 1
     assert [part for part in parts if part not in found.problems[0]] == []
 
 
-def test_what_depends_on_what_tasks_give_is_a_remark_that_reports_it() -> None:
+def test_errors_that_depend_on_values_of_tasks_are_warnings() -> None:
     declared = {**REGION, "lane": {"type": "string"}}
     made = template(parameters=declared, manifests=[container(args=["l=${parameters.lane}"])])
     found = template_findings(made, Policy())
@@ -154,7 +154,7 @@ def test_what_depends_on_what_tasks_give_is_a_remark_that_reports_it() -> None:
     [{"type": "string", "pattern": "^[0-9]+$"}, {"type": "array", "items": "string"}, {"type": "object"}],
     ids=["pattern", "array", "object"],
 )
-def test_of_values_whose_shape_cannot_be_guessed_nothing_is_reported(parameter: dict[str, Any]) -> None:
+def test_values_of_unknown_shape_give_no_findings(parameter: dict[str, Any]) -> None:
     expression = {
         "string": "${10 / double(parameters.x)}",
         "array": "${parameters.x[4]}",
@@ -166,7 +166,7 @@ def test_of_values_whose_shape_cannot_be_guessed_nothing_is_reported(parameter: 
     ).all
 
 
-def test_a_name_made_of_a_tasks_text_is_no_problem() -> None:
+def test_a_name_from_a_text_parameter_is_not_a_problem() -> None:
     named = {**DEPLOYMENT, "metadata": {"name": "${instance.name}-${parameters.region}"}}
     assert not template_findings(template(parameters=REGION, manifests=[named]), Policy()).all
     twice = [named, {**named, "metadata": {"name": "${instance.name}-${parameters.lane}"}}]
@@ -183,7 +183,7 @@ def test_a_template_of_too_many_expressions_is_refused_before_any_is_compiled() 
     assert problem.startswith("spec: has 1001 expressions")
 
 
-def test_what_fails_for_the_baseline_is_a_problem() -> None:
+def test_errors_with_the_baseline_are_problems() -> None:
     declared, args = {"lane": {"type": "string"}}, ["l=${parameters.lane}"]
     spec = {"parameters": declared, "manifests": [container(args=args)]}
     found = template_findings(template(**spec, baseline={}), Policy())
@@ -207,7 +207,7 @@ def deploying(of: str = "app", operation: str = "Deploy", **parameters: Any) -> 
         (deploying(rate=3), ["deploy.parameters.region: is missing", "requires it"]),
     ],
 )  # fmt: skip
-def test_what_tasks_of_a_rule_would_be_refused_for_is_a_remark(requested: EventRule, parts: list[str]) -> None:
+def test_rejections_expected_for_a_rules_tasks_are_warnings(requested: EventRule, parts: list[str]) -> None:
     app = template(parameters={**REGION, "rate": {"type": "number", "maximum": 50}})
     (found,) = deploy_remarks(requested, [app])
     assert [part for part in parts if part not in str(found)] == []
@@ -215,7 +215,7 @@ def test_what_tasks_of_a_rule_would_be_refused_for_is_a_remark(requested: EventR
     assert not deploy_remarks(requested.model_copy(update={"metadata": metadata}), [app])
 
 
-def test_what_a_template_takes_is_not_remarked_on() -> None:
+def test_valid_task_values_give_no_warning() -> None:
     app = template(parameters={**REGION, "rate": {"type": "number", "maximum": 50}})
     assert not deploy_remarks(deploying(region="${client}", rate="${speed}"), [app])
     assert not deploy_remarks(deploying(operation="Reconfigure", rate=3), [app])

@@ -51,7 +51,9 @@ VALUES = st.fixed_dictionaries(
     st.sampled_from(NAMES),
     st.lists(VALUES, min_size=1, max_size=4),
 )
-def test_what_renders_for_some_task_is_not_refused(texts: list[str], name: str, tasks: list[dict[str, Any]]) -> None:
+def test_a_template_that_renders_for_some_task_is_not_rejected(
+    texts: list[str], name: str, tasks: list[dict[str, Any]]
+) -> None:
     data = {f"text{number}": text for number, text in enumerate(texts)}
     manifest = {"apiVersion": "v1", "kind": "ConfigMap", "metadata": {"name": name}, "data": data}
     made = template(parameters=DECLARED, manifests=[manifest])

@@ -33,7 +33,7 @@ def test_the_pods_of_each_kind_are_found_judged_and_changed(kind: str) -> None:
 
 
 @pytest.mark.parametrize("wrong", [{}, {"spec": None}, {"spec": "text"}, {"spec": {"template": []}}])
-def test_what_is_of_a_wrong_shape_has_no_pods_and_stays_as_it_is(wrong: dict[str, Any]) -> None:
+def test_manifests_of_a_wrong_shape_have_no_pods_and_stay_unchanged(wrong: dict[str, Any]) -> None:
     made = {"kind": "Deployment", **wrong}
     assert pod_spec(made) == {}
     assert with_pod_template(made, lambda _: {}) == made

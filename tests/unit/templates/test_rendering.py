@@ -71,7 +71,7 @@ def test_integral_doubles_become_integers() -> None:
     assert json.dumps(rendered["spec"]["replicas"]) == "4"
 
 
-def test_a_parameter_that_nobody_gives_drops_its_field() -> None:
+def test_an_unset_parameter_drops_its_field() -> None:
     manifest = changed(DEPLOYMENT, "spec.replicas", "${parameters.n}")
     assert "replicas" not in render(manifest, declared={"n": {"type": "integer"}}).manifests[0]["spec"]
 
@@ -142,7 +142,7 @@ def test_a_listed_account_keeps_its_token() -> None:
         ),
     ],
 )
-def test_what_a_template_may_not_do_is_reported_with_its_place(path: str, value: Any, parts: list[str]) -> None:
+def test_forbidden_template_content_is_reported_by_field(path: str, value: Any, parts: list[str]) -> None:
     message = refusal(changed(DEPLOYMENT, path, value))
     for part in parts:
         assert part in message
@@ -194,7 +194,7 @@ def test_pod_specs_are_checked_in_any_kind(api_version: str, kind: str, where: s
     assert "'automountServiceAccountToken': False" in str(plain)
 
 
-def test_an_account_that_a_kind_names_outside_of_a_pod_has_to_be_listed_too() -> None:
+def test_an_account_named_outside_of_a_pod_must_be_listed_too() -> None:
     policy, workflow = Policy(), {"apiVersion": "argoproj.io/v1alpha1", "kind": "Workflow", "metadata": {"name": "w"}}
     assert [field for field, _ in policy.pod_problems(workflow | {"spec": {"serviceAccountName": "admin"}})] == [
         "spec.serviceAccountName"
@@ -202,7 +202,7 @@ def test_an_account_that_a_kind_names_outside_of_a_pod_has_to_be_listed_too() ->
     assert list(policy.pod_problems(CONFIG | {"data": {"serviceAccountName": "admin", "containers": "none"}})) == []
 
 
-def test_what_does_not_compile_and_what_there_is_not_are_reported_together() -> None:
+def test_compile_errors_and_unknown_names_are_reported_together() -> None:
     manifest = changed(DEPLOYMENT, "spec.replicas", "${parameters.n}")
     manifest = changed(manifest, "spec.template.spec.containers.0.args", ["${1 +}", "${instance.nam}"])
     message = refusal(manifest)
@@ -219,7 +219,7 @@ def test_all_problems_are_reported_at_once() -> None:
     assert "manifests[1].data.a" in message
 
 
-def test_a_secret_needs_leave_and_never_holds_a_service_accounts_token() -> None:
+def test_a_secret_needs_permission_and_never_contains_a_service_accounts_token() -> None:
     secret = {"apiVersion": "v1", "kind": "Secret", "metadata": {"name": "s"}}
     assert "v1/Secret is not a kind that the administrator allows" in refusal(secret)
     allowed = Policy(DEFAULT_KINDS | {SECRET})
@@ -234,7 +234,7 @@ def test_with_a_key_each_name_must_identify_the_instance() -> None:
     assert "must contain ${instance.name}" in message
 
 
-def test_two_objects_of_one_kind_and_name_are_refused() -> None:
+def test_two_objects_of_the_same_kind_and_name_are_rejected() -> None:
     assert "Deployment 'app' is given twice" in refusal(DEPLOYMENT, DEPLOYMENT)
 
 
@@ -250,7 +250,7 @@ def test_values_are_never_evaluated_again() -> None:
     assert rendered["data"] == {"text": "${instance.name}"}
 
 
-def test_a_persons_instance_gets_the_defaults_and_its_values_are_checked() -> None:
+def test_a_manually_created_instance_gets_the_defaults_and_its_values_are_checked() -> None:
     declared = {"rate": {"type": "number", "default": 5}}
     assert render(CONFIG, declared=declared).manifests[0]["data"]["rate"] == "5 Hz"
     assert "spec.parameters.rate" in refusal(CONFIG, declared=declared, rate="fast")
@@ -262,6 +262,6 @@ def test_some_kinds_cannot_be_allowed(kind: str) -> None:
         Policy.parse([kind], None)
 
 
-def test_a_kind_without_a_version_is_no_kind() -> None:
+def test_a_kind_without_a_version_is_rejected() -> None:
     with pytest.raises(ValueError, match="must be apiVersion/Kind"):
         Policy.parse(["Deployment"], None)

@@ -44,7 +44,7 @@ EVERYTHING = (
 )
 
 
-def test_every_kind_stops_in_its_own_way_and_nothing_else_changes() -> None:
+def test_every_kind_is_suspended_by_its_own_field_only() -> None:
     running, stopped = rendered(*EVERYTHING), rendered(*EVERYTHING, suspended=True)
     before = {each["kind"]: each for each in running.manifests}
     after = {each["kind"]: each for each in stopped.manifests}
@@ -71,7 +71,7 @@ def test_every_kind_stops_in_its_own_way_and_nothing_else_changes() -> None:
     ("target", "states"),
     [(autoscaler(), False), (autoscaler("other"), True), (autoscaler(kind="StatefulSet"), True)],
 )
-def test_a_number_of_replicas_is_left_to_an_autoscaler_of_the_same_template(target: Any, states: bool) -> None:
+def test_replicas_are_left_to_an_autoscaler_of_the_same_template(target: Any, states: bool) -> None:
     manifest = copy.deepcopy(DEPLOYMENT)
     deployment, _ = rendered(manifest, target).manifests
     assert ("replicas" in deployment["spec"]) is states
@@ -91,7 +91,7 @@ def live(replicas: int, pods: int) -> dict[str, Any]:
     return {**DEPLOYMENT, "metadata": {"name": "app"}, "spec": {"replicas": replicas}, "status": {"replicas": pods}}
 
 
-def test_the_instance_reports_who_suspends_it_what_is_left_and_what_rests() -> None:
+def test_the_instance_reports_its_suspending_task_remaining_pods_and_paused_objects() -> None:
     stopped = instance(suspended=True)
     assert logged(instance(), live(1, 1)) is None
     assert logged(stopped, live(0, 2)) == (

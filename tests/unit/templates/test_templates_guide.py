@@ -37,7 +37,7 @@ def instance(*without: str, and_tasks: Iterable[ApplicationTask] = ()) -> dict[s
     return parameters
 
 
-def test_the_tasks_come_to_the_results_in_the_text() -> None:
+def test_the_tasks_give_the_results_in_the_text() -> None:
     merged = {"region": "north", "detail": "low", "sources": ["car1", "car2", "car3"], "uplink": 100, "rateHz": 2}
     assert instance() == merged
     assert instance("thin-network") == {**merged, "rateHz": 20}

@@ -187,7 +187,7 @@ def test_a_stream_that_matches_nothing_is_found_with_the_keys_that_there_are(tmp
     assert "has no field" not in result.output
 
 
-def test_a_field_that_only_some_messages_have_is_no_doubt(tmp_path: Path) -> None:
+def test_a_field_of_only_some_messages_gives_no_warning(tmp_path: Path) -> None:
     rule = RULE.replace("msg.pose.X", "msg.door").replace(
         "stream: odom, value: msg.door", "stream: state, value: msg.door"
     )

@@ -28,7 +28,7 @@ def test_a_number_has_its_extremes_its_mean_and_a_plot_for_each_client(tmp_path:
     assert lines[0].split()[1][-1] == "█"
 
 
-def test_a_boolean_shows_how_long_it_is_true_and_a_text_its_value(tmp_path: Path) -> None:
+def test_a_boolean_shows_its_share_of_time_true_and_a_text_its_value(tmp_path: Path) -> None:
     messages = [(at / 10, "v/car1/state", {"v": at, "gear": "D" if at < 50 else "N"}) for at in range(101)]
     recording = drive(tmp_path, *messages)
     assert "true 50% of the time" in tried("msg.v >= 50", recording).output
@@ -45,7 +45,7 @@ def test_a_boolean_shows_how_long_it_is_true_and_a_text_its_value(tmp_path: Path
         ("1", [], "fits the streams odom, state: give --stream odom"),
     ],
 )
-def test_what_does_not_fit_is_refused_with_the_remedy(
+def test_invalid_input_is_rejected_with_the_remedy(
     tmp_path: Path, expression: str, options: list[str], words: str
 ) -> None:
     result = tried(expression, two_cars(tmp_path), *options)
