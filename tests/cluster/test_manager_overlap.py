@@ -52,7 +52,7 @@ def test_the_younger_release_waits_until_the_older_one_stops(
         assert not [each for each in second.writes() if "/applicationinstances" in each.path]
 
         older.terminate()
-        younger.wait_for_output("does not respond: this manager is active there")
+        younger.wait_for_output("this manager becomes active there")
         api.wait_for(
             "ApplicationTemplate",
             "app",
