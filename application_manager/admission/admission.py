@@ -42,7 +42,7 @@ from application_manager.core.findings.templatefindings import template_findings
 from application_manager.core.objects.detectors import deployment_to_try
 from application_manager.core.objects.poddefaults import PodDefaults
 from application_manager.measures import Measures
-from application_manager.workers.jobs import judge_detector
+from application_manager.workers.jobs import check_detector
 from application_manager.workers.pool import ExceededError, Runs
 from application_manager.workers.process import Job
 from wayside.api import ApplicationTemplate, Detector, EventRule
@@ -125,7 +125,7 @@ class Admission:
         return Findings()
 
     async def _of_rule(self, rule: EventRule) -> Findings:
-        findings = await self._judged(rule)
+        findings = await self._check(rule)
         if not findings.all:
             return findings
         if (await self._run(rule.namespace, partial(RuleContext().findings, rule))).problems:
@@ -141,9 +141,9 @@ class Admission:
             log.warning("EventRule %s/%s: reviewed against the cache only: %s", rule.namespace, rule.name, error)
             problems = (Finding(INVALID_RULE.name, each, rule.name) for each in findings.problems)
             return Findings((), (*problems, *findings.doubts), findings.remarks)
-        return await self._judged(rule)
+        return await self._check(rule)
 
-    async def _judged(self, rule: EventRule) -> Findings:
+    async def _check(self, rule: EventRule) -> Findings:
         return await self._run(rule.namespace, partial(rule_context(self.cache, rule).findings, rule))
 
     async def _run(self, namespace: str, job: Job[Findings]) -> Findings:
@@ -160,7 +160,7 @@ class Admission:
     async def _of_detector(self, detector: Detector, old: Kind | None) -> Findings:
         """The findings about the Detector. Rules that no longer compile are remarks: they may be changed next."""
         before = old if isinstance(old, Detector) else None
-        findings = await self._run(detector.namespace, partial(judge_detector, detector))
+        findings = await self._run(detector.namespace, partial(check_detector, detector))
         if not findings.problems and (problem := await self._pod_problem(detector, before)):
             return replace(findings, problems=(problem,))
         remarks: list[Finding] = []
@@ -168,7 +168,7 @@ class Admission:
         rules = self.cache.models(EVENT_RULE, EventRule, detector.namespace)
         for first in range(0, len(rules), _RULES_AT_ONCE):
             some = rules[first : first + _RULES_AT_ONCE]
-            remarks += (await self._run(detector.namespace, partial(judge_detector, detector, before, some))).remarks
+            remarks += (await self._run(detector.namespace, partial(check_detector, detector, before, some))).remarks
             if time.monotonic() > until and first + _RULES_AT_ONCE < len(rules):
                 unseen = "not all of its rules were reviewed: see their statuses"
                 remarks.append(Finding(BROKEN_RULE.name, unseen))

@@ -59,11 +59,11 @@ class CertificateIssuer:
     """
 
     client: Client
-    serving: WebhookOptions
+    options: WebhookOptions
 
     async def look(self) -> None:
         """Check once: create a certificate if it is due, write the CA into the webhooks, and write the files."""
-        namespace, name = self.serving.secret
+        namespace, name = self.options.secret
         secret = await self.client.get(_SECRETS, namespace, name)
         if secret is None:
             raise ConfigurationError(
@@ -71,7 +71,7 @@ class CertificateIssuer:
             )
         files = {key: base64.b64decode(value) for key, value in (secret.get("data") or {}).items()}
         if _due(files, now := datetime.datetime.now(datetime.UTC)):
-            files = issued(WebhookClientConfig.of_service(self.serving.service).hosts)
+            files = issued(WebhookClientConfig.of_service(self.options.service).hosts)
             files[AUTHORITY] += _trusted(secret, now)
             data = {key: base64.b64encode(content).decode() for key, content in files.items()}
             try:
@@ -82,18 +82,18 @@ class CertificateIssuer:
                 raise
             log.info("created a certificate for the webhook, valid for %d days", VALID.days)
         await self._trust(base64.b64encode(files[AUTHORITY]).decode())
-        write_whole(self.serving.certificates, {each: files[each] for each in (AUTHORITY, CERTIFICATE, KEY)})
+        write_whole(self.options.certificates, {each: files[each] for each in (AUTHORITY, CERTIFICATE, KEY)})
 
     async def _trust(self, bundle: str) -> None:
         """Write the CA into the existing webhook configurations."""
         for resource in _CONFIGURATIONS:
-            found: Object | None = await self.client.get(resource, "", self.serving.webhooks)
+            found: Object | None = await self.client.get(resource, "", self.options.webhooks)
             if found is None:
                 continue
             webhooks: list[Any] = found.get("webhooks") or []
             if any(each["clientConfig"].get("caBundle") != bundle for each in webhooks):
                 changed = [{"name": each["name"], "clientConfig": {"caBundle": bundle}} for each in webhooks]
-                await self.client.merge_members(resource, self.serving.webhooks, {"webhooks": changed})
+                await self.client.merge_members(resource, self.options.webhooks, {"webhooks": changed})
                 log.info("wrote the CA of the webhook's certificate into the %s", resource.kind)
 
 
@@ -120,16 +120,16 @@ def _trusted(secret: Object, now: datetime.datetime) -> bytes:
 
 
 @asynccontextmanager
-async def issuing(client: Client, serving: WebhookOptions | None) -> AsyncIterator[None]:
+async def issuing(client: Client, options: WebhookOptions | None) -> AsyncIterator[None]:
     """Keep the webhook's certificate valid while the block runs, if the manager issues it.
 
     First it waits for a certificate, as long as the API server takes to respond. Raises ConfigurationError if the
     Secret does not exist, and ApiError if the API server refuses permanently.
     """
-    if serving is None or not serving.service:
+    if options is None or not options.service:
         yield
         return
-    look = CertificateIssuer(client, serving).look
+    look = CertificateIssuer(client, options).look
     await until_answered(look)
     renewing = repeatedly(look, EVERY, "cannot renew the webhook's certificate")
     following = asyncio.create_task(renewing, name="issuing")

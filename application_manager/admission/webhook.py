@@ -98,15 +98,15 @@ class ReviewHandler:
 
 
 @asynccontextmanager
-async def webhook(serving: WebhookOptions | None, handlers: Mapping[str, ReviewHandler]) -> AsyncIterator[None]:
-    """Serve the handlers, by their paths, on all addresses while the block runs; nothing if `serving` is None.
+async def webhook(options: WebhookOptions | None, handlers: Mapping[str, ReviewHandler]) -> AsyncIterator[None]:
+    """Serve the handlers, by their paths, on all addresses while the block runs; nothing if `options` is None.
 
     Raises ConfigurationError if the port is in use, CertificateError if there is no valid certificate.
     """
-    if serving is None:
+    if options is None:
         yield
         return
-    certificate = ServingCertificate(serving.certificates, FOLDER_OPTION)
+    certificate = ServingCertificate(options.certificates, FOLDER_OPTION)
     application = web.Application(client_max_size=LARGEST)
     for path, handler in handlers.items():
         application.router.add_post(path, handler.answer)
@@ -118,11 +118,11 @@ async def webhook(serving: WebhookOptions | None, handlers: Mapping[str, ReviewH
     following = asyncio.create_task(certificate.follow(), name="certificate")
     try:
         try:
-            await web.TCPSite(runner, port=serving.port, ssl_context=certificate.context).start()
+            await web.TCPSite(runner, port=options.port, ssl_context=certificate.context).start()
         except OSError as error:
             reason = error.strerror or error
-            raise ConfigurationError(f"{PORT_OPTION} {serving.port}: {reason}: give another port") from error
-        log.info("answering AdmissionReviews on port %s", serving.port)
+            raise ConfigurationError(f"{PORT_OPTION} {options.port}: {reason}: give another port") from error
+        log.info("answering AdmissionReviews on port %s", options.port)
         yield
     finally:
         following.cancel()

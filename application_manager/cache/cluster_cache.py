@@ -74,7 +74,7 @@ class LastDecision:
     """The last decision about an instance, and the progress since."""
 
     decision: Decision
-    service: InstanceProgress
+    progress: InstanceProgress
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +101,7 @@ class ClusterCache:
     """The objects of the cluster with their indexes. Only the thread of the event loop uses it.
 
     Attributes:
-        served: by instance; without an entry until it was reconciled for the first time.
+        last_decisions: by instance; without an entry until it was reconciled for the first time.
         records: by instance; newer than its status; without an entry until then as well.
         deadlines: by instance, its uid and the last decided release time; newer than its status, which may be written
             long after the decision.
@@ -120,10 +120,10 @@ class ClusterCache:
     pods: PodIndex = field(default_factory=PodIndex)
     leases: LeaseIndex = field(default_factory=LeaseIndex)
     healthy: HealthyTime = field(default_factory=HealthyTime)
-    served: dict[Name, LastDecision] = field(default_factory=dict)
+    last_decisions: dict[Name, LastDecision] = field(default_factory=dict)
     records: dict[Name, WorkRecord] = field(default_factory=dict)
     deadlines: dict[Name, tuple[str, float | None]] = field(default_factory=dict)
-    turns: FallbackIndex = field(default_factory=FallbackIndex)
+    fallbacks: FallbackIndex = field(default_factory=FallbackIndex)
     overlap: OverlapIndex = field(default_factory=OverlapIndex)
     places: PlaceIndex = field(default_factory=PlaceIndex)
     _limits: dict[str, dict[str, int]] = field(default_factory=dict)  # by namespace, of its templates
@@ -182,7 +182,7 @@ class ClusterCache:
     def decide(self, name: Name, now: float) -> Decided:
         """The decision about the instance at `now`, in seconds since 1970, and the other instances to enqueue."""
         decided = decide(name[1], _NamespaceIndexes(self, name[0]), now)
-        moved = self.turns.moved(name, _fallback(decided))
+        moved = self.fallbacks.moved(name, _fallback(decided))
         if decided.placement is not None:
             moved |= decided.placement.moved(self.places.placement(name[0]))
         return replace(decided, enqueue=frozenset(moved - {name[1]}))
@@ -200,9 +200,9 @@ class ClusterCache:
         elif instance is not None:
             self.deadlines[name] = (instance.metadata.uid, decided.unlimited.release_time)
         self.places.note(name[0], decided.placement)
-        for each in self.turns.moved(name, fallback):
+        for each in self.fallbacks.moved(name, fallback):
             self.places.touch((name[0], each))
-        self.turns.note(name, fallback)
+        self.fallbacks.note(name, fallback)
 
     def note_task(self, name: Name) -> set[Name]:
         """Compute the claim of a task again; returns the previous and new instances that it claims, if that changed.
@@ -237,14 +237,14 @@ class ClusterCache:
     def note_limits(self, template: Name) -> None:
         """Note the template's maximum number of instances, and its fallback, if any."""
         found = self.template(template)
-        self.turns.note_template(template, fallback_of(found))
+        self.fallbacks.note_template(template, fallback_of(found))
         own = limits([found], None).templates if found is not None else {}
         others = {name: count for name, count in self._limits.get(template[0], {}).items() if name != template[1]}
         self._limits[template[0]] = {**others, **own}
 
     def falling_back_to(self, template: Name) -> set[Name]:
         """The instances whose tasks use this template as the fallback while they are not ready."""
-        return {each for name in self.turns.falling_to(template) for each in self.instances_of(name)}
+        return {each for name in self.fallbacks.falling_to(template) for each in self.instances_of(name)}
 
     def known_instances(self, namespace: str) -> set[str]:
         """The names of a namespace's instances that exist, or may be demanded."""
@@ -263,7 +263,7 @@ class ClusterCache:
             return {name}
         template = (name[0], of)
         own = {template} if has_baseline(self.template(template)) else set()
-        demanded = own | self.claims.claimed_of(template) | self.turns.instances_of(template)
+        demanded = own | self.claims.claimed_of(template) | self.fallbacks.instances_of(template)
         return {name} | demanded | set(self.instances_of(template))
 
     def lease_views(self, namespace: str, holders: Iterable[str | None]) -> dict[str, LeaseView]:
@@ -281,7 +281,7 @@ class ClusterCache:
 
     def forget_work(self) -> None:
         """Forget the decisions and results of this manager: another one has acted since, as the statuses show."""
-        self.served.clear()
+        self.last_decisions.clear()
         self.records.clear()
         self.deadlines.clear()
         self.places.forget()
@@ -317,7 +317,7 @@ class _NamespaceIndexes:
         return self.cache.lease_views(self.namespace, (each.task.spec.requester.holder for each in claims))
 
     def fallback_templates(self) -> Iterable[str]:
-        return self.cache.turns.targets(self.namespace)
+        return self.cache.fallbacks.targets(self.namespace)
 
     def fallbacks(self, template: str, now: float) -> Iterable[Fallback]:
         for name in self.cache.falling_back_to((self.namespace, template)):

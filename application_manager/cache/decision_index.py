@@ -55,7 +55,7 @@ class FallbackIndex:
 
     def __init__(self) -> None:
         self._templates: dict[Name, str] = {}
-        self._turned: dict[Name, Fallback] = {}
+        self._fallbacks: dict[Name, Fallback] = {}
 
     def note_template(self, template: Name, other: str | None) -> None:
         """Note the fallback template of a template; None if it has none, or was deleted."""
@@ -73,18 +73,18 @@ class FallbackIndex:
 
     def moved(self, instance: Name, to: Fallback | None) -> set[str]:
         """The instances that get or lose tasks if the fallback of this instance's tasks becomes `to`."""
-        before = self._turned.get(instance)
+        before = self._fallbacks.get(instance)
         if before == to:
             return set()
         return (before.instances if before else set()) | (to.instances if to else set())
 
     def note(self, instance: Name, to: Fallback | None) -> None:
         """Note the fallback of an instance's tasks; None if there is none."""
-        self._turned.pop(instance, None)
+        self._fallbacks.pop(instance, None)
         if to is not None:
-            self._turned[instance] = to
+            self._fallbacks[instance] = to
 
     def instances_of(self, template: Name) -> set[Name]:
         """The instances of a template whose tasks use their fallback."""
-        turned = (each for of, each in self._turned.items() if (of[0], each.template) == template)
+        turned = (each for of, each in self._fallbacks.items() if (of[0], each.template) == template)
         return {(template[0], instance) for each in turned for instance in each.instances}

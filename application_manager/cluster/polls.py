@@ -25,7 +25,7 @@ _NEWEST = 50  # Events of one workload to read; the API server keeps them for an
 log = logging.getLogger(__name__)
 
 
-class _Look:
+class _Poll:
     """Lists objects of a kind, and logs once if they cannot be listed."""
 
     def __init__(self, client: Client, resource: Resource, without: str) -> None:
@@ -58,7 +58,7 @@ class FailedPodsPoll:
     """The Events FailedCreate of workloads."""
 
     def __init__(self, client: Client) -> None:
-        self._look = _Look(
+        self._poll = _Poll(
             client,
             EVENTS,
             "cannot list Events (%s): statuses do not report why pods of a StatefulSet cannot be created",
@@ -66,23 +66,23 @@ class FailedPodsPoll:
 
     async def events(self, namespace: str, uid: str) -> list[Object]:
         """The Events of the object with this uid; none if they may not be listed, or there is no response."""
-        return await self._look.objects(namespace, f"regarding.uid={uid},reason={FAILED_CREATE}", _NEWEST) or []
+        return await self._poll.objects(namespace, f"regarding.uid={uid},reason={FAILED_CREATE}", _NEWEST) or []
 
 
 class NodePoll:
     """The labels of all nodes, at most a few seconds old."""
 
     def __init__(self, client: Client) -> None:
-        self._look = _Look(client, NODES, "cannot list nodes (%s): only the scheduler reports why a pod fits no node")
+        self._poll = _Poll(client, NODES, "cannot list nodes (%s): only the scheduler reports why a pod fits no node")
         self._known: Nodes | None = None
         self._until = 0.0  # monotonic time until which the result is reused
-        self._looking = asyncio.Lock()
+        self._polling = asyncio.Lock()
 
     async def labels(self) -> Nodes | None:
         """The labels of nodes by name; None if they may not be listed, or the API server does not respond."""
-        async with self._looking:
+        async with self._polling:
             if time.monotonic() >= self._until:
-                found = await self._look.objects(None)
+                found = await self._poll.objects(None)
                 self._until = time.monotonic() + FRESH
                 self._known = (
                     None

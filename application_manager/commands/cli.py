@@ -23,8 +23,8 @@ from application_manager.commands.options import (
     option_bytes,
     policy_of,
     seconds_of,
-    serving_of,
     tasks_of,
+    webhook_of,
 )
 from application_manager.commands.printing import detector_rbac, inject, rbac, webhooks
 from wayside.inputerror import InputError
@@ -239,7 +239,7 @@ def run(
         helm=HelmRunner(helm),
         chart_cache=chart_cache or default_folder(),
         chart_folder=chart_folder,
-        admission=serving_of(admission_port, admission_certificates, admission_service, admission_webhooks),
+        admission=webhook_of(admission_port, admission_certificates, admission_service, admission_webhooks),
         lease=lease_of(lease, tuple(namespace or ())),
         detectors=detectors_of(
             detector_image,

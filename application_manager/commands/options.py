@@ -75,7 +75,7 @@ def tasks_of(most: int | None, holders: list[str] | None) -> TaskPolicy:
         return TaskPolicy(most, tuple(HolderPolicy.parse(each) for each in holders or ()))
 
 
-def serving_of(
+def webhook_of(
     port: int | None, certificates: Path | None, service: str | None, webhooks: str
 ) -> WebhookOptions | None:
     """The settings of the webhook; None: do not serve it."""

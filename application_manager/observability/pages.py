@@ -78,10 +78,10 @@ async def pages(
         return _answer(measures.text())
 
     async def healthz(_: web.Request) -> web.Response:
-        return _judged(healthy())
+        return _health_response(healthy())
 
     async def readyz(_: web.Request) -> web.Response:
-        return _judged(healthy() or ready(), role())
+        return _health_response(healthy() or ready(), role())
 
     for path, page in (("/metrics", metrics), ("/healthz", healthz), ("/readyz", readyz)):
         application.router.add_get(path, page)
@@ -107,6 +107,6 @@ def _answer(text: bytes, status: int = 200) -> web.Response:
     return web.Response(body=text, status=status, headers={"Content-Type": _TEXT})
 
 
-def _judged(lack: str | None, role: str = "") -> web.Response:
+def _health_response(lack: str | None, role: str = "") -> web.Response:
     answer = lack or ", ".join(filter(None, ("ok", role)))
     return _answer(f"{answer}\n".encode(), 200 if lack is None else 503)

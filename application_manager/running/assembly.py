@@ -45,11 +45,11 @@ from wayside.kubernetes.workqueue import Key, WorkQueue
 if TYPE_CHECKING:
     from wayside.process.spans import Tracing
 
-_JUDGING_PAUSE = 0.3  # s from a change of a template, rule or detector to its status: it combines several changes
+_VALIDATION_PAUSE = 0.3  # s from a change of a template, rule or detector to its status: it combines several changes
 _INSTANCE_WORKERS = 16
 _INSTANCE_SHARE = 6  # of these for one namespace: more concurrent requests slow down all namespaces
 _CONFIGURATION_WORKERS = 4
-_JUDGING_WORKERS = 4  # one per namespace: they mostly wait for worker processes
+_VALIDATION_WORKERS = 4  # one per namespace: they mostly wait for worker processes
 _STATUS_WORKERS = 4
 _STATUS_SHARE = 2  # few: work on instances comes before their statuses
 
@@ -100,8 +100,8 @@ class Assembly:
         self._instances = instances
         self._statuses = statuses_of("instance status", self._reconcile_instance_status)
         self._tasks = statuses_of("task", self._reconcile_task)
-        self._templates: WorkQueue[Name] = queue("template", self._reconcile_template, _JUDGING_WORKERS, 1)
-        self._rules: WorkQueue[RuleKey] = queue("rule", self._reconcile_rule, _JUDGING_WORKERS, 1)
+        self._templates: WorkQueue[Name] = queue("template", self._reconcile_template, _VALIDATION_WORKERS, 1)
+        self._rules: WorkQueue[RuleKey] = queue("rule", self._reconcile_rule, _VALIDATION_WORKERS, 1)
         self.detector_index = DetectorIndex(options.detectors)
         detectors = DetectorWork(
             self.cache,
@@ -128,8 +128,8 @@ class Assembly:
             applier,
             instances.add,
             self._tasks.add,
-            lambda name: self._templates.add_at(name, time.time() + _JUDGING_PAUSE),
-            self._judge,
+            lambda name: self._templates.add_at(name, time.time() + _VALIDATION_PAUSE),
+            self._validate,
             self._configurations.add,
         )
         self.cache.claims.claim_of = ClaimEvaluator(self._answers, self.router.claimed)
@@ -157,7 +157,7 @@ class Assembly:
             client=client,
             applier=applier,
             recorder=self.recorder,
-            suspending=WorkloadScaler(client, applier, self.router.observe),
+            scaler=WorkloadScaler(client, applier, self.router.observe),
             again=instances.add_at,
             enqueue=instances.add,
             done=self._statuses.add,
@@ -240,8 +240,8 @@ class Assembly:
         if await self._looks_after(key[1][0]):
             await self._rule_work.reconcile(key)
 
-    def _judge(self, key: RuleKey) -> None:
+    def _validate(self, key: RuleKey) -> None:
         """Enqueue the check of a rule or Detector; a Detector's objects are reconciled first."""
-        self._rules.add_at(key, time.time() + _JUDGING_PAUSE)
+        self._rules.add_at(key, time.time() + _VALIDATION_PAUSE)
         if key[0] == DETECTOR:
             self.detectors.add(key[1])

@@ -76,7 +76,7 @@ async def discovered(client: Client, policy: Policy) -> dict[KindKey, Resource]:
     return found
 
 
-async def entitled(
+async def check_rights(
     client: Client,
     policy: Policy,
     resources: Mapping[KindKey, Resource],

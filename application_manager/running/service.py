@@ -27,7 +27,7 @@ from application_manager.measures import Measures
 from application_manager.observability.pages import pages, stalled
 from application_manager.running.assembly import Assembly
 from application_manager.running.options import Options
-from application_manager.running.prerequisites import discovered, entitled, recent_enough, selectable
+from application_manager.running.prerequisites import check_rights, discovered, recent_enough, selectable
 from application_manager.running.watchdog import SILENT, watchdog
 from application_manager.watching.detectorwatch import DetectorWatch
 from application_manager.watching.leasewatch import LeaseWatch
@@ -61,7 +61,7 @@ async def serve(options: Options) -> None:
         version = await recent_enough(client)
         resources = await discovered(client, options.policy)
         runs = options.detectors is not None
-        await entitled(client, options.policy, resources, options.namespaces, options.lease, detectors=runs)
+        await check_rights(client, options.policy, resources, options.namespaces, options.lease, detectors=runs)
         await selectable(client, options.namespaces)
         helm = replace(options.helm, kube_version=version)
         async with issuing(renewals, options.admission):
@@ -88,7 +88,7 @@ class Manager:
         client, options, resources, measures = work.client, work.options, work.resources, work.measures
         # Always Pods: the pods of workloads show why these do not run.
         children = [resources[kind] for kind in sorted({*options.policy.kinds, POD}) if kind in resources]
-        self._listing = Resync(
+        self._resync = Resync(
             cache=work.cache,
             client=client,
             router=work.router,
@@ -98,14 +98,14 @@ class Manager:
             measures=measures,
         )
         work.cache.overlap.own = lambda: leadership.lease
-        self._pulse = WatchHealth(options.watch_timeout, lambda: work.cache.healthy.elapsed)
-        measures.registry.register(self._pulse)
+        self._watch_health = WatchHealth(options.watch_timeout, lambda: work.cache.healthy.elapsed)
+        measures.registry.register(self._watch_health)
         self._detector_watch = DetectorWatch(
             work.cache, client, work.detector_index, options.namespaces, work.detectors.add
         )
-        self._grants = NamespacePermissions(client, work.router.everything)
+        self._permissions = NamespacePermissions(client, work.router.everything)
         if not options.namespaces:
-            client.may_write = self._grants.may_write
+            client.may_write = self._permissions.may_write
         self._leases = LeaseWatch(work.cache, client, TEMPLATES, options.namespaces, work.router.look_at)
         self._admission = Admission(
             cache=work.cache,
@@ -130,7 +130,7 @@ class Manager:
         stall = stalled(self._work.measures, self._work.options.resync, self._work.queues, limit)
 
         def healthy() -> str | None:
-            return stall() or self._pulse.dead()
+            return stall() or self._watch_health.dead()
 
         ready = partial(self._lacks, watching)
         async with (
@@ -156,10 +156,10 @@ class Manager:
     async def _first(self) -> None:
         """Determine whether we are active, then list everything, so that an active manager decides on newer lists."""
         await until_answered(self._leadership.look)
-        await self._listing.first()
+        await self._resync.first()
 
     def _lacks(self, watching: asyncio.Event) -> str | None:
-        if not watching.is_set() or not self._pulse.begun("applicationtasks"):
+        if not watching.is_set() or not self._watch_health.begun("applicationtasks"):
             return "the caches are not synced yet"
         return None if self._work.cache.healthy.reached else "the API server does not respond"
 
@@ -167,10 +167,10 @@ class Manager:
         tasks = [
             asyncio.create_task(self._watch(watching), name="watches"),
             asyncio.create_task(self._leases.run(), name="leases"),
-            asyncio.create_task(self._listing.resync(watching), name="resync"),
+            asyncio.create_task(self._resync.resync(watching), name="resync"),
             asyncio.create_task(self._detector_watch.run(), name="detectors"),
             asyncio.create_task(self._leadership.run(), name="leadership"),
-            asyncio.create_task(self._grants.run(), name="grants"),
+            asyncio.create_task(self._permissions.run(), name="permissions"),
             asyncio.create_task(self._act(stop), name="acting"),
             asyncio.create_task(self._announce(watching, stop), name="signals"),
         ]
@@ -196,8 +196,8 @@ class Manager:
     async def _begin(self, again: bool) -> None:
         """Prepare to act. If others may have acted since the last list, everything is read from the cluster again."""
         if again:  # otherwise everything was listed after we acquired the Lease
-            self._work.begin_term(self._listing.children)
-            await self._listing.first()
+            self._work.begin_term(self._resync.children)
+            await self._resync.first()
             self._work.publish_all()
         self._work.cache.claims.begin()
 
@@ -214,15 +214,15 @@ class Manager:
 
     async def _watch(self, watching: asyncio.Event) -> None:
         await watch(
-            self._listing.children,
+            self._resync.children,
             observe=self._work.router.observe,
             vanished=self._work.router.vanished,
-            relist=self._listing.again,
+            relist=self._resync.again,
             failed=self._work.measures.unhandled,
             connect=self._connection,
             namespaces=self._work.options.namespaces,
             ready=watching,
-            pulse=self._pulse,
+            health=self._watch_health,
         )
 
     async def _connection(self) -> kopf.ConnectionInfo:

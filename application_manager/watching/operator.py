@@ -22,7 +22,7 @@ from kopf._cogs.clients import fetching, watching
 
 from application_manager.cache.cluster_cache import OWN
 from application_manager.core.objects.ownership import INSTANCE_LABEL
-from application_manager.watching.watch_health import NEVER, WatchHealth, pulsing
+from application_manager.watching.watch_health import NEVER, WatchHealth, supervising
 from wayside.kubernetes.errors import RequestError
 from wayside.kubernetes.leases import HOLDER_LEASE_LABEL
 from wayside.kubernetes.resources import LEASES, Object, Resource
@@ -59,12 +59,12 @@ async def watch(
     connect: Callable[[], Awaitable[kopf.ConnectionInfo]],
     namespaces: Collection[str],
     ready: asyncio.Event,
-    pulse: WatchHealth,
+    health: WatchHealth,
 ) -> None:
     """Watch our own kinds, holders' Leases, and objects with an instance's label, until cancelled.
 
     `namespaces` empty: all. `relist` lists a kind and routes its objects; `failed` counts an object that could not be
-    handled. `pulse` receives each watch's signs of life. `ready` is set once kopf has started. `connect` returns
+    handled. `health` receives each watch's signs of life. `ready` is set once kopf has started. `connect` returns
     credentials, at the start and when the API server no longer accepts them.
     """
     logging.getLogger("kopf").setLevel(logging.WARNING)
@@ -75,7 +75,7 @@ async def watch(
     settings.networking.error_backoffs = _Pauses()
     settings.networking.request_timeout = 15
     settings.networking.connect_timeout = 5
-    settings.watching.inactivity_timeout = NEVER  # see pulse
+    settings.watching.inactivity_timeout = NEVER  # see `supervising`
     settings.watching.chunk_size = 1  # its list only provides the version, see relaying
     settings.process.ultimate_exiting_timeout = None
     settings.queueing.exit_timeout = 0.1  # s; the next start lists everything that is lost by stopping immediately
@@ -94,7 +94,7 @@ async def watch(
         settings.watching.label_selectors[resource.group, resource.version, resource.plural] = label
 
     identity: Any = "application-manager"  # otherwise kopf looks up the user's name, which may not exist
-    with pulsing(pulse), relaying(observe, vanished, relist, failed):
+    with supervising(health), relaying(observe, vanished, relist, failed):
         await kopf.operator(
             registry=registry,
             settings=settings,

@@ -84,27 +84,27 @@ class WatchHealth(Collector):
 
 
 @contextmanager
-def pulsing(pulse: WatchHealth) -> Iterator[None]:
+def supervising(health: WatchHealth) -> Iterator[None]:
     """Make kopf's watches report signs of life while the block runs, and restart those that report none."""
     original = watching.watch_objs
 
     async def watch_objs(*, resource: Any, namespace: Any, **more: Any) -> AsyncIterator[Any]:
         watch = (str(resource.plural), str(namespace or ""))
         stream = original(resource=resource, namespace=namespace, **more)
-        pulse.beat(watch)
+        health.beat(watch)
         while True:
             try:
-                async with asyncio.timeout(pulse.limit):  # only while it waits for the stream
+                async with asyncio.timeout(health.limit):  # only while it waits for the stream
                     event = await anext(stream)
             except StopAsyncIteration:
                 return
             except TimeoutError:
-                pulse.restarted(watch)
+                health.restarted(watch)
                 return
             except errors.APIForbiddenError:
-                pulse.forget(watch)
+                health.forget(watch)
                 raise
-            pulse.beat(watch)
+            health.beat(watch)
             yield event
 
     watching.watch_objs = watch_objs

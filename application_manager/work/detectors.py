@@ -56,12 +56,12 @@ class _Posted:
 
 @dataclass(frozen=True, slots=True)
 class DetectorWork:
-    """Creates, changes and deletes a detector's objects; `judge` enqueues the Detector's status."""
+    """Creates, changes and deletes a detector's objects; `validate` enqueues the Detector's status."""
 
     cache: ClusterCache
     client: Client
     index: DetectorIndex
-    judge: Callable[[Name], None]
+    validate: Callable[[Name], None]
     recorder: Recorder
     _posted: dict[Name, dict[str, _Posted]] = field(default_factory=dict)  # by Detector, then the pod's uid
     _applied: dict[str, tuple[str, str]] = field(default_factory=dict)  # uid → the last apply, our fields
@@ -84,7 +84,7 @@ class DetectorWork:
         processed = Processed(entry.uid, detector.metadata.generation, running)
         if self.index.processed.get(name) != processed:
             self.index.processed[name] = processed
-            self.judge(name)
+            self.validate(name)
 
     async def _make(self, name: Name, detector: Detector) -> ConditionState:
         if self.index.defaults is None:

@@ -116,7 +116,7 @@ class InstanceWork:
     client: Client
     applier: Applier
     recorder: Recorder
-    suspending: WorkloadScaler
+    scaler: WorkloadScaler
     again: Callable[[Name, float], None]
     enqueue: Callable[[Name], None]
     done: Callable[[Name], None]
@@ -223,7 +223,7 @@ class InstanceWork:
                 return  # the objects stay unchanged until the chart is rendered, or has failed
             self._note(start, instance, ApplyResult(rendering, references(known.objects), complete=False), known.digest)
             return
-        await self.suspending.settle(instance, rendering)
+        await self.scaler.settle(instance, rendering)
         trying = (instance.metadata.uid, rendering.digest)
         until = self.attempts.waits_until(name, trying, time.time())
         pending = self.applier.pending(instance, rendering, known)

@@ -98,7 +98,7 @@ class InstanceStatusWork:
         if record.decision.withheld and applied.state.holds:
             why_not = f"instance {name[1]} is paused (annotation {PAUSE_ANNOTATION}): the task's values are not applied"
         serves = applied.state.holds and not record.decision.withheld
-        service = InstanceProgress(
+        progress = InstanceProgress(
             name[1],
             serves,
             serves and ready.holds,
@@ -107,24 +107,24 @@ class InstanceStatusWork:
             suspended=instance.spec.suspended,
             stopped=serves and suspended is not None and suspended.holds,
         )
-        self.report(name, record.decision, service)
+        self.report(name, record.decision, progress)
 
     def report_not_made(self, name: Name, decision: Decision, problem: str) -> None:
         """Enqueue the tasks that demand an instance that does not exist, with the reason."""
         self.report(name, decision, InstanceProgress(name[1], applied=False, ready=False, problem=problem))
 
-    def report(self, name: Name, decision: Decision | None, service: InstanceProgress | None) -> None:
+    def report(self, name: Name, decision: Decision | None, progress: InstanceProgress | None) -> None:
         """Enqueue the tasks whose verdict or progress changed; the progress is None if there is no instance."""
-        old = self.cache.served.pop(name, None)
+        old = self.cache.last_decisions.pop(name, None)
         verdicts = decision.verdicts if decision is not None else {}
         before = old.decision.verdicts if old is not None else {}
         for task in before.keys() - verdicts.keys():
             self.task_changed((name[0], task))  # a task for all instances may have others yet
         if decision is None:
             return
-        new = LastDecision(decision, service or InstanceProgress(name[1], applied=False, ready=False))
-        self.cache.served[name] = new
-        all_changed = old is None or (old.service, old.decision.fallback) != (new.service, decision.fallback)
+        new = LastDecision(decision, progress or InstanceProgress(name[1], applied=False, ready=False))
+        self.cache.last_decisions[name] = new
+        all_changed = old is None or (old.progress, old.decision.fallback) != (new.progress, decision.fallback)
         known = old.decision.generations if old is not None else {}
         for task, verdict in verdicts.items():
             if all_changed or (before.get(task), known.get(task)) != (verdict, decision.generations[task]):

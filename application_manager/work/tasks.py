@@ -65,12 +65,12 @@ class TaskWork:
         known = self._verdict(name, task) if task is not None else None
         if task is None or known is None or task.metadata.deletion_timestamp is not None:
             return
-        verdict, service, generation = known
+        verdict, progress, generation = known
         if verdict.reason == RefusalReason.TEMPLATE_NOT_FOUND and await self._has_template(
             name[0], task.spec.template_name
         ):
             return  # the watch of templates is behind that of tasks; the template's event enqueues the task again
-        await self._write(name, task, verdict, service, generation)
+        await self._write(name, task, verdict, progress, generation)
 
     async def _write_shed(self, name: Name) -> None:
         """Write that a task is not accepted for lack of memory; it is read only for this."""
@@ -83,11 +83,11 @@ class TaskWork:
             await self._write(name, task, finished(task) or _SHED, None, task.metadata.generation)
 
     async def _write(
-        self, name: Name, task: ApplicationTask, verdict: Verdict, service: InstanceProgress | None, generation: int
+        self, name: Name, task: ApplicationTask, verdict: Verdict, progress: InstanceProgress | None, generation: int
     ) -> None:
         now = time.time()
         old = task.status or ApplicationTaskStatus()
-        new = task_status(task, verdict, service, now, generation)
+        new = task_status(task, verdict, progress, now, generation)
         try:
             if not await self.statuses.write(TASKS, task, task.status, new, now, _OWN_CONDITIONS):
                 return
@@ -129,18 +129,18 @@ class TaskWork:
         claimed = self.cache.claims.claim(name)
         if claimed is None:
             return None
-        known = self.cache.served
+        known = self.cache.last_decisions
         served = {each[1]: known[each] for each in self._decided(name[0], claimed) if each in known}
         found = verdict_of(claimed, {of: each.decision for of, each in served.items()}, served)
         if found is None:
             return None
-        services = [served[each].service for each in found.serving]
-        return found.verdict, together(services) if services else None, found.generation
+        parts = [served[each].progress for each in found.serving]
+        return found.verdict, together(parts) if parts else None, found.generation
 
     def _decided(self, namespace: str, claimed: Claim) -> Iterator[Name]:
         """The instances whose decisions determine the verdict of a claim."""
         yield from self.cache.meant((namespace, claimed.instance))
-        served = self.cache.served.get((namespace, claimed.instance))
+        served = self.cache.last_decisions.get((namespace, claimed.instance))
         fallback = served.decision.fallback if served is not None else None
         instead = fallback.instance_of(claimed.task.name) if fallback is not None else None
         if instead is not None:

@@ -54,10 +54,10 @@ class RuleWork:
         if entry is None:
             return
         now = time.time()
-        old, new = await self._judged(kind, name, entry, now)
+        old, new = await self._statuses(kind, name, entry, now)
         await self.statuses.write(OWN[kind], _bare(entry), old if entry.raw.get("status") else None, new, now)
 
-    async def _judged(self, kind: KindKey, name: Name, entry: Entry, now: float) -> tuple[Status, Status]:
+    async def _statuses(self, kind: KindKey, name: Name, entry: Entry, now: float) -> tuple[Status, Status]:
         """The current status and the new one."""
         namespace = name[0]
         written = entry.raw.get("status") or {}

@@ -57,7 +57,7 @@ def _compiled(template: bytes, policy: Policy) -> Renderer | ApplyProblem:
         return ApplyProblem(error.reason, str(error))
 
 
-def judge_detector(detector: Detector, old: Detector | None = None, rules: Sequence[EventRule] = ()) -> Findings:
+def check_detector(detector: Detector, old: Detector | None = None, rules: Sequence[EventRule] = ()) -> Findings:
     """The findings about a detector; new problems of these rules are remarks, because they may be changed next."""
     remarks = [each for rule in rules for each in newly_wrong(rule, detector, old)]
     return replace(detector_findings(detector), remarks=tuple(remarks))

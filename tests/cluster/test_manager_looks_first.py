@@ -46,7 +46,7 @@ def work_on(cache: ClusterCache, client: Client) -> tuple[Router, InstanceWork]:
         client=client,
         applier=applier,
         recorder=Recorder(client),
-        suspending=WorkloadScaler(client, applier, router.observe),
+        scaler=WorkloadScaler(client, applier, router.observe),
         again=ignore,
         enqueue=ignore,
         done=ignore,

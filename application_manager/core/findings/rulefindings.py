@@ -57,13 +57,13 @@ def rule_findings(
 
     `invalid`: the names of the namespace's other Detectors.
     """
-    judges = selecting(rule, detectors)
-    if not judges:
+    selected_by = selecting(rule, detectors)
+    if not selected_by:
         unselected = Finding(RULE_NOT_SELECTED.name, _not_selected(rule, detectors, invalid), rule.name)
         return Findings(tuple(map(str, own_problems(rule))), (unselected,))
     having: dict[RuleProblem, list[str]] = {}  # problem → detectors with which the rule has it
     passing: set[RuleProblem] = set()
-    for detector in judges:
+    for detector in selected_by:
         beside = [each for each in others if each.name != rule.name and selects(detector, each)]
         known = dependency_problems([rule, *beside]).get(rule.name, ())
         passing |= {each for each in known if _names_what_is_not_there(each, rule, beside)}
@@ -71,11 +71,11 @@ def rule_findings(
             having.setdefault(problem, []).append(detector.name)
     own = {each for each in having if each.detector is None and each not in passing}
     # One Detector that can evaluate the rule is enough.
-    refused = {name for each in own for name in having[each]} == {each.name for each in judges}
+    refused = {name for each in own for name in having[each]} == {each.name for each in selected_by}
     problems: list[str] = []
     doubts: list[Finding] = []
     for problem, names in having.items():
-        whose = "" if len(names) == len(judges) else f"with Detector {', '.join(names)}: "
+        whose = "" if len(names) == len(selected_by) else f"with Detector {', '.join(names)}: "
         if refused and problem in own:
             problems.append(f"{whose}{problem}")
         else:

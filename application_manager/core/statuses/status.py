@@ -56,23 +56,23 @@ class InstanceProgress:
     stopped: bool = False
 
 
-def together(services: Sequence[InstanceProgress]) -> InstanceProgress:
+def together(parts: Sequence[InstanceProgress]) -> InstanceProgress:
     """The combined progress of several instances, at least one, for a task for all instances."""
     return InstanceProgress(
-        instance=", ".join(sorted(each.instance for each in services)),
-        applied=all(each.applied for each in services),
-        ready=all(each.ready for each in services),
-        problem="; ".join(sorted(each.problem for each in services if each.problem)),
-        reason=next((each.reason for each in services if each.reason), ""),
-        suspended=any(each.suspended for each in services),
-        stopped=all(each.stopped for each in services),
+        instance=", ".join(sorted(each.instance for each in parts)),
+        applied=all(each.applied for each in parts),
+        ready=all(each.ready for each in parts),
+        problem="; ".join(sorted(each.problem for each in parts if each.problem)),
+        reason=next((each.reason for each in parts if each.reason), ""),
+        suspended=any(each.suspended for each in parts),
+        stopped=all(each.stopped for each in parts),
     )
 
 
 def task_status(
-    task: ApplicationTask, verdict: Verdict, service: InstanceProgress | None, now: float, generation: int
+    task: ApplicationTask, verdict: Verdict, progress: InstanceProgress | None, now: float, generation: int
 ) -> ApplicationTaskStatus:
-    """The task's status; `service` is the progress of the verdict's instance.
+    """The task's status; `progress` is the progress of the verdict's instance.
 
     `generation`: the generation of the task that the verdict is based on: the task may have changed since. A finished
     task has no condition Applied or Ready: no more work is done for it.
@@ -91,14 +91,14 @@ def task_status(
     suspends = task.spec.operation is Operation.SUSPEND
     applied_time, ready_time = old.applied_time, old.ready_time
     if verdict.kind is VerdictKind.COUNTS:
-        if service is not None:
-            done = service.stopped if suspends else service.ready
+        if progress is not None:
+            done = progress.stopped if suspends else progress.ready
             word = "suspended" if suspends else "ready"
             states += [
-                _served("Applied", service.applied, "Applied", "NotApplied", service),
-                _served("Ready", done, "Ready", "NotReady", service, word),
+                _served("Applied", progress.applied, "Applied", "NotApplied", progress),
+                _served("Ready", done, "Ready", "NotReady", progress, word),
             ]
-            applied_time = applied_time or (since if service.applied else None)
+            applied_time = applied_time or (since if progress.applied else None)
             ready_time = ready_time or (since if done else None)
         elif find(old.conditions, "Applied") is None:
             states.append(ConditionState("Ready", False, "NotReady", f"instance {verdict.instance} does not exist yet"))
@@ -111,9 +111,9 @@ def task_status(
     conditions = updated(old.conditions, states, generation, now, only_while=only_while)
     instance = old.instance_name or verdict.instance if finished else verdict.instance
     return ApplicationTaskStatus(
-        phase=_task_phase(verdict, service, suspends),
+        phase=_task_phase(verdict, progress, suspends),
         instance_name=instance,
-        message=_task_message(verdict, service, suspends),
+        message=_task_message(verdict, progress, suspends),
         observed_generation=generation,
         applied_time=applied_time,
         ready_time=ready_time,
@@ -128,16 +128,17 @@ def finished_since(task: ApplicationTask) -> float | None:
 
 
 def _served(
-    type_: str, now_holds: bool, reason: str, otherwise: str, service: InstanceProgress, word: str = "applied"
+    type_: str, now_holds: bool, reason: str, otherwise: str, progress: InstanceProgress, word: str = "applied"
 ) -> ConditionState:
     if now_holds:
-        return ConditionState(type_, True, reason, f"instance {service.instance} is {word}")
-    if service.applied and service.reason and word != "suspended":
-        otherwise = service.reason
-    return ConditionState(type_, False, otherwise, service.problem or f"instance {service.instance} is not {word} yet")
+        return ConditionState(type_, True, reason, f"instance {progress.instance} is {word}")
+    if progress.applied and progress.reason and word != "suspended":
+        otherwise = progress.reason
+    problem = progress.problem or f"instance {progress.instance} is not {word} yet"
+    return ConditionState(type_, False, otherwise, problem)
 
 
-def _task_phase(verdict: Verdict, service: InstanceProgress | None, suspends: bool) -> TaskPhase:
+def _task_phase(verdict: Verdict, progress: InstanceProgress | None, suspends: bool) -> TaskPhase:
     match verdict.kind:
         case VerdictKind.WAITING:
             return TaskPhase.WAITING
@@ -147,26 +148,26 @@ def _task_phase(verdict: Verdict, service: InstanceProgress | None, suspends: bo
             return TaskPhase.REFUSED
         case VerdictKind.LAPSED:
             return TaskPhase.LAPSED
-    if service is None or not service.applied:
+    if progress is None or not progress.applied:
         return TaskPhase.PENDING
     if suspends:
-        return TaskPhase.READY if service.stopped else TaskPhase.ACTIVE
-    if service.suspended:
+        return TaskPhase.READY if progress.stopped else TaskPhase.ACTIVE
+    if progress.suspended:
         return TaskPhase.SUSPENDED
-    return TaskPhase.READY if service.ready else TaskPhase.ACTIVE
+    return TaskPhase.READY if progress.ready else TaskPhase.ACTIVE
 
 
-def _task_message(verdict: Verdict, service: InstanceProgress | None, suspends: bool) -> str | None:
+def _task_message(verdict: Verdict, progress: InstanceProgress | None, suspends: bool) -> str | None:
     if verdict.kind is not VerdictKind.COUNTS:
         return _short(verdict.message)
     notes = [] if verdict.reason == ACCEPTED else [verdict.message]
-    if service is None:
+    if progress is None:
         return _short("; ".join([*notes, f"instance {verdict.instance} does not exist yet"]))
-    done, word = (service.stopped, "suspended") if suspends else (service.ready, "ready")
-    if service.applied and done:
+    done, word = (progress.stopped, "suspended") if suspends else (progress.ready, "ready")
+    if progress.applied and done:
         return _short("; ".join(notes))
-    lacks = word if service.applied else "applied"
-    return _short("; ".join([*notes, service.problem or f"instance {service.instance} is not {lacks} yet"]))
+    lacks = word if progress.applied else "applied"
+    return _short("; ".join([*notes, progress.problem or f"instance {progress.instance} is not {lacks} yet"]))
 
 
 def instance_status(

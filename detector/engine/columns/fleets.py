@@ -121,7 +121,7 @@ class FleetGroup:
                     self._of_points.forget(of_points)
                     return FleetCondition(expression, None, {})
                 node = self._of_points.truth(lowered)
-            found[name] = (fold.how, node)
+            found[name] = (fold.kind, node)
         lowered = self._of_ticks.add(rest, partial(self._outside, track, field, found))
         if lowered is None:
             self._of_points.forget(of_points)

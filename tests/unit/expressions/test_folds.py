@@ -34,7 +34,7 @@ def loops(node: object) -> int:
 )  # fmt: skip
 def test_loops_over_the_items_become_folds(source: str, how: list[FoldKind]) -> None:
     rest, folds = folded(ENVIRONMENT.compile(source, result=CelType.BOOL), "members")
-    assert [each.how for each in folds.values()] == how
+    assert [each.kind for each in folds.values()] == how
     assert loops(rest.tree) == 0
 
 

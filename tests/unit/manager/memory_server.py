@@ -87,7 +87,7 @@ def work_on(cache: ClusterCache, server: object, absent: list[Name]) -> Instance
         client=client,
         applier=applier,
         recorder=Recorder(client),
-        suspending=WorkloadScaler(client, applier, cache.store.put),
+        scaler=WorkloadScaler(client, applier, cache.store.put),
         again=lambda name, at: None,
         enqueue=lambda name: None,
         done=lambda name: None,

@@ -29,7 +29,7 @@ class FoldKind(enum.Enum):
 class Fold(NamedTuple):
     """A fold of a predicate over the items."""
 
-    how: FoldKind
+    kind: FoldKind
     variable: str
     """The name of an item in the predicate."""
     predicate: Part | None
@@ -51,20 +51,20 @@ def folded(expression: Expression, items: str) -> Folded:
     """The expression with each loop over the list `items` as a fold; loops of other kinds stay."""
     folds: dict[str, Fold] = {}
     rest = _without_loops(expression.tree, items, expression, folds)
-    kinds = {**expression.kinds, **{name: _KINDS[fold.how] for name, fold in folds.items()}}
+    kinds = {**expression.kinds, **{name: _KINDS[fold.kind] for name, fold in folds.items()}}
     return Folded(Part(rest, kinds, expression.result), folds)
 
 
 def _without_loops(node: Node, items: str, whole: Expression, folds: dict[str, Fold]) -> Node:
     if (found := _found(node, items)) is not None:
-        how, variable, predicate, one = found
+        kind, variable, predicate, one = found
         part = None
         if predicate is not None:
             part = Part(predicate, {**whole.kinds, variable: CelType.DYN}, CelType.BOOL)
         name = f"fold{len(folds)}"
         while name in whole.kinds:
             name += "_"
-        folds[name] = Fold(how, variable, part)
+        folds[name] = Fold(kind, variable, part)
         return Call("_==_", None, (Name(name), Scalar(1.0))) if one else Name(name)
     match node:
         case Call(function, None, arguments):

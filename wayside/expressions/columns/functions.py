@@ -71,8 +71,8 @@ def _scalar_functions() -> dict[tuple[str, int], Callable[..., float]]:
     for function in (*FUNCTIONS.values(), *OF_FIELDS.values()):
         for signature in function.signatures:
             alone = sum(len(each.parameters) == len(signature.parameters) for each in function.signatures) == 1
-            numbers = all(parameter.takes is ArgumentType.NUMBER for parameter in signature.parameters)
-            if function.yields is ResultType.NUMBER and alone and numbers:
+            numbers = all(parameter.type is ArgumentType.NUMBER for parameter in signature.parameters)
+            if function.result is ResultType.NUMBER and alone and numbers:
                 found[function.name, len(signature.parameters)] = signature.implementation  # type: ignore[assignment]
     return found
 

@@ -59,7 +59,7 @@ class FunctionParameter:
     """A parameter. Its name contains the unit, unless the unit is clear from the meaning."""
 
     name: str
-    takes: ArgumentType
+    type: ArgumentType
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +75,7 @@ class Function:
     """A function of expressions."""
 
     name: str
-    yields: ResultType
+    result: ResultType
     summary: str
     """The meaning of the result, with its unit."""
     signatures: tuple[Signature, ...]
@@ -83,7 +83,7 @@ class Function:
     @property
     def takes_handles(self) -> bool:
         """Whether it takes a list, a map or bytes."""
-        return any(p.takes in _UNREAD for signature in self.signatures for p in signature.parameters)
+        return any(p.type in _UNREAD for signature in self.signatures for p in signature.parameters)
 
     def usage(self) -> str:
         """The ways to call it, as in `inside(x, y, polygon)`."""
@@ -93,7 +93,7 @@ class Function:
 
     def types(self) -> str:
         """The parameters' types, as in `number, number, list`."""
-        return " or ".join(", ".join(p.takes.value for p in s.parameters) for s in self.signatures)
+        return " or ".join(", ".join(p.type.value for p in s.parameters) for s in self.signatures)
 
     def declaration(self) -> cel.FunctionDecl:
         """The declaration for CEL."""
@@ -102,9 +102,9 @@ class Function:
     def _overloads(self) -> Iterator[cel.Overload]:
         for number, signature in enumerate(self.signatures):
             call = _called(self, signature)
-            for types in itertools.product(*(_TAKES[parameter.takes] for parameter in signature.parameters)):
+            for types in itertools.product(*(_TAKES[parameter.type] for parameter in signature.parameters)):
                 identifier = "_".join((self.name, str(number), *(each.name().split("<")[0].lower() for each in types)))
-                yield cel.Overload(identifier, _YIELDS[self.yields], list(types), False, call)
+                yield cel.Overload(identifier, _YIELDS[self.result], list(types), False, call)
 
 
 def _called(function: Function, signature: Signature) -> Callable[..., object]:
@@ -115,27 +115,27 @@ def _called(function: Function, signature: Signature) -> Callable[..., object]:
         for parameter, value in zip(signature.parameters, values, strict=True):
             if isinstance(value, float) and math.isnan(value):
                 raise ValueError(f"no value for {parameter.name} of {function.name}: it is not a number")
-            if parameter.takes in _UNREAD and not _fits(parameter.takes, value):
-                article = "" if parameter.takes is ArgumentType.BYTES else "a "
-                raise ValueError(f"{function.name}: {parameter.name} must be {article}{parameter.takes.value}")
+            if parameter.type in _UNREAD and not _fits(parameter.type, value):
+                article = "" if parameter.type is ArgumentType.BYTES else "a "
+                raise ValueError(f"{function.name}: {parameter.name} must be {article}{parameter.type.value}")
         return signature.implementation(*values)
 
     return called_by_cel(call)
 
 
-def _fits(takes: ArgumentType, value: object) -> bool:
-    if takes is ArgumentType.BYTES:
+def _fits(wanted: ArgumentType, value: object) -> bool:
+    if wanted is ArgumentType.BYTES:
         return isinstance(value, bytes | bytearray | memoryview)
-    if takes is ArgumentType.LIST:
+    if wanted is ArgumentType.LIST:
         return isinstance(value, list | tuple) or hasattr(value, "tolist")  # a numpy array, which behaves like a list
     return isinstance(value, Mapping) or dataclasses.is_dataclass(value)
 
 
-def function(name: str, yields: ResultType, summary: str, *ways: tuple[Callable[..., object], str]) -> Function:
+def function(name: str, result: ResultType, summary: str, *ways: tuple[Callable[..., object], str]) -> Function:
     """A function with its signatures: for each, an implementation, and the parameters as in `x y polygon:list`."""
     return Function(
         name,
-        yields,
+        result,
         summary,
         tuple(
             Signature(tuple(map(_parameter, parameters.split())), implementation) for implementation, parameters in ways
@@ -144,5 +144,5 @@ def function(name: str, yields: ResultType, summary: str, *ways: tuple[Callable[
 
 
 def _parameter(text: str) -> FunctionParameter:
-    name, _, takes = text.partition(":")
-    return FunctionParameter(name, ArgumentType(takes) if takes else ArgumentType.NUMBER)
+    name, _, type_ = text.partition(":")
+    return FunctionParameter(name, ArgumentType(type_) if type_ else ArgumentType.NUMBER)

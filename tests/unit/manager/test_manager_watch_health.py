@@ -11,7 +11,7 @@ import kopf
 import pytest
 from kopf._cogs.clients import api, watching
 
-from application_manager.watching.watch_health import NEVER, WatchHealth, pulsing
+from application_manager.watching.watch_health import NEVER, WatchHealth, supervising
 
 TASKS = SimpleNamespace(plural="applicationtasks", get_url=lambda **_: "")
 
@@ -50,28 +50,28 @@ def test_our_watch_timeout_does_not_cancel_the_reader_as_kopfs_does(monkeypatch:
     async def ours() -> tuple[int, WatchHealth]:
         settings = kopf.OperatorSettings()
         settings.watching.inactivity_timeout = NEVER
-        pulse = WatchHealth(0.05, lambda: 0.0)
-        with pulsing(pulse):
-            return await asyncio.create_task(read(settings, 0.1)), pulse
+        health = WatchHealth(0.05, lambda: 0.0)
+        with supervising(health):
+            return await asyncio.create_task(read(settings, 0.1)), health
 
     streaming(monkeypatch, 3)
     with pytest.raises(asyncio.CancelledError):
         asyncio.run(kopfs())
-    count, pulse = asyncio.run(ours())
+    count, health = asyncio.run(ours())
     assert count == 3
-    assert pulse.dead() is None
-    samples = {each.name: each.samples for each in pulse.collect()}
+    assert health.dead() is None
+    samples = {each.name: each.samples for each in health.collect()}
     assert [each.labels for each in samples["wayside_manager_watch_age_seconds"]] == [{"resource": "applicationtasks"}]
     assert [each.value for each in samples["wayside_manager_watch_restarts"]] == [1]
 
 
 def test_only_time_in_which_the_api_server_answers_counts_against_a_watch() -> None:
     healthy = [0.0]
-    pulse = WatchHealth(90, lambda: healthy[0])
-    pulse.beat(("applicationtasks", "town"))
+    health = WatchHealth(90, lambda: healthy[0])
+    health.beat(("applicationtasks", "town"))
     healthy[0] = 180
-    assert pulse.dead() is None
+    assert health.dead() is None
     healthy[0] = 181
-    assert pulse.dead() == "the watch of applicationtasks has had neither events nor bookmarks for 181 s"
-    pulse.forget(("applicationtasks", "town"))
-    assert pulse.dead() is None
+    assert health.dead() == "the watch of applicationtasks has had neither events nor bookmarks for 181 s"
+    health.forget(("applicationtasks", "town"))
+    assert health.dead() is None
