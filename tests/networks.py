@@ -13,7 +13,7 @@ from typing import Any
 
 import zenoh
 
-from detector.streams.zenoh import Put
+from detector.engine.samples.intake import Put
 from tests.certificates import Authority
 from tests.patience import PATIENCE
 from wayside.api.stream import Encoding, Stream

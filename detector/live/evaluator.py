@@ -25,9 +25,9 @@ from detector.engine.evaluation.observing import Observer
 from detector.engine.evaluation.rule import OnDemandResult
 from detector.engine.samples.intake import Intake
 from detector.engine.samples.sample import Arrival
+from detector.engine.timing.schedule import LONG, Overload
 from detector.engine.timing.timeline import ORDER
 from detector.findings.losses import Losses
-from detector.live.overload import LONG, Overload
 from detector.live.state import RestoredState
 from detector.plugins.outages import Outages
 from detector.resources.selection import RuleSet

@@ -7,7 +7,7 @@ import logging
 import re
 import threading
 import time
-from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Sequence
+from collections.abc import AsyncIterator, Iterable, Iterator
 from dataclasses import replace
 from itertools import chain, count
 from pathlib import Path
@@ -17,7 +17,7 @@ from detector.actions.deploy.reconciler import DemandReconciler
 from detector.actions.outcomes import Outcomes
 from detector.actions.tracing import EpisodeTraces
 from detector.assembly import DetectorError, StreamReaders, make_engine, stream_readers
-from detector.engine.samples.intake import Intake
+from detector.engine.samples.intake import Intake, Put
 from detector.engine.samples.liveliness import LIVELINESS
 from detector.findings.losses import Loss
 from detector.live.answers import Answers
@@ -196,7 +196,7 @@ class Running:
             loss_counter=self._loss_counter,
         )
 
-    def _putter(self, stream: str) -> Callable[[Sequence[tuple[str, bytes]]], None]:
+    def _putter(self, stream: str) -> Put:
         """The inputs for the messages of a stream; changes of tokens wait for room before they are dropped."""
         return self._intake.patient_putter(stream) if stream == LIVELINESS else self._intake.putter(stream)
 

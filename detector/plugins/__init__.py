@@ -3,8 +3,7 @@
 This module has the interface for plugins; the rest of the package finds and runs them.
 """
 
-from detector.engine.queries.geometry import Pose
-from detector.engine.queries.poses import PoseError, pose_in
+from detector.engine.queries.geometry import Pose, PoseError, pose_in
 from detector.engine.queries.queries import DecodedSample, Queries, QueryError
 from detector.engine.queries.transforms import TransformError
 from detector.plugins.base import Plugin, PluginParameters, PluginSubject, Seconds, StreamName

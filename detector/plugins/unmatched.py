@@ -18,9 +18,8 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from detector.engine.queries.geometry import NO_MOTION, Pose
-from detector.engine.queries.queries import DecodedSample, Queries, frame_of
+from detector.engine.queries.queries import DecodedSample, Queries, frame_of, matched
 from detector.engine.queries.transforms import TransformError
-from detector.engine.queries.tuples import matched
 from detector.plugins.base import Plugin, PluginParameters, PluginSubject, Seconds, StreamName
 from wayside.expressions import Value
 

@@ -17,8 +17,7 @@ from typing import Any
 
 import msgspec
 
-from detector.engine.queries.geometry import Pose
-from detector.engine.queries.poses import PoseError
+from detector.engine.queries.geometry import Pose, PoseError
 from detector.engine.queries.queries import DecodedSample, QueryError
 from detector.engine.queries.transforms import TransformError
 from detector.plugins.base import PluginSubject

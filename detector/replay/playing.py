@@ -16,8 +16,7 @@ import msgspec
 from msgspec.structs import replace
 
 from detector.assembly import stream_readers
-from detector.engine.buffering.lanes import latched_topics
-from detector.engine.buffering.latched import Topic
+from detector.engine.buffering.lanes import Topic, latched_topics
 from detector.engine.samples.sample import Arrival
 from detector.engine.scoping.plugins import PluginHost
 from detector.replay.clips import Clips

@@ -10,14 +10,12 @@ from typing import ClassVar, Generic, Protocol, TypeVar
 
 from pydantic import BaseModel
 
+from detector.engine.samples.intake import Put
 from wayside.api.stream import Stream
 from wayside.keys import KeyPattern
 
 P = TypeVar("P", bound=BaseModel)
 """The model of a source's parameters."""
-
-Put = Callable[[Sequence[tuple[str, bytes]]], None]
-"""Receives messages that arrived together: the key and the payload of each. Thread-safe, and never waits."""
 
 
 class Putter(Protocol):

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Sequence
 
 import zenoh
 
+from detector.engine.samples.intake import Put
 from detector.engine.samples.liveliness import TokenState
 from detector.streams.session import Connections
 from wayside.keys import KeyPattern
@@ -46,7 +46,7 @@ class TokenWatch:
         self,
         subscriber: Tokens,
         connections: Connections,
-        put: Callable[[Sequence[tuple[str, bytes]]], None],
+        put: Put,
     ) -> None:
         """`connections`: of the subscriber's session."""
         self._put = put

@@ -19,7 +19,7 @@ from collections.abc import Iterable, Sequence
 
 import zenoh
 
-from detector.streams.bursts import Put
+from detector.engine.samples.intake import Put
 from detector.streams.loss_counter import Cause, LossCounter
 
 MAXIMUM_PUBLISHERS = 10_000

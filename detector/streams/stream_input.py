@@ -19,11 +19,14 @@ from itertools import islice
 
 import zenoh
 
-from detector.streams.bursts import LONGEST
 from detector.streams.subscribing import Subscription
 
 MAXIMUM_NOTED = 1_000_000
 """Maximum number of noted and of queued samples for one stream; beyond it, the sessions are exchanged at once."""
+
+_LONGEST = 256
+"""Maximum number of messages that are queued at once, so that they share the cost: receiving them takes a fraction of a
+millisecond."""
 
 _MAXIMUM_KEYS = 200_000
 
@@ -61,7 +64,7 @@ class StreamInput:
             try:
                 while True:
                     burst = [receive()]
-                    burst.extend(islice(iter(try_receive, None), LONGEST - 1))
+                    burst.extend(islice(iter(try_receive, None), _LONGEST - 1))
                     # The hot path: without an exchange, it costs three attribute reads per burst.
                     if self._echo is None and self._noted is None and self._newest is None:
                         yield burst

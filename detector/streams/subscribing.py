@@ -16,8 +16,8 @@ from typing import Protocol
 import zenoh
 from zenoh import ext
 
+from detector.engine.samples.intake import Put
 from detector.streams import rmw_zenoh
-from detector.streams.bursts import Put
 from detector.streams.loss_counter import Cause, LossCounter
 from wayside.api.stream import Layout, Stream
 from wayside.keys import KeyPattern

@@ -16,8 +16,8 @@ from collections.abc import Callable, Iterable
 import zenoh
 
 from detector.access.mounted import LoadedCredentials
+from detector.engine.samples.intake import Put
 from detector.engine.samples.liveliness import LIVELINESS
-from detector.streams.bursts import Put
 from detector.streams.liveliness import TokenWatch
 from detector.streams.loss_counter import LossCounter
 from detector.streams.query_handler import QueryHandler
@@ -30,7 +30,7 @@ from wayside.api.zenoh import Zenoh, ZenohMode
 
 log = logging.getLogger(__name__)
 
-__all__ = ["EVENT_ENCODING", "Network", "NetworkError", "Put", "open_session"]
+__all__ = ["EVENT_ENCODING", "Network", "NetworkError", "open_session"]
 
 EVENT_ENCODING = "application/cloudevents+json"
 

@@ -1,4 +1,6 @@
-"""The clients named in messages: a stream's `client` is a template over the message, or over its items.
+"""The clients of a stream: which can have samples of it, and which a message names.
+
+A stream's `client` may be a template over the message, or over its items.
 
 Such messages are decoded as they enter the buffer, on the thread that evaluates, never on the one that receives.
 """
@@ -6,13 +8,15 @@ Such messages are decoded as they enter the buffer, on the thread that evaluates
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from detector.engine.buffering.items import Items, below
 from detector.engine.counters import Counters
 from detector.engine.samples.sample import DecodeError, Decoder
+from wayside.api.stream import Stream
 from wayside.expressions import CompiledTemplate, EvaluationError, InterpolationError
+from wayside.keys import KeyPattern
 from wayside.rules import CompiledStream
 
 CLIENT_NAME = re.compile(r"(?!\.*$)[A-Za-z0-9._:-]{1,63}")
@@ -125,3 +129,31 @@ class _Namer:
 def _is_plain(value: Any) -> bool:
     """Whether equal values of this type render the same: 0.0 and -0.0 do not, and NaN equals nothing."""
     return type(value) in (str, bool) or (type(value) is float and value != 0 and value == value)  # noqa: PLR0124
+
+
+class PossibleStreams:
+    """Whether a client can ever have samples of a stream, by the stream's key and `client`."""
+
+    def __init__(self, streams: Iterable[Stream]) -> None:
+        self._limits = {stream.name: limit for stream in streams if (limit := _limit(stream)) is not None}
+
+    @property
+    def limited(self) -> bool:
+        """Whether any stream is limited to some clients."""
+        return bool(self._limits)
+
+    def __call__(self, stream: str, client: str) -> bool:
+        """Whether the client can have samples of the stream; true for names that are no stream of the Detector."""
+        limit = self._limits.get(stream)
+        return limit is None or limit(client)
+
+
+def _limit(stream: Stream) -> Callable[[str], bool] | None:
+    """The clients that can have samples; None: all."""
+    if stream.client is None:
+        pattern = KeyPattern.parse(stream.key)
+        return None if "${client:*}" in stream.key else lambda client: pattern.can_capture("client", client)
+    if not stream.names_by_message:
+        return stream.client.__eq__
+    prefix = stream.client.partition("${")[0]
+    return (lambda client: client.startswith(prefix)) if prefix else None

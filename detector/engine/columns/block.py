@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from detector.engine.buffering.clients import Clients
-from detector.engine.buffering.possible import PossibleStreams
+from detector.engine.buffering.naming import PossibleStreams
 from detector.engine.columns.earlier import EarlierValues
 from detector.engine.columns.table import Integers, Truths
 from detector.engine.columns.tables import Tables

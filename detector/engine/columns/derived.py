@@ -1,21 +1,26 @@
-"""Signals over other signals, in columns: expressions over the points of a block, windows over their earlier values."""
+"""Signals over other signals: expressions over the points of a block, and windows over their earlier values.
+
+`with_derived` computes them for rules that are evaluated one by one.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterator
-from typing import NamedTuple
+from collections.abc import Callable, Hashable, Iterable, Iterator
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from detector.engine.columns.block import Block, Context, Track
 from detector.engine.columns.client_values import ClientValues
-from detector.engine.columns.earlier import Evaluations
+from detector.engine.columns.earlier import EarlierValues, Evaluations
 from detector.engine.columns.formulas import Formula, Rows
 from detector.engine.columns.table import Integers
-from wayside.expressions import Path, Reason
+from detector.engine.counters import RuleCounters
+from detector.engine.scoping.scopes import Candidate, evaluated
+from wayside.expressions import UNKNOWN, Path, Reason
 from wayside.expressions.columns.lowering import Constant
-from wayside.expressions.columns.values import Column, Tag
-from wayside.rules import CompiledDerived
+from wayside.expressions.columns.values import Column, Tag, Texts, column_of, value_at
+from wayside.rules import CompiledDerived, CompiledRule
 
 
 class Derived(NamedTuple):
@@ -119,3 +124,45 @@ def _scattered(column: Column, points: Integers, size: int) -> Column:
         others = np.full(size, None, object)
         others[points] = column.others
     return Column(values, tags, others)
+
+
+def with_derived(
+    rule: CompiledRule, earlier: EarlierValues, now: int, candidates: Iterable[Candidate], counters: RuleCounters
+) -> Iterator[Candidate]:
+    """The subjects with these signals among their variables, and with the values that statistics of episodes
+    aggregate."""
+    by_element: dict[str | None, list[Candidate]] = {}
+    for candidate in candidates:
+        by_element.setdefault(candidate.subject.element, []).append(candidate)
+    for element in rule.elements:
+        yield from _of_one(rule, earlier, now, element.name, by_element.get(element.name, []), counters)
+
+
+def _of_one(
+    rule: CompiledRule,
+    earlier: EarlierValues,
+    now: int,
+    element: str | None,
+    candidates: list[Candidate],
+    counters: RuleCounters,
+) -> Iterator[Candidate]:
+    texts = Texts()
+    variables: list[dict[str, Any]] = [dict(candidate.variables) for candidate in candidates]
+    measured: list[dict[str, Any]] = [{} for _ in candidates]
+    keys = np.array([earlier.key(candidate.subject) for candidate in candidates], np.int64)
+    evaluations = Evaluations(keys, np.full(len(keys), now, np.int64), now)
+    for signal in rule.derived:
+        if signal.of is None:
+            continue
+        values = [
+            evaluated(signal.of, seen, f"signal {signal.name} of {candidate.subject.text}", candidate.never, counters)
+            for candidate, seen in zip(candidates, variables, strict=True)
+        ]
+        if not signal.episode:
+            column = earlier.window(signal, element, evaluations, column_of(values, texts), texts, counters)
+            values = [value_at(column, row, texts) for row in range(len(values))]
+        for known, value in zip(measured if signal.episode else variables, values, strict=True):
+            if value is not UNKNOWN:
+                known[signal.name] = value
+    for candidate, seen, over in zip(candidates, variables, measured, strict=True):
+        yield candidate._replace(variables=seen, measured=over)

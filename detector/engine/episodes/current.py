@@ -1,8 +1,9 @@
-"""The state of an open episode of a rule: its record, and the demands that its deploy actions hold."""
+"""The state of an open episode of a rule: its record, and the demands of its deploy actions. The budget of starts."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections import deque
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,13 +13,11 @@ from detector.engine.counters import RuleCounters
 from detector.engine.episodes.demands import Demand
 from detector.engine.episodes.episodes import EndReason
 from detector.engine.episodes.events import Event
-from detector.engine.episodes.following import followed
-from detector.engine.episodes.identifiers import episode_id
 from detector.engine.episodes.open_episodes import OpenEpisode
-from detector.engine.episodes.record import EpisodeRecord
-from detector.engine.episodes.rendering import Rendered, render_templates
+from detector.engine.episodes.record import EpisodeRecord, episode_id
+from detector.engine.episodes.rendering import Rendered, followed, render_templates
 from detector.engine.episodes.statistics import Statistics
-from detector.engine.episodes.subjects import Subject
+from detector.engine.episodes.subjects import FLEET, Subject
 from wayside.expressions import InterpolationError
 from wayside.rules import CompiledDeploy, CompiledRule
 
@@ -174,3 +173,32 @@ class EpisodeState(msgspec.Struct, eq=False):
             dry_run=rule.dry_run,
             rendered=rendered,
         )
+
+
+HOUR = 3_600 * 10**9
+"""Nanoseconds."""
+
+
+class Budget:
+    """Counts the starts of the last hour by client. An episode of a pair counts for both clients."""
+
+    def __init__(self) -> None:
+        self._starts: dict[str, deque[int]] = {}
+
+    def takes(self, clients: Sequence[str], now: int, limit: int) -> bool:
+        """Whether each of the clients had fewer than `limit` starts in (now - 1 h, now]; if so, count this one."""
+        names = clients or (FLEET,)
+        for name in names:
+            starts = self._starts.get(name)
+            while starts and starts[0] <= now - HOUR:
+                starts.popleft()
+            if starts and len(starts) >= limit:
+                return False
+        for name in names:
+            self._starts.setdefault(name, deque()).append(now)
+        return True
+
+    def expire(self, now: int) -> None:
+        """Forget clients without starts in the last hour."""
+        for name in [name for name, starts in self._starts.items() if not starts or starts[-1] <= now - HOUR]:
+            del self._starts[name]

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
-from detector.engine.episodes.identifiers import identifier
 from detector.engine.episodes.plain import plain
-from detector.engine.episodes.record import EpisodeRecord
+from detector.engine.episodes.record import EpisodeRecord, identifier
 from wayside.api.applicationtask import (
     HOLDER_LABEL,
     RULE_DIGEST_ANNOTATION,

@@ -1,4 +1,4 @@
-"""The templates of actions, rendered with the variables of a rule when an episode starts."""
+"""The templates of actions, rendered with the variables of a rule: at the start of an episode; `follow` also later."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from detector.engine.counters import RuleCounters
 from wayside.api.base import JsonValue
 from wayside.expressions import InterpolationError
-from wayside.rules import CompiledAction
+from wayside.rules import CompiledAction, CompiledDeploy
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,3 +35,30 @@ def render_templates(action: CompiledAction, variables: Mapping[str, Any] | None
         else:
             values |= rendered if isinstance(rendered, dict) else {}  # a null key or value is dropped
     return Rendered(values, problems)
+
+
+def followed(
+    deploy: CompiledDeploy,
+    subject: str,
+    before: Mapping[str, JsonValue],
+    variables: Mapping[str, Any],
+    counters: RuleCounters,
+) -> dict[str, JsonValue]:
+    """The current parameters of the action.
+
+    Each parameter is evaluated separately: one that is unknown or fails keeps its value in `before`, and is counted.
+    Null ones are left out, as at the start.
+    """
+    now: dict[str, JsonValue] = {}
+    for name, template in deploy.each_parameter.items():
+        try:
+            value = template.render(variables)
+        except InterpolationError as error:
+            counters.unfollowed += 1
+            counters.last_unfollowed = f"action {deploy.action} of {subject}: {error}"
+            if name in before:
+                now[name] = before[name]
+        else:
+            if value is not None:
+                now[name] = value
+    return now

@@ -13,8 +13,7 @@ from detector.engine.buffering.ingest import Ingest
 from detector.engine.buffering.items import Items
 from detector.engine.buffering.lanes import lane_makers
 from detector.engine.buffering.messages import KeyReader, Messages
-from detector.engine.buffering.naming import MessageClients
-from detector.engine.buffering.possible import PossibleStreams
+from detector.engine.buffering.naming import MessageClients, PossibleStreams
 from detector.engine.columns.block import Context
 from detector.engine.columns.tables import Tables
 from detector.engine.counters import Counters

@@ -9,10 +9,10 @@ from typing import Any
 import msgspec
 
 from detector.engine.buffering.clients import Clients
+from detector.engine.columns.derived import with_derived
 from detector.engine.columns.earlier import EarlierValues
 from detector.engine.counters import RuleCounters
-from detector.engine.episodes.budget import Budget
-from detector.engine.episodes.current import DetectorIdentity, EpisodeState, new_record
+from detector.engine.episodes.current import Budget, DetectorIdentity, EpisodeState, new_record
 from detector.engine.episodes.demands import Demand, DemandChange
 from detector.engine.episodes.episodes import (
     Ended,
@@ -29,7 +29,6 @@ from detector.engine.episodes.open_episodes import OpenEpisode
 from detector.engine.episodes.record import EpisodeRecord
 from detector.engine.episodes.statistics import Statistics
 from detector.engine.episodes.subjects import Subject, fits
-from detector.engine.evaluation.derived import with_derived
 from detector.engine.scoping.plugins import PluginSignals
 from detector.engine.scoping.scopes import Candidate, Evaluated, Views, candidates, condition
 from detector.engine.scoping.snapshots import signals_read, snapshot

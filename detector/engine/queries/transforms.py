@@ -16,8 +16,7 @@ from typing import Any, NamedTuple
 from detector.engine.buffering.buffer import Buffer
 from detector.engine.buffering.messages import Messages
 from detector.engine.counters import Counters
-from detector.engine.queries.geometry import NO_MOTION, Pose
-from detector.engine.queries.poses import PoseError, pose_in
+from detector.engine.queries.geometry import NO_MOTION, Pose, PoseError, pose_in
 from detector.engine.samples.sample import Sample
 from wayside.expressions import UNKNOWN
 

@@ -16,6 +16,9 @@ from msgspec.structs import replace
 
 from detector.engine.samples.sample import SAMPLE_OVERHEAD, Arrival
 
+Put = Callable[[Sequence[tuple[str, bytes]]], None]
+"""Receives messages that arrived together: the key and the payload of each. Thread-safe, and never waits."""
+
 _PAUSE = 0.01
 """Seconds between two checks for room."""
 
@@ -45,7 +48,7 @@ class Intake:
         self.on_urgent: Callable[[], None] = lambda: None
         """Called after messages of such a stream were queued, by the thread that queued them."""
 
-    def putter(self, *streams: str) -> Callable[[Sequence[tuple[str, bytes]]], None]:
+    def putter(self, *streams: str) -> Put:
         """A function that takes messages: the key and the payload of each. Thread-safe; never waits.
 
         Each message gets the time at which it is queued. With several streams, each of them gets the message, with the
@@ -73,7 +76,7 @@ class Intake:
 
         return put
 
-    def patient_putter(self, stream: str, patience: float = 1.0) -> Callable[[Sequence[tuple[str, bytes]]], None]:
+    def patient_putter(self, stream: str, patience: float = 1.0) -> Put:
         """The same for rare messages that should not be dropped: it waits for room, at most `patience` seconds."""
         put = self.putter(stream)
         pause = threading.Event()

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from detector.engine.buffering.buffer import Buffer
 from detector.engine.buffering.clients import is_fresh
 from detector.engine.buffering.messages import Messages
-from detector.engine.buffering.possible import PossibleStreams
+from detector.engine.buffering.naming import PossibleStreams
 from detector.engine.counters import RuleCounters
 from detector.engine.samples.sample import Sample
 from wayside.expressions import UNKNOWN, Expression, Unknown, Value

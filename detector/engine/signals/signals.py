@@ -8,7 +8,7 @@ from typing import Final, cast
 from detector.engine.buffering.buffer import NEVER, Buffer, Lane
 from detector.engine.buffering.clients import Clients, is_fresh
 from detector.engine.buffering.messages import Messages
-from detector.engine.buffering.possible import PossibleStreams
+from detector.engine.buffering.naming import PossibleStreams
 from detector.engine.counters import RuleCounters
 from detector.engine.samples.sample import Sample
 from detector.engine.signals.aggregates import Timed, calculated, distinct, is_number

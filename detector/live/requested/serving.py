@@ -14,8 +14,7 @@ from detector.actions.trigger.requests import RecordingReport, RecordingRequest,
 from detector.engine.consequences.consequences import ActionRun, Consequences
 from detector.engine.engine import Engine
 from detector.engine.episodes.events import Event
-from detector.engine.episodes.identifiers import identifier
-from detector.engine.episodes.record import EpisodeRecord
+from detector.engine.episodes.record import EpisodeRecord, identifier
 from detector.live.requested.index import RecordingIndex, RequestedRecording
 from wayside.api import API_VERSION, Detector, EventRule
 from wayside.names import FLEET, parse_subject

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from detector.engine.buffering.buffer import Buffer, Lane
-from detector.engine.buffering.latched import LatchedLane, by_key
+from detector.engine.buffering.lanes import LatchedLane, by_key
 from detector.engine.samples.sample import SAMPLE_OVERHEAD, Sample, StampedSample
 from detector.replay.playing import recorded_arrivals
 from detector.replay.replaying import replay_arrivals

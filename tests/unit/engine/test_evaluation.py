@@ -11,9 +11,8 @@ from pydantic import ValidationError
 
 from detector.engine.engine import NotEvaluableError
 from detector.engine.samples.sample import Arrival
-from detector.engine.timing.schedule import highest_level, thinning
+from detector.engine.timing.schedule import CALM, LONG, Overload, highest_level, thinning
 from detector.live.evaluator import Evaluator
-from detector.live.overload import CALM, LONG, Overload
 from detector.replay.intake_file import Control
 from detector.replay.replaying import replay_intake
 from tests.driving import (

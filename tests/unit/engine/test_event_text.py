@@ -18,9 +18,8 @@ from hypothesis import strategies as st
 
 from detector.engine.episodes.episodes import EndReason
 from detector.engine.episodes.events import Event
-from detector.engine.episodes.identifiers import episode_id
 from detector.engine.episodes.plain import plain, plain_text
-from detector.engine.episodes.record import EpisodeRecord
+from detector.engine.episodes.record import EpisodeRecord, episode_id
 from tests.driving import START
 
 YEAR_1 = -62_135_596_800 * 10**9

@@ -9,10 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from detector.engine.queries.geometry import Pose, slerp, unit
-from detector.engine.queries.poses import PoseError, pose_in
-from detector.engine.queries.queries import BufferQueries
-from detector.engine.queries.tuples import matched, nearest_index
+from detector.engine.queries.geometry import Pose, PoseError, pose_in, slerp, unit
+from detector.engine.queries.queries import BufferQueries, matched, nearest_index
 from tests.driving import Drive, a_detector, a_stream, arrival, at
 
 STAMPED = {"stamp": "msg.t"}
