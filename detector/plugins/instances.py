@@ -11,6 +11,7 @@ from detector.engine.queries.queries import Queries
 from detector.engine.scoping.plugins import PluginCall, PluginFailedError
 from detector.plugins.base import Plugin, PluginParameters, PluginSubject
 from detector.plugins.entrypoints import PluginClasses, PluginError
+from wayside.expressions.numbers import as_double
 from wayside.api import Detector, EventRule
 from wayside.expressions import Reason, Value
 from wayside.rules import CompiledRule, RuleProblem
@@ -129,7 +130,6 @@ class LocalHost:
 
 
 _DEEPEST = 32
-_EXACT = 2**53
 
 
 def plain_value(value: Any, depth: int = _DEEPEST) -> Value:
@@ -141,7 +141,7 @@ def plain_value(value: Any, depth: int = _DEEPEST) -> Value:
         case None | bool() | str():
             return value
         case int():
-            return float(value) if -_EXACT <= value <= _EXACT else int(value)
+            return as_double(int(value))
         case float():
             return None if math.isnan(value) else float(value)
         case list() | tuple() if depth:

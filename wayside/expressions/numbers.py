@@ -36,6 +36,11 @@ _COUNTING_METHODS = frozenset(
 _PAIRS = {")": "(", "]": "[", "}": "{"}
 
 
+def as_double(value: int) -> float | int:
+    """The integer as a double if that is exact, otherwise unchanged."""
+    return float(value) if -MAX_EXACT <= value <= MAX_EXACT else value
+
+
 @dataclass(frozen=True, slots=True)
 class Rewritten:
     """An expression after the pass; `origin[i]` is the offset of character i in the author's text."""

@@ -89,7 +89,7 @@ class Queries(Protocol):
     def tuples(self, client: str, streams: Sequence[str], slop: int) -> list[tuple[DecodedSample, ...]]:
         """Samples of several streams that belong together, oldest first; `slop` is in nanoseconds.
 
-        The first stream is the reference; engine/queries/tuples.py explains the matching.
+        The first stream is the reference; see `matched`.
         """
 
     def transform(self, client: str, target: str, source: str, stamp: int | None = None) -> Pose:

@@ -16,7 +16,7 @@ from typing import Any
 import cbor2
 
 from detector.engine.samples.sample import DecodeError
-from detector.streams.codecs.doubles import as_double
+from wayside.expressions.numbers import as_double
 
 MAX_DEPTH = 64
 """Maximum nesting of maps, lists and tags, far from real messages: a hostile one must not exhaust the stack."""

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from detector.streams.codecs.doubles import EXACT, as_double
+from wayside.expressions.numbers import MAX_EXACT, as_double
 
 LEAST = 128
 """Minimum number of payloads with equal places: fewer are read faster one by one."""
@@ -126,7 +126,7 @@ class CdrColumns(NamedTuple):
         values = block.view(kind, begin)[rows]
         if kind.kind == "b":
             return values.astype(object)
-        if kind.kind in "iu" and kind.itemsize == 8 and ((values > EXACT) | (values < -EXACT)).any():
+        if kind.kind in "iu" and kind.itemsize == 8 and ((values > MAX_EXACT) | (values < -MAX_EXACT)).any():
             return np.fromiter(map(as_double, values.tolist()), object, len(values))
         return values.astype(np.float64)
 

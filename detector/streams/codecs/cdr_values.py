@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from detector.streams.codecs.doubles import EXACT, as_double
+from wayside.expressions.numbers import MAX_EXACT, as_double
 
 Convert = Callable[[Any], Any]
 
@@ -40,7 +40,7 @@ def _small_integers(values: np.ndarray[Any, Any]) -> list[float]:
 
 
 def _large_integers(values: np.ndarray[Any, Any]) -> list[float | int]:
-    if values.size and (int(values.max()) > EXACT or int(values.min()) < -EXACT):
+    if values.size and (int(values.max()) > MAX_EXACT or int(values.min()) < -MAX_EXACT):
         return [as_double(int(value)) for value in values]
     return list(_small_integers(values))
 

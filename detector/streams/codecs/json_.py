@@ -17,7 +17,7 @@ from typing import Any
 import msgspec
 
 from detector.engine.samples.sample import MISSING, DecodeError, FieldReader, Fields
-from detector.streams.codecs.doubles import as_double
+from wayside.expressions.numbers import as_double
 from detector.streams.codecs.paths import Path, complete, shortest, spread
 
 MAX_DEPTH = 64

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from detector.actions.episode import Outcome, OutcomeState
 from detector.actions.trigger.orders import Progress
 from detector.actions.trigger.requests import MAXIMUM_BYTES, RecordingRequest, read_request, short, write_request
-from detector.live.requested.index import RecordingIndex
+from detector.live.requested import RecordingIndex
 from wayside.api.base import Duration, PositiveDuration
 from wayside.api.recordings import OnRequest
 

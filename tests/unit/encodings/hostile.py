@@ -8,7 +8,7 @@ from random import Random
 from typing import Any
 
 from detector.engine.samples.sample import DecodeError, Decoder
-from detector.streams.codecs.doubles import EXACT
+from wayside.expressions.numbers import MAX_EXACT
 
 _LARGE = (b"\xff\xff\xff\xff", b"\xff\xff\xff\x7f", b"\x00\x00\x00\x80", b"\x7f\xff\xff\xff\xff\xff\xff\xff")
 """What makes a length or a count enormous, or negative."""
@@ -70,6 +70,6 @@ def assert_plain(value: Any) -> None:
         for item in value:
             assert_plain(item)
     elif type(value) is int:
-        assert abs(value) > EXACT
+        assert abs(value) > MAX_EXACT
     else:
         assert type(value) in (float, str, bool, bytes, type(None))

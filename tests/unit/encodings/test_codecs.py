@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 
 from detector.engine.samples.sample import Arrival, DecodeError
 from detector.streams.codecs import CborDecoder, CdrDecoder, JsonDecoder, RawDecoder, UnknownTypeError, codec_for
-from detector.streams.codecs.doubles import EXACT
 from detector.streams.codecs.json_ import MAX_DEPTH
 from tests.driving import Drive, a_detector, a_rule, at
 from tests.ros_messages import cdr, make, odometry, point_cloud, pose_stamped
 from tests.unit.encodings import hostile
 from tests.unit.encodings.hostile import assert_plain
 from wayside.api.stream import Encoding, Stream
+from wayside.expressions.numbers import MAX_EXACT
 
 MESSAGES = [pose_stamped(), odometry(), point_cloud()]
 SECOND = 1_000_000_000
@@ -63,9 +63,9 @@ def test_a_message_larger_than_the_copying_limit_reads_the_same() -> None:
     assert len(decoder(cloud).decode(cdr(cloud))["data"]) == 1_200_000
 
 
-@pytest.mark.parametrize("value", [0, EXACT, EXACT + 1, 2**63 - 1, -(2**63)])
+@pytest.mark.parametrize("value", [0, MAX_EXACT, MAX_EXACT + 1, 2**63 - 1, -(2**63)])
 def test_integers_beyond_doubles_stay_integers(value: int) -> None:
-    expected = int if abs(value) > EXACT else float
+    expected = int if abs(value) > MAX_EXACT else float
     scalar = CdrDecoder("std_msgs/msg/Int64").decode(cdr(make("std_msgs/Int64", data=value)))["data"]
     layout = make("std_msgs/MultiArrayLayout", dim=[], data_offset=0)
     array = make("std_msgs/Int64MultiArray", layout=layout, data=np.array([value, 1], np.int64))

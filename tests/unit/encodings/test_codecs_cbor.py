@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from detector.engine.samples.sample import DecodeError
 from detector.streams.codecs import CborDecoder, RawDecoder
 from detector.streams.codecs.cbor import MAX_DEPTH
-from detector.streams.codecs.doubles import EXACT
 from tests.driving import Drive, a_detector, a_rule, arrival
 from tests.unit.encodings import hostile
+from wayside.expressions.numbers import MAX_EXACT
 
 values = st.recursive(
     st.none() | st.booleans() | st.integers(-(2**70), 2**70) | st.floats(allow_nan=False) | st.text() | st.binary(),
@@ -38,7 +38,7 @@ def test_output_of_cbor2_reads_back_with_doubles(value: Any, canonical: bool, in
     ("value", "read"),
     [
         (3, 3.0),
-        (EXACT + 1, EXACT + 1),
+        (MAX_EXACT + 1, MAX_EXACT + 1),
         (-(2**64), -(2**64)),
         (2**80, 2**80),
         (Decimal("1.25"), 1.25),

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 from detector.engine.samples.sample import DecodeError
-from detector.streams.codecs.doubles import as_double
+from wayside.expressions.numbers import as_double
 from detector.streams.codecs.etsi.asn1 import Integer
 
 UNAVAILABLE = frozenset({"unavailable", "outOfRange"})
