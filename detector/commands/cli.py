@@ -109,18 +109,19 @@ def run(
     with importing():
         import asyncio
 
-        from detector.live.service import FromCluster, FromFiles, RunOptions
-        from detector.live.service import run_detector as run_service
+        from detector.live.running import RunOptions
+        from detector.live.service import FromCluster, FromFiles, run_detector
         from detector.status.server import PagesAddress
 
     pages = None if metrics_port is None else PagesAddress(metrics_port, metrics_certificates)
     if name is not None:
         holder = _holder_in_pod(name) if as_pod else name
-        source: FromFiles | FromCluster = FromCluster(name, namespace, output, holder)
+        source: FromFiles | FromCluster = FromCluster(name, namespace, holder)
     else:
         assert detector is not None  # noqa: S101  one of the two is given
-        source = FromFiles(detector, tuple(rules or ()), output or Path("out"))
-    asyncio.run(run_service(RunOptions(source, record_intake, pages, _view(foxglove))))
+        output = output or Path("out")
+        source = FromFiles(detector, tuple(rules or ()), output)
+    asyncio.run(run_detector(source, RunOptions(output, record_intake, pages, _view(foxglove))))
     leave()
 
 

@@ -63,17 +63,12 @@ class Losses:
         self._engine = engine
         self._intake = intake
         self._monotonic = monotonic
-        self._counters: list[LossCounter] = []
-        self._others: list[Callable[[], Iterable[Loss]]] = []
+        self._watched: list[Callable[[], Iterable[Loss]]] = []
         self._logged: dict[str, tuple[int, float]] = {}
 
-    def watch(self, loss_counter: LossCounter) -> None:
-        """Also report the counts of this counter."""
-        self._counters.append(loss_counter)
-
-    def watch_also(self, losses: Callable[[], Iterable[Loss]]) -> None:
+    def watch(self, losses: Callable[[], Iterable[Loss]]) -> None:
         """Also report these losses."""
-        self._others.append(losses)
+        self._watched.append(losses)
 
     def log_new(self) -> None:
         """Log each kind of loss that has increased, unless it was logged within the last minute."""
@@ -171,10 +166,7 @@ class Losses:
     def all(self) -> Iterator[Loss]:
         """Every kind of loss, including those with count 0."""
         counters, timeline = self._engine.counters, self._engine.timeline
-        for loss_counter in self._counters:
-            for entry in loss_counter.entries():
-                yield Loss(entry.text, entry.count, entry.last, cause=entry.cause.name.lower(), stream=entry.name)
-        for losses in self._others:
+        for losses in self._watched:
             yield from losses()
         if self._intake is not None:
             full = "samples dropped because the intake queue is full: more arrive than are evaluated"
@@ -215,6 +207,12 @@ class Losses:
             yield Loss(slow, rule.skipped, cause="skipped", rule=name)
             often = f"episodes of EventRule {name} suppressed beyond maxEpisodesPerHour"
             yield Loss(often, rule.suppressed, cause="suppressed", rule=name)
+
+
+def of_streams(loss_counter: LossCounter) -> Iterator[Loss]:
+    """The losses before the detector, and those of sources."""
+    for entry in loss_counter.entries():
+        yield Loss(entry.text, entry.count, entry.last, cause=entry.cause.name.lower(), stream=entry.name)
 
 
 def _line(loss: Loss, count: int) -> str:

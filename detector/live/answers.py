@@ -20,7 +20,7 @@ from detector.engine.episodes.plain import plain
 from detector.live.evaluator import Evaluator
 from detector.live.requested import RequestedRecordings
 from detector.live.sink import LiveSink
-from detector.sources.supervision import SourceThread
+from detector.sources.supervision import Sources
 from detector.status.model import (
     TASK_CHANGES,
     ActionStatus,
@@ -56,17 +56,14 @@ class Answers:
     def __init__(
         self,
         evaluator: Evaluator,
-        sink: Callable[[], LiveSink],
-        sources: Callable[[], list[SourceThread]],
+        sink: LiveSink,
+        sources: Sources,
         requested: RequestedRecordings,
-        pulse: Callable[[], float] = lambda: 0.0,
+        loop_silence: Callable[[], float],
         lease: HolderLease | None = None,
     ) -> None:
-        """`sink` returns the event sink: its network changes with the Detector, and so do the `sources`.
-
-        `pulse` returns the seconds for which the event loop has not run.
-        """
-        self._pulse = pulse
+        """`loop_silence` returns the seconds for which the event loop has not run."""
+        self._loop_silence = loop_silence
         self._evaluator = evaluator
         self._sources = sources
         self._requested = requested
@@ -91,14 +88,14 @@ class Answers:
 
     def status(self) -> Status:
         """The latest status, with the parts that the engine does not have."""
-        latest, sink = self._evaluator.status.latest, self._sink()
+        latest, sink = self._evaluator.status.latest, self._sink
         dropped = [
             Drops("event_unpublished", "events not published", sink.network.dropped_events),
             Drops("event_unwritten", "events not written to events.jsonl", sink.unwritten),
         ]
         sources = [
             SourceStatus(each.source.name, each.source.plugin, each.state.value, each.messages, each.last_error)
-            for each in self._sources()
+            for each in self._sources.threads
         ]
         actions = [
             ActionStatus(
@@ -121,7 +118,7 @@ class Answers:
 
     def healthy(self) -> tuple[bool, bytes]:
         """Whether everything runs that only a restart can repair, for /healthz."""
-        silent, hung, dead = self._evaluator.status.silence, self._pulse(), self._sink().network.dead
+        silent, hung, dead = self._evaluator.status.silence, self._loop_silence(), self._sink.network.dead
         lines = [f"the last evaluation was {silent:.1f} s ago"]
         if hung >= _SILENT:
             lines.append(f"the event loop has been blocked for {hung:.1f} s: tasks and the Lease are not updated")
@@ -135,7 +132,7 @@ class Answers:
         A listening detector is ready without connections: otherwise no Service would route to it.
         """
         well, text = self.healthy()
-        network = self._sink().network
+        network = self._sink.network
         if not network.joined:
             return False, text + b"no Zenoh session yet\n"
         if not network.listens and not network.connected:

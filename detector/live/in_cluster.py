@@ -7,18 +7,15 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable
-from pathlib import Path
 from typing import TypeVar
 
 from detector.actions.deploy.kubernetes_store import KubernetesTaskStore
 from detector.actions.deploy.lease import HolderLease
 from detector.actions.deploy.reconciler import DemandReconciler
-from detector.actions.deploy.stores import TaskStore
 from detector.actions.tracing import EpisodeTraces
-from detector.live.running import EvaluationView, Running
+from detector.live.running import Running, RunOptions
 from detector.live.state import state_file, what_was_open
 from detector.resources.kubernetes import PROGRAM, ClusterRules
-from detector.status.server import PagesAddress
 from wayside.kubernetes.connection import connect
 
 Result = TypeVar("Result")
@@ -29,12 +26,9 @@ async def run_in_cluster(
     name: str,
     namespace: str | None,
     holder: str,
-    output: Path | None,
-    record: Path | None,
+    options: RunOptions,
     stopping: asyncio.Event,
-    pages: PagesAddress | None,
     traces: EpisodeTraces | None,
-    view: EvaluationView | None = None,
 ) -> None:
     """Run the Detector of that name, and emit its tasks as the holder, until `stopping` is set.
 
@@ -49,45 +43,19 @@ async def run_in_cluster(
         async with asyncio.TaskGroup() as group:
             group.create_task(lease.run())
             try:
-                await _run_while_held(
-                    holder, output, record, stopping, rules, lease, store, reconciler, pages, traces, view
-                )
+                changes = rules.follow()
+                first = await _unless(stopping, anext(changes))
+                if first is None or await _unless(stopping, lease.held.wait()) is None:
+                    return
+                state = state_file(first.detector, holder)
+                restored = await _unless(stopping, what_was_open(store, state))
+                if restored is not None:
+                    running = Running(
+                        first, holder, reconciler, restored, options, state=state, traces=traces, lease=lease
+                    )
+                    await running.run(changes, stopping)
             finally:
                 lease.stop()
-
-
-async def _run_while_held(
-    holder: str,
-    output: Path | None,
-    record: Path | None,
-    stopping: asyncio.Event,
-    rules: ClusterRules,
-    lease: HolderLease,
-    store: TaskStore,
-    reconciler: DemandReconciler,
-    pages: PagesAddress | None,
-    traces: EpisodeTraces | None,
-    view: EvaluationView | None = None,
-) -> None:
-    changes = rules.follow()
-    first = await _unless(stopping, anext(changes))
-    if first is None or await _unless(stopping, lease.held.wait()) is None:
-        return
-    state = state_file(first.detector, holder)
-    restored = await _unless(stopping, what_was_open(store, state))
-    if restored is None:
-        return
-    async with asyncio.TaskGroup() as group:
-        group.create_task(reconciler.run())
-        try:
-            with Running(
-                first, holder, reconciler, output, record, restored, pages, state, traces, view, lease
-            ) as running:
-                following = group.create_task(running.follow(changes))
-                await running.until(stopping)
-                following.cancel()
-        finally:
-            reconciler.stop()
 
 
 async def _unless(stopping: asyncio.Event, work: Awaitable[Result]) -> Result | None:

@@ -8,7 +8,7 @@ import re
 import threading
 import time
 from collections.abc import AsyncIterator, Iterable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
@@ -19,7 +19,7 @@ from detector.actions.tracing import EpisodeTraces
 from detector.assembly import DetectorError, StreamReaders, make_engine, stream_readers
 from detector.engine.samples.intake import Intake, Put
 from detector.engine.samples.liveliness import LIVELINESS
-from detector.findings.losses import Loss
+from detector.findings.losses import Loss, of_streams
 from detector.live.answers import Answers
 from detector.live.evaluator import Evaluator, LiveObserver
 from detector.live.requested import RequestedRecordings
@@ -58,6 +58,18 @@ class EvaluationView(LiveObserver, Protocol):
         """Stop it."""
 
 
+@dataclass(frozen=True, slots=True)
+class RunOptions:
+    """What a run writes and serves."""
+
+    output: Path | None = None
+    """The folder of events.jsonl."""
+    record_intake: Path | None = None
+    pages: PagesAddress | None = None
+    """The address of /metrics, /healthz and /readyz; None: not served."""
+    view: EvaluationView | None = None
+
+
 class Running:
     """Inside the `with`, the detector's threads run."""
 
@@ -66,13 +78,11 @@ class Running:
         rule_set: RuleSet,
         holder: str,
         reconciler: DemandReconciler,
-        output: Path | None,
-        record: Path | None,
         restored: RestoredState,
-        pages: PagesAddress | None = None,
+        options: RunOptions,
+        *,
         state: StateFile | None = None,
         traces: EpisodeTraces | None = None,
-        view: EvaluationView | None = None,
         lease: HolderLease | None = None,
     ) -> None:
         """Starts nothing yet.
@@ -92,8 +102,8 @@ class Running:
         self._intake = Intake(time.time_ns)
         self._plugins = ProcessHost()
         self._engine = make_engine(detector, readers, holder=holder, start=time.time_ns(), plugins=self._plugins)
-        self._writer = None if record is None else _writer(record, detector, readers)
-        self._log = None if output is None else EventLog(output / "events.jsonl")
+        self._writer = None if options.record_intake is None else _writer(options.record_intake, detector, readers)
+        self._log = None if options.output is None else EventLog(options.output / "events.jsonl")
         self._sink = LiveSink(self._network(detector), holder, self._log, reconciler, state, traces)
         self._state = state
         self._reconciler = reconciler
@@ -105,26 +115,25 @@ class Running:
             recorder=self._writer,
             on_failure=self._fail,
             outages=self._plugins.outages,
-            observer=view,
+            observer=options.view,
         )
         requested = RequestedRecordings(self._engine, self._evaluator.call)
         self._sink.actions.outcomes.on_outcome = requested.on_outcome
-        pulse = LoopMonitor(self._loop)
-        self.answers = Answers(
-            self._evaluator, lambda: self._sink, lambda: self._sources.threads, requested, pulse.silence, lease
-        )
-        self._server = None if pages is None else _server(pages, self.answers)
-
-        self._evaluator.losses.watch(self._loss_counter)
-        self._evaluator.losses.watch_also(lambda: _of_actions(self._sink.actions.outcomes))
-        if state is not None:
-            self._evaluator.losses.watch_also(lambda: _of_state(state))
-        self._view = view
-        if view is not None:
-            self._evaluator.losses.watch_also(view.losses)
-        if traces is not None:
-            self._evaluator.losses.watch_also(lambda: _of_traces(traces))
         self._sources = Sources(self._intake.putter, self._loss_counter)
+        loop_silence = LoopMonitor(self._loop).silence
+        self.answers = Answers(self._evaluator, self._sink, self._sources, requested, loop_silence, lease)
+        self._server = None if options.pages is None else _server(options.pages, self.answers)
+        self._view = options.view
+
+        watch = self._evaluator.losses.watch
+        watch(lambda: of_streams(self._loss_counter))
+        watch(lambda: _of_actions(self._sink.actions.outcomes))
+        if state is not None:
+            watch(lambda: _of_state(state))
+        if options.view is not None:
+            watch(options.view.losses)
+        if traces is not None:
+            watch(lambda: _of_traces(traces))
 
     def __enter__(self) -> Running:
         self._evaluator.start(self._rule_set, self._restored)
@@ -163,7 +172,19 @@ class Running:
             self._writer.close()
         self._summarise()
 
-    async def until(self, stopping: asyncio.Event) -> None:
+    async def run(self, changes: AsyncIterator[RuleSet], stopping: asyncio.Event) -> None:
+        """Run, with the reconciler, and apply each change, until `stopping` is set."""
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self._reconciler.run())
+            try:
+                with self:
+                    following = group.create_task(self.follow(changes))
+                    await self._until(stopping)
+                    following.cancel()
+            finally:
+                self._reconciler.stop()
+
+    async def _until(self, stopping: asyncio.Event) -> None:
         """Wait for the end. Raises the error that ended the evaluation, if any."""
         async with asyncio.TaskGroup() as group:
             ending = group.create_task(stopping.wait())

@@ -18,17 +18,16 @@ from detector.actions.deploy.reconciler import DemandReconciler
 from detector.actions.tracing import EpisodeTraces, episode_traces
 from detector.assembly import detector_problems
 from detector.assembly.memory import tune_garbage_collection
-from detector.live.running import EvaluationView, Running
+from detector.live.running import Running, RunOptions
 from detector.live.state import state_file, what_was_open
 from detector.resources.files import follow_files, hangups, load_rules
-from detector.status.server import PagesAddress
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class FromFiles:
-    """The Detector and its rules come from files; tasks go into files."""
+    """The Detector and its rules come from files; tasks go into the folder `tasks` of the output."""
 
     detector: Path
     rules: tuple[Path, ...]
@@ -41,23 +40,11 @@ class FromCluster:
 
     name: str
     namespace: str | None
-    output: Path | None
     holder: str
     """The holder of the tasks: the name of the Detector, or `<name>.<pod>` if several pods run it."""
 
 
-@dataclass(frozen=True, slots=True)
-class RunOptions:
-    """The options of a run."""
-
-    source: FromFiles | FromCluster
-    record_intake: Path | None = None
-    pages: PagesAddress | None = None
-    """The address of /metrics, /healthz and /readyz; None: not served."""
-    view: EvaluationView | None = None
-
-
-async def run_detector(options: RunOptions) -> None:
+async def run_detector(source: FromFiles | FromCluster, options: RunOptions) -> None:
     """Run until SIGTERM or SIGINT.
 
     Raises:
@@ -70,21 +57,14 @@ async def run_detector(options: RunOptions) -> None:
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stopping.set)
     with episode_traces() as traces:
-        await _run(options, stopping, traces)
+        match source:
+            case FromFiles() as files:
+                await _run_from_files(files, options, stopping, traces)
+            case FromCluster() as named:
+                # Not at the top: the Kubernetes client takes half a second to import, and only a cluster needs it.
+                from detector.live.in_cluster import run_in_cluster  # noqa: PLC0415
 
-
-async def _run(options: RunOptions, stopping: asyncio.Event, traces: EpisodeTraces | None) -> None:
-    match options.source:
-        case FromFiles() as files:
-            await _run_from_files(files, options, stopping, traces)
-        case FromCluster() as named:
-            # Not at the top: the Kubernetes client takes half a second to import, and only a cluster needs it.
-            from detector.live.in_cluster import run_in_cluster  # noqa: PLC0415
-
-            record, pages = options.record_intake, options.pages
-            await run_in_cluster(
-                named.name, named.namespace, named.holder, named.output, record, stopping, pages, traces, options.view
-            )
+                await run_in_cluster(named.name, named.namespace, named.holder, options, stopping, traces)
 
 
 async def _run_from_files(
@@ -95,23 +75,10 @@ async def _run_from_files(
     for warning in loaded.warnings:
         _log.warning("%s", warning)
     holder = loaded.rule_set.detector.name
-    folder = files.output / "tasks"
-    store = FileTaskStore(folder, holder)
+    store = FileTaskStore(files.output / "tasks", holder)
     reconciler = DemandReconciler(store, traces=traces)
     state = state_file(loaded.rule_set.detector, holder)
     restored = await what_was_open(store, state)
-    async with asyncio.TaskGroup() as group:
-        group.create_task(reconciler.run())
-        try:
-            record, pages = options.record_intake, options.pages
-            with Running(
-                loaded.rule_set, holder, reconciler, files.output, record, restored, pages, state, traces, options.view
-            ) as running:
-                following = group.create_task(
-                    running.follow(follow_files(files.detector, files.rules, detector_problems, changed))
-                )
-                await running.until(stopping)
-                following.cancel()
-        finally:
-            reconciler.stop()
+    running = Running(loaded.rule_set, holder, reconciler, restored, options, state=state, traces=traces)
+    await running.run(follow_files(files.detector, files.rules, detector_problems, changed), stopping)
     write_tasks_yaml(files.output / "tasks.yaml", (await store.all()).values())

@@ -11,9 +11,9 @@ from detector.engine.queries.queries import Queries
 from detector.engine.scoping.plugins import PluginCall, PluginFailedError
 from detector.plugins.base import Plugin, PluginParameters, PluginSubject
 from detector.plugins.entrypoints import PluginClasses, PluginError
-from wayside.expressions.numbers import as_double
 from wayside.api import Detector, EventRule
 from wayside.expressions import Reason, Value
+from wayside.expressions.numbers import as_double
 from wayside.rules import CompiledRule, RuleProblem
 
 _GROUP = "wayside.signals"

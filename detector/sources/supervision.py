@@ -26,6 +26,9 @@ _LONGEST_PAUSE = 30.0
 _STEADY = 60.0
 """Seconds: a run of at least this duration resets the backoff."""
 
+_TIMEOUT = 2.0
+"""Seconds for which sources may take to stop."""
+
 
 class SourceState(StrEnum):
     """The state of a source."""
@@ -121,11 +124,10 @@ class SourceThread:
 class Sources:
     """The sources of a Detector, which may change."""
 
-    def __init__(self, putter: Putter, loss_counter: LossCounter, *, timeout: float = 2.0) -> None:
-        """`putter` returns the function that receives messages of streams; sources have `timeout` seconds to stop."""
+    def __init__(self, putter: Putter, loss_counter: LossCounter) -> None:
+        """`putter` returns the function that receives messages of streams."""
         self._putter = putter
         self._loss_counter = loss_counter
-        self._timeout = timeout
         self._threads: dict[str, SourceThread] = {}
 
     def follow(self, detector: Detector) -> None:
@@ -162,7 +164,7 @@ class Sources:
     def _stop(self, threads: Mapping[str, SourceThread]) -> None:
         for thread in threads.values():
             thread.request_stop()
-        deadline = time.monotonic() + self._timeout
+        deadline = time.monotonic() + _TIMEOUT
         for name, thread in threads.items():
             thread.join(max(0.0, deadline - time.monotonic()))
             del self._threads[name]

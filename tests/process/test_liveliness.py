@@ -13,7 +13,7 @@ from detector.assembly import DetectorError, stream_readers
 from detector.engine.samples import liveliness
 from detector.engine.samples.liveliness import LIVELINESS, TokenState
 from detector.engine.samples.sample import Arrival
-from detector.live.running import Running
+from detector.live.running import Running, RunOptions
 from detector.live.state import RestoredState
 from detector.replay.intake_file import read_intake
 from detector.replay.replaying import replay_intake
@@ -187,7 +187,8 @@ def test_live_and_replay_agree_on_tokens(endpoint: str, tmp_path: Path) -> None:
 
     async def live() -> None:
         reconciler = DemandReconciler(FileTaskStore(tmp_path / "tasks", "h"))
-        with Running(RuleSet(watched, (rule,)), "h", reconciler, tmp_path, tmp_path / "intake.mcap", RestoredState()):
+        options = RunOptions(tmp_path, tmp_path / "intake.mcap")
+        with Running(RuleSet(watched, (rule,)), "h", reconciler, RestoredState(), options):
             for times, reason in ((1, "ended"), (2, None)):  # the second time, the detector ends first
                 car1 = await asyncio.to_thread(vehicle, endpoint)
                 token = car1.liveliness().declare_token("alive/car1")

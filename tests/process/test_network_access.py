@@ -16,7 +16,7 @@ from detector.access.mounted import AccessError, Login, login, tls_files
 from detector.actions.deploy.file_store import FileTaskStore
 from detector.actions.deploy.reconciler import DemandReconciler
 from detector.engine.samples.liveliness import LIVELINESS, TokenState
-from detector.live.running import Running
+from detector.live.running import Running, RunOptions
 from detector.live.state import RestoredState
 from detector.resources.selection import RuleSet
 from detector.streams.session import NetworkError, open_session
@@ -241,7 +241,7 @@ def test_a_running_detector_moves_to_another_network_with_its_buffer(endpoint: s
 
     async def live() -> None:
         reconciler = DemandReconciler(FileTaskStore(tmp_path, "h"))
-        with Running(at(endpoint), "h", reconciler, None, None, RestoredState()) as running:
+        with Running(at(endpoint), "h", reconciler, RestoredState(), RunOptions()) as running:
 
             def buffered(client: str) -> bool:
                 with open_session(

@@ -17,7 +17,7 @@ from rosbags.rosbag2 import Writer as BagWriter
 from detector.assembly import make_engine, stream_readers
 from detector.assembly.checking import findings
 from detector.engine.samples.intake import Intake
-from detector.findings.losses import Losses
+from detector.findings.losses import Losses, of_streams
 from detector.replay.recordings import open_recordings
 from detector.replay.replaying import replay_arrivals
 from detector.replay.routing import MessageRouter
@@ -99,7 +99,7 @@ class Receiver:
 
     def losses(self) -> list[str]:
         losses = Losses(Drive(self.detector, MOVED).engine, self.intake)
-        losses.watch(self.loss_counter)
+        losses.watch(lambda: of_streams(self.loss_counter))
         return [*losses.report()]
 
 

@@ -15,7 +15,7 @@ from detector.actions.deploy.file_store import FileTaskStore
 from detector.actions.deploy.reconciler import DemandReconciler
 from detector.assembly import DetectorError, stream_readers
 from detector.engine.samples.intake import Intake
-from detector.live.running import Running
+from detector.live.running import Running, RunOptions
 from detector.live.state import RestoredState
 from detector.plugins import entrypoints
 from detector.resources.selection import RuleSet
@@ -209,7 +209,7 @@ def test_a_running_detector_follows_changes_of_its_sources_and_reports_their_sta
 
     async def live() -> None:
         reconciler = DemandReconciler(FileTaskStore(tmp_path, "h"))
-        with Running(RuleSet(a_detector_of(first), ()), "h", reconciler, None, None, RestoredState()) as running:
+        with Running(RuleSet(a_detector_of(first), ()), "h", reconciler, RestoredState(), RunOptions()) as running:
             await asyncio.to_thread(wait_for, lambda: states(running) == [("first", "Running", 1)])
             await running.follow(changes())
             await asyncio.to_thread(

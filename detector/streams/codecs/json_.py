@@ -17,8 +17,8 @@ from typing import Any
 import msgspec
 
 from detector.engine.samples.sample import MISSING, DecodeError, FieldReader, Fields
-from wayside.expressions.numbers import as_double
 from detector.streams.codecs.paths import Path, complete, shortest, spread
+from wayside.expressions.numbers import as_double
 
 MAX_DEPTH = 64
 """Maximum nesting of maps and lists: no real message comes near it, and a hostile one must not exhaust the stack."""

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 from detector.engine.samples.sample import DecodeError
-from wayside.expressions.numbers import as_double
 from detector.streams.codecs.etsi.asn1 import Integer
+from wayside.expressions.numbers import as_double
 
 UNAVAILABLE = frozenset({"unavailable", "outOfRange"})
 """The names of numbers and enumeration values that mean "no value"."""
