@@ -1,4 +1,4 @@
-"""The data about an episode known from its start on, and its identifier. Events, demands and actions share the record."""
+"""The data about an episode known from its start on, and its identifier. Events, demands and actions share it."""
 
 from __future__ import annotations
 
