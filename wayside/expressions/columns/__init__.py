@@ -1,13 +1,13 @@
-"""CEL expressions over columns: many rules and many rows at once, with the results that CEL gives row by row.
+"""CEL expressions over columns: evaluates many rules on many rows at once, with the same results as CEL row by row.
 
     graph, texts = Graph(), Texts()
     node = graph.add(expression, leaf)          # None: only CEL can evaluate it
     program = Program(graph, [graph.truth(node)], texts)
     results = program.run(values, tags)         # a row for each of program.leaves
 
-`values` defines columns, `nodes` the elements of a graph, `lowering` turns syntax into nodes, `program` puts
-them into steps, and `operations` runs a step. Where a row holds what columns cannot decide, such as two texts that are
-ordered, `Results.foreign` marks the row, and the caller evaluates the expression itself there.
+`values` defines columns, `nodes` the elements of a graph; `lowering` turns syntax into nodes, `program` groups them
+into steps, and `operations` runs a step. If columns cannot decide a row, such as the order of two strings,
+`Results.foreign` marks the row, and the caller evaluates the expression with CEL there.
 """
 
 from wayside.expressions.columns.lowering import Constant, Graph

@@ -1,4 +1,4 @@
-"""Finds the rows that columns cannot decide as CEL does, so that the caller evaluates them with CEL."""
+"""Finds the rows that columns cannot decide, so that the caller evaluates them with CEL."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from wayside.expressions.columns.values import Bools, Bytes, Tag
 
 Places = Mapping[int, tuple[Array, int]]
 CelRows = Mapping[int, Bools]
-"""bool[n] by the number of a check: the rows that it found, if any."""
+"""bool[n] by the number of a check: the rows that the check found, if any."""
 
 
 class CelChecks:
-    """The checks below each root of a program. Nearly always, none finds a row, and that costs next to nothing."""
+    """The checks below each root of a program. Nearly always, no check finds a row, and the cost is negligible."""
 
     def __init__(self, graph: Nodes, roots: Sequence[int], places: Places) -> None:
         self._places = places
@@ -25,9 +25,9 @@ class CelChecks:
             root: frozenset(numbers.setdefault(check, len(numbers)) for check in _checks(graph, root)) for root in roots
         }
         self._of_others: dict[int, int] = {}
-        """By the row of a leaf: the check that looks for the tag OTHER."""
+        """The checks for the tag OTHER, by the row of the leaf."""
         self._of_texts: dict[tuple[int, int], int] = {}
-        """By the rows of two leaves: the check that looks for texts in both."""
+        """The checks for strings in two leaves, by the rows of the leaves."""
         self._rest: list[tuple[int, CelCheck]] = []
         for check, number in numbers.items():
             rows = [places[node][1] for node in check.nodes]
@@ -56,7 +56,7 @@ class CelChecks:
                 yield number, found
 
     def rows(self, root: int, found: CelRows) -> Bools | None:
-        """bool[n]: the rows that the checks below the root found; None if none. Raises KeyError for other nodes."""
+        """bool[n]: the rows that the checks below the root found; None for no row. Raises KeyError for other nodes."""
         checks = self._below[root]
         rows: Bools | None = None
         for number, here in found.items():
@@ -80,7 +80,7 @@ class CelChecks:
         return None if rows[0] is None or rows[1] is None else rows[0] & rows[1]
 
     def _tags(self, node: int, frame: Frame) -> Bytes | None:
-        """The tags of a node; None: all are numbers."""
+        """The tags of a node; None: all rows are numbers."""
         source, row = self._places[node]
         if source is Array.LEAVES and not frame.tagged:
             return None

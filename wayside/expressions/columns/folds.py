@@ -1,10 +1,10 @@
-"""Loops over a list whose items are rows: each becomes a fold of a predicate, and the rest reads the folds' results.
+"""Loops over a list whose items are rows: each loop becomes a fold of a predicate; the rest reads the folds' results.
 
     members.exists(m, m.v > 1) && size(members) > 2
         →  fold0 && fold1 > 2        fold0: ANY of `m.v > 1`        fold1: COUNT of all
 
-A fold follows Kleene's logic as CEL's macros do: `exists` is unknown where no item is true and one is unknown, and
-`filter` where any item is unknown.
+A fold follows Kleene's logic, as CEL's macros do: `exists` is unknown if no item is true and one is unknown, and
+`filter` is unknown if any item is unknown.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from wayside.expressions.syntax import Call, Collection, Loop, Name, Node, Scala
 
 
 class FoldKind(enum.Enum):
-    """The result of a fold over the truths of its rows."""
+    """The kind of a fold over the booleans of its rows."""
 
     ANY = enum.auto()
     ALL = enum.auto()
     COUNT = enum.auto()
-    """How many are true."""
+    """The number of true rows."""
 
 
 class Fold(NamedTuple):
@@ -31,16 +31,16 @@ class Fold(NamedTuple):
 
     kind: FoldKind
     variable: str
-    """The name of an item in the predicate."""
+    """The variable of an item in the predicate."""
     predicate: Part | None
-    """None: true for every item."""
+    """None: the predicate is true for every item."""
 
 
 class Folded(NamedTuple):
     """An expression without its loops."""
 
     rest: Part
-    """Reads the results of the folds as variables of these names."""
+    """The expression that reads the results of the folds as variables of these names."""
     folds: dict[str, Fold]
 
 
@@ -48,7 +48,7 @@ _KINDS: Final = {FoldKind.ANY: CelType.BOOL, FoldKind.ALL: CelType.BOOL, FoldKin
 
 
 def folded(expression: Expression, items: str) -> Folded:
-    """The expression with each loop over the list `items` as a fold; loops of other kinds stay."""
+    """The expression with each loop over the list `items` replaced by a fold; other loops stay."""
     folds: dict[str, Fold] = {}
     rest = _without_loops(expression.tree, items, expression, folds)
     kinds = {**expression.kinds, **{name: _KINDS[fold.kind] for name, fold in folds.items()}}
@@ -77,11 +77,11 @@ def _without_loops(node: Node, items: str, whole: Expression, folds: dict[str, F
 
 
 _Found = tuple[FoldKind, str, Node | None, bool]
-"""How, the variable, the predicate, and whether the result is that the count is one."""
+"""The kind, the variable, the predicate, and whether the result is `count == 1`."""
 
 
 def _found(node: Node, items: str) -> _Found | None:
-    """The fold that a node is; None: it is none."""
+    """The fold that is equivalent to a node; None if there is none."""
     match node:
         case Call("double", None, (Call("size", None, (counted,)),)):
             return _count(counted, items)

@@ -1,4 +1,4 @@
-"""The memory of one run: a row of doubles or truths for each node, over n points."""
+"""The memory of one run: a row of doubles or booleans for each node, over n points."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from wayside.expressions.columns.values import Bools, Bytes, Doubles, Tag
 
 Rows = slice | NDArray[np.intp]
-"""Which rows of an array: a slice where possible, since that copies nothing."""
+"""The selected rows of an array: a slice if possible, since a slice copies nothing."""
 
 ABSENT: Final = np.uint8(Tag.ABSENT)
 NUMBER: Final = np.uint8(Tag.NUMBER)
@@ -24,7 +24,7 @@ THREE: Final = np.uint8(3)
 
 
 class Array(enum.IntEnum):
-    """The array that an operand lies in."""
+    """The array that contains an operand."""
 
     CONSTANT = 0
     LEAVES = 1
@@ -35,22 +35,22 @@ class Array(enum.IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Operand:
-    """k nodes as one operand of k operations."""
+    """The operand of k operations: k nodes."""
 
     source: Array
     rows: Rows
-    """The index in that array; for constants, the index in `values`."""
+    """The rows in that array; for constants, the rows in `values`."""
     partial: bool
-    """Whether some may be unknown even where every leaf is a number."""
+    """Whether some node may be unknown even if every leaf is a number."""
     values: Doubles
-    """float64[k, 1], of constants; otherwise empty."""
+    """float64[k, 1]: the constants; otherwise empty."""
     tags: Bytes | None
-    """uint8[k, 1], of constants that are no numbers."""
+    """uint8[k, 1]: the tags of constants that are not numbers."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sizes:
-    """How many nodes of each kind there are."""
+    """The number of nodes of each type."""
 
     numbers: int
     truths: int
@@ -62,7 +62,8 @@ class Sizes:
 
 
 class Memory:
-    """Memory for frames, used again once nothing refers to it: new pages cost more than the calculation in them."""
+    """Memory for frames. It is reused once nothing refers to it, since new pages take more time than the
+    computation."""
 
     def __init__(self) -> None:
         self._spare: list[Bytes] = []
@@ -71,10 +72,10 @@ class Memory:
         """A frame in memory that no other run uses. Thread-safe."""
         needed = sizes.bytes(values.shape[1])
         try:
-            block = self._spare.pop()  # nobody else gets it before it is in use
+            block = self._spare.pop()  # no other thread gets it before it is in use
         except IndexError:
             block = np.empty(needed, np.uint8)
-        # Every array within the block refers to it: results, and whatever a caller took out of them.
+        # Every array within the block refers to it: the results, and arrays that a caller took from them.
         if sys.getrefcount(block) > _UNUSED or not needed <= block.size <= _ROOMY * needed + _SMALL:
             block = np.empty(needed, np.uint8)
         frame = Frame(sizes, values, tags, block)
@@ -83,13 +84,14 @@ class Memory:
 
 
 _UNUSED: Final = 2
-"""References to a block that nobody uses: the variable, and the argument of `sys.getrefcount`."""
+"""The reference count of an unused block: the variable, and the argument of `sys.getrefcount`."""
 _ROOMY: Final = 4
 _SMALL: Final = 1 << 20
 
 
 class Frame:
-    """The arrays of one run. `tagged` is whether any leaf holds other values than numbers; else steps are skipped."""
+    """The arrays of one run. `tagged`: whether any leaf has values other than numbers; otherwise some work is
+    skipped."""
 
     def __init__(self, sizes: Sizes, values: Doubles, tags: Bytes | None, block: Bytes) -> None:
         n = values.shape[1]
@@ -107,20 +109,20 @@ class Frame:
 
     @cached_property
     def odd(self) -> bool:
-        """Whether any leaf holds anything but numbers and nothing."""
+        """Whether any leaf has values other than numbers and absent ones."""
         return self.tagged and bool((self.leaf_tags > NUMBER).any())
 
     def leaves_with(self, tag: Tag) -> frozenset[int]:
-        """The leaves that hold such a value in some row."""
+        """The leaves that have this tag at some point."""
         return frozenset(np.flatnonzero((self.leaf_tags == np.uint8(tag)).any(axis=1)).tolist())
 
     @cached_property
     def leaf_known(self) -> Bools:
-        """bool[leaves, n]: where a leaf is a number."""
+        """bool[leaves, n]: whether a leaf is a number."""
         return np.equal(self.leaf_tags, NUMBER)
 
     def number(self, operand: Operand) -> tuple[Doubles, Bools | None]:
-        """The operand's numbers, and where there is one; None: everywhere."""
+        """The operand's numbers, and whether there is one; None: everywhere."""
         rows = operand.rows
         match operand.source:
             case Array.LEAVES:
@@ -132,7 +134,7 @@ class Frame:
         return self.mixed[rows], self.mixed_tags[rows] == NUMBER
 
     def truth(self, operand: Operand) -> tuple[Bools, Bools]:
-        """The rows in which the operand is true, and those in which it is false."""
+        """Whether the operand is true, and whether it is false."""
         rows = operand.rows
         match operand.source:
             case Array.TRUTHS:
@@ -149,7 +151,7 @@ class Frame:
         return _truths(self.mixed[rows], self.mixed_tags[rows])
 
     def anything(self, operand: Operand) -> tuple[Doubles, Bytes | None]:
-        """The operand's values and tags; None: they are all numbers."""
+        """The operand's values and tags; None: all are numbers."""
         rows = operand.rows
         match operand.source:
             case Array.LEAVES:

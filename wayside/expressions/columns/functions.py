@@ -1,7 +1,8 @@
-"""The functions of numbers over columns, each with the very doubles that it gives CEL.
+"""The functions of numbers over columns, with exactly the doubles that they return to CEL.
 
-A few have a form in numpy that is exact: tests compare every bit. numpy's sine, cosine, arctangent and hypotenuse are
-not always those of Python, and differ between processors, so these functions run row by row, at a tenth of CEL's cost.
+A few functions have an exact form in numpy: tests compare every bit. The sine, cosine, arctangent and hypotenuse of
+numpy sometimes differ from those of Python, and between processors. So these functions run row by row, at a tenth of
+CEL's cost.
 """
 
 from __future__ import annotations
@@ -19,9 +20,9 @@ from wayside.geo.geometry import Shape
 from wayside.geo.positions import AT, positions_at
 
 Called = tuple[str, int] | tuple[str, int, Shape]
-"""A function, how many numbers it takes, and perhaps the place that it is about."""
+"""A function, the number of its arguments, and the place that it refers to, if any."""
 Answer = tuple[Doubles, Bools | None]
-"""The results, and where there is one; None: everywhere."""
+"""The results, and whether there is one; None: everywhere."""
 Vectorised = Callable[..., Answer]
 
 
@@ -34,7 +35,7 @@ def _larger(x: Doubles, y: Doubles) -> Answer:
 
 
 def _within(angle: Doubles, whole: float) -> Doubles:
-    """As Python's `%`, which leaves what lies in [0, whole) as it is; dividing takes long."""
+    """As Python's `%`. Angles in [0, whole) are unchanged, and skip the slow division."""
     beyond = ~((angle >= 0) & (angle < whole))
     found: Doubles = angle + 0.0  # -0.0 % 360.0 is 0.0
     return np.remainder(angle, whole, out=found, where=beyond) if beyond.any() else found
@@ -63,7 +64,7 @@ VECTORISED: Final[dict[tuple[str, int], Vectorised]] = {
         None,
     ),
 }
-"""By name and count of arguments. No argument is NaN where the answer counts."""
+"""The functions by name and number of arguments. Where a result is used, no argument is NaN."""
 
 
 def _scalar_functions() -> dict[tuple[str, int], Callable[..., float]]:
@@ -78,11 +79,11 @@ def _scalar_functions() -> dict[tuple[str, int], Callable[..., float]]:
 
 
 SCALAR: Final = _scalar_functions()
-"""The functions of numbers alone that yield a number, by name and count of arguments."""
+"""The functions that take only numbers and yield a number, by name and number of arguments."""
 
 
 def takes_columns(name: str, count: int) -> bool:
-    """Whether the function of that many arguments can be evaluated over columns."""
+    """Whether the function with this number of arguments can be evaluated over columns."""
     return (name, count) in SCALAR
 
 
@@ -92,9 +93,9 @@ def about_place(name: str) -> bool:
 
 
 def calculate(called: Called, given: Sequence[Doubles], wanted: Bools) -> Answer:
-    """The function's results where they are wanted, and where there is one.
+    """The function's results where `wanted` is true, and whether there is one.
 
-    The arrays given broadcast to the shape of `wanted`.
+    The given arrays are broadcast to the shape of `wanted`.
     """
     key = called[0], len(given)
     if len(called) == 3:
@@ -117,7 +118,7 @@ def calculate(called: Called, given: Sequence[Doubles], wanted: Bools) -> Answer
 
 
 def _placed(name: str, shape: Shape, given: Sequence[Doubles], wanted: Bools) -> Answer:
-    """A function of positions with regard to a place."""
+    """A function of positions relative to a place."""
     whole = [np.broadcast_to(each, wanted.shape) for each in given]
     at = positions_at(shape)
     known = wanted & at.allows(*whole)
@@ -136,7 +137,7 @@ def _row_by_row(function: Callable[..., float], arguments: Sequence[Sequence[flo
     for row, given in enumerate(zip(*arguments, strict=True)):
         try:
             answers[row] = function(*given)
-        except (ValueError, ArithmeticError):  # no answer for these: unknown
+        except (ValueError, ArithmeticError):  # no result for these arguments: unknown
             continue
         answered[row] = True
     return answers, answered

@@ -1,4 +1,4 @@
-"""Lowers the syntax tree of an expression to nodes of the graph, or refuses what only CEL can evaluate."""
+"""Lowers the syntax tree of an expression to nodes of the graph. Refuses expressions that only CEL can evaluate."""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ _ARITHMETIC: Final = {"_+_": Op.ADD, "_-_": Op.SUBTRACT, "_*_": Op.MULTIPLY, "_/
 _ORDER: Final = {"_<_": (Op.LESS, False), "_<=_": (Op.LESS_EQUAL, False)} | {
     "_>_": (Op.LESS, True), "_>=_": (Op.LESS_EQUAL, True),
 }  # fmt: skip
-"""The operation, and whether its operands change places."""
+"""The operation, and whether its operands are swapped."""
 _DECLARED: Final = {CelType.DOUBLE: Tag.NUMBER, CelType.BOOL: Tag.BOOLEAN, CelType.STRING: Tag.TEXT}
 _MOST_ELEMENTS: Final = 256
-"""Of a list after `in`: each is one comparison for each row."""
+"""The maximum length of a list after `in`: each element is one comparison per row."""
 
 
 class Constant(NamedTuple):
-    """A value that stands in place of a leaf, the same for every row."""
+    """A value instead of a leaf, the same for every row."""
 
     value: bool | float | str
 
 
 class LoweringError(Exception):
-    """The columns cannot take this expression."""
+    """The columns cannot evaluate this expression."""
 
 
 class Part(NamedTuple):
-    """A part of an expression, or one that was put together of parts."""
+    """A part of an expression, or an expression that is composed of parts."""
 
     tree: Node
     kinds: Mapping[str, CelType]
-    """Of the variables that it may read."""
+    """The types of the variables that it may read."""
     result: CelType
 
     @property
@@ -49,7 +49,7 @@ class Part(NamedTuple):
 
 
 Leaves = Callable[[Path], Hashable | Constant | None]
-"""The leaf of a path, a constant in its place, or None where the columns do not have it."""
+"""The leaf of a path, a constant instead of it, or None if there is no such column."""
 
 
 class _Lowering:
@@ -61,9 +61,9 @@ class _Lowering:
         self._names = expression.names
 
     def root(self) -> int:
-        """The node of the result, checked against the kind that the expression was compiled for.
+        """The node of the result, checked against the result type of the expression.
 
-        Raises LoweringError where there is none.
+        Raises LoweringError if there is no node.
         """
         found = self._lower(self._tree)
         holds = self._holds(found)
@@ -155,7 +155,7 @@ class _Lowering:
         found = self._named(path)
         if isinstance(found, Constant):
             return self._graph.constant(True)
-        # Bytes that the expression also orders are absent in all of it; that comparison makes their rows foreign.
+        # Bytes that the expression also compares by order are absent everywhere in it; the comparison marks their rows.
         return self._graph.node(Op.HAS, NodeType.TRUTHS, (self._graph.leaf(found),))
 
     def _number(self, node: Node) -> int:
@@ -195,7 +195,7 @@ class _Lowering:
             if not isinstance(value, bool | float | str):
                 raise LoweringError
             found.append(self._graph.node(Op.EQUAL, NodeType.TRUTHS, (what, self._constant(value))))
-        while len(found) > 1:  # as a tree, so that it is not deep
+        while len(found) > 1:  # as a balanced tree, so that it is not deep
             rest = found[len(found) & ~1 :]
             found = [
                 self._graph.node(Op.OR, NodeType.TRUTHS, pair) for pair in zip(found[::2], found[1::2], strict=False)
@@ -210,7 +210,7 @@ class _Lowering:
         return self._graph.node(Op.CHOOSE, holds, (test, first, second))
 
     def _check_not_null(self, node: Node) -> None:
-        """Refuses an item of a list: null is a value there, which a column cannot distinguish from absent."""
+        """Refuses an item of a list: it can be null, which a column cannot distinguish from an absent value."""
         match node:
             case Call("_?_:_", None, (_, a, b)):
                 self._check_not_null(a)
@@ -234,10 +234,10 @@ class Graph(Nodes):
     """Nodes that the expressions of all rules share: equal operations on equal operands are one node."""
 
     def add(self, expression: Expression | Part, leaf: Leaves) -> int | None:
-        """The node of the expression's result; None where the columns cannot take it, and the graph stays as it was.
+        """The node of the expression's result. None if the columns cannot evaluate it; the graph is then unchanged.
 
         `leaf` names each literal path that the expression reads: the same name is the same leaf for all expressions.
-        It may give a Constant in its place, or None if there is no such column.
+        It may return a Constant instead, or None if there is no such column.
         """
         before = len(self.nodes)
         try:

@@ -1,4 +1,4 @@
-"""The nodes of a graph of expressions, and which of them need CEL."""
+"""The nodes of a graph of expressions, and the checks for rows that need CEL."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from wayside.expressions.columns.values import Tag
 
 
 class NodeType(enum.Enum):
-    """The type of a node's result, as far as it is known without rows."""
+    """The static type of a node's result."""
 
     NUMBERS = enum.auto()
     TRUTHS = enum.auto()
     TEXTS = enum.auto()
     ANY = enum.auto()
-    """The tag of each row decides."""
+    """The tag of each row defines the type."""
 
 
 class Op(enum.Enum):
@@ -26,7 +26,7 @@ class Op(enum.Enum):
     LEAF = enum.auto()
     CONSTANT = enum.auto()
     EXPECT = enum.auto()
-    """The leaf itself, of which the expression declares what it holds."""
+    """A leaf whose type the expression declares."""
     ADD = enum.auto()
     SUBTRACT = enum.auto()
     MULTIPLY = enum.auto()
@@ -44,11 +44,11 @@ class Op(enum.Enum):
     CHOOSE = enum.auto()
     """`?:`."""
     NUMBER = enum.auto()
-    """The numbers of its operand; what is none is unknown."""
+    """The numbers of its operand; other values are unknown."""
     TRUTH = enum.auto()
     TEXT = enum.auto()
     NEVER = enum.auto()
-    """Unknown in every row: a truth of a value that cannot be one."""
+    """Unknown in every row: the boolean of a value that cannot be one."""
 
 
 COMMUTATIVE = frozenset({Op.ADD, Op.MULTIPLY, Op.EQUAL, Op.AND, Op.OR})
@@ -64,23 +64,23 @@ class Node:
     holds: NodeType
     operands: tuple[int, ...]
     detail: Hashable = None
-    """A leaf's name, a constant's value, the tag that is expected, a function's name, count of arguments and place."""
+    """A leaf's name, a constant's value, the expected tag, or a function's name, number of arguments and place."""
     depth: int = 0
 
 
 class Nodes:
-    """Nodes that the expressions of all rules share: equal operations on equal operands are one node."""
+    """The nodes that the expressions of all rules share: equal operations on equal operands are one node."""
 
     def __init__(self) -> None:
         self.nodes: list[Node] = []
         self._numbers: dict[Hashable, int] = {}
 
     def leaf(self, name: Hashable) -> int:
-        """The node of a leaf itself."""
+        """The node of a leaf."""
         return self.node(Op.LEAF, NodeType.ANY, detail=name)
 
     def truth(self, node: int) -> int:
-        """The node's rows as truths: a row that is no boolean is unknown."""
+        """The node's rows as booleans: a row of another type is unknown."""
         match self.nodes[node]:
             case Node(Op.CONSTANT, NodeType.TRUTHS) | Node(holds=NodeType.ANY):
                 return self.node(Op.TRUTH, NodeType.TRUTHS, (node,))
@@ -97,7 +97,7 @@ class Nodes:
         return self.node(Op.CONSTANT, NodeType.NUMBERS, detail=float(value))
 
     def node(self, op: Op, holds: NodeType, operands: Sequence[int] = (), detail: Hashable = None) -> int:
-        """The number of this node, a new one if there is none yet."""
+        """The number of this node. It is created if it does not exist."""
         operands = tuple(sorted(operands) if op in COMMUTATIVE else operands)
         named = detail.hex() if isinstance(detail, float) and op is Op.CONSTANT else detail  # 0.0 is not -0.0
         key = (op, holds, operands, named)
@@ -109,12 +109,12 @@ class Nodes:
         return found
 
     def forget(self, count: int) -> None:
-        """Keeps the first `count` nodes alone."""
+        """Removes all nodes but the first `count`."""
         del self.nodes[count:]
         self._numbers = {key: number for key, number in self._numbers.items() if number < count}
 
     def checks(self, node: int) -> tuple[CelCheck, ...]:
-        """The rows that the columns cannot decide because of this node alone."""
+        """The checks for rows that columns cannot decide because of this node."""
         here = self.nodes[node]
         if here.op is Op.EXPECT and isinstance(here.detail, Tag):
             return (CelCheck(RowsForCel.UNEXPECTED, here.operands, here.detail),)
@@ -129,24 +129,24 @@ class Nodes:
         return tuple(found)
 
     def _leaf_of(self, node: int) -> int:
-        """The leaf that an expectation is about; any other node is itself."""
+        """The leaf of an EXPECT node; any other node itself."""
         here = self.nodes[node]
         return here.operands[0] if here.op is Op.EXPECT else node
 
 
 class RowsForCel(enum.Enum):
-    """Which rows CEL has to decide."""
+    """The rows that CEL has to decide."""
 
     OTHER = enum.auto()
-    """Those with a value that is OTHER."""
+    """Those with a value whose tag is OTHER."""
     TEXTS = enum.auto()
-    """Those where both are texts: CEL orders and joins them."""
+    """Those in which both values are strings: CEL compares and concatenates them."""
     UNEXPECTED = enum.auto()
-    """Those with anything but what is declared: CEL converts some of it."""
+    """Those with a value of another type than declared: CEL converts some of these."""
 
 
 class CelCheck(NamedTuple):
-    """Rows of one or two nodes that CEL has to decide."""
+    """A check of one or two nodes for rows that CEL has to decide."""
 
     rows: RowsForCel
     nodes: tuple[int, ...]

@@ -1,6 +1,6 @@
-"""Runs one step: the same operation for k nodes over n points, written into the frame's arrays in place.
+"""Runs one step: the same operation for k nodes over n rows, written into the frame's arrays in place.
 
-A node that cannot be unknown where all leaves are numbers has no `known` and no `false` of its own in such a run.
+If all leaves are numbers, nodes that cannot be unknown then do not fill `known` and `false`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ TEXT: Final = np.uint8(Tag.TEXT)
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One call for k nodes: their operands, and where the results go."""
+    """One operation for k nodes: their operands, and the place of the results."""
 
     op: Op
     operands: tuple[Operand, ...]
@@ -32,7 +32,7 @@ class Step:
     function: Called = ("", 0)
 
     def __call__(self, frame: Frame) -> None:
-        """Runs it."""
+        """Runs the step."""
         _OPERATIONS[self.op](frame, self)
 
 
@@ -40,7 +40,7 @@ Run = Callable[[Frame, Step], None]
 
 
 def _put_known(frame: Frame, step: Step, *knowns: Bools | None) -> None:
-    """Known is what all operands are known for."""
+    """The results are known if all operands are known."""
     if not (frame.tagged or step.partial):
         return
     out = frame.known[step.out]
@@ -56,7 +56,7 @@ def _put_known(frame: Frame, step: Step, *knowns: Bools | None) -> None:
 
 
 def _put_false(frame: Frame, step: Step, known: Bools | None) -> None:
-    """Completes a comparison whose truth is in place: it holds only where known, and where it does not, it is false."""
+    """Completes a comparison whose `true` is written: it is true only if known, and false if known and not true."""
     true = frame.true[step.out]
     if known is not None:
         np.logical_and(true, known, out=true)
@@ -227,4 +227,4 @@ _OPERATIONS: Final[Mapping[Op, Run]] = {
 }
 
 UNKNOWN_OF_NUMBERS: Final = frozenset({Op.CALL, Op.NUMBER, Op.TRUTH, Op.TEXT, Op.NEVER})
-"""The operations that can be unknown where all leaves are numbers; the others are where an operand is."""
+"""The operations that can be unknown even if all leaves are numbers. The others are unknown only if an operand is."""

@@ -1,7 +1,7 @@
-"""Orders the nodes of a graph into steps, runs them over rows, and returns the results of the roots.
+"""Groups the nodes of a graph into steps, runs them over rows, and returns the results of the roots.
 
-Nodes of the same depth with the same operation are one step, whatever rule they belong to, so a run costs a few numpy
-calls for each depth and operation, however many rules and rows there are.
+Nodes of the same depth with the same operation are one step, for all rules together. So a run takes a few numpy calls
+per depth and operation, independent of the number of rules and rows.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ _TAGS: Final[dict[type, Tag]] = {bool: Tag.BOOLEAN, str: Tag.TEXT}
 
 
 class Program:
-    """The steps to some nodes of a graph, its roots. It stays as it is when the graph grows."""
+    """The steps that compute some nodes of a graph, the roots. It does not change when the graph grows."""
 
     leaves: tuple[Hashable, ...]
-    """The leaves' names, in the order of the rows that `run` takes."""
+    """The names of the leaves, in the order of the rows of the arguments of `run`."""
 
     def __init__(self, graph: Nodes, roots: Sequence[int], texts: Texts) -> None:
         self._nodes = graph.nodes
@@ -65,9 +65,9 @@ class Program:
         return Results(self, frame, self._foreign)
 
     def operand(self, roots: Sequence[int]) -> Operand:
-        """Nodes of the program that lie in one array, as one operand.
+        """Nodes of the program that are in one array, as one operand.
 
-        Raises KeyError for a node that is none of the program's, and ValueError for nodes of several arrays.
+        Raises KeyError for a node that the program does not have, and ValueError for nodes in several arrays.
         """
         key = tuple(roots)
         found = self._rows.get(key)
@@ -80,11 +80,11 @@ class Program:
         return found
 
     def partial(self, roots: Sequence[int]) -> Bools:
-        """bool[len(roots), 1]: which of the nodes may be unknown even where every leaf is a number."""
+        """bool[len(roots), 1]: whether each node may be unknown even if every leaf is a number."""
         return np.array([[self._partial[root]] for root in roots])
 
     def _is_partial(self, node: Node) -> bool:
-        """Whether the node may be unknown, or not a number where one is required, although all leaves are numbers."""
+        """Whether the node may be unknown, or of the wrong type, even if all leaves are numbers."""
         if node.op in UNKNOWN_OF_NUMBERS:
             return True
         operands = [self._nodes[each].holds for each in node.operands]
@@ -178,7 +178,7 @@ def _reachable(graph: Nodes, roots: Sequence[int]) -> set[int]:
 
 
 def _rows(rows: Sequence[int]) -> Rows:
-    """A slice where the rows lie at equal distances, or are all the same."""
+    """The rows as a slice if they have equal distances, or are all the same."""
     first = rows[0]
     if len(set(rows)) == 1:
         return slice(first, first + 1)
@@ -204,10 +204,10 @@ class Results:
         self._found: CelRows | None = None
 
     def truths(self, roots: Sequence[int]) -> tuple[Bools, Bools]:
-        """bool[len(roots), n] twice: where each root is true, and where it is false; neither: unknown.
+        """bool[len(roots), n] twice: whether each root is true, and whether it is false; neither: unknown.
 
-        The roots are those that `Graph.truth` gives. Raises KeyError for one that the program does not have, and
-        ValueError for one that is no truth.
+        The roots must be results of `Graph.truth`. Raises KeyError for a root that the program does not have, and
+        ValueError for one that is not boolean.
         """
         n = self._frame.leaves.shape[1]
         if not roots:
@@ -216,13 +216,14 @@ class Results:
         if operand.source is not Array.TRUTHS:
             raise ValueError("the roots are not boolean: use the nodes that Graph.truth returns for them")
         true, false = self._frame.truth(operand)
-        if operand.partial and not self._frame.tagged:  # nobody wrote where the others are false
+        if operand.partial and not self._frame.tagged:  # `false` is not filled for the others
             false = np.where(self._program.partial(roots), false, ~true)
         shape = (len(roots), n)
         return _spread(true, shape), _spread(false, shape)
 
     def column(self, root: int) -> Column:
-        """The values of a root; NaN, as 0/0 gives it, is absent. Of a leaf what went in, but for the others."""
+        """The values of a root. NaN, the result of 0/0, is absent. A leaf has its input, without the values tagged
+        OTHER."""
         n = self._frame.leaves.shape[1]
         several, several_tags = self._frame.anything(self._program.operand((root,)))
         values = _spread(several[0], (n,))
@@ -234,10 +235,10 @@ class Results:
         return Column(values, tags)
 
     def foreign(self, root: int) -> Bools | None:
-        """bool[n]: the rows that CEL has to decide, since the columns cannot as it does; None: no row.
+        """bool[n]: the rows that CEL has to decide, because the columns cannot; None: no row.
 
-        Those are rows where two texts are joined or ordered, or where a value that is OTHER takes part in anything but
-        `has()`, or where a variable holds another kind than its environment declares.
+        In these rows, two strings are concatenated or compared by order, a value tagged OTHER is used by anything
+        but `has()`, or a variable has another type than its environment declares.
         """
         if self._found is None:
             self._found = self._foreign.find(self._frame)

@@ -1,4 +1,4 @@
-"""The contents of a column: a double for each row, and a tag for the meaning of the double."""
+"""The contents of a column: a double for each row, and a tag that defines the meaning of the double."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ class Tag(IntEnum):
     """The type of the value in a row."""
 
     ABSENT = 0
-    """Nothing: not there, null, NaN or unknown."""
+    """No value: missing, null, NaN or unknown."""
     NUMBER = 1
     BOOLEAN = 2
     TEXT = 3
     OTHER = 4
     """A list, a map, bytes, a time, or an integer beyond 2^53."""
     UNREACHABLE = 5
-    """Nothing, and there is no map above either that could hold it: `has()` of it is unknown, not false."""
+    """No value, and no map above it that could contain one: `has()` of it is unknown, not false."""
 
 
 _, _NUMBER, _BOOLEAN, _TEXT, _OTHER, _ = map(int, Tag)
-"""As plain integers: access to members of an enum is slow in Python 3.11."""
+"""The tags as plain integers: access to members of an enum is slow in Python 3.11."""
 
 
 @final
@@ -49,13 +49,13 @@ class _Sentinel:
 
 
 MISSING: Final = _Sentinel("MISSING")
-"""In place of a value: the map that is read has no such field."""
+"""Instead of a value: the map has no such field."""
 NOWHERE: Final = _Sentinel("NOWHERE")
-"""In place of a value: what the field is read of is no map, or is absent itself."""
+"""Instead of a value: the field belongs to a value that is not a map, or is absent itself."""
 
 
 class Texts:
-    """Gives each text a code. Codes are small integers and stay the same for its life."""
+    """Assigns a code to each string. Codes are small integers, and never change in the lifetime of the object."""
 
     __slots__ = ("_codes", "_texts")
 
@@ -67,9 +67,9 @@ class Texts:
         return len(self._texts)
 
     def code(self, text: str) -> int:
-        """The code of the text; NUL in it is `␀`, as in every expression.
+        """The code of the string; NUL in it is `␀`, as in every expression.
 
-        Raises UnicodeEncodeError for a lone surrogate, which no expression takes.
+        Raises UnicodeEncodeError for a lone surrogate, which no expression supports.
         """
         found = self._codes.get(text)
         if found is None:
@@ -81,7 +81,7 @@ class Texts:
         return found
 
     def text(self, code: int) -> str:
-        """The text of a code. Raises IndexError for a code that was never given."""
+        """The string of a code. Raises IndexError for a code that was never assigned."""
         return self._texts[code]
 
 
@@ -90,17 +90,17 @@ class Column:
     """One value for each of n rows."""
 
     values: Doubles
-    """float64[n]: the number, 1.0 or 0.0 of a boolean, the code of a text, 0.0 otherwise."""
+    """float64[n]: the number, 1.0 or 0.0 for a boolean, the code of a string, or 0.0 otherwise."""
     tags: Bytes | None
     """uint8[n]: a `Tag` for each row; None: every row is a number."""
     others: Objects | None = None
-    """object[n]: the values whose tag is OTHER; None: there is none."""
+    """object[n]: the values whose tag is OTHER; None: there are none, or they are not kept."""
 
 
 def column_of(values: Sequence[object] | Doubles, texts: Texts) -> Column:
-    """The column of plain values, one a row, as decoders give them and `Expression.evaluate_or_unknown` takes them.
+    """The column of plain values, one per row, of the types that `Expression.evaluate_or_unknown` accepts.
 
-    None, NaN, UNKNOWN and MISSING are absent; NOWHERE is unreachable. Integers are doubles up to 2^53.
+    None, NaN, UNKNOWN and MISSING are absent; NOWHERE is unreachable. Integers up to 2^53 become doubles.
     """
     if isinstance(values, np.ndarray):
         return _column_of_doubles(values)
@@ -123,7 +123,7 @@ def column_of(values: Sequence[object] | Doubles, texts: Texts) -> Column:
 
 
 def _column_of_numbers(values: Sequence[object]) -> Column | None:
-    """The column of values that are nothing but doubles, small integers and None; None for others."""
+    """The column of values that are all doubles, small integers or None; None if there are other values."""
     kinds = set(map(type, values))
     if not kinds <= _NUMERIC:
         return None
@@ -177,9 +177,9 @@ def _rare_entry(value: object, texts: Texts) -> tuple[Tag, float]:
 
 
 def value_at(column: Column, row: int, texts: Texts) -> Value | Unknown:
-    """The value of a row, as `evaluate_or_unknown` gives it; UNKNOWN where the row is absent.
+    """The value of a row, as `evaluate_or_unknown` returns it; UNKNOWN if the row is absent.
 
-    Raises ValueError for a row whose tag is OTHER in a column that has no others.
+    Raises ValueError for a row whose tag is OTHER in a column without `others`.
     """
     double: float = column.values.item(row)
     tag = _NUMBER if column.tags is None else column.tags.item(row)
@@ -197,7 +197,7 @@ def value_at(column: Column, row: int, texts: Texts) -> Value | Unknown:
 
 
 def stacked(columns: Sequence[Column], size: int) -> tuple[Doubles, Bytes | None]:
-    """The values and tags of columns of this size, in the form that programs take; no tags: all are numbers."""
+    """The values and tags of columns of this size, as arguments for `Program.run`; no tags: all are numbers."""
     values = np.empty((len(columns), size))
     for at, column in enumerate(columns):
         values[at] = column.values
