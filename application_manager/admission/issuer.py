@@ -32,6 +32,7 @@ from wayside.kubernetes.connection import ConfigurationError
 from wayside.kubernetes.errors import ApiError
 from wayside.kubernetes.resources import Object, Resource
 from wayside.kubernetes.retrying import repeatedly, until_answered
+from wayside.process.files import replace_file
 from wayside.process.servingcertificate import CERTIFICATE, KEY
 
 EVERY = 10.0  # s between two checks of the Secret
@@ -155,13 +156,9 @@ def write_whole(folder: Path, files: Mapping[str, bytes]) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name, content in files.items():
-            if (folder / name).is_file() and (folder / name).read_bytes() == content:
-                continue
-            new = folder / f".{name}"
-            new.unlink(missing_ok=True)
-            new.touch(mode=0o600)
-            new.write_bytes(content)
-            new.replace(folder / name)
+            path = folder / name
+            if not path.is_file() or path.read_bytes() != content:
+                replace_file(path, content, private=True)
     except OSError as error:
         reason = error.strerror or error
         raise ConfigurationError(f"{folder}: {reason}: give a writable folder") from error

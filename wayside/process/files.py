@@ -7,7 +7,9 @@ from contextlib import suppress
 from pathlib import Path
 
 
-def replace_file(path: Path, content: bytes | str, *, draft: Path | None = None, durable: bool = False) -> None:
+def replace_file(
+    path: Path, content: bytes | str, *, draft: Path | None = None, durable: bool = False, private: bool = False
+) -> None:
     """Write the content to another file in the same folder, and rename that file when it is complete.
 
     Args:
@@ -15,6 +17,7 @@ def replace_file(path: Path, content: bytes | str, *, draft: Path | None = None,
         content: bytes, or text, which is encoded as UTF-8.
         draft: the other file; None: a hidden file, the same for every process that writes this file.
         durable: whether to sync the content to disk before the file is renamed.
+        private: whether only its owner may read it.
 
     Raises:
         OSError: the content could not be written; the file is unchanged.
@@ -22,6 +25,8 @@ def replace_file(path: Path, content: bytes | str, *, draft: Path | None = None,
     draft = draft or path.with_name(f".{path.name}.new")
     try:
         with draft.open("wb") as file:
+            if private:
+                os.fchmod(file.fileno(), 0o600)
             file.write(content.encode() if isinstance(content, str) else content)
             if durable:
                 file.flush()
