@@ -68,3 +68,8 @@ def format_seconds(seconds: float) -> str:
         ValueError: the time is outside the years 1 to 9999.
     """
     return f"{format_time(round(seconds * 1000) * 1_000_000)[:-7]}Z"
+
+
+def format_microseconds(seconds: float) -> str:
+    """The same with microseconds, as the API requires in Leases and Events."""
+    return format_seconds(seconds).replace("Z", "000Z")

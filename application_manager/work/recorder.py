@@ -30,7 +30,7 @@ from wayside.kubernetes.client import Client
 from wayside.kubernetes.errors import ApiError, Unreachable
 from wayside.kubernetes.pacing import FairQueue
 from wayside.kubernetes.resources import EVENTS
-from wayside.times import format_seconds
+from wayside.times import format_microseconds
 
 COMPONENT = "wayside.dev/application-manager"
 _WAITING = 1000  # Events of a namespace that may wait; further ones are dropped and counted
@@ -291,7 +291,7 @@ class Recorder:
         known = self._series.get(event.what)
         if known is not None and known.count > 1:
             known.written = event.now
-            series = {"count": known.count, "lastObservedTime": _microseconds(known.last)}
+            series = {"count": known.count, "lastObservedTime": format_microseconds(known.last)}
             if await self._client.merge(EVENTS, event.regarding.namespace, known.name, {"series": series}):
                 return
         manifest = self._manifest(event)
@@ -312,7 +312,7 @@ class Recorder:
                 "name": f"{regarding.name[:_NAME_LENGTH].rstrip('-.')}.{ending[:16]}",
                 "namespace": regarding.namespace,
             },
-            "eventTime": _microseconds(event.now),
+            "eventTime": format_microseconds(event.now),
             "reportingController": COMPONENT,
             "reportingInstance": self._instance,
             "action": "Reconcile",
@@ -327,11 +327,6 @@ class Recorder:
                 "uid": regarding.metadata.uid,
             },
         }
-
-
-def _microseconds(seconds: float) -> str:
-    """A time since 1970 as the API wants it, with microseconds."""
-    return format_seconds(seconds).replace("Z", "000Z")
 
 
 class TokenBuckets:

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from wayside.times import format_seconds
+from wayside.times import format_microseconds
 
 PREFIX = "wayside-"
 """The prefix of the names of all holders' Leases."""
@@ -100,9 +100,10 @@ class LeaseCandidate:
         """The Lease to write, held by this process. `time`, in seconds since the epoch, is only for people."""
         spec, metadata = dict(_spec(self._seen)), self._metadata() or {"name": name, "namespace": namespace}
         if spec.get("holderIdentity") != self.identity or "acquireTime" not in spec:
-            spec["acquireTime"] = _micro(time)
+            spec["acquireTime"] = format_microseconds(time)
             spec["leaseTransitions"] = int(spec.get("leaseTransitions") or 0) + (1 if self._seen is not None else 0)
-        spec |= {"holderIdentity": self.identity, "leaseDurationSeconds": self.duration, "renewTime": _micro(time)}
+        spec |= {"holderIdentity": self.identity, "leaseDurationSeconds": self.duration}
+        spec["renewTime"] = format_microseconds(time)
         return _lease(metadata, spec)
 
     def released(self, time: float) -> dict[str, Any] | None:
@@ -110,7 +111,7 @@ class LeaseCandidate:
         if self._seen is None or self.holder != self.identity:
             return None
         spec = {key: value for key, value in _spec(self._seen).items() if key != "holderIdentity"}
-        return _lease(self._metadata(), spec | {"renewTime": _micro(time)})
+        return _lease(self._metadata(), spec | {"renewTime": format_microseconds(time)})
 
     def took(self, stored: Mapping[str, Any], sent: float, now: float) -> None:
         """Note that the Lease that was sent at `sent` is stored."""
@@ -136,7 +137,3 @@ def _version(lease: Mapping[str, Any] | None) -> tuple[str, str]:
     """The part of the metadata that every write changes."""
     metadata = (lease or {}).get("metadata") or {}
     return metadata.get("uid", ""), metadata.get("resourceVersion", "")
-
-
-def _micro(time: float) -> str:
-    return format_seconds(time).replace("Z", "000Z")  # the API wants microseconds
