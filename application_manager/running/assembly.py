@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Awaitable, Callable, Iterable
+from functools import partial
 from typing import TYPE_CHECKING
 
 from application_manager.cache.cluster_cache import DETECTOR, INSTANCE, ClusterCache
@@ -36,7 +37,7 @@ from application_manager.work.tasks import TaskWork
 from application_manager.work.tracing import LostSpans, TaskTraces
 from application_manager.work.validating import RuleKey, RuleWork, TemplateWork
 from application_manager.workers.answers import AnswerCache
-from application_manager.workers.claiming import ClaimEvaluator
+from application_manager.workers.claiming import evaluate_claim
 from application_manager.workers.pool import Pool
 from wayside.kubernetes.client import Client
 from wayside.kubernetes.resources import Resource
@@ -132,7 +133,7 @@ class Assembly:
             self._validate,
             self._configurations.add,
         )
-        self.cache.claims.claim_of = ClaimEvaluator(self._answers, self.router.claimed)
+        self.cache.claims.claim_of = partial(evaluate_claim, self._answers, self.router.claimed)
         self.cache.claims.settled = self.router.settled
         self.cache.claims.moved = self.router.claimed
         self.cache.overlap.every = options.resync

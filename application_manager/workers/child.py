@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import os
-import pickle
 import signal
 import struct
 import sys
@@ -85,8 +84,3 @@ class Child:
             return EndedError("used up its CPU time", of_time=True)
         why = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with code {code}"
         return EndedError(why, of_time=False)
-
-
-def pickled(job: object) -> bytes:
-    """A job in the form that is sent to a process."""
-    return pickle.dumps(job, pickle.HIGHEST_PROTOCOL)

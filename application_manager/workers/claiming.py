@@ -20,36 +20,33 @@ from application_manager.workers.jobs import claims_are_plain
 from wayside.api import ApplicationTask, ApplicationTemplate
 
 
-class ClaimEvaluator:
-    """Computes claims."""
+def evaluate_claim(
+    answers: AnswerCache, done: Callable[[Name], None], template: TemplateState, task: ApplicationTask
+) -> Claim | Verdict | None:
+    """The claim of the task, or its verdict if it claims nothing; None while that is being computed.
 
-    def __init__(self, answers: AnswerCache, done: Callable[[Name], None]) -> None:
-        """`done` is called with a task once its claim is available."""
-        self._answers = answers
-        self._done = done
-
-    def __call__(self, template: TemplateState, task: ApplicationTask) -> Claim | Verdict | None:
-        """The claim of the task, or its verdict if it claims nothing; None while that is being computed."""
-        if not isinstance(template, ApplicationTemplate) or claims_are_plain(template):
-            return claim_or_verdict(template, task)
-        over = finished(task)
-        if over is not None:
-            return over
-        name = (task.namespace, task.name)
-        metadata, spec = template.metadata, task.spec
-        found = self._answers.answer(
-            key=("claim", *name),
-            question=(metadata.uid, metadata.generation, task.metadata.uid, spec.operation, spec.parameters),
-            namespace=task.namespace,
-            job=lambda: partial(claim, without_objects(template), task),
-            done=partial(self._done, name),
-        )
-        match found:
-            case Claim():
-                return replace(found, task=task)
-            case Refusal():
-                return refused(found)
-            case Exceeded(message):
-                what = f"spec.parameters: checking them against template {template.name}"
-                return Verdict(VerdictKind.REFUSED, RefusalReason.EXPRESSION_LIMIT, f"{what} {message}")
-        return None
+    `done` is called with the task once its claim is available.
+    """
+    if not isinstance(template, ApplicationTemplate) or claims_are_plain(template):
+        return claim_or_verdict(template, task)
+    over = finished(task)
+    if over is not None:
+        return over
+    name = (task.namespace, task.name)
+    metadata, spec = template.metadata, task.spec
+    found = answers.answer(
+        key=("claim", *name),
+        question=(metadata.uid, metadata.generation, task.metadata.uid, spec.operation, spec.parameters),
+        namespace=task.namespace,
+        job=lambda: partial(claim, without_objects(template), task),
+        done=partial(done, name),
+    )
+    match found:
+        case Claim():
+            return replace(found, task=task)
+        case Refusal():
+            return refused(found)
+        case Exceeded(message):
+            what = f"spec.parameters: checking them against template {template.name}"
+            return Verdict(VerdictKind.REFUSED, RefusalReason.EXPRESSION_LIMIT, f"{what} {message}")
+    return None

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Protocol, cast
 
 from application_manager.measures import Measures
-from application_manager.workers.child import Child, EndedError, pickled
+from application_manager.workers.child import Child, EndedError
 from application_manager.workers.process import FAILED, Job, Result
 
 PROCESSES = 2
@@ -82,7 +82,8 @@ class Pool:
         """The pickled result, for `unpickled`. Raises the same."""
         if self._closed:
             raise asyncio.CancelledError
-        ticket = _Ticket(namespace, pickled(job), asyncio.get_running_loop().create_future())
+        job_bytes = pickle.dumps(job, pickle.HIGHEST_PROTOCOL)
+        ticket = _Ticket(namespace, job_bytes, asyncio.get_running_loop().create_future())
         self._waiting.setdefault(namespace, deque()).append(ticket)
         self._open.add(ticket.answer)
         ticket.answer.add_done_callback(self._open.discard)

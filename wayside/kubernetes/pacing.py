@@ -55,11 +55,6 @@ class FairQueue(Generic[Item]):
 
     def next(self, may: Callable[[str], bool] = lambda _: True) -> Item | None:
         """Take the next item of the namespaces that may have a turn; None if no item of these waits."""
-        taken = self.take(may)
-        return None if taken is None else taken[1]
-
-    def take(self, may: Callable[[str], bool]) -> tuple[str, Item] | None:
-        """As `next`, with the namespace of the item."""
         for namespace, items in self._waiting.items():
             if may(namespace):
                 item = items.popleft()
@@ -67,7 +62,7 @@ class FairQueue(Generic[Item]):
                     self._waiting.move_to_end(namespace)
                 else:
                     del self._waiting[namespace]
-                return namespace, item
+                return item
         return None
 
 
@@ -115,7 +110,7 @@ class Pacing:
         self._share = share
         self._under_way = 0
         self._writing: Counter[str] = Counter()  # writes by namespace
-        self._waiting: FairQueue[asyncio.Future[None]] = FairQueue()
+        self._waiting: FairQueue[tuple[str, asyncio.Future[None]]] = FairQueue()
         self._held_until = 0.0  # on the monotonic clock
 
     @property
@@ -147,7 +142,7 @@ class Pacing:
 
     async def _place(self, namespace: str) -> None:
         place: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._waiting.add(namespace, place)
+        self._waiting.add(namespace, (namespace, place))
         self._admit()
         try:
             await place
@@ -164,7 +159,7 @@ class Pacing:
         self._admit()
 
     def _admit(self) -> None:
-        while self._under_way < self._at_once and (found := self._waiting.take(self._may)) is not None:
+        while self._under_way < self._at_once and (found := self._waiting.next(self._may)) is not None:
             namespace, place = found
             if not place.done():  # else its request was cancelled
                 self._under_way += 1

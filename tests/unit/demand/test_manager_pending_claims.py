@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 from application_manager.cache.claim_index import ClaimIndex
@@ -10,7 +11,7 @@ from application_manager.core.claims.claims import Claim, RefusalReason
 from application_manager.core.claims.operations import Verdict, VerdictKind
 from application_manager.core.demand.demand import claim_or_verdict
 from application_manager.workers.answers import Exceeded
-from application_manager.workers.claiming import ClaimEvaluator
+from application_manager.workers.claiming import evaluate_claim
 from wayside.api import ApplicationTask, ApplicationTemplate
 
 NAME = ("site", "a")
@@ -47,7 +48,7 @@ class Answers:
 
 
 def index_of(answers: Answers) -> ClaimIndex:
-    return ClaimIndex(ClaimEvaluator(answers, lambda _: None))  # type: ignore[arg-type]  it has what is used
+    return ClaimIndex(partial(evaluate_claim, answers, lambda _: None))  # type: ignore[arg-type]  it has what is used
 
 
 def test_a_key_of_plain_parameters_is_computed_inline_and_others_in_workers() -> None:
