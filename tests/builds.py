@@ -1,6 +1,6 @@
-"""All that the tests build once, side by side: `python -m tests.builds`.
+"""Builds everything that the tests need once, in parallel: `python -m tests.builds`.
 
-`make test` runs it beside lint and the unit tests, which need none of it. What takes longest starts first.
+`make test` runs it in parallel to lint and the unit tests, which need no builds. The longest build starts first.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ AT_ONCE = 2  # each compiles on all cores; a second one works while the first on
 
 
 def image() -> int:
-    """Make the layers of the project's image that last; nothing where there can be no node to run it."""
+    """Build the cached layers of the project's image, if this machine can run a node."""
     if why_no_node() is not None:
         return 0
     console = Console(stderr=True)
@@ -47,7 +47,7 @@ BUILDS: tuple[Callable[[], int], ...] = (
 
 
 def main() -> int:
-    """Provide everything; 1 where something cannot be had."""
+    """Build everything; exit code 1 if a build failed."""
     with ThreadPoolExecutor(AT_ONCE) as pool:
         return max(pool.map(lambda build: build(), BUILDS))
 

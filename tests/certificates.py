@@ -1,4 +1,4 @@
-"""Certificates for tests, made on the spot: an authority, and what it signs."""
+"""Certificates for tests: an authority and the certificates that it signs."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Authority:
     def sign(
         self, name: str, host: str = "localhost", lasting: datetime.timedelta = _DAY, folder: Path | None = None
     ) -> tuple[Path, Path]:
-        """The files of a certificate and its key, for a host and 127.0.0.1, to be used by either side."""
+        """The files of a certificate and its key, for a host and 127.0.0.1, for clients and servers."""
         key = ec.generate_private_key(ec.SECP256R1())
         builder = (
             self._builder(x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)]), key.public_key(), lasting)
@@ -55,11 +55,11 @@ class Authority:
         return files
 
     def mount(self, volume: Path, name: str, lasting: datetime.timedelta = _DAY) -> None:
-        """A new certificate of that name as a Secret's mount has it: the kubelet changes all its files at one go."""
+        """Write a new certificate as a mounted Secret: the kubelet replaces all files atomically."""
         self.change(volume, dict(zip(("tls.crt", "tls.key"), self._signed(name, lasting), strict=True)))
 
     def change(self, volume: Path, files: dict[str, bytes]) -> None:
-        """These files, and the authority's, become the content of a Secret's mount."""
+        """Replace the content of a mounted Secret by these files and the authority's."""
         new = volume / f"..{x509.random_serial_number()}"
         new.mkdir(parents=True)
         for each, content in ({"ca.crt": self.ca.read_bytes()} | files).items():

@@ -1,4 +1,4 @@
-"""What a failing test prints: the useful lines, and the path of the whole report."""
+"""Shortens the report of a failing test to the useful lines and the path of the full report."""
 
 from __future__ import annotations
 

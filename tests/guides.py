@@ -1,4 +1,4 @@
-"""The guides in docs/, and the examples in them."""
+"""The guides in docs/ and their examples."""
 
 from __future__ import annotations
 
@@ -15,5 +15,5 @@ def guide(name: str) -> str:
 
 
 def yaml_blocks(text: str) -> list[str]:
-    """What stands in the text's fenced blocks of YAML."""
+    """The contents of the text's fenced YAML blocks."""
     return re.findall(r"^```yaml\n(.*?)^```", text, re.MULTILINE | re.DOTALL)

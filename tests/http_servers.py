@@ -39,7 +39,7 @@ def answers(status: int = 200, body: bytes = b"", **headers: str) -> Behaviour:
 
 
 def sends(*pieces: bytes) -> Behaviour:
-    """These bytes, then the connection's end."""
+    """Send these bytes, then close the connection."""
 
     def send(_: Endpoint, connection: socket.socket, __: Received) -> None:
         for piece in pieces:
@@ -49,7 +49,7 @@ def sends(*pieces: bytes) -> Behaviour:
 
 
 def hangs(after: bytes = b"") -> Behaviour:
-    """These bytes, then nothing, for as long as the test lasts."""
+    """Send these bytes, then nothing until the test ends."""
 
     def hang(endpoint: Endpoint, connection: socket.socket, _: Received) -> None:
         connection.sendall(after)
@@ -59,7 +59,7 @@ def hangs(after: bytes = b"") -> Behaviour:
 
 
 def first_then(first: Behaviour, then: Behaviour) -> Behaviour:
-    """The one for the first request, the other for all that follow, however soon they come."""
+    """One behaviour for the first request, the other for all later ones."""
 
     def one_after_the_other(endpoint: Endpoint, connection: socket.socket, request: Received) -> None:
         (first if request is endpoint.requests[0] else then)(endpoint, connection, request)
@@ -78,7 +78,7 @@ def holds(until: threading.Event, then: Behaviour) -> Behaviour:
 
 
 def drips(begin: bytes, drop: bytes = b"x", every: float = 0.02) -> Behaviour:
-    """These bytes, then a drop time and again."""
+    """Send these bytes, then `drop` repeatedly."""
 
     def drip(endpoint: Endpoint, connection: socket.socket, _: Received) -> None:
         connection.sendall(begin)
@@ -185,7 +185,7 @@ def endpoint(behaviour: Behaviour | None = None, certificate: tuple[Path, Path] 
 
 @contextmanager
 def nobody() -> Iterator[str]:
-    """The URL of an endpoint at which nobody listens; its port is nobody else's meanwhile."""
+    """A URL without a listener; its port is reserved meanwhile."""
     with socket.socket() as held:
         held.bind(("127.0.0.1", 0))
         yield f"http://localhost:{held.getsockname()[1]}"

@@ -22,12 +22,12 @@ class InProcess:
     """Runs jobs."""
 
     async def run(self, namespace: str, job: Job[Result]) -> Result:
-        """What the job gives."""
+        """The result of the job."""
         return job()
 
 
 def objects(wanted: ApplicationInstance, template: TemplateState) -> Rendering | ConditionState | None:
-    """The instance's objects, or why it has none."""
+    """The instance's objects, or the reason why it has none."""
     if not isinstance(template, ApplicationTemplate):
         return drafting.without_template(wanted, template)
     found = render_instance(pickle.dumps(template), Policy(), wanted)

@@ -1,4 +1,4 @@
-"""Networks for tests: endpoints that are free, routers, and what the detector's streams took in."""
+"""Networks for tests: free endpoints, routers, and the arrivals of the detector's streams."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from wayside.api.stream import Encoding, Stream
 
 
 class Arrivals:
-    """What the streams took in, to be waited for."""
+    """The arrivals of the streams, to wait for."""
 
     def __init__(self) -> None:
         self.seen: list[tuple[str, str, bytes]] = []

@@ -1,4 +1,4 @@
-"""Notify actions at work without a host: their setting, what they report and lose, and episodes for them."""
+"""Runs notify actions without a host: settings, reports, losses, and episodes for them."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Harness:
             self.action.completed(episode, Completion())
 
     def end(self) -> None:
-        """As when the detector ends."""
+        """Close the action, as at the end of the detector."""
         self.closing.set()
         self.action.close()
 

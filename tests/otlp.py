@@ -77,7 +77,7 @@ class Receiver:
         return f"http://127.0.0.1:{self._server.server_address[1]}"
 
     def spans(self) -> list[Received]:
-        """What came so far, in the order of the spans' starts."""
+        """The spans received so far, ordered by their starts."""
         with self._lock:
             return sorted(self._spans, key=lambda each: each.start)
 

@@ -1,4 +1,4 @@
-"""A synchronous client of the API server for tests: the verbs, plainly, with JSON objects in and out.
+"""A synchronous client of the API server for tests, with plain JSON objects.
 
 The transport is that of the `kubernetes` package, which the product uses too (there asynchronously). Kinds are named as
 in manifests (`"Deployment"`, or `"Event.events.k8s.io"` where two groups have a kind of the same name), and their paths
@@ -40,8 +40,8 @@ class ApiError(Exception):
 
     Attributes:
         code: the HTTP status, e.g. 409.
-        reason: in the words of the API, e.g. `AlreadyExists`.
-        message: what a user would read.
+        reason: the reason of the Status, e.g. `AlreadyExists`.
+        message: the message for users.
     """
 
     def __init__(self, code: int, reason: str, message: str):
@@ -52,12 +52,12 @@ class ApiError(Exception):
 
 
 class Unreachable(Exception):  # noqa: N818  a state of the world that tests bring about
-    """No answer: the API server is away."""
+    """No answer: the API server is unreachable."""
 
 
 @dataclass(frozen=True)
 class Resource:
-    """Where a kind lives."""
+    """The API path of a kind."""
 
     api_version: str
     plural: str

@@ -1,4 +1,4 @@
-"""An event loop in a thread of its own, as the detector has one beside its engine; the test is the engine."""
+"""An event loop in a separate thread, like the detector's; the test takes the place of the engine."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Background:
 
 @contextmanager
 def background(kubeconfig: Path) -> Iterator[Background]:
-    """Start a loop; at the end whatever still runs in it is cancelled."""
+    """Start a loop; cancel everything that still runs in it at the end."""
     loop = asyncio.new_event_loop()
     thread = threading.Thread(target=loop.run_forever, name="background")
     thread.start()

@@ -105,7 +105,7 @@ def _find(name: str) -> Path | None:
 
 
 def _module(name: str) -> GoModule:
-    """From which module a program comes."""
+    """The Go module of a program."""
     return OLDEST if os.environ.get(VERSION) == "oldest" and name in OLDEST.packages else MODULE
 
 

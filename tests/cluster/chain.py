@@ -1,4 +1,4 @@
-"""The whole chain for a test: vehicles that stand where the test puts them, both programs, and what comes of it.
+"""The whole chain for a test: vehicles at the positions that the test sets, both programs, and the resulting objects.
 
 The rule starts an episode for two vehicles closer than 150 m and ends it beyond 200 m, so at 175 m only an episode that
 is open already keeps its demand. The template makes one Deployment for each pair.
@@ -49,7 +49,7 @@ def cdr_pose(x: float, y: float) -> bytes:
 
 
 class Vehicles:
-    """Publishes each vehicle's pose ten times a second, from where the test has put it last."""
+    """Publishes each vehicle's pose ten times a second, at the position set last."""
 
     def __init__(self, endpoint: str, encode: Callable[[float, float], bytes] = json_pose) -> None:
         self._encode = encode
@@ -62,13 +62,13 @@ class Vehicles:
         self._thread = threading.Thread(target=self._run, daemon=True)
 
     def place(self, pair: Pair, distance: float) -> None:
-        """From now on, the two are this far apart (metres)."""
+        """Set the distance between the two (metres)."""
         with self._lock:
             self._where[pair[0]] = (0.0, LANES[pair])
             self._where[pair[1]] = (distance, LANES[pair])
 
     def instead(self, vehicle: str, payload: Callable[[], bytes] | None) -> None:
-        """From now on, the vehicle sends these payloads; None: its pose again."""
+        """Let the vehicle send these payloads; None: its pose again."""
         with self._lock:
             if payload is None:
                 self._instead.pop(vehicle, None)
@@ -104,7 +104,7 @@ class Vehicles:
 
 
 class PairsNamespace:
-    """A namespace in which the demands of pairs are served, however the programs run.
+    """A namespace in which the demands of pairs are served, wherever the programs run.
 
     Attributes:
         api: for the namespace.
@@ -116,7 +116,7 @@ class PairsNamespace:
         self.patience = patience
 
     def apply(self, *manifests: Object) -> None:
-        """Apply them in the town's namespace."""
+        """Apply the manifests in the namespace."""
         for manifest in manifests:
             metadata = {**manifest["metadata"], "namespace": self.api.namespace}
             self.api.apply({**manifest, "metadata": metadata})
@@ -162,7 +162,7 @@ class PairsNamespace:
         return condition(found, type_)
 
     def settled(self) -> None:
-        """Wait until the cluster is as its live tasks demand, and nothing else is there."""
+        """Wait until the cluster has exactly the objects that its live tasks demand."""
         wait_settled(self.api, timeout=self.patience)
 
     def _wait(self, read: Callable[[], Object | None], what: str) -> Object:
@@ -184,7 +184,7 @@ class Chain(PairsNamespace):
         self.manager: Process | None = None
 
     def start(self, *options: str, rules: int = 1) -> Process:
-        """Start both programs; returns once they are at work. `options` are the detector's."""
+        """Start both programs and wait until they are ready. `options` are the detector's."""
         self.manager = start_manager(self.processes, self.namespace)
         self.detector = self.processes.start(
             "detector", "run", "--name", HOLDER, "--namespace", self.namespace, "--output", str(self.folder), *options
@@ -209,7 +209,7 @@ class Chain(PairsNamespace):
 
 
 def detector(endpoint: str, **spec: Any) -> Object:
-    """The Detector. However slowly all goes, it loses no client and ends no episode for being long unknown."""
+    """The Detector. Its long timeouts keep clients and episodes on slow machines."""
     pose = {"name": "pose", "key": "vehicles/${client:*}/pose", "encoding": "json", "staleAfter": "2s"}
     full = {
         "zenoh": {"mode": "peer", "listen": [endpoint]},
@@ -290,7 +290,7 @@ def template(*, linger: str = "1s", after: str = "10m") -> Object:
 
 
 def untouched(before: Object, after: Object | None) -> bool:
-    """Whether it is the same object, and nobody has changed its spec."""
+    """Whether it is the same object with an unchanged spec."""
     return after is not None and all(
         after["metadata"][field] == before["metadata"][field] for field in ("uid", "generation")
     )

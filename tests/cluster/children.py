@@ -1,4 +1,4 @@
-"""Child processes with a log each, which never outlive the test run.
+"""Child processes with a log each, which end with the test run at the latest.
 
 Every child has a session of its own, so a Ctrl-C in the terminal reaches only the test run, which then stops its
 children in the right order; should the test run itself be killed, the reaper kills them.
@@ -65,7 +65,7 @@ class Child:
         return self.returncode is None
 
     def signal(self, number: int) -> None:
-        """Send a signal to the process itself, not to what it started; nothing happens if it has ended."""
+        """Send a signal to the process itself, not to its children; does nothing if it has ended."""
         self._process.send_signal(number)
 
     def wait(self, timeout: float) -> int:
@@ -127,7 +127,7 @@ def log_tail(log: Path, lines: int = 40) -> str:
 
 
 def remove_afterwards(folder: Path) -> None:
-    """Have the folder removed when the test run ends, however it ends."""
+    """Remove the folder when the test run ends, even if it is killed."""
     _register(str(folder.absolute()))
 
 

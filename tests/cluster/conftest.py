@@ -92,7 +92,7 @@ def api(control_plane: ControlPlane, namespace: str) -> Api:
 
 @pytest.fixture
 def processes(control_plane: ControlPlane, namespace: str, tmp_path: Path) -> Iterator[Processes]:
-    """Starts Wayside's programs with the kubeconfig of the control plane; none outlives the test."""
+    """Starts Wayside's programs with the kubeconfig of the control plane and kills them after the test."""
     folder = tmp_path / "logs"
     folder.mkdir()
     started = Processes(folder, environment_of(control_plane.kubeconfig))

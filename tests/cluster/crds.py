@@ -1,4 +1,4 @@
-"""Installing Wayside's CRDs, and knowing that they serve."""
+"""Installs Wayside's CRDs and waits until they are served."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the manager should have made of a namespace, computed from the live objects, and the differences.
+"""The objects that the manager should have created in a namespace, computed from the live objects, and the differences.
 
 The expectation comes from `demand` and `Renderer`, called here on the live objects: whatever the manager has been
 through, after a while the world must equal this pure function of it, and nothing else may have the manager's label.
@@ -77,7 +77,7 @@ def wait_settled(
 def differences(
     api: Api, leases: Mapping[str, LeaseView], refused: Collection[str] = (), limit: int | None = None
 ) -> Iterator[str]:
-    """Where the world differs from what should be."""
+    """The differences between the existing and the expected objects."""
     templates = {raw["metadata"]["name"]: _template(raw) for raw in api.list("ApplicationTemplate")}
     tasks = [ApplicationTask.model_validate(raw) for raw in api.list("ApplicationTask")]
     instances = {
@@ -154,7 +154,7 @@ def _objects(
 
 
 def _unlike(wanted: Any, live: Any, path: str) -> Iterator[str]:
-    """The places where the live object lacks a part of the manifest; it may have more."""
+    """The fields of the manifest that the live object does not have; it may have more."""
     if isinstance(wanted, dict) and isinstance(live, dict):
         for key, value in wanted.items():
             yield from _unlike(value, live.get(key), f"{path}.{key}")

@@ -1,4 +1,4 @@
-"""A proxy before the API server that does to one program what networks and loaded servers do to it.
+"""A proxy before the API server that simulates failures of networks and loaded servers for one program.
 
 It speaks plain HTTP on loopback and hands everything on with the program's own credentials, watches included. What it
 shall do wrong is set from the test's thread at any time; what it saw is read from there.
@@ -26,7 +26,7 @@ _HOP = frozenset({"connection", "content-length", "content-encoding", "host", "k
 
 @dataclass
 class ProxiedRequest:
-    """One request: when it came, by a monotonic clock, and what was answered (0: nothing yet).
+    """One request: its monotonic time and the status of the answer (0: none yet).
 
     `refused`: by the proxy, since an API server itself may have reasons to answer the same.
     """
@@ -40,7 +40,7 @@ class ProxiedRequest:
 
 @dataclass
 class Proxy:
-    """What it shall do, and what it saw.
+    """The settings of the proxy and the requests that it has seen.
 
     Attributes:
         cut: nothing gets through: requests are left without an answer, and open watches are broken.

@@ -1,4 +1,4 @@
-"""One valid object of each kind, as a user would write it, and ways to spoil a copy."""
+"""One valid object of each kind, as a user would write it, and functions that make invalid copies."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from tests.cluster.api import Object
 
 
 class Absent:
-    """Stands for a field that is to be removed."""
+    """Marks a field to remove."""
 
     def __repr__(self) -> str:
         return "absent"

@@ -1,4 +1,4 @@
-"""Playing the kubelet: there are no nodes here, so only a test reports that a pod runs.
+"""Simulates the kubelet: there are no nodes here, so tests set the statuses of pods.
 
 `mark_pods_ready` does it once, `kubelet` does it continuously.
 """

@@ -1,4 +1,4 @@
-"""Clears up what a killed test run leaves behind.
+"""Cleans up after a killed test run.
 
 A test run that is killed cannot stop its processes any more. So one small process reads, from a pipe that only the test
 run holds, what there is: `+<pid>` a process started, `-<pid>` it ended, `/<path>` a folder to remove. When the pipe

@@ -1,4 +1,4 @@
-"""Doing something again and again beside a test, for the duration of a `with` block."""
+"""Repeats a call in a thread beside a test, for the duration of a `with` block."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A Detector of mode Sidecar, the pods that it is injected into, and what the API server shows of them."""
+"""A Detector of mode Sidecar, the pods that it is injected into, and their state at the API server."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The API server calls the manager before it stores a template, rule or detector; an outage harms nobody."""
+"""The API server calls the manager before it stores a template, rule or detector; an outage blocks no request."""
 
 from __future__ import annotations
 

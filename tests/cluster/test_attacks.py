@@ -1,4 +1,4 @@
-"""What the table of attacks in docs/security.md promises of those who write templates, tasks, rules and detectors.
+"""The promises in the table of attacks in docs/security.md about authors of templates, tasks, rules and detectors.
 
 The namespace enforces the restricted Pod Security Standard, and the manager runs under the rights that it prints.
 """
@@ -29,7 +29,7 @@ ANYTHING = {"v": {"type": "string"}, "region": {"type": "string", "required": Tr
 
 @pytest.fixture
 def attacked(api: Api, namespace: str, control_plane: ControlPlane, processes: Processes) -> Process:
-    """A manager of the namespace, under its rights and no more, with an application of somebody who means well."""
+    """A manager of the namespace with only its own rights, and an application of a well-behaved user."""
     api.patch("Namespace", namespace, {"metadata": {"labels": RESTRICTED}})
     api.create({"apiVersion": "v1", "kind": "ServiceAccount", "metadata": {"name": "manager"}})
     account = control_plane.kubeconfig_of_service_account(namespace, "manager")

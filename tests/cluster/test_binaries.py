@@ -1,4 +1,4 @@
-"""Where the programs of the control plane come from."""
+"""The sources of the programs of the control plane."""
 
 from __future__ import annotations
 

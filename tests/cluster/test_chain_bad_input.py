@@ -72,7 +72,7 @@ def unharmed(chain: Chain, vehicles: Vehicles, running: Process) -> Iterator[Non
 
 
 def in_turn(*payloads: Callable[[], bytes]) -> Callable[[], bytes]:
-    """Each of them, over and over."""
+    """Repeat the items endlessly."""
     following = cycle(payloads)
     return lambda: next(following)()  # noqa: PLW0108  the next one each time, not the first for ever
 

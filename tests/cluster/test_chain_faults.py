@@ -1,4 +1,4 @@
-"""Whatever happens to the detector or the API server: open episodes continue, and so do their demands."""
+"""Open episodes and their demands continue through failures of the detector and the API server."""
 
 from __future__ import annotations
 

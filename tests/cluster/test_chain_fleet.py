@@ -1,4 +1,4 @@
-"""Rules over the fleet whose parameters follow: what comes and goes reaches the instance, through one task each."""
+"""Rules over the fleet with `follow`: clients that appear and leave change the instance through one task each."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""docs/install.md: its values render, and what it lists is what there is."""
+"""docs/install.md: its values render, and its lists match the chart."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the chart renders from its values: detectors, options, labels, budgets; and which values it refuses."""
+"""The objects that the chart renders from its values, and the values that it rejects."""
 
 from __future__ import annotations
 

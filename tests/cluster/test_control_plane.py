@@ -1,4 +1,4 @@
-"""What these tests rely on and no other test shows: the words of failures, and pods that stay as they were marked."""
+"""Properties that these tests rely on: messages of failures, and pods that keep the status a test sets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The holder's Lease: renewed while the detector lives, and never held by two."""
+"""The holder's Lease: renewed while the detector runs, and never held by two processes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ LONG = 600  # s: a Lease that lasts longer than any wait here
 
 
 class LeaseCandidate:
-    """A process that wants the Lease, as far as the Lease is concerned."""
+    """The part of a detector process that acquires and renews the Lease."""
 
     def __init__(self, loop: Background, namespace: str, identity: ProcessIdentity, **options: Any):
         self._loop = loop

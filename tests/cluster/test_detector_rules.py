@@ -33,7 +33,7 @@ def rule(name: str, labels: dict[str, str] | None = None, **spec: Any) -> Object
 
 
 class RulesFollower:
-    """Collects each set as it comes."""
+    """Collects the sets of rules in order."""
 
     def __init__(self, loop: Background, namespace: str):
         self.sets: list[RuleSet] = []

@@ -1,4 +1,4 @@
-"""The tasks in the API server are what is demanded, whatever happens in between."""
+"""The tasks at the API server match the demands after outages, restarts and manual changes."""
 
 from __future__ import annotations
 

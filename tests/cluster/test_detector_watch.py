@@ -1,4 +1,4 @@
-"""Lists that are kept current, however the watch behind them ends."""
+"""Lists stay current, however their watch ends."""
 
 from __future__ import annotations
 

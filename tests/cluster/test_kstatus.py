@@ -1,4 +1,4 @@
-"""What kubectl, Flux, Argo CD and kstatus conclude from the statuses of all five kinds is how the objects are."""
+"""kubectl, Flux, Argo CD and kstatus derive the right state from the statuses of all five kinds."""
 
 from __future__ import annotations
 

@@ -86,7 +86,7 @@ def wait_until_announced(api: Api, *sources: str) -> Object:
 
 
 class SourcesSubscriber:
-    """What comes on a key, as sources; None for a deletion."""
+    """Collects the sources published on a key; None for a deletion."""
 
     def __init__(self, session: zenoh.Session, key: str) -> None:
         self.contents: list[list[str] | None] = []
@@ -109,7 +109,7 @@ def _sources_of(sample: zenoh.Sample) -> list[str]:
 
 
 def requested(session: zenoh.Session, key: str) -> list[list[str]]:
-    """What a late joiner gets from a query on the key."""
+    """The answer to a late joiner's query on the key."""
     return [_sources_of(reply.ok) for reply in session.get(key) if reply.ok is not None]
 
 

@@ -1,4 +1,4 @@
-"""People's annotations on instances: pause leaves one as it is, hold keeps one, and both are seen in its status."""
+"""Manual annotations on instances: pause stops changes, hold keeps an instance, and its status shows both."""
 
 from __future__ import annotations
 

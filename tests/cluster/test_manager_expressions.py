@@ -1,4 +1,4 @@
-"""Expressions that take too long cost their template, and nothing else: what runs stays, and all others are served."""
+"""An expression that takes too long affects only its template: objects stay, and other templates are served."""
 
 from __future__ import annotations
 

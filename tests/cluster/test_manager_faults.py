@@ -1,4 +1,4 @@
-"""Whatever happens to the manager, the API server or the objects: afterwards the world is what is demanded."""
+"""After failures of the manager, the API server or the objects, the cluster again matches the demands."""
 
 from __future__ import annotations
 

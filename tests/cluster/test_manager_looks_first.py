@@ -1,4 +1,4 @@
-"""Nothing is stopped without looking: what the manager knows may have holes.
+"""The manager reads from the API server before it stops anything, since its cache may be incomplete.
 
 The manager's parts run in the test itself here, since a hole in what a process knows cannot be made from outside.
 """

@@ -1,4 +1,4 @@
-"""What is too large is refused or not kept, and a manager near its memory limit takes in no more."""
+"""Objects that are too large are rejected or not cached, and a manager near its memory limit accepts no more tasks."""
 
 from __future__ import annotations
 

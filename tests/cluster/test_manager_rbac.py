@@ -1,4 +1,4 @@
-"""The manager lives on exactly the rights that `application-manager rbac` prints, and reports a missing one."""
+"""The manager needs exactly the rights that `application-manager rbac` prints, and reports a missing one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Ready means that the workload does its work; the task reports what keeps its pods from running.
+"""Ready means that the workload serves; the task reports why its pods do not run.
 
 There is no kubelet here: the test writes what one writes into the status of a pod.
 """

@@ -1,4 +1,4 @@
-"""Namespaces take turns: whatever waits in one, the others' tasks are applied, and have their statuses, in between.
+"""Namespaces take turns: a backlog in one does not delay the tasks and statuses of others.
 
 Versions give the order of writes: they grow over all objects of the cluster. Everything is there before the manager
 starts, so it is all enqueued at once, that of the small namespace last.

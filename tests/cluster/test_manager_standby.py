@@ -1,4 +1,4 @@
-"""Of two managers one acts, and the other takes over only once the first has stopped, however it stopped."""
+"""Of two managers one is active; the other takes over only after the first has stopped or lost its Lease."""
 
 from __future__ import annotations
 

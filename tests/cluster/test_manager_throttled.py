@@ -1,4 +1,4 @@
-"""A loaded API server gets no more than it can take: few requests at once, and none while it wants to be left alone."""
+"""A loaded API server gets few concurrent requests, and none before its Retry-After has passed."""
 
 from __future__ import annotations
 

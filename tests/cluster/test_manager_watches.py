@@ -1,4 +1,4 @@
-"""Watches that bring nothing any more are begun again, or end the manager; none is lost in silence."""
+"""Silent watches are restarted or end the manager; none is lost unnoticed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Processes of tests: what they write is kept, and none is left behind."""
+"""Processes of tests: their output is kept, and all are stopped."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who may hold as a sidecar: bindings follow the Detector, and each pod holds for itself alone."""
+"""Rights of sidecars: role bindings follow the Detector, and each pod may act only for itself."""
 
 from __future__ import annotations
 

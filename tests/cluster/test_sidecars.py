@@ -1,4 +1,4 @@
-"""Pods that ask for a detector get it on their way through a real API server, and are made without it in any case."""
+"""A real API server injects the detector into pods that request it, and creates pods without it on any failure."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A trace runs from the vehicle's event to the readiness of what it calls for, through both programs."""
+"""A trace covers both programs, from the vehicle's event to the readiness of its application."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What docs/tutorial.md shows is what a run prints: names that chance gives, times and ages made uniform."""
+"""docs/tutorial.md shows the output of a run, with random names, times and ages normalised."""
 
 from __future__ import annotations
 

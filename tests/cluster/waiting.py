@@ -1,4 +1,4 @@
-"""Waiting for a state of the world, and telling what it was instead."""
+"""Waits for a condition and reports the last state on a timeout."""
 
 from __future__ import annotations
 

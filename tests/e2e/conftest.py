@@ -52,7 +52,7 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
 
 
 def pods_text(node: Node, namespace: str) -> str:
-    """What there is to know about the pods of a namespace, for a message."""
+    """The state of the pods of a namespace, for messages."""
     kubectl = partial(node.plane.kubectl, "--namespace", namespace)
     reported = [kubectl("get", "pods,deployments", "-o", "wide"), kubectl("get", "events")]
     for pod in node.api(namespace).list("Pod"):

@@ -1,4 +1,4 @@
-"""Everything that a cluster has, so that what something leaves behind is seen."""
+"""An inventory of a cluster, to find leftover objects."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether this machine lets us have a node: root alone is not enough, as in a container that has no privileges."""
+"""Whether this machine can run a node: root is not enough, for instance in an unprivileged container."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a node does to a machine ends with it, however it ends."""
+"""A node's changes to the machine end with it, even if it is killed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The node of these tests does what tests rely on."""
+"""The node has the properties that the tests rely on."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a node, its programs or the API server go through: afterwards everything matches the live demands."""
+"""After failures of a node, its programs or the API server, everything matches the live demands."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ OUTAGE = 60.0
 
 @pytest.fixture
 def town(node: Node, api: Api, image: str) -> PairsOnNode:
-    """Not yet started."""
+    """The programs are not started yet."""
     return PairsOnNode(node, api, image)
 
 

@@ -1,4 +1,4 @@
-"""The Zenoh router goes and comes back while vehicles publish: all find each other again; what was lost is counted."""
+"""The Zenoh router restarts while vehicles publish: all sessions reconnect, and lost samples are counted."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A detector in others' pods, on a real node: it sees its pod's data, acts, and is no burden to the pod."""
+"""A detector as a sidecar on a real node: it sees its pod's data, acts, and does not affect the pod."""
 
 from __future__ import annotations
 

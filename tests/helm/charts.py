@@ -1,4 +1,4 @@
-"""Charts for tests, and the places that serve them: a repository over HTTP and an OCI registry, both real."""
+"""Charts for tests, and real servers for them: a repository over HTTP and an OCI registry."""
 
 from __future__ import annotations
 
@@ -145,6 +145,6 @@ def _listens(port: int) -> bool:
 
 @contextmanager
 def silence() -> Iterator[str]:
-    """A repository that takes connections and never answers; its URL."""
+    """A repository that accepts connections and never answers; its URL."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
         yield f"http://127.0.0.1:{listener.getsockname()[1]}"

@@ -1,1 +1,1 @@
-"""Tests with what a detector meets: its own processes, real Zenoh, HTTP and MQTT, a database's server, kill -9."""
+"""Tests with real processes and peers: Zenoh, HTTP, MQTT, a database server, kill -9."""

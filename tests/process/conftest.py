@@ -1,4 +1,4 @@
-"""What many of these tests stand on: a shared MongoDB server, free endpoints, an authority, an HTTP endpoint."""
+"""Shared fixtures: a MongoDB server, free endpoints, an authority, an HTTP endpoint."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A database action as its host has it, before a real server: episodes in a few words, and what came of them."""
+"""Runs a database action as its host does, against a real server: short episodes and their outcomes."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class NoMessenger:
 
 
 class Harness:
-    """One action, driven by hand."""
+    """One action, driven step by step."""
 
     def __init__(self, database: dict[str, Any], name: str, streams: Sequence[Any] = (), **parameters: Any) -> None:
         self.detector = a_detector(*(streams or (a_stream("speed"), a_stream("pose"))), database=database)
@@ -109,7 +109,7 @@ class Harness:
             return self.outcomes[name][-1] if name in self.outcomes else None
 
     def outcome(self, name: str = "e1", within: float = PATIENCE) -> Outcome:
-        """What became of the episode in the end."""
+        """The final outcome of the episode."""
 
         def final() -> bool:
             return name in self.outcomes and self.outcomes[name][-1].state is not OutcomeState.RUNNING

@@ -23,7 +23,7 @@ PASSWORD = "open sesame"
 
 
 class PasswordPlugin(BaseAuthPlugin):
-    """Lets in who knows the password, and the tests' publisher."""
+    """Accepts clients with the password, and the tests' publisher."""
 
     async def authenticate(self, *, session: Session) -> bool:
         return (session.username, session.password) == ("detector", PASSWORD) or session.client_id == "publisher"

@@ -1,4 +1,4 @@
-"""A made-up ROS 2 node that offers services over real Zenoh, as rmw_zenoh or zenoh-bridge-ros2dds would.
+"""A simulated ROS 2 node that offers services over real Zenoh, as rmw_zenoh or zenoh-bridge-ros2dds would.
 
 There is no ROS 2 here. It reads requests and writes responses with rosbags, keeps to what rmw_zenoh's servers ask for
 (one declares its queryable as complete; a query without payload or attachment is not answered; a number that is still

@@ -25,7 +25,7 @@ from wayside.api.zenoh import Zenoh, ZenohMode
 
 
 class Process:
-    """`detector run` with files of its own, and a vehicle that is connected to it."""
+    """`detector run` with its own files, and a vehicle that is connected to it."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder

@@ -1,4 +1,4 @@
-"""The example action is installed as a user would, and at work in a real detector over real Zenoh."""
+"""The example action is installed like a user's package and runs in a real detector over real Zenoh."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ def network(arrivals: Arrivals, *streams: Any, **config: Any) -> Iterator[Networ
 
 
 class Traffic:
-    """Vehicles that number what they send."""
+    """Vehicles with numbered samples."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self._session = session

@@ -1,4 +1,4 @@
-"""The database action writes each sample of an episode once, and calls complete only what is."""
+"""The database action writes each sample of an episode once, and marks only complete scenarios as complete."""
 
 from __future__ import annotations
 

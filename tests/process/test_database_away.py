@@ -27,7 +27,7 @@ PADDING = "x" * 12_000
 
 
 class RecordingDetector(Process):
-    """A detector that writes each bout to a database and to a recording."""
+    """A detector that writes each episode to a database and to a recording."""
 
     def __init__(self, folder: Path, database: Any, spool: str) -> None:
         folder.mkdir()

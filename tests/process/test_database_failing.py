@@ -1,4 +1,4 @@
-"""The database action while its server is away, hangs or refuses: it counts each loss and writes nothing twice."""
+"""The database action with an unreachable, hanging or rejecting server counts each loss and writes nothing twice."""
 
 from __future__ import annotations
 

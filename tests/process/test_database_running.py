@@ -1,4 +1,4 @@
-"""`detector run` with a database: it has what the recording has; after kill -9 nothing looks complete that is not."""
+"""`detector run` with a database: it has the recording's samples; after kill -9 no incomplete scenario is complete."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The example package is installed as a user would, checked, tested with the kit, and run by the commands."""
+"""The example package is installed like a user's, checked, tested with the kit, and run by the commands."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The reported health of real detector processes in which something fails."""
+"""The reported health of real detector processes with injected faults."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The intake: one order for all streams and producers, and never a wait."""
+"""The intake: one order for all streams and producers, without blocking."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The live view of a running detector, seen by a client that is not the SDK's own."""
+"""The live view of a running detector, seen by an independent client."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A client with a liveliness token is there, and lost when the token is; live over Zenoh, and the same in a replay."""
+"""A client is known while its liveliness token exists, live over Zenoh and in a replay."""
 
 import asyncio
 from collections.abc import Iterator

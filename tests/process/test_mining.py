@@ -1,4 +1,4 @@
-"""`detector mine`: one dataset from many recordings, whatever happens to the processes that work on it."""
+"""`detector mine`: one dataset from many recordings, even if worker processes are killed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The mqtt source over a real broker: topics become keys, and a broker that goes and comes is followed."""
+"""The mqtt source over a real broker: topics become keys, and the source reconnects to a restarted broker."""
 
 import itertools
 import time

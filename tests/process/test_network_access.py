@@ -1,4 +1,4 @@
-"""The detector enters networks that are guarded: TLS, certificates on both sides, passwords; and shares memory."""
+"""The detector in protected networks: TLS, mutual TLS, passwords; and shared memory."""
 
 import asyncio
 import re

@@ -1,4 +1,4 @@
-"""Alerts: they fire at the start, are repeated before they lapse, are resolved at the end, and keep their labels."""
+"""Alerts fire at the start, are repeated before they expire, are resolved at the end, and keep their labels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Notifications over HTTP and Zenoh: what arrives, what is tried again, and what becomes of what nobody takes."""
+"""Notifications over HTTP and Zenoh: delivery, retries, and dead letters."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The journal and the dead letters: what a kill leaves, what cannot be read, and how big they get."""
+"""The journal and the dead letters: recovery after a kill, unreadable entries, and bounds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A plugin at work in a running detector: it starts, is killed and started again; the replay gives the same events."""
+"""A plugin in a running detector is killed and restarted; the replay gives the same events."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Plugins in separate processes: the same values, and one that hangs or dies is stopped while others continue."""
+"""Plugins in separate processes give the same values; one that hangs or dies is stopped while others continue."""
 
 from __future__ import annotations
 

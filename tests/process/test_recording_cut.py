@@ -1,4 +1,4 @@
-"""Recordings that do not come to their end: a killed process, a full disk, a disk that fails."""
+"""Truncated recordings: a killed process, a full disk, a failing disk."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ time.sleep(60)
 
 
 def recovered(path: Path) -> Bench:
-    """A new start, which has done what it does about what is left behind."""
+    """A restarted action that has recovered unfinished recordings."""
     bench = Bench(path)
     bench.action.wake()
     for thread in threading.enumerate():

@@ -166,7 +166,7 @@ class ControlPlane:
         self._api_server = None
 
     def recover(self) -> None:
-        """Start what a failed test left stopped or dead, so that the next test is not its victim."""
+        """Restart programs that a failed test left stopped, so that the next test is not affected."""
         if self._api_server is None or not self._api_server.alive:
             self.start_api_server()
         if self._controller_manager is None or not self._controller_manager.alive:

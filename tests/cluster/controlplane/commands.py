@@ -11,7 +11,7 @@ from tests.cluster.controlplane.site import LOOPBACK, Site
 
 @dataclass(frozen=True)
 class Setup:
-    """All that the command lines depend on."""
+    """The inputs of the command lines."""
 
     binaries: Binaries
     folder: Path
@@ -32,7 +32,7 @@ class Setup:
 
     @property
     def tokens(self) -> Path:
-        """Who may come: `token,user,uid,"group,…"` a line."""
+        """The accepted tokens: `token,user,uid,"group,…"` a line."""
         return self.folder / "tokens.csv"
 
     @property

@@ -10,7 +10,7 @@ import yaml
 
 
 def new_token() -> str:
-    """Return a bearer token that nobody can guess."""
+    """Return a random bearer token."""
     return secrets.token_urlsafe(32)
 
 

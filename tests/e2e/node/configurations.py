@@ -1,4 +1,4 @@
-"""What the programs of a node are configured with."""
+"""The configurations of a node's programs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The namespaces that a node lives in: mounts, network and processes of its own.
+"""The Linux namespaces of a node, with separate mounts, network and processes.
 
 Everything that a node does to a machine (network interfaces, iptables rules, mounts, daemons that outlive their parent)
 happens inside, so it neither meets what else runs on the machine nor stays: the kernel removes it all when the first
