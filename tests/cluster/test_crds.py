@@ -124,6 +124,11 @@ class TestApplicationTask:
             with pytest.raises(ApiError, match=r"spec\.endTime: Forbidden: is immutable once set: create another task"):
                 api.replace(changed(ended, {"spec.endTime": value}))
 
+    def test_a_task_can_end_whatever_its_event_recorded(self, api: Api) -> None:
+        stored = api.create(changed(APPLICATION_TASK, {"spec.event.values.gone": None}))
+        ended = api.replace(changed(stored, {"spec.endTime": TIME}))
+        assert ended["spec"]["event"] == stored["spec"]["event"]
+
     def test_a_manually_created_task_needs_only_a_template(self, api: Api) -> None:
         stored = api.create(changed(APPLICATION_TASK, {"spec": {"templateName": "scene-fusion"}}))
         assert stored["spec"]["priority"] == 0

@@ -146,19 +146,10 @@ class ApplicationTask(Kind):
         ".spec.requester.detectorName",
         ".status.instanceName",
     ]
-    # CEL does not see event.values, whose items may be of any type.
     object_validations: ClassVar[list[JsonDict]] = [
         validation(
             "has(self.spec.event) == has(oldSelf.spec.event)"
-            " && (!has(self.spec.event) || (self.spec.event.id == oldSelf.spec.event.id"
-            " && self.spec.event.rule == oldSelf.spec.event.rule"
-            " && self.spec.event.action == oldSelf.spec.event.action"
-            " && self.spec.event.subject == oldSelf.spec.event.subject"
-            " && self.spec.event.onsetTime == oldSelf.spec.event.onsetTime"
-            " && self.spec.event.startTime == oldSelf.spec.event.startTime"
-            " && has(self.spec.event.classification) == has(oldSelf.spec.event.classification)"
-            " && (!has(self.spec.event.classification)"
-            " || self.spec.event.classification == oldSelf.spec.event.classification)))",
+            " && (!has(self.spec.event) || self.spec.event == oldSelf.spec.event)",
             _IMMUTABLE,
             ".spec.event",
             "Forbidden",
