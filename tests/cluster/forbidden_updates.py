@@ -22,6 +22,7 @@ UPDATES: list[tuple[str, Changes, str]] = [
     ("ApplicationTask", {"spec.requester": ABSENT}, rf"spec\.requester: {_TASK}"),
     ("ApplicationTask", {"spec.event": ABSENT}, rf"spec\.event: {_TASK}"),
     ("ApplicationTask", {"spec.event.startTime": TIME}, rf"spec\.event: {_TASK}"),
+    ("ApplicationTask", {"spec.event.onsetTime": "2026-01-02T03:04:05.000000002Z"}, rf"spec\.event: {_TASK}"),
     ("ApplicationTask", {"spec.event.values": ABSENT}, rf"spec\.event: {_TASK}"),
     ("ApplicationTask", {"spec.event.values.speed": 1}, rf"spec\.event: {_TASK}"),
     ("ApplicationTask", {"spec.event.values.nested": {"a": [1, {"b": 3}]}}, rf"spec\.event: {_TASK}"),

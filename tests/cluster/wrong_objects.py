@@ -344,6 +344,12 @@ WRONG: list[tuple[str, str, Changes, str]] = [
         {"spec.event.startTime": "yesterday"},
         r"spec\.event\.startTime: .*should match",
     ),
+    (
+        "ApplicationTask",
+        "an end on a day that does not exist",
+        {"spec.endTime": "2026-02-30T25:00:00Z"},
+        r"spec\.endTime: .*must be of type date-time",
+    ),
     ("ApplicationTask", "a priority beyond bounds", {"spec.priority": 2_000_000}, r"spec\.priority: .*1e\+06|1000000"),
     (
         "ApplicationTask",

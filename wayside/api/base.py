@@ -23,6 +23,7 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, core_schema
 
 from wayside.api.constraints import Constraint
+from wayside.times import parse_time
 
 GROUP = "wayside.dev"
 VERSION = "v1alpha1"
@@ -220,12 +221,20 @@ Key = Annotated[str, Field(min_length=1, max_length=512), AfterValidator(lambda 
 Identifier = Annotated[str, Field(min_length=1, max_length=63, pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
 """A name that expressions can use as a variable."""
 
+
+def _checked_time(text: str) -> str:
+    parse_time(text)
+    return text
+
+
 Time = Annotated[
     str,
     Field(
         max_length=40,
+        json_schema_extra={"format": "date-time"},
         pattern=r"^[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}(\.[0-9]{1,9})?(Z|[+-][0-9]{2}:[0-9]{2})$",
     ),
+    AfterValidator(_checked_time),
 ]
 """An RFC 3339 time, with up to nanoseconds."""
 

@@ -21,7 +21,7 @@ from wayside.api import API_VERSION, GROUP, KINDS
 from wayside.api.base import LABEL, VERSION, Kind, Model
 
 _KEPT = {
-    "type", "description", "pattern", "minLength", "maxLength", "minimum", "maximum", "exclusiveMinimum",
+    "type", "format", "description", "pattern", "minLength", "maxLength", "minimum", "maximum", "exclusiveMinimum",
     "minItems", "maxItems", "minProperties", "maxProperties", "enum", "default", "required", "nullable",
 }  # fmt: skip
 

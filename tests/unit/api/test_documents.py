@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,13 @@ def problems(tmp_path: Path, text: str | bytes) -> list[str]:
         load_documents([file])
     assert str(caught.value) == "\n".join(map(str, caught.value.problems))
     return [str(problem).removeprefix(f"{tmp_path}/") for problem in caught.value.problems]
+
+
+@pytest.mark.parametrize("time", ["2026-02-30T00:00:00Z", "2026-01-01T25:00:00Z", "2026-13-01T00:00:00+01:00"])
+def test_a_time_that_does_not_exist_is_rejected(time: str) -> None:
+    raw = {"apiVersion": "wayside.dev/v1alpha1", "kind": "ApplicationTask", "metadata": {"name": "t"}}
+    with pytest.raises(ValueError, match=rf"^spec\.endTime: must be a time; got '{re.escape(time)}'"):
+        parse_object(raw | {"spec": {"templateName": "app", "endTime": time}})
 
 
 @pytest.mark.parametrize("name", ["a.b", "A", "-a", "a" * 64])
