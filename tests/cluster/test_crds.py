@@ -207,6 +207,12 @@ class TestServerSideApply:
             assert "'f:vehicles'" not in fields
             assert "'f:nested'" not in fields
 
+    def test_a_selector_is_replaced_as_a_whole(self, api: Api) -> None:
+        for manager, labels in (("one", {"site": "north"}), ("two", {"tier": "edge"})):
+            selecting = changed(DETECTOR, {"spec.ruleSelector": {"matchLabels": labels}})
+            stored = api.apply(selecting, field_manager=manager)
+        assert stored["spec"]["ruleSelector"]["matchLabels"] == {"tier": "edge"}
+
     def test_applying_an_unchanged_object_changes_nothing(self, api: Api) -> None:
         for kind, manifest in VALID.items():
             name = api.apply(manifest)["metadata"]["name"]

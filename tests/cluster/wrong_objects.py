@@ -47,6 +47,12 @@ WRONG: list[tuple[str, str, Changes, str]] = [
         {"spec.each": {"as": "site", "of": [{"name": "n"}, {"name": "n", "x": 1}]}},
         r'spec\.each\.of\[1\]: Duplicate value: .*"n"',
     ),
+    (
+        "EventRule",
+        "an element of too many fields",
+        {"spec.each": {"as": "site", "of": [{"name": "n", **{f"f{each}": 1 for each in range(64)}}]}},
+        r"spec\.each\.of\[0\]: Too many: 65: must have at most 64 items",
+    ),
     ("EventRule", "no element", {"spec.each": {"as": "site", "of": []}}, r"spec\.each\.of: .*at least 1 items"),
     ("EventRule", "no condition", {"spec.when": ABSENT}, r"spec\.when: Required value"),
     ("EventRule", "an empty condition", {"spec.when": ""}, r"spec\.when: .*at least 1 chars"),

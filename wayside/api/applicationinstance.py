@@ -11,6 +11,7 @@ from pydantic.config import JsonDict
 from wayside.api.base import (
     ATOMIC_LIST,
     Conditions,
+    Count,
     Identifier,
     Kind,
     Model,
@@ -75,7 +76,7 @@ class SuspendedReplicas(Model):
 class Demands(Model):
     """The live tasks that the instance serves."""
 
-    count: int = 0
+    count: Count = 0
     """The number of live tasks."""
     names: list[Annotated[str, Field(max_length=253)]] = Field(
         default_factory=list, max_length=20, json_schema_extra=ATOMIC_LIST
@@ -101,7 +102,7 @@ class ApplicationInstanceStatus(Model):
     """A one-word summary of the state."""
     message: str | None = Field(default=None, max_length=512)
     """Why the instance is waiting or is being kept. Absent in normal operation."""
-    observed_generation: int = 0
+    observed_generation: Count = 0
     """The metadata.generation that the status was computed from."""
     spec_hash: str | None = Field(default=None, max_length=64)
     """The digest of the manifests at the last complete apply."""

@@ -12,6 +12,7 @@ from wayside.api.base import (
     ATOMIC_LIST,
     SUBDOMAIN,
     Conditions,
+    Count,
     Identifier,
     Kind,
     Model,
@@ -113,7 +114,7 @@ class ApplicationTaskStatus(Model):
     """The name of the ApplicationInstance that serves the task."""
     message: str | None = Field(default=None, max_length=512)
     """Why the task is waiting or does not count. Absent in normal operation."""
-    observed_generation: int = 0
+    observed_generation: Count = 0
     """The metadata.generation that the status was computed from."""
     applied_time: Time | None = None
     """The time at which the task's values were first applied to the instance."""

@@ -11,6 +11,7 @@ from pydantic.config import JsonDict
 from wayside.api.base import (
     ATOMIC_LIST,
     Conditions,
+    Count,
     Duration,
     Expression,
     Identifier,
@@ -84,7 +85,9 @@ class Baseline(Model):
     they count as the values of a task of the lowest priority."""
 
 
-Manifest = Annotated[dict[str, Any], Field(json_schema_extra={"x-kubernetes-preserve-unknown-fields": True})]
+Manifest = Annotated[
+    dict[str, Any], Field(max_length=64, json_schema_extra={"x-kubernetes-preserve-unknown-fields": True})
+]
 
 
 FileName = Annotated[str, Field(min_length=1, max_length=253, pattern=r"^[-._a-zA-Z0-9]+$")]
@@ -128,7 +131,7 @@ class Helm(Model):
     repository: str | None = Field(default=None, max_length=512, pattern=r"^https?://[^ ]+$")
     """The URL of the chart repository. Only for a chart given by name."""
     values: dict[str, Any] = Field(
-        default_factory=dict, json_schema_extra={"x-kubernetes-preserve-unknown-fields": True}
+        default_factory=dict, max_length=256, json_schema_extra={"x-kubernetes-preserve-unknown-fields": True}
     )
     """The values of the chart. They can contain ${…} with parameters and instance (name, key, namespace, configMap)."""
 
@@ -213,9 +216,9 @@ class TemplateManager(Model):
 class ApplicationTemplateStatus(Model):
     """The observed state of the template."""
 
-    observed_generation: int = 0
+    observed_generation: Count = 0
     """The metadata.generation that the status was computed from."""
-    instances: int = 0
+    instances: Count = 0
     """The number of instances."""
     manager: TemplateManager | None = None
     """The application manager that is active in the namespace."""

@@ -248,6 +248,10 @@ SET_LIST: JsonDict = {"x-kubernetes-list-type": "set"}
 """The schema of a list of unique items. Each field manager owns the items that it applies."""
 
 
+ATOMIC_MAP: JsonDict = {"x-kubernetes-map-type": "atomic"}
+"""Of a field or model: server-side apply replaces the map as a whole."""
+
+
 def map_list(key: str) -> JsonDict:
     """The schema of a list that server-side apply merges by this field of its items; the values of the field are
     unique."""
@@ -270,6 +274,10 @@ class Metadata(BaseModel):
     deletion_timestamp: str | None = None
 
 
+Count = Annotated[int, Field(ge=0)]
+"""A number of things, or a generation."""
+
+
 class Condition(Model):
     """One condition of an object's state, in the standard form of Kubernetes."""
 
@@ -281,7 +289,7 @@ class Condition(Model):
     """The machine-readable reason for the status, in CamelCase."""
     message: str = Field(default="", max_length=4096)
     """The human-readable explanation of the status."""
-    observed_generation: int = 0
+    observed_generation: Count = 0
     """The metadata.generation that the condition was computed from."""
     last_transition_time: Time
     """The time of the last change of the status."""

@@ -13,6 +13,7 @@ from wayside.api.base import (
     SET_LIST,
     ClientName,
     Conditions,
+    Count,
     Duration,
     Kind,
     Model,
@@ -221,9 +222,9 @@ class DetectorSpec(Model):
 class DetectorStatus(Model):
     """The observed state of the detector."""
 
-    observed_generation: int = 0
+    observed_generation: Count = 0
     """The metadata.generation that the status was computed from."""
-    rules: int = 0
+    rules: Count = 0
     """The number of EventRules that the detector selects."""
     conditions: Conditions = Field(default_factory=list)
     """Accepted: the specification is valid. Running (only with a mode): the detector runs; otherwise the reason

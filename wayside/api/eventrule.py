@@ -12,6 +12,7 @@ from wayside.api.base import (
     ATOMIC_LIST,
     ClientName,
     Conditions,
+    Count,
     Duration,
     Expression,
     Identifier,
@@ -323,7 +324,7 @@ class EventRuleSpec(Model):
 class EventRuleStatus(Model):
     """The observed state of the rule."""
 
-    observed_generation: int = 0
+    observed_generation: Count = 0
     """The metadata.generation that the status was computed from."""
     detectors: list[Annotated[str, Field(max_length=63)]] = Field(
         default_factory=list, max_length=256, json_schema_extra=ATOMIC_LIST

@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 
 from wayside.api.base import ATOMIC_LIST, JsonValue, Model
 from wayside.api.constraints import constraint
+from wayside.api.freedata import Value
 
 
 class ParameterType(StrEnum):
@@ -109,7 +110,7 @@ class Parameter(Model):
     """The meaning of the parameter, with its unit."""
     required: bool = False
     """If true, every task must set the parameter. A required parameter has no default."""
-    default: JsonValue = None
+    default: Value = None
     """The value if no task sets the parameter."""
     minimum: float | None = None
     """The minimum of a number. A task with a smaller value is refused."""
@@ -119,7 +120,7 @@ class Parameter(Model):
     pattern: str | None = Field(default=None, min_length=1, max_length=256)
     """A regular expression (RE2 syntax) for a string, or for each string of an array. It may match anywhere in the
     string; use ^…$ to match the whole string."""
-    enum: list[JsonValue] | None = Field(default=None, min_length=1, max_length=64, json_schema_extra=ATOMIC_LIST)
+    enum: list[Value] | None = Field(default=None, min_length=1, max_length=64, json_schema_extra=ATOMIC_LIST)
     """The allowed values. Not with merge Union, Intersection or Sum, which can produce other values."""
     merge: Merge = Merge.SAME
     """How the values of several tasks become one. Same: all tasks must have the same value; a task that differs is

@@ -6,11 +6,12 @@ import re
 from enum import StrEnum
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, model_validator
 from pydantic.alias_generators import to_snake
 
 from wayside.api.base import (
     ATOMIC_LIST,
+    ATOMIC_MAP,
     LABEL,
     SET_LIST,
     Identifier,
@@ -22,6 +23,7 @@ from wayside.api.base import (
 )
 from wayside.api.constraints import GIVEN_TWICE, constraint, exactly_one, unique
 from wayside.api.freedata import of_bounded_size
+from wayside.api.selector import LabelKey, LabelValue
 
 _OWN_VOLUMES = "^(scratch|metrics|token|folder-[0-9]+|secret-[0-9]+)$"
 
@@ -140,6 +142,8 @@ _RESOURCES = ("cpu", "memory", "ephemeral-storage")
 class KeySelector(Model):
     """A key of a Secret or ConfigMap, as in a PodSpec."""
 
+    model_config = ConfigDict(json_schema_extra=ATOMIC_MAP)
+
     name: SubdomainName
     """The name of the object, in the namespace of the Detector."""
     key: Annotated[str, Field(min_length=1, max_length=253, pattern=r"^[-._A-Za-z0-9]+$")]
@@ -151,12 +155,16 @@ class KeySelector(Model):
 class FieldSelector(Model):
     """A field of the pod, as in a PodSpec."""
 
+    model_config = ConfigDict(json_schema_extra=ATOMIC_MAP)
+
     field_path: Annotated[str, Field(min_length=1, max_length=317)]
     """The path of the field, e.g. spec.nodeName."""
 
 
 class ResourceSelector(Model):
     """A resource of the detector's container, as in a PodSpec."""
+
+    model_config = ConfigDict(json_schema_extra=ATOMIC_MAP)
 
     resource: Annotated[str, Field(min_length=1, max_length=317)]
     """The resource, e.g. limits.memory."""
@@ -204,6 +212,8 @@ class DetectorVariable(Model):
 class ObjectNameReference(Model):
     """A reference to an object of the same namespace."""
 
+    model_config = ConfigDict(json_schema_extra=ATOMIC_MAP)
+
     name: SubdomainName
     """The name of the object."""
 
@@ -238,11 +248,11 @@ class DetectorToleration(Model):
         ),
     )
 
-    key: Annotated[str, Field(min_length=1, max_length=317)] | None = None
+    key: LabelKey | None = None
     """The taint key. Default, with operator Exists: every key."""
     operator: TolerationOperator | None = None
     """Equal: the values must match. Exists: any value matches. Default: Equal."""
-    value: Annotated[str, Field(max_length=63)] | None = None
+    value: LabelValue | None = None
     """The taint value. Not with operator Exists."""
     effect: TaintEffect | None = None
     """The taint effect. Default: every effect."""
@@ -266,9 +276,7 @@ class DetectorPod(Model):
     """The image. Default: the value of the manager's option --detector-image."""
     resources: DetectorResources = Field(default_factory=DetectorResources)
     """The compute resources of the detector: requests and limits."""
-    node_selector: dict[Annotated[str, Field(max_length=317)], Annotated[str, Field(max_length=63)]] = Field(
-        default_factory=dict, max_length=16
-    )
+    node_selector: dict[LabelKey, LabelValue] = Field(default_factory=dict, max_length=16, json_schema_extra=ATOMIC_MAP)
     """The labels that a node must have. Not with mode Sidecar."""
     affinity: Embedded | None = None
     """The affinity to nodes and other pods, as in a PodSpec. Not with mode Sidecar."""

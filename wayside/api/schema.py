@@ -148,6 +148,8 @@ def _structural(node: dict[str, Any], definitions: dict[str, Any]) -> dict[str, 
         result["default"] = _without_nulls(result["default"])
         if result["default"] is None:
             del result["default"]
+    if result.get("type") == "integer":
+        result["format"] = "int64"
     if "exclusiveMinimum" in result:
         result["minimum"] = result.pop("exclusiveMinimum")
         result["exclusiveMinimum"] = True

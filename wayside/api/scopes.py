@@ -121,10 +121,16 @@ class Scope(Model):
     """All member clients together are one subject."""
 
 
+MAXIMUM_FIELDS = 64
+"""Of one element, its name included."""
+
+
 class Element(Model):
     """One element of `each`: a name, and any fields that expressions use."""
 
-    model_config = ConfigDict(extra="allow", json_schema_extra={"x-kubernetes-preserve-unknown-fields": True})
+    model_config = ConfigDict(
+        extra="allow", json_schema_extra={"x-kubernetes-preserve-unknown-fields": True, "maxProperties": MAXIMUM_FIELDS}
+    )
 
     name: ClientName
     """The name of the element. It is part of the subject, as in car1~north."""
@@ -142,6 +148,9 @@ class Each(Model):
 
     @model_validator(mode="after")
     def _bounded(self) -> Each:
+        for element in self.of:
+            if (count := 1 + len(element.model_extra or {})) > MAXIMUM_FIELDS:
+                raise ValueError(f"of: element {element.name} must have at most {MAXIMUM_FIELDS} fields; got {count}")
         try:
             bounded({element.name: element.model_extra or {} for element in self.of})
         except ValueError as error:

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from enum import StrEnum
 from typing import Annotated
 
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
-from wayside.api.base import ATOMIC_LIST, Model
+from wayside.api.base import ATOMIC_LIST, ATOMIC_MAP, Model
 from wayside.api.constraints import constraint
 
 LabelKey = Annotated[
@@ -74,6 +74,8 @@ class LabelRequirement(Model):
 
 class LabelSelector(Model):
     """Selects objects by their labels. An object must meet all requirements; an empty selector selects every object."""
+
+    model_config = ConfigDict(json_schema_extra=ATOMIC_MAP)
 
     match_labels: dict[LabelKey, LabelValue] = Field(default_factory=dict, max_length=16)
     """The labels that an object must have."""

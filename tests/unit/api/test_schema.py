@@ -88,7 +88,7 @@ def test_every_field_is_described_and_bounded(kind: str) -> None:
             if node.get("type") == "array":
                 assert "maxItems" in node, f"{kind} {path} is unbounded"
                 assert "x-kubernetes-list-type" in node, f"{kind} {path} does not define how lists merge"
-            if "additionalProperties" in node:
+            if "additionalProperties" in node or node.get("x-kubernetes-preserve-unknown-fields"):
                 assert "maxProperties" in node, f"{kind} {path} is unbounded"
 
 

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar
 
-from pydantic import Field, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
 from wayside.api.access import Access, Tls
-from wayside.api.base import Model, PositiveDuration, SubdomainName, map_list
+from wayside.api.base import ATOMIC_MAP, Model, PositiveDuration, SubdomainName, map_list
 from wayside.api.constraints import Constraint, exactly_one, not_both
 
 _VARIABLE = r"^WAYSIDE_[A-Z0-9_]+$"
@@ -24,6 +24,8 @@ HttpUrl = Annotated[str, Field(max_length=2048, pattern=r"^https?://[^\s/?#@\\]+
 
 class SecretKey(Model):
     """A key of a Secret that is mounted for the detector."""
+
+    model_config = ConfigDict(json_schema_extra=ATOMIC_MAP)
 
     name: SubdomainName
     """The name of the Secret."""
