@@ -230,7 +230,7 @@ class TestKubectl:
             ("eventrule.spec.scope.pairs.within", "The maximum distance in metres"),
             ("eventrule.spec.when", "the condition that starts an episode"),
             ("detector.spec.streams.key", "captures the name of the client"),
-            ("applicationtemplate.spec.parameters.merge", "Union, Intersection: the items"),
+            ("applicationtemplate.spec.parameters.merge", "Union: the items that occur in any array"),
             ("applicationtask.spec.endTime", "Absent while the demand is live"),
             ("applicationinstance.status.releaseTime", "The end of the linger time"),
         ],
