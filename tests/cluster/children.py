@@ -24,6 +24,10 @@ _register_lock = threading.Lock()
 _reaper: subprocess.Popen[str] | None = None
 
 
+GRACE = 30
+"""Seconds that Kubernetes gives a pod to end, by default."""
+
+
 class Child:
     """One process, from its start to its end; stdout and stderr go to the end of `log`."""
 

@@ -25,6 +25,7 @@ from tests.cluster.chain import (
     template,
     untouched,
 )
+from tests.cluster.children import GRACE
 from tests.cluster.controlplane import ControlPlane
 from tests.cluster.waiting import wait_until
 from wayside.times import parse_time
@@ -137,7 +138,7 @@ def test_a_detector_that_is_stopped_ends_promptly_and_its_tasks_stay(chain: Chai
     vehicles.place(CARS, NEAR)
     deployed = chain.wait_deployed(CARS)
     task = chain.wait_task(CARS)
-    assert running.terminate(patience=15) == 0
+    assert running.terminate(patience=GRACE) == 0
     assert chain.wait_task(CARS)["spec"] == task["spec"]
     lease = chain.api.get("Lease", f"wayside-{HOLDER}")
     assert not lease["spec"].get("holderIdentity"), "a successor need not wait"

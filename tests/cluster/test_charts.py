@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from tests.cluster.api import Api, Object
+from tests.cluster.children import GRACE
 from tests.cluster.expected_objects import condition, end, start_manager, task
 from tests.cluster.processes import Process, Processes
 from tests.helm import Tools, ensure_tools
@@ -167,7 +168,7 @@ def test_hanging_chart_repositories_delay_no_other_template(api: Api, manager: P
             lambda raw: condition(raw, "Applied").get("status") == "False",
             what="one that waits for its chart reports it",
         )
-        assert manager.terminate(patience=15) == 0
+        assert manager.terminate(patience=GRACE) == 0
 
 
 def test_a_missing_chart_is_reported_and_a_path_outside_the_folder_is_rejected(api: Api, manager: Process) -> None:

@@ -91,7 +91,7 @@ def test_changes_around_an_outage_are_not_missed(
     following.wait(a="1", b="1")
     control_plane.stop_api_server()
     try:
-        wait_until(lambda: following.reflector.outages, lambda n: n == 1, what="the outage was noticed")
+        wait_until(lambda: following.reflector.outages, bool, what="the outage was noticed")
     finally:
         control_plane.start_api_server()
     api.delete("ConfigMap", "a")

@@ -16,6 +16,7 @@ import zenoh
 
 from application_manager.core.objects.configuration import ANNOTATION, fingerprint
 from tests.cluster.api import Api, Object
+from tests.cluster.children import GRACE
 from tests.cluster.expected_objects import end, start_manager, task, wait_settled
 from tests.cluster.processes import Process, Processes
 from tests.cluster.repeating import repeated
@@ -206,7 +207,7 @@ def test_the_zenoh_router_may_start_late_and_stop(api: Api, namespace: str, endp
             reported = SourcesSubscriber(session, key)
             api.create(vehicle(f"car{number}"))
             reported.wait_for([*cars, f"car{number}"])
-    assert manager.terminate(patience=15) == 0
+    assert manager.terminate(patience=GRACE) == 0
 
 
 class Mount:

@@ -87,8 +87,8 @@ def test_the_demand_of_a_lost_holder_is_released_and_counts_again_when_it_return
 
 def test_a_lease_that_is_renewed_keeps_the_demand(api: Api, manager: Process, renew: Callable[..., None]) -> None:
     api.create(lossy())
-    renew(SHORT, "silent")
-    renew(SHORT, "old")
+    renew(LONG, "silent")
+    renew(LONG, "old")
     for holder in ("det", "old", "silent", "nobody"):
         api.create(task(holder, holder=holder))
         # There is patience with one that has no Lease: for 15 s, and one more.

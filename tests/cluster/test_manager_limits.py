@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -9,10 +10,11 @@ from typing import Any
 import pytest
 
 from application_manager.core.claims.claims import instance_name
-from tests.cluster.api import Api, Object
+from tests.cluster.api import Api, Object, Objects
 from tests.cluster.expected_objects import condition, end, start_manager, task, template, wait_settled
 from tests.cluster.processes import Processes
 from tests.cluster.repeating import repeated
+from tests.cluster.waiting import wait_until
 
 LOW, HIGH = (instance_name("app", each) for each in ("low", "high"))
 
@@ -280,14 +282,20 @@ def test_pod_rejections_known_only_from_events_are_reported_and_resolved_once_th
     assert ready["status"] == "False"
     assert 'pods "' not in ready["message"]  # the name is another one each time
     raise_quota(api, {"pods": "2"})
-    api.patch(kind, LOW, {"metadata": {"annotations": {"looked-at": "again"}}})  # a controller looks at what changes
+    changes = itertools.count()
+
+    def pods() -> Objects:
+        # A controller looks at what changes, and the API server may learn of the quota only after that.
+        api.patch(kind, LOW, {"metadata": {"annotations": {"changed": str(next(changes))}}})
+        return api.list("Pod")
+
+    wait_until(pods, bool, what="there is a pod")
     api.wait_for(
         "ApplicationInstance",
         LOW,
         lambda raw: condition(raw, "Ready")["reason"] != "QuotaExceeded",
         what="it is not reported any more",
     )
-    assert api.list("Pod") != []
 
 
 def workload(kind: str) -> Object:

@@ -166,7 +166,11 @@ def test_a_manager_that_is_cut_off_ends_on_sigterm(api: Api, pair: Pair) -> None
 
 def test_metrics_and_readiness_show_the_active_manager(api: Api, pair: Pair) -> None:
     holder = api.get("Lease", LEASE)["spec"]["holderIdentity"]
-    assert [scraped(port)["active",] for port in pair.ports] == [1, 0]
+    wait_until(
+        lambda: [scraped(port)["active",] for port in pair.ports],
+        lambda found: found == [1, 0],
+        what="the metrics show it",
+    )
     wait_until(lambda: get(pair.ports[0], "/readyz"), lambda found: found == (200, "ok\n"), what="one is active")
     logged = (200, f"ok, standby: {holder} is active\n")
     wait_until(lambda: get(pair.ports[1], "/readyz"), lambda found: found == logged, what="the other stands by")

@@ -17,7 +17,7 @@ from wayside.kubernetes.pacing import AT_ONCE, MOST_WRITES
 WATCHERS = 8  # requests of watches that (re)list, and those about the Lease: apart from the bound
 BURST = 100  # tasks: many times what may run at once
 HOLD = 9  # s for which the API server wants to be left alone
-UNDER_WAY = 5.0  # s: what was sent before the answer had arrived at a manager on a machine that is busy otherwise
+LATE = 3.0  # s by which the proxy may see a request late, on a machine that is busy otherwise
 
 
 def test_a_burst_of_tasks_is_served_with_few_concurrent_requests(
@@ -26,7 +26,8 @@ def test_a_burst_of_tasks_is_served_with_few_concurrent_requests(
     with faulty_proxy(control_plane.kubeconfig) as (proxy, kubeconfig):
         start_manager(processes, namespace, kubeconfig=kubeconfig).wait_for_output("active: holds the Lease")
         api.create(template())
-        proxy.most, proxy.slow = 0, 0.2  # so slow that all that may run at once does
+        # So slow that all that may run at once does, and that it is no matter how long the machine itself takes.
+        proxy.most, proxy.slow = 0, max(0.2, 5 * longest(api))
         with ThreadPoolExecutor(8) as pool:
             list(pool.map(api.create, (task(f"t{index}", region=f"r{index % 20}") for index in range(BURST))))
         wait_until(
@@ -58,9 +59,11 @@ def test_no_request_is_sent_before_the_servers_retry_after_has_passed(
         wait_settled(api)
         (refused,) = (each for each in proxy.seen if each.refused)
         own = [each for each in proxy.seen if "/leases" not in each.path and not watches(each)]
-        early = [each for each in own if refused.at + UNDER_WAY < each.at < refused.at + HOLD]
-        assert early == []
-        assert [each for each in own if each.at >= refused.at + HOLD]
+        served = max(each.at for each in own if each.method == "PATCH" and "/deployments/" in each.path)
+        assert served >= refused.at + HOLD
+        # What was sent before the answer had arrived comes first, however long that took.
+        times = sorted(each.at for each in own if refused.at <= each.at <= served)
+        assert max(after - before for before, after in itertools.pairwise(times)) >= HOLD - LATE
         assert "Traceback" not in manager.output()
 
 
@@ -84,6 +87,16 @@ def test_an_api_server_that_rejects_everything_for_a_while_is_waited_for(
         api.wait_list("Deployment", lambda found: len(found) == 21, what="all is served in the end")
         wait_settled(api)
         assert manager.alive
+
+
+def longest(api: Api) -> float:
+    """The longest of some requests, in seconds."""
+    took = []
+    for _ in range(10):
+        began = time.monotonic()
+        api.list("ApplicationTask")
+        took.append(time.monotonic() - began)
+    return max(took)
 
 
 def watches(seen: ProxiedRequest) -> bool:

@@ -180,7 +180,7 @@ def wait_seen_twice(folder: Path, endpoint: str) -> None:
     file.write_text((EXAMPLE / "detectors.yaml").read_text().replace("tcp/zenoh:7447", endpoint))
 
     def requested() -> Total:
-        words = ("status", "--all", "--detector", str(file), "--timeout", str(PATIENCE), "--json")
+        words = ("status", "--all", "--detector", str(file), "--timeout", str(PATIENCE / 4), "--json")
         return msgspec.json.decode(programs.run("detector", *words, check=True).stdout, type=Total)
 
     found = wait_until(

@@ -168,5 +168,5 @@ def status_of(folder: Path, endpoint: str) -> list[str]:
     (file := folder / "detector.yaml").write_text(
         yaml.safe_dump(sidecar_detector("vehicle", zenoh={"mode": "peer", "listen": [endpoint]}))
     )
-    done = programs.run("detector", "status", "--detector", file, "--json", "--timeout", str(PATIENCE), check=True)
+    done = programs.run("detector", "status", "--detector", file, "--json", "--timeout", str(PATIENCE / 4), check=True)
     return [json.loads(line)["holder"] for line in done.stdout.splitlines()]

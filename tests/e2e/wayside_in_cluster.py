@@ -17,6 +17,7 @@ from tests.patience import NODE_PATIENCE
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "cooperative-recording"
 ZENOH_PORT, METRICS_PORT = 7447, 9100
+LATE = {"timeoutSeconds": 5}  # as the chart has it; the default of a second is short on a busy machine
 RESTRICTED = {  # the Pod Security Standard of this name
     "allowPrivilegeEscalation": False,
     "capabilities": {"drop": ["ALL"]},
@@ -94,8 +95,8 @@ def _program(name: str, image: str, command: tuple[str, ...]) -> Object:
     container: dict[str, Any] = {
         "env": [{"name": "POD_NAME", "valueFrom": field[0]}, {"name": "POD_UID", "valueFrom": field[1]}],
         "ports": [{"containerPort": METRICS_PORT}],
-        "readinessProbe": {"httpGet": {"path": "/readyz", "port": METRICS_PORT}, "periodSeconds": 1},
-        "livenessProbe": {"httpGet": {"path": "/healthz", "port": METRICS_PORT}, "initialDelaySeconds": 30},
+        "readinessProbe": {"httpGet": {"path": "/readyz", "port": METRICS_PORT}, "periodSeconds": 1, **LATE},
+        "livenessProbe": {"httpGet": {"path": "/healthz", "port": METRICS_PORT}, "initialDelaySeconds": 30, **LATE},
         "securityContext": RESTRICTED,
         "volumeMounts": [{"name": "scratch", "mountPath": "/tmp"}],
     }

@@ -87,7 +87,9 @@ def test_a_rule_is_evaluated_paused_and_resumed_by_commands(process: Process) ->
     process.status_when(lambda s: len(s.rules) == 2 and s.streams[1].samples == 1)
 
     def command(*words: str) -> subprocess.CompletedProcess[str]:
-        return programs.run("detector", *words, "--detector", "detector.yaml", folder=process.folder)
+        return programs.run(
+            "detector", *words, "--detector", "detector.yaml", "--timeout", str(PATIENCE / 4), folder=process.folder
+        )
 
     answer = json.loads(command("evaluate", "on-demand").stdout)
     assert (answer["subject"], answer["when"], answer["values"]) == ("car1", True, {"v": 20})

@@ -286,7 +286,7 @@ def test_without_a_recorder_only_the_recording_is_missing(endpoint: str, tmp_pat
 
 def test_people_request_recordings_by_commands(unhurt: Peer) -> None:
     def command(*words: str) -> Result:
-        return CliRunner().invoke(app, [*words, "--connect", unhurt.endpoint])
+        return CliRunner().invoke(app, [*words, "--connect", unhurt.endpoint, "--timeout", str(PATIENCE / 4)])
 
     begun = command("recordings", "start", "mine", "--stream", "pose", "--name", "rsu", "--json")
     assert json.loads(begun.stdout)["state"] == "Recording"
