@@ -172,7 +172,7 @@ def with_requested(rules: Sequence[EventRule], detector: Detector) -> list[Event
         {
             "apiVersion": API_VERSION,
             "kind": "EventRule",
-            "metadata": {"name": REQUESTED.rule, "namespace": detector.namespace},
+            "metadata": {"name": "requested", "namespace": detector.namespace},
             "spec": {
                 "description": "Recordings requested by others.",
                 "when": "false",
@@ -180,7 +180,8 @@ def with_requested(rules: Sequence[EventRule], detector: Detector) -> list[Event
             },
         }
     )
-    return [*rules, rule]
+    metadata = rule.metadata.model_copy(update={"name": REQUESTED.rule})  # not valid, so no other rule has it
+    return [*rules, rule.model_copy(update={"metadata": metadata})]
 
 
 def run_of(identity: str) -> ActionRun:

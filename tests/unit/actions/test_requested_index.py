@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from detector.actions.episode import Outcome, OutcomeState
 from detector.actions.trigger.orders import Progress
 from detector.actions.trigger.requests import MAXIMUM_BYTES, RecordingRequest, read_request, short, write_request
-from detector.live.requested import RecordingIndex
+from detector.live.requested import REQUESTED, RecordingIndex, with_requested
+from wayside.api import Detector
 from wayside.api.base import Duration, PositiveDuration
 from wayside.api.recordings import OnRequest
 
@@ -102,3 +103,19 @@ def test_the_event_of_a_large_fleet_fits_into_a_request() -> None:
     assert len(payload) < MAXIMUM_BYTES
     assert read_request(payload).event == {"id": "e", "data": {"rule": "r"}}
     assert short({"id": "e", "data": {"values": {"v": 1}}}) == {"id": "e", "data": {"values": {"v": 1}}}
+
+
+def test_recordings_on_request_run_under_a_rule_with_a_reserved_name() -> None:
+    detector = Detector.model_validate(
+        {
+            "apiVersion": "wayside.dev/v1alpha1",
+            "kind": "Detector",
+            "metadata": {"name": "town"},
+            "spec": {
+                "streams": [{"name": "pose", "key": "${client:*}/pose", "encoding": "json"}],
+                "recordings": {"path": "/recordings", "onRequest": {}},
+            },
+        }
+    )
+    (rule,) = with_requested([], detector)
+    assert (rule.name, [action.name for action in rule.spec.actions]) == (REQUESTED.rule, [REQUESTED.action])
