@@ -322,9 +322,9 @@ class _NamespaceIndexes:
     def fallbacks(self, template: str, now: float) -> Iterable[Fallback]:
         for name in self.cache.falling_back_to((self.namespace, template)):
             instance = self.cache.instance(name)
-            turned = fallback_claims(instance, self, now) if instance is not None else None
-            if turned is not None:
-                yield turned
+            fallback = fallback_claims(instance, self, now) if instance is not None else None
+            if fallback is not None:
+                yield fallback
 
     def placement(self, name: str, unlimited: Decision | None, now: float) -> Placement | None:
         limits, places = self.cache.limits(self.namespace), self.cache.places

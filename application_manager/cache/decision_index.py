@@ -86,5 +86,5 @@ class FallbackIndex:
 
     def instances_of(self, template: Name) -> set[Name]:
         """The instances of a template whose tasks use their fallback."""
-        turned = (each for of, each in self._fallbacks.items() if (of[0], each.template) == template)
-        return {(template[0], instance) for each in turned for instance in each.instances}
+        fallbacks = (each for of, each in self._fallbacks.items() if (of[0], each.template) == template)
+        return {(template[0], instance) for each in fallbacks for instance in each.instances}

@@ -76,14 +76,14 @@ async def _inquire(client: Client, subject: str, namespace: str) -> Explanation:
         )
     if task is not None and existing is not None:
         raise InquiryError(f"{name} is the name of a task and of an instance: write task/{name} or instance/{name}")
-    found = NamespaceSnapshot(
+    snapshot = NamespaceSnapshot(
         await _templates(client, namespace),
         await _list(client, TASKS, ApplicationTask, namespace),
         await _list(client, INSTANCES, ApplicationInstance, namespace),
     )
     now = time.time()
-    instance = serving(found, task, now) if task is not None else name
-    existing = next((each for each in found.instances if each.name == instance), None)
+    instance = serving(snapshot, task, now) if task is not None else name
+    existing = next((each for each in snapshot.instances if each.name == instance), None)
     listed = existing.status.objects if existing and existing.status else []
     objects = {
         (each.api_version, each.kind, each.name): await _live(client, each.api_version, each.kind, namespace, each.name)
@@ -93,7 +93,7 @@ async def _inquire(client: Client, subject: str, namespace: str) -> Explanation:
     holders = {task.spec.requester.holder} if task is not None else set()
     leases = {each: await client.get(LEASES, namespace, lease_name(each)) for each in holders if each}
     there = {holder: lease for holder, lease in leases.items() if lease is not None}
-    whole = replace(found, objects=objects, pods=pods, leases=there)
+    whole = replace(snapshot, objects=objects, pods=pods, leases=there)
     return explanation_of(whole, task=task.name if task else None, instance=instance, now=now)
 
 

@@ -90,14 +90,14 @@ class Applier:
         self._drifted.discard(uid)
         self._controlled.drop(controller_uid(raw) or "", uid)
 
-    def pending(self, instance: ApplicationInstance, rendering: Rendering, known: LastApplied) -> list[Manifest]:
+    def pending(self, instance: ApplicationInstance, rendering: Rendering, last: LastApplied) -> list[Manifest]:
         """The manifests to apply: all of a new rendering, otherwise those that are missing or have drifted."""
-        if known.digest != rendering.digest:
+        if last.digest != rendering.digest:
             return list(rendering.manifests)
         return [
             manifest
             for manifest in rendering.manifests
-            if not self._is_as_recorded(instance.namespace, object_key(manifest), known.objects)
+            if not self._is_as_recorded(instance.namespace, object_key(manifest), last.objects)
         ]
 
     def _is_as_recorded(self, namespace: str, key: ObjectKey, recorded: Mapping[ObjectKey, str | None]) -> bool:
@@ -118,7 +118,7 @@ class Applier:
         instance: ApplicationInstance,
         rendering: Rendering,
         manifests: Sequence[Manifest],
-        known: LastApplied,
+        last: LastApplied,
         looked: Mapping[ObjectKey, Object | None],
     ) -> ApplyResult:
         """Apply all or some manifests of the rendering, and prune the objects that are no longer rendered.
@@ -128,7 +128,7 @@ class Applier:
         """
         began = time.time_ns()
         wanted = rendering.keys()
-        recorded = dict(known.objects)
+        recorded = dict(last.objects)
         supporting = [each for each in manifests if each["kind"] not in _WORKLOADS]
         workloads = [each for each in manifests if each["kind"] in _WORKLOADS]
         results: list[Object | ApplyProblem | BaseException] = []

@@ -59,7 +59,7 @@ class _Start:
         """The record, unless it is of another instance with the same name."""
         return self.record if self.record is not None and self.record.uid == instance.metadata.uid else None
 
-    def known(self, instance: ApplicationInstance) -> LastApplied:
+    def last_applied(self, instance: ApplicationInstance) -> LastApplied:
         """The last apply: from the record if there is one, because it is newer than the status."""
         if (record := self.record_of(instance)) is not None:
             return LastApplied.read(record.digest, record.applied.objects)
@@ -217,18 +217,18 @@ class InstanceWork:
         rendering: Rendering | ConditionState,
         looked: Mapping[ObjectKey, Object | None],
     ) -> None:
-        name, known, was_applied = start.name, start.known(instance), start.was_applied(instance)
+        name, last, was_applied = start.name, start.last_applied(instance), start.was_applied(instance)
         if not isinstance(rendering, Rendering):
             if rendering.reason == drafting.CHART_PENDING and was_applied is not None:
                 return  # the objects stay unchanged until the chart is rendered, or has failed
-            self._note(start, instance, ApplyResult(rendering, references(known.objects), complete=False), known.digest)
+            self._note(start, instance, ApplyResult(rendering, references(last.objects), complete=False), last.digest)
             return
         await self.scaler.settle(instance, rendering)
         trying = (instance.metadata.uid, rendering.digest)
         until = self.attempts.waits_until(name, trying, time.time())
-        pending = self.applier.pending(instance, rendering, known)
+        pending = self.applier.pending(instance, rendering, last)
         if not pending and was_applied is not None:
-            self._note(start, instance, ApplyResult(was_applied, references(known.objects), True), known.digest)
+            self._note(start, instance, ApplyResult(was_applied, references(last.objects), True), last.digest)
             return
         if until is not None and start.record is not None:
             self.again(name, until)
@@ -236,19 +236,19 @@ class InstanceWork:
             return
         if start.existing is not None:
             looked = await self.applier.look(name[0], pending)
-            if rendering.keys() - known.objects.keys():
-                await self._announce(instance, known, rendering)
+            if rendering.keys() - last.objects.keys():
+                await self._announce(instance, last, rendering)
         try:
-            applied = await self.applier.apply(instance, rendering, pending, known, looked)
+            applied = await self.applier.apply(instance, rendering, pending, last, looked)
         except ApiError as error:
             if not error.terminating:
                 message = f"the API server failed; retrying with backoff: {error.message}"
                 retrying = ConditionState("Applied", False, "Retrying", message)
                 self._note(
-                    start, instance, ApplyResult(retrying, references(known.objects), complete=False), known.digest
+                    start, instance, ApplyResult(retrying, references(last.objects), complete=False), last.digest
                 )
             raise
-        self._note(start, instance, applied, rendering.digest if applied.complete else known.digest)
+        self._note(start, instance, applied, rendering.digest if applied.complete else last.digest)
         if any(object_key(each) == config_map_key(name[1]) for each in pending):
             self.configured(name)
         if applied.complete:
@@ -268,21 +268,21 @@ class InstanceWork:
 
     def _leave(self, start: _Start, instance: ApplicationInstance) -> None:
         """Note that the instance stays unchanged, because a person paused it."""
-        known = start.known(instance)
+        last = start.last_applied(instance)
         message = "unchanged since the instance was paused"
         state = (
             ConditionState("Applied", True, "Applied", message)
             if start.was_applied(instance) is not None
             else ConditionState("Applied", False, "Paused", "the instance was paused before all objects were applied")
         )
-        self._note(start, instance, ApplyResult(state, references(known.objects), complete=False), known.digest)
+        self._note(start, instance, ApplyResult(state, references(last.objects), complete=False), last.digest)
 
-    async def _announce(self, instance: ApplicationInstance, known: LastApplied, rendering: Rendering) -> None:
+    async def _announce(self, instance: ApplicationInstance, last: LastApplied, rendering: Rendering) -> None:
         """Record the objects in the instance's status before any of them is applied.
 
         Not for an instance that was just created: every object with its label and it as controller belongs to it.
         """
-        announced = references({**dict.fromkeys(rendering.keys()), **known.objects})
+        announced = references({**dict.fromkeys(rendering.keys()), **last.objects})
         status = {"objects": [each.to_json() for each in announced]}
         namespace, name, uid = instance.namespace, instance.name, instance.metadata.uid
         self.observe(await self.client.patch_status(INSTANCES, namespace, name, uid, status))

@@ -1,7 +1,7 @@
 """The objects that the manager should have created in a namespace, computed from the live objects, and the differences.
 
 The expectation comes from `demand` and `Renderer`, called here on the live objects: whatever the manager has been
-through, after a while the world must equal this pure function of it, and nothing else may have the manager's label.
+through, after a while the cluster must equal this pure function of it, and nothing else may have the manager's label.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def wait_settled(
         lambda: list(differences(api, lost or {}, refused, limit)),
         lambda found: not found,
         timeout=timeout,
-        what="the world equals the pure function of what is live",
+        what="the cluster equals the pure function of what is live",
     )
 
 

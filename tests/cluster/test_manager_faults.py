@@ -153,7 +153,7 @@ def test_a_foreign_object_is_left_alone(api: Api, manager: Process) -> None:
         "ApplicationInstance",
         NORTH,
         lambda raw: condition(raw, "Applied").get("reason") == "ObjectExists",
-        what="the instance reports the obstacle",
+        what="the instance reports the problem",
     )
     message = condition(reported, "Applied")["message"]
     assert f"Deployment {NORTH} already exists" in message

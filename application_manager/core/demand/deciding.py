@@ -136,7 +136,9 @@ def _template_of(
 
 def _borrowed(name: str, template: str, indexes: Indexes, now: float) -> list[Claim]:
     """The claims on an instance by tasks whose own instance is not ready."""
-    return [each for turned in indexes.fallbacks(template, now) for each in turned.claims if each.instance == name]
+    return [
+        each for fallback_ in indexes.fallbacks(template, now) for each in fallback_.claims if each.instance == name
+    ]
 
 
 def _decide_one(name: str, template_name: str, claims: Iterable[Claim], indexes: Indexes, now: float) -> Decision:

@@ -29,7 +29,7 @@ from application_manager.core.demand.deciding import (
     request,
 )
 from application_manager.core.demand.decisions import Decision
-from application_manager.core.demand.fallback import FALLEN_BACK, Fallback, fallback_of, turned
+from application_manager.core.demand.fallback import FALLEN_BACK, Fallback, fallback_of, with_fallback
 from application_manager.core.demand.lingering import written_deadline
 from application_manager.core.demand.places import Placement
 from application_manager.core.demand.placing import limits
@@ -118,10 +118,13 @@ class _Snapshot:
         """The instances that exist, or are demanded."""
         own = {each for each in self._claims if template_of_all(each) is None}
         always = {name for name, each in self._templates.items() if has_baseline(each)}
-        turned = {
-            each for to in self.fallback_templates() for turn in self.fallbacks(to, now) for each in turn.instances
+        taken_over = {
+            each
+            for to in self.fallback_templates()
+            for fallback in self.fallbacks(to, now)
+            for each in fallback.instances
         }
-        return sorted(own | always | turned | self._instances.keys())
+        return sorted(own | always | taken_over | self._instances.keys())
 
     def template(self, name: str) -> TemplateState:
         return self._templates.get(name)
@@ -147,8 +150,8 @@ class _Snapshot:
         if template not in self._fallbacks:
             falling = {name for name, each in self._templates.items() if fallback_of(each) == template}
             of = [each for each in self._instances.values() if each.spec.template_name in falling]
-            turned = (fallback_claims(each, self, now) for each in of)
-            self._fallbacks[template] = [each for each in turned if each is not None]
+            found = (fallback_claims(each, self, now) for each in of)
+            self._fallbacks[template] = [each for each in found if each is not None]
         return self._fallbacks[template]
 
     def placement(self, name: str, unlimited: Decision | None, now: float) -> Placement | None:
@@ -188,7 +191,7 @@ def verdict_of(claimed: Claim, decided: Mapping[str, Decision], meant: Iterable[
         return TaskVerdict(gathered(claimed, parts, own.verdicts[task]), serving, generation)
     instead = own.fallback.instance_of(task) if own.fallback is not None else None
     other = decided.get(instead) if instead is not None else None
-    verdict = turned(own.verdicts[task], task, own.fallback, other.verdicts if other is not None else {})
+    verdict = with_fallback(own.verdicts[task], task, own.fallback, other.verdicts if other is not None else {})
     serves = instead if instead is not None and verdict.reason == FALLEN_BACK else claimed.instance
     known = own.generations[task]
     return TaskVerdict(verdict, (serves,), known if other is None else min(known, other.generations.get(task, known)))

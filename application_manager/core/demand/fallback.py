@@ -119,7 +119,7 @@ def _claim(other: ApplicationTemplate | InvalidTemplate, each: Claim) -> Claim |
     return claim(other, each.task.model_copy(update={"spec": spec}))
 
 
-def turned(verdict: Verdict, task: str, to: Fallback | None, others: Mapping[str, Verdict]) -> Verdict:
+def with_fallback(verdict: Verdict, task: str, to: Fallback | None, others: Mapping[str, Verdict]) -> Verdict:
     """The task's verdict, with the result at the fallback.
 
     `verdict`: that of its own instance; `others`: the verdicts of the fallback instance, empty if it was not decided
@@ -143,25 +143,23 @@ def turned(verdict: Verdict, task: str, to: Fallback | None, others: Mapping[str
 
 
 def fallback_conditions(
-    known: Iterable[Condition], late: str, turns: Fallback | None, stands_in_for: Iterable[str]
+    known: Iterable[Condition], late: str, to: Fallback | None, stands_in_for: Iterable[str]
 ) -> Iterator[ConditionState]:
     """The conditions TimedOut and StandsIn of an instance; each is absent until it is True for the first time.
 
-    `late`: the readyTimeout that it exceeded, empty if it did not; `turns`: the fallback of its tasks; `stands_in_for`:
+    `late`: the readyTimeout that it exceeded, empty if it did not; `to`: the fallback of its tasks; `stands_in_for`:
     the instances whose tasks it serves.
     """
     conditions, others, timed_out = list(known), ", ".join(stands_in_for), None
     if late:
         message = f"this instance was not ready for {late}"
-        if turns is not None and turns.instances:
-            names = ", ".join(sorted(turns.instances))
+        if to is not None and to.instances:
+            names = ", ".join(sorted(to.instances))
             message += (
-                f": template {turns.template} ({names}) serves its tasks until this instance has been ready for {late}"
+                f": template {to.template} ({names}) serves its tasks until this instance has been ready for {late}"
             )
-        elif turns is not None and turns.refused:
-            message += (
-                f", and its fallback, template {turns.template}, cannot serve: {next(iter(turns.refused.values()))}"
-            )
+        elif to is not None and to.refused:
+            message += f", and its fallback, template {to.template}, cannot serve: {next(iter(to.refused.values()))}"
         timed_out = READY_TIMEOUT, message
     yield from from_first(
         conditions, TIMED_OUT, timed_out, ("InTime", "the instance is ready, or within its readyTimeout")

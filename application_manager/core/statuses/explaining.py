@@ -66,25 +66,25 @@ class NamespaceSnapshot:
     leases: Mapping[str, Object] = field(default_factory=dict)
 
 
-def serving(found: NamespaceSnapshot, task: ApplicationTask, now: float) -> str | None:
+def serving(snapshot: NamespaceSnapshot, task: ApplicationTask, now: float) -> str | None:
     """The name of the instance that serves the task, or that it claims; None if there is none, or it claims all.
 
     `now` is in seconds since 1970.
     """
-    template = next((each for each in found.templates if each.name == task.spec.template_name), None)
+    template = next((each for each in snapshot.templates if each.name == task.spec.template_name), None)
     claimed: str | None = getattr(claim(template, task), "instance", None)
     if claimed is not None and template_of_all(claimed) is not None:
         return None
-    verdict, written = _outcome(found, now).verdicts[task.name], task.status.instance_name if task.status else None
+    verdict, written = _outcome(snapshot, now).verdicts[task.name], task.status.instance_name if task.status else None
     if verdict.kind is VerdictKind.FINISHED:
         return written or claimed
     return verdict.instance or claimed or written
 
 
-def _outcome(found: NamespaceSnapshot, now: float) -> NamespaceOutcome:
+def _outcome(snapshot: NamespaceSnapshot, now: float) -> NamespaceOutcome:
     """The demand. Only the manager knows its limits, so a waiting task keeps the verdict of its status."""
-    outcome = demand(found.templates, found.tasks, found.instances, _written_leases(found.tasks), now)
-    limited = {each.name: verdict for each in found.tasks if (verdict := _written_limit(each)) is not None}
+    outcome = demand(snapshot.templates, snapshot.tasks, snapshot.instances, _written_leases(snapshot.tasks), now)
+    limited = {each.name: verdict for each in snapshot.tasks if (verdict := _written_limit(each)) is not None}
     verdicts = {
         name: limited.get(name, verdict) if verdict.kind is VerdictKind.COUNTS else verdict
         for name, verdict in outcome.verdicts.items()
@@ -102,15 +102,15 @@ def _written_limit(task: ApplicationTask) -> Verdict | None:
     return Verdict(VerdictKind.WAITING, accepted.reason, accepted.message)
 
 
-def explanation_of(found: NamespaceSnapshot, *, task: str | None, instance: str | None, now: float) -> Explanation:
-    """The chain of a task or, if `task` is None, of an instance; these are names of objects in `found`.
+def explanation_of(snapshot: NamespaceSnapshot, *, task: str | None, instance: str | None, now: float) -> Explanation:
+    """The chain of a task or, if `task` is None, of an instance; these are names of objects in `snapshot`.
 
     `instance`: the one that serves the task, None if none does; `now` is in seconds since 1970.
     """
-    outcome = _outcome(found, now)
+    outcome = _outcome(snapshot, now)
     decision = (outcome.instances | outcome.waiting).get(instance) if instance else None
-    subject = next((each for each in found.tasks if each.name == task), None)
-    existing = next((each for each in found.instances if each.name == instance), None)
+    subject = next((each for each in snapshot.tasks if each.name == task), None)
+    existing = next((each for each in snapshot.instances if each.name == instance), None)
     of = (
         subject.spec.template_name
         if subject
@@ -120,22 +120,22 @@ def explanation_of(found: NamespaceSnapshot, *, task: str | None, instance: str 
         if existing
         else ""
     )
-    template = next((each for each in found.templates if each.name == of), None)
-    served = next((each for each in found.templates if decision and each.name == decision.template), template)
+    template = next((each for each in snapshot.templates if each.name == of), None)
+    served = next((each for each in snapshot.templates if decision and each.name == decision.template), template)
     others = [
         each
-        for each in sorted(found.tasks, key=precedence)
+        for each in sorted(snapshot.tasks, key=precedence)
         if each.name in (decision.verdicts if decision else ()) or each is subject or _names(each, instance)
     ]
-    explained = [_task(each, outcome.verdicts[each.name], found.leases, now) for each in others]
+    explained = [_task(each, outcome.verdicts[each.name], snapshot.leases, now) for each in others]
     return Explanation(
         task=next((each for each in explained if each.name == task), None),
         template=_template(of, template),
         instance=_instance(instance, existing, decision),
         tasks=explained,
         parameters=_parameters(served, others, decision, existing),
-        objects=[_object(key, live) for key, live in sorted(found.objects.items())],
-        pods=[_pod(each) for each in sorted(found.pods, key=lambda each: str(each["metadata"]["name"]))],
+        objects=[_object(key, live) for key, live in sorted(snapshot.objects.items())],
+        pods=[_pod(each) for each in sorted(snapshot.pods, key=lambda each: str(each["metadata"]["name"]))],
     )
 
 
