@@ -1,4 +1,5 @@
-"""Rules, validated and compiled against a Detector: the manager reports the problems, the engine runs the result."""
+"""Rules, validated and compiled against a Detector: the manager reports the problems, the engine evaluates the
+result."""
 
 from wayside.rules.compiled import (
     ClientSubject,

@@ -1,4 +1,4 @@
-"""Compiles actions: their templates, and the windows of samples of those other than deploy."""
+"""Compiles actions: their templates, and the windows of samples for actions other than deploy."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def compile_actions(compiler: Compiler, environment: Environment) -> list[Compil
 
 
 def canonical_json(value: object) -> str:
-    """JSON that is the same for the same value."""
+    """JSON in a canonical form: equal values give equal texts."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"))
 
 
@@ -68,7 +68,7 @@ def _compiled(compiler: Compiler, at: FieldPath, action: ActionSpec, environment
     below, values = action.templates
     rendered = {
         name: compiler.template((*at, *below), {name: value}, environment) for name, value in values.items()
-    }  # one by one: what cannot be rendered takes nothing else with it
+    }  # one by one, so that one value that cannot be rendered does not affect the others
     if action.database is not None:
         _check_database(compiler, (*at, "database"), action.database)
     window = action.window
@@ -102,7 +102,7 @@ def _window(compiler: Compiler, at: FieldPath, action: ActionSpec, window: Windo
 def window_of(
     spec: DetectorSpec, streams: Iterable[Stream], clients: frozenset[str] | None, before_ns: int = 0, after_ns: int = 0
 ) -> CompiledWindow:
-    """The window of these streams; of the latched ones all come with it."""
+    """The window of these streams; it includes all latched streams."""
     return CompiledWindow(
         frozenset(stream.name for stream in streams if not stream.latched),
         frozenset(stream.name for stream in spec.streams if stream.latched),
@@ -114,12 +114,12 @@ def window_of(
 
 
 def _of_one(stream: Stream) -> bool:
-    """Whether all its samples belong to a client named by the Detector."""
+    """Whether all its samples belong to one client, which the Detector names."""
     return stream.client is not None and not stream.names_by_message
 
 
 def _check_database(compiler: Compiler, at: FieldPath, action: DatabaseAction) -> None:
-    """Report what the Detector lacks."""
+    """Report missing fields of the Detector."""
     detector = compiler.detector
     if detector.spec.database is None:
         compiler.problem(

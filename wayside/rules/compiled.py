@@ -1,4 +1,4 @@
-"""A rule as the engine evaluates it: expressions compiled, durations in nanoseconds."""
+"""A rule in the form that the engine evaluates: expressions are compiled, durations are in nanoseconds."""
 
 from __future__ import annotations
 
@@ -20,50 +20,50 @@ class CompiledSignal:
 
     name: str
     stream: str
-    """A stream of the Detector, or the result of `episode_stream` for `rule`."""
+    """A stream of the Detector, or, with `rule`, the result of `episode_stream`."""
     aggregate: Aggregate
     value: Expression | None
     where: Expression | None
     over_ns: int | None
     parameters: Parameters = NO_PARAMETERS
-    """The `parameters` of value and where, by client."""
+    """The `parameters` for value and where, by client."""
     rule: str | None = None
-    """The rule whose episode starts or ends are the samples; None where they come from a stream."""
+    """The rule whose episode starts or ends are the samples; None if they come from a stream."""
     element: CompiledElement | None = None
-    """The element that it is computed for, where value or where read it."""
+    """The element for which it is computed, if value or where reads the element."""
     quantile: float | None = None
-    """Of the aggregate Quantile, in [0, 1]."""
+    """The quantile of the aggregate Quantile, in [0, 1]."""
     client: str | None = None
-    """Whose samples these are, for every subject; None: the subject's own."""
+    """The client whose samples are used for every subject; None: the subject's own client."""
 
     @property
     def place(self) -> str:
-        """Under this its samples' values are kept: names have no `~`."""
+        """The key under which the values of its samples are kept. Names contain no `~`."""
         return self.name if self.element is None else f"{self.name}~{self.element.name}"
 
 
 @dataclass(frozen=True, slots=True)
 class CompiledDerived:
-    """A signal over the values that an expression had at the evaluations of a subject; times in nanoseconds."""
+    """A signal over the values of an expression at the evaluations of a subject. Times are in nanoseconds."""
 
     name: str
     of: Expression | None
-    """None: it is the age of the open episode."""
+    """None: the signal is the age of the open episode."""
     aggregate: Aggregate
     over_ns: int
     lag_ns: int
     quantile: float | None = None
     episode: bool = False
-    """Whether it is a statistic of the open episode; it has no window then."""
+    """Whether it is a statistic of the open episode, without a window."""
 
     @property
     def keeps(self) -> bool:
-        """Whether it looks at earlier evaluations."""
+        """Whether it needs the values of earlier evaluations."""
         return not self.episode and (self.lag_ns > 0 or self.aggregate is not Aggregate.LAST)
 
 
 def episode_stream(rule: str, *, ends: bool = False) -> str:
-    """The name of a rule's episode starts, or ends, in place of a stream name; no stream can have such a name."""
+    """The name of a rule's episode starts or ends, used like a stream name. No stream can have such a name."""
     return f"rule/{rule}/ends" if ends else f"rule/{rule}"
 
 
@@ -74,7 +74,7 @@ class CompiledPlugin:
     name: str
     plugin: str
     parameters: Mapping[str, Any] = field(hash=False)
-    """As written; the plugin's own model validates them."""
+    """The parameters as written. The plugin's own model validates them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,27 +83,27 @@ class CompiledPosition:
 
     stream: str
     axes: Mapping[str, Expression]
-    """x and y, perhaps z, in metres; or latitude and longitude, in degrees (WGS 84)."""
+    """x, y and optionally z, in metres; or latitude and longitude, in degrees (WGS 84)."""
     parameters: Parameters = NO_PARAMETERS
     max_age_ns: int | None = None
-    """Of older samples the position is unknown; None: as long as the stream is not stale."""
+    """The position is unknown if the newest sample is older; None: no limit, while the stream is not stale."""
 
     @property
     def geographic(self) -> bool:
-        """Whether it is on the Earth, else in a flat frame."""
+        """Whether it is in degrees on the Earth; otherwise it is in metres."""
         return "latitude" in self.axes
 
 
 @dataclass(frozen=True, slots=True)
 class ClientSubject:
-    """The rule is about each client."""
+    """Each client is a subject."""
 
     where: Expression | None
 
 
 @dataclass(frozen=True, slots=True)
 class PairSubject:
-    """The rule is about each pair of clients at most `within` metres apart."""
+    """Each pair of clients at most `within` metres apart is a subject."""
 
     position: CompiledPosition
     within: float
@@ -113,7 +113,7 @@ class PairSubject:
     maximum: int = 10_000
     """The maximum number of pairs in reach per evaluation."""
     closing_speed: bool = False
-    """Whether any expression uses it."""
+    """Whether any expression uses `closingSpeed`."""
 
     @property
     def ordered(self) -> bool:
@@ -123,7 +123,7 @@ class PairSubject:
 
 @dataclass(frozen=True, slots=True)
 class FleetSubject:
-    """The rule is about all members together."""
+    """All members together are the subject."""
 
     members: Expression
 
@@ -133,13 +133,13 @@ CompiledSubject = ClientSubject | PairSubject | FleetSubject
 
 @dataclass(frozen=True, slots=True)
 class CompiledElement:
-    """One of the elements that the rule is evaluated for; a rule without `each` has one without a name."""
+    """An element for which the rule is evaluated. A rule without `each` has one element without a name."""
 
     name: str | None = None
     variables: Mapping[str, Any] = field(default_factory=dict)
-    """The element's map under its variable's name."""
+    """The variable of the element, with its map."""
     signals: tuple[CompiledSignal, ...] = ()
-    """The signals that are computed for this element: those that read it."""
+    """The signals that read the element, and are computed for it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,7 +155,7 @@ class CompiledDeploy:
     follow: bool = False
     """Whether the parameters are evaluated again at each evaluation."""
     each_parameter: Mapping[str, CompiledTemplate] = field(default_factory=dict, compare=False)
-    """The parameters one by one, where they follow."""
+    """With `follow`, each parameter by name."""
     operation: Operation = Operation.DEPLOY
 
     @property
@@ -166,7 +166,7 @@ class CompiledDeploy:
 
 @dataclass(frozen=True, slots=True)
 class CompiledWindow:
-    """The samples that an action gets of an episode."""
+    """The samples of an episode that an action receives."""
 
     streams: frozenset[str]
     latched: frozenset[str]
@@ -174,11 +174,11 @@ class CompiledWindow:
     shared: frozenset[str]
     """The latched streams that belong to one client named by the Detector: they are included for every client."""
     clients: frozenset[str] | None
-    """Beside the episode's own; None: those of all clients."""
+    """The clients in addition to those of the episode; None: all clients."""
     before_ns: int
-    """Before the onset."""
+    """The time before the onset."""
     after_ns: int
-    """After the end."""
+    """The time after the end."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,7 +190,7 @@ class CompiledAction:
     """The values that are rendered over the rule's variables at the start of each episode."""
     window: CompiledWindow | None
     source: str
-    """The action as written, in canonical JSON: another action where this differs."""
+    """The action as written, in canonical JSON. A different text is a different action."""
 
 
 class ModelRunner(Protocol):
@@ -198,13 +198,13 @@ class ModelRunner(Protocol):
 
     @property
     def sha256(self) -> str:
-        """Of the model's file."""
+        """The SHA-256 digest of the model's file."""
 
     def tensor(self, name: str, payload: bytes) -> Any:
-        """The bytes of a camera's or lidar's message as a tensor for that input; raises the engine's DecodeError."""
+        """The message of a camera or lidar as a tensor for that input. Raises the engine's DecodeError."""
 
     def run(self, rows: Sequence[Mapping[str, Any]]) -> list[Any]:
-        """The signal's value for each row of inputs by name. Raises ValueError where the model fails."""
+        """The signal's value for each row of inputs by name. Raises ValueError if the model fails."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,16 +213,16 @@ class CompiledModel:
 
     name: str
     index: int
-    """Its place among the rule's signals."""
+    """The index of the signal in the rule."""
     source: ModelSource
     windows: Mapping[tuple[str, str], CompiledSignal] = field(compare=False)
-    """By the name of the input and of the signal: where its samples are found."""
+    """The signals of windows, with their samples, by the names of the input and of the signal."""
     runner: ModelRunner | None = field(default=None, compare=False)
     """None until the model's file is bound to the rule."""
 
     @property
     def sensors(self) -> tuple[ModelImage | ModelPoints, ...]:
-        """The cameras and lidars that it looks at."""
+        """The cameras and lidars among its inputs."""
         return tuple(source for each in self.source.inputs if (source := each.image or each.points) is not None)
 
 
@@ -233,12 +233,12 @@ class CompiledRule:
     name: str
     subject: CompiledSubject
     signals: tuple[CompiledSignal, ...]
-    """All of them. Those that read the element of `each` are computed for each element: see `elements`."""
+    """All signals. Those that read the element of `each` are computed for each element: see `elements`."""
     plugins: tuple[CompiledPlugin, ...]
     when: Expression
     until: Expression | None
     every_ns: int | None
-    """None: it is evaluated with samples or on demand."""
+    """None: the rule is evaluated at samples or on demand."""
     for_ns: int
     cooldown_ns: int
     unknown_timeout_ns: int
@@ -248,7 +248,7 @@ class CompiledRule:
     actions: tuple[CompiledAction, ...]
     classification: dict[str, Any] | None
     digest: str
-    """Of the fields that decide which episodes there are: open episodes end when it changes."""
+    """The digest of the fields that define the rule's episodes: open episodes end when it changes."""
     elements: tuple[CompiledElement, ...] = (CompiledElement(),)
     parameters: Parameters = NO_PARAMETERS
     models: tuple[CompiledModel, ...] = ()
@@ -256,11 +256,11 @@ class CompiledRule:
     places: tuple[Shape, ...] = ()
     """The places that its expressions name."""
     derived: tuple[CompiledDerived, ...] = ()
-    """The signals over what conditions see, each after those that it reads."""
+    """The signals over the variables of conditions, each after the signals that it reads."""
     has_margin: bool = False
-    """Whether one of these is the margin of `when`."""
+    """Whether one of these signals is the margin of `when`."""
     on_sample: str | None = None
-    """The stream with whose samples it is evaluated."""
+    """The stream at whose samples the rule is evaluated."""
     on_demand: bool = False
     priority: int = 0
     maximum_per_hour: int | None = None
@@ -268,7 +268,7 @@ class CompiledRule:
 
     @property
     def has_actions(self) -> bool:
-        """Whether an episode has any consequence in addition to its events, so that its variables may be rendered."""
+        """Whether an episode has actions, for which its variables may be rendered."""
         return bool(self.deploys or self.actions)
 
     @property
@@ -279,7 +279,7 @@ class CompiledRule:
 
     @property
     def linked(self) -> frozenset[str]:
-        """The streams of whose samples it reads the one before."""
+        """The streams whose previous samples it reads."""
         signals = [(signal.stream, each) for signal in self.signals for each in (signal.value, signal.where)]
         position = self.subject.position if isinstance(self.subject, PairSubject) else None
         axes = [] if position is None else [(position.stream, each) for each in position.axes.values()]
@@ -287,7 +287,7 @@ class CompiledRule:
 
     @property
     def streams(self) -> frozenset[str]:
-        """The streams that it looks at."""
+        """The streams that it reads."""
         position = {self.subject.position.stream} if isinstance(self.subject, PairSubject) else set()
         seen = (source.stream for model in self.models for source in model.sensors)
         return frozenset({*position, *seen, *(signal.stream for signal in self.signals)})
@@ -295,7 +295,7 @@ class CompiledRule:
 
 @dataclass(frozen=True, slots=True)
 class CompiledStream:
-    """The expressions of a stream for the sender's time and the client, if the Detector has them."""
+    """The expressions of a stream: the sender's time, the client and the items, if the Detector defines them."""
 
     name: str
     stamp: Expression | None

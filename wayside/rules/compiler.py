@@ -1,4 +1,4 @@
-"""Compiles the expressions of a rule against its Detector, and collects what is wrong with them and the rule."""
+"""Compiles the expressions of a rule against its Detector, and collects the problems of the rule."""
 
 from __future__ import annotations
 
@@ -34,16 +34,16 @@ _WITHOUT = {
     "item": "; item is for signals over streams with items, not over {}",
     "before": "; before is for signals over streams, not over a {}",
 }
-"""What samples do not have, by the variable."""
+"""Hints by variable, for variables that some samples do not have."""
 
 
 class Compiler:
-    """One rule and its Detector: each part of the rule is compiled with it, and reports its problems to it."""
+    """One rule and its Detector. The parts of the rule are compiled with it, and report their problems to it."""
 
     def __init__(self, rule: EventRule, detector: Detector, fields: Mapping[str, Fields], places: KnownPlaces) -> None:
         self.written = rule
         self.rule = located(rule, detector)
-        """With what the Detector knows of positions written out."""
+        """The rule, completed with the positions of the Detector."""
         self.spec = self.rule.spec
         self.detector = detector
         self._places = places
@@ -61,7 +61,7 @@ class Compiler:
     def template(
         self, path: FieldPath, value: Mapping[str, JsonValue], environment: Environment
     ) -> CompiledTemplate | None:
-        """Texts with ${…}, which stand at the path by name; None where one is wrong."""
+        """The compiled values with ${…}, whose names follow the path; None if one is invalid."""
         try:
             compiled = compile_template(dict(value), self._typed(environment))
         except InterpolationError as error:
@@ -74,7 +74,7 @@ class Compiler:
         return compiled
 
     def stream(self, path: FieldPath, name: str) -> Stream | None:
-        """The Detector's stream of that name; None, and a problem, where it has none."""
+        """The Detector's stream of that name; None, with a problem, if it has none."""
         stream = self.detector.spec.stream(name)
         if stream is None:
             names = [stream.name for stream in self.detector.spec.streams]
@@ -85,7 +85,7 @@ class Compiler:
     def condition(
         self, path: FieldPath, source: str | None, environment: Environment, kind: CelType = CelType.BOOL
     ) -> Expression | None:
-        """An expression over what a subject is seen as; None where there is none, or it is wrong."""
+        """An expression over the variables of a subject; None if there is none, or it is invalid."""
         expression = self._expression(path, source, environment, kind)
         if expression is not None:
             self._members(path, expression.paths)
@@ -101,9 +101,9 @@ class Compiler:
         *,
         of_rule: bool = False,
     ) -> Expression | None:
-        """An expression over one sample, and the element's variable; None where there is none, or it is wrong.
+        """An expression over one sample and the element's variable; None if there is none, or it is invalid.
 
-        `of_rule`: the samples are those of a rule; else `stream` is None where the Detector has no such stream.
+        `of_rule`: the samples are those of a rule; otherwise, `stream` is None if the Detector has no such stream.
         """
         items = not of_rule and (stream is None or stream.items is not None)
         environment = sample_environment(element, items=items, before=not of_rule)
@@ -136,7 +136,7 @@ class Compiler:
         places: NamedPlaces | None = None,
         whose: str = "",
     ) -> Expression | None:
-        """`whose` samples it is over: the stream's name, or `rule`."""
+        """`whose`: the source of its samples, a stream's name or `rule`; empty without samples."""
         if source is None:
             return None
         try:
@@ -153,7 +153,7 @@ class Compiler:
         self.used |= {shape.name: shape for shape in expression.places}
 
     def _typed(self, environment: Environment, places: NamedPlaces | None = None) -> Environment:
-        """The environment, knowing of which kinds the rule's parameters are, and the places; None: of conditions."""
+        """The environment with the types of the rule's parameters, and the places; None: those of conditions."""
         key = environment, None if places is None else places.stream
         if key not in self._knowing:
             self._knowing[key] = environment.knowing(self._kinds).naming(places or self._of_conditions)
@@ -164,7 +164,8 @@ class Compiler:
         return self.detector.spec.buffer_duration_ns(stream)
 
     def not_kept(self, path: FieldPath, problem: str, stream: Stream) -> None:
-        """Report that a time, as the beginning of the message has it, exceeds what the Detector keeps of a stream."""
+        """Report that a time exceeds the duration for which the Detector keeps a stream. The message begins with
+        `problem`."""
         self.problem(
             path,
             f"{problem} the {self.kept_ns(stream) / 1e9:g} s that Detector {self.detector.name} keeps of stream "
@@ -172,17 +173,18 @@ class Compiler:
         )
 
     def _members(self, path: FieldPath, paths: Iterable[Path]) -> None:
-        """A pair's a and b and the element of `each` are maps: CEL itself does not know what is in them."""
+        """Check the fields of a pair's a and b, and of the element of `each`: they are maps, which CEL does not
+        check."""
         for name, members in known_members(self.spec):
             for text in unknown_fields(paths, name, members):
                 self.problem(path, text)
 
     def problem(self, path: FieldPath, message: str) -> None:
-        """Report a problem with a field, once: a position that is written once is read by axes."""
+        """Report a problem with a field, only once: a position that is used once is read once per axis."""
         if (problem := RuleProblem(path, message)) not in self.problems:
             self.problems.append(problem)
 
 
 def _parameter_of(located: InterpolationError | Embedded) -> str:
-    """The parameter in which it stands, of a path such as `sources[0].name`."""
+    """The parameter that contains it, from a path such as `sources[0].name`."""
     return re.split(r"[.\[]", located.path, maxsplit=1)[0]

@@ -33,11 +33,11 @@ def compile_rule(
     known: Iterable[RuleProblem] = (),
     places: KnownPlaces | None = None,
 ) -> CompiledRule:
-    """The rule as the engine evaluates it.
+    """The rule in the form that the engine evaluates.
 
-    `fields` has the message fields of the streams that are known to have no others; what an expression reads beside
-    them is a problem. `known` has problems that were found beside it, among several rules. `places` are those that it
-    can name; None: those that the Detector defines itself, and any other if it has maps.
+    `fields` has the message fields of the streams whose fields are all known: reading another field is a problem.
+    `known` has problems that were already found between several rules. `places` are the places that the rule can
+    name; None: those that the Detector itself defines, and any other name if it has maps.
 
     Raises:
         RuleError: with every problem of the rule.
@@ -51,7 +51,7 @@ def compile_rule(
 
 
 def _compiled(compiler: Compiler) -> CompiledRule | None:
-    """The compiled rule, or None where problems forbid it."""
+    """The compiled rule; None if it has problems."""
     spec = compiler.spec
     subject = compile_subject(compiler)
     elements = compile_elements(compiler, spec.each)
@@ -115,7 +115,7 @@ def _signal(compiler: Compiler, index: int, signal: Signal) -> CompiledSignal | 
     if signal.rule_name is not None:
         return _episode_signal(compiler, at, signal, signal.rule_name)
     if signal.stream is None:
-        return None  # a model's or a plugin's, or computed from other signals
+        return None  # computed by a model, by a plugin, or from other signals
     stream = compiler.stream((*at, "stream"), signal.stream)
     value = compiler.sample((*at, "value"), signal.value, stream, CelType.DYN, element_of(compiler.spec))
     where = compiler.sample((*at, "where"), signal.where, stream, CelType.BOOL, element_of(compiler.spec))
@@ -150,7 +150,7 @@ def _episode_signal(compiler: Compiler, at: FieldPath, signal: Signal, rule: str
 
 
 def _digest(compiler: Compiler) -> str:
-    """Of what decides which episodes there are, the Detector's values for the parameters and its places among it."""
+    """The digest of everything that defines the rule's episodes, including the Detector's parameters and places."""
     rule, clients = compiler.rule, compiler.detector.spec.clients
     decisive: list[JsonValue] = [
         rule.semantics(),
@@ -173,15 +173,15 @@ def _of_stream(rule: EventRule, stream: str) -> list[str]:
 
 
 def own_problems(rule: EventRule) -> tuple[RuleProblem, ...]:
-    """The problems of a rule that do not depend on a Detector; none where some Detector could evaluate it.
+    """The problems of a rule that do not depend on a Detector; none if some Detector could evaluate it.
 
-    The rule is compiled against a Detector that has every stream, keeps everything and takes every action. So what
-    remains is the rule's alone, and no change of a Detector could put it right.
+    The rule is compiled against a Detector that has every stream, keeps everything and supports every action. So the
+    remaining problems are those of the rule itself, and no change of a Detector can solve them.
     """
     try:
         compile_rule(rule, _taking_everything(), places=NO_MORE_IS_KNOWN)
     except RuleError as error:
-        # The stream's type and messages depend on the Detector; the ones here are invented.
+        # The type and the messages of a stream depend on the Detector; those here are made up.
         return tuple(each for each in error.problems if each.path[-1:] != ("stream",))
     return ()
 

@@ -1,7 +1,7 @@
 """Rules over rules: the dependencies of rules, their order of evaluation, and the problems of both.
 
-A signal's samples may be the episode starts of another rule. Within a tick a rule is evaluated after those it depends
-on: its depth is 0 where it names none, else one more than the greatest depth of those it names.
+The samples of a signal can be the episodes of another rule. Within a tick, a rule is evaluated after the rules that it
+names: its depth is 0 if it names none, otherwise one more than the greatest depth of these.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from wayside.rules.problems import RuleProblem
 
 
 def in_order(rules: Iterable[CompiledRule]) -> list[CompiledRule]:
-    """The rules as they are evaluated within a tick: by depth, then by name.
+    """The rules in the order of evaluation within a tick: by depth, then by name.
 
-    Unknown rules are ignored, and so are dependencies that close a cycle (only rules that stay active as they
-    last were can form one: `dependency_problems` refuses the others).
+    Unknown rules are ignored, and so are dependencies that close a cycle. (Only rules whose last valid version stays
+    active can form a cycle: `dependency_problems` refuses all others.)
     """
     named = {rule.name: [signal.rule for signal in rule.signals if signal.rule is not None] for rule in rules}
     depths: dict[str, int] = {}
@@ -35,7 +35,7 @@ def in_order(rules: Iterable[CompiledRule]) -> list[CompiledRule]:
 
 
 def dependency_problems(rules: Sequence[EventRule]) -> dict[str, list[RuleProblem]]:
-    """By the names of the rules: signals that name a rule that is not among them, and cycles."""
+    """The problems by rule: signals that name an unknown rule, and cycles."""
     problems: dict[str, list[RuleProblem]] = {}
     named = {rule.name: dict(_named(rule)) for rule in rules}
     for name, signals in named.items():
@@ -68,7 +68,7 @@ def _unknown(name: str, others: Sequence[str]) -> str:
 
 
 def _way(start: str, end: str, named: Mapping[str, Mapping[int, str]]) -> tuple[str, ...]:
-    """The shortest way along dependencies from one rule to another, both included; none: empty."""
+    """The shortest path along dependencies from one rule to another, including both; empty if there is none."""
     ways: list[tuple[str, ...]] = [(start,)]
     seen = {start}
     for way in ways:

@@ -1,4 +1,4 @@
-"""Compiles the signals over what conditions see: signals of signals, and statistics of the open episode."""
+"""Compiles the signals over the variables of conditions: signals of signals, and statistics of the open episode."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from wayside.rules.margins import MARGIN, MarginError, margin_of
 
 
 def compile_derived(compiler: Compiler, environment: Environment) -> tuple[CompiledDerived, ...]:
-    """The signals over what conditions see, each after those that it reads."""
+    """The signals over the variables of conditions, each after the signals that it reads."""
     found: dict[str, CompiledDerived] = {}
     places: dict[str, FieldPath] = {}
     for index, signal in enumerate(compiler.rule.spec.signals):
@@ -38,7 +38,7 @@ def compile_derived(compiler: Compiler, environment: Environment) -> tuple[Compi
 
 
 def _margin(compiler: Compiler, environment: Environment) -> Expression | None:
-    """The margin of `when`; None, and problems, where it can have none."""
+    """The margin of `when`; None, with a problem, if it can have none."""
     spec = compiler.rule.spec
     for index, signal in enumerate(spec.signals):
         if signal.name == MARGIN:
@@ -54,7 +54,7 @@ def _margin(compiler: Compiler, environment: Environment) -> Expression | None:
 
 
 def statistics_read(expression: Expression, derived: Iterable[CompiledDerived]) -> Iterator[str]:
-    """The problems of an expression, other than of an action, that reads a statistic of the open episode."""
+    """The problems of an expression outside of actions that reads a statistic of the open episode."""
     for name in sorted(expression.names & {each.name for each in derived if each.episode}):
         yield f"{name} is known only while an episode is open: use it in actions; conditions and signals cannot read it"
 
@@ -75,7 +75,7 @@ def _compiled(compiler: Compiler, at: FieldPath, signal: Signal, of: Expression 
 
 
 def _in_order(derived: Mapping[str, CompiledDerived]) -> Iterator[str]:
-    """The names, each after those that it reads; without those that depend on themselves."""
+    """The names, each after those that it reads, without those that depend on themselves."""
     reads = {name: each.of.names & derived.keys() if each.of else frozenset() for name, each in derived.items()}
     done: set[str] = set()
     while ready := [name for name in reads if name not in done and reads[name] <= done]:

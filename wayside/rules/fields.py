@@ -1,4 +1,4 @@
-"""The fields of messages: finds misspelt fields before any sample arrives."""
+"""The fields of messages. Misspelt fields are found before any sample arrives."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from wayside.expressions import Path
 from wayside.names import did_you_mean
 
 Fields = Mapping[str, "Fields | None"]
-"""The fields of a message by name; None below a field: it has none of its own, or they are not known."""
+"""The fields of a message by name. The value None means that a field has no fields, or that they are unknown."""
 
 
 BYTES: Fields = {}
-"""Those of a message that is bytes: none."""
+"""The fields of a message that consists of bytes: none."""
 
 
 class ItemFields(dict[str, "Fields | None"]):
@@ -20,7 +20,7 @@ class ItemFields(dict[str, "Fields | None"]):
 
 
 def unknown_fields(paths: Iterable[Path], variable: str, fields: Fields) -> Iterable[str]:
-    """A message for each path that starts at the variable and names a field that is not there."""
+    """A message for each path that starts at the variable and names a field that does not exist."""
     for path in sorted(paths, key=str):
         if path[0] != variable:
             continue
@@ -42,7 +42,7 @@ def unknown_fields(paths: Iterable[Path], variable: str, fields: Fields) -> Iter
 
 
 def fields_at(path: Path, fields: Fields | None) -> Fields | None:
-    """The fields of what a path below a message leads to; None where they are not known."""
+    """The fields of the value at a path below a message; None if they are unknown."""
     for step in path:
         if fields is None:
             return None

@@ -1,8 +1,8 @@
-"""The margin of a condition: how far it is from changing.
+"""The margin of a condition: its distance from the next change.
 
-It is the robustness of signal temporal logic: the signed distance of each comparison to its threshold in units of a
-scale, the smaller of both for `&&`, the larger for `||`, and the negative for `!`. It is written as an expression of
-CEL, so what is unknown stays unknown, in columns as elsewhere.
+It is the robustness of signal temporal logic: the signed distance of each comparison from its threshold in units of a
+scale, the smaller of both sides for `&&`, the larger for `||`, and the negative for `!`. It is a CEL expression, so
+unknown values stay unknown, in columns as well.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _NO_NUMBERS = ("true", "false", "null")
 
 
 class MarginError(Exception):
-    """A rule can have no such margin; `path` is the field."""
+    """The margin of a rule is not valid; `path` is the field."""
 
     def __init__(self, path: FieldPath, message: str) -> None:
         super().__init__(message)
@@ -54,7 +54,7 @@ class _Comparison(NamedTuple):
 
 
 class _Margin:
-    """Goes through a condition."""
+    """Translates a condition into its margin."""
 
     def __init__(self, source: str, scales: Mapping[str, float], quantities: set[str]) -> None:
         self._source, self._scales, self._quantities = source, scales, quantities
@@ -65,7 +65,7 @@ class _Margin:
         return _joined("larger", [self._both(part) for part in parts])
 
     def check(self) -> None:
-        """Raises MarginError where comparisons are of different quantities and one has no scale."""
+        """Raises MarginError if comparisons are of different quantities and one has no scale."""
         unscaled = [each for each in self._comparisons if not each.scaled]
         if unscaled and len({each.quantities for each in self._comparisons}) > 1:
             names = " or ".join(sorted(unscaled[0].quantities)) or "a signal that it reads"
@@ -149,7 +149,7 @@ def _split(text: Sequence[Token], operators: Sequence[str]) -> Iterator[Sequence
 
 
 def _is_group(text: Sequence[Token]) -> bool:
-    """Whether all of it stands in one pair of parentheses."""
+    """Whether one pair of parentheses encloses the whole text."""
     if not text or text[0].text != "(" or text[-1].text != ")":
         return False
     return all(depth > 0 for _, depth in [*_depths(text)][1:-1])

@@ -1,6 +1,6 @@
 """Compiles signals that a model computes, from the rule and its Detector. The model file is checked elsewhere.
 
-A model's inputs are signals of the same rule over streams; a model cannot be the input of a model.
+A model's inputs are signals of the same rule over streams. A model cannot be the input of a model.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _POINTS = "sensor_msgs/msg/PointCloud2"
 
 
 def compile_models(compiler: Compiler, compiled: Sequence[CompiledSignal]) -> tuple[CompiledModel, ...]:
-    """The rule's model signals; their files are not there yet. `compiled` has the signals over streams."""
+    """The rule's model signals, without their files. `compiled` has the signals over streams."""
     by_name = {signal.name: signal for signal in compiled}
     models = []
     for index, signal in enumerate(compiler.spec.signals):
@@ -40,7 +40,7 @@ def compile_models(compiler: Compiler, compiled: Sequence[CompiledSignal]) -> tu
 
 
 def _windowed(signal: CompiledSignal, name: str, detector: Detector) -> CompiledSignal:
-    """The signal's samples under a name of their own, as far back as they are kept."""
+    """The signal's samples under their own name, as far back as the Detector keeps them."""
     stream = detector.spec.stream(signal.stream or "")
     kept = None if stream is None else detector.spec.buffer_duration_ns(stream)
     return replace(signal, name=name, over_ns=kept)
@@ -62,7 +62,7 @@ def _check(compiler: Compiler, at: FieldPath, given: ModelInput) -> None:
 
 
 def _usable(compiler: Compiler, at: FieldPath, names: Sequence[str]) -> list[tuple[FieldPath, Signal]]:
-    """The signals of these names that a model can take, with their places; the others are problems."""
+    """The signals of these names that can be inputs of a model, with their paths. Each other name is a problem."""
     by_name = {signal.name: signal for signal in compiler.spec.signals}
     found = []
     for position, name in enumerate(names):

@@ -12,7 +12,7 @@ from wayside.expressions import CelType, normalise
 from wayside.names import did_you_mean
 
 Values = Mapping[str, Any]
-"""Parameters by name, as expressions take them."""
+"""Parameters by name, in the types of expressions."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,12 +20,12 @@ class Parameters:
     """The values that expressions see as `parameters`."""
 
     own: Values = field(default_factory=dict)
-    """As the rule has them."""
+    """The values of the rule."""
     overridden: Mapping[str, Values] = field(default_factory=dict)
-    """By client, for those for which the Detector sets some of them: all of them, for that client."""
+    """All values for each client for which the Detector overrides some, by client."""
 
     def of(self, client: str) -> Values:
-        """Those for one client."""
+        """The values for one client."""
         return self.overridden.get(client, self.own)
 
 
@@ -33,7 +33,7 @@ NO_PARAMETERS = Parameters()
 
 
 def parameters_of(rule: EventRule, detector: Detector) -> Parameters:
-    """The rule's parameters at that Detector; overrides that are wrong are left out (see `override_problems`)."""
+    """The rule's parameters in that Detector, without invalid overrides (see `override_problems`)."""
     own = _values(rule.spec.parameters)
     wrong = {path for path, _ in override_problems(rule, detector)}
     overridden = {
@@ -48,7 +48,7 @@ def parameters_of(rule: EventRule, detector: Detector) -> Parameters:
 
 
 def kinds_of(rule: EventRule) -> Mapping[str, CelType]:
-    """The kinds of the rule's parameters, by their paths in expressions, those of a pair's a and b among them."""
+    """The types of the rule's parameters, by their paths in expressions, including those of a pair's a and b."""
     prefixes = ("", "a.", "b.") if rule.spec.scope.pairs is not None else ("",)
     return {
         f"{prefix}parameters.{name}": cel_type
@@ -82,7 +82,8 @@ def unknown_rules(detector: Detector, rules: Iterable[str]) -> Iterator[tuple[Fi
 
 
 def _misfits(name: str, own: object, other: object, rule: str) -> Iterator[str]:
-    """The differences of type between an override and the rule's own value; for lists, the items are compared."""
+    """The differences of type between an override and the rule's own value; for lists and maps, also between their
+    items."""
     wanted, given = _kind(own).name, _kind(other).name
     if wanted != given:
         yield f"{name} must be a {wanted}, as in EventRule {rule}; got a {given}, {other!r:.60}"

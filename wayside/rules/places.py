@@ -16,7 +16,7 @@ from wayside.geo.geometry import FARTHEST, Point, Shape, crossing, interned
 from wayside.rules.problems import RuleProblem
 
 _MOTION: Final = {False: ("yaw", "speed"), True: ("heading", "speed")}
-"""The signals that `seenFrom` reads of both clients."""
+"""The signals of both clients that `seenFrom` reads, in metres (False) and on the Earth (True)."""
 
 
 class KnownPlaces(NamedTuple):
@@ -24,14 +24,14 @@ class KnownPlaces(NamedTuple):
 
     shapes: Mapping[str, Shape]
     complete: bool = True
-    """Whether there are no others; else any name is accepted."""
+    """Whether all places are known; if not, any name is accepted."""
 
 
 NO_MORE_IS_KNOWN: Final = KnownPlaces({}, complete=False)
 
 
 def place_problems(detector: Detector) -> Iterator[RuleProblem]:
-    """What is wrong with the places that the Detector defines itself."""
+    """The problems of the places that the Detector itself defines."""
     for index, place in enumerate(detector.spec.places):
         for field, text in shape_problems(place.frame is CoordinateFrame.WGS84, place.area, place.line):
             yield RuleProblem(("spec", "places", index, *field), text)
@@ -40,7 +40,7 @@ def place_problems(detector: Detector) -> Iterator[RuleProblem]:
 def shape_problems(
     geographic: bool, area: Sequence[Sequence[float]] | None, line: Sequence[Sequence[float]] | None
 ) -> Iterator[tuple[FieldPath, str]]:
-    """What is wrong with an area and a line: the field and the message."""
+    """The problems of an area and a line: the field and the message."""
     found = False
     for field, points in (("area", area), ("line", line)):
         for index, (u, v) in enumerate(map(_point, points or ())):
@@ -74,13 +74,13 @@ def _out_of_range(geographic: bool, u: float, v: float) -> str | None:
 
 
 def places_of(detector: Detector) -> Mapping[str, Shape]:
-    """The places that the Detector defines itself, by name; those that are wrong are left out."""
+    """The valid places that the Detector itself defines, by name."""
     wrong = {problem.path[2] for problem in place_problems(detector)}
     return {place.name: shape_of_place(place) for at, place in enumerate(detector.spec.places) if at not in wrong}
 
 
 def own_places(detector: Detector) -> KnownPlaces:
-    """The places that rules can name, where the Detector's maps cannot be read."""
+    """The places that rules can name if the Detector's maps are not read."""
     return KnownPlaces(places_of(detector), complete=not detector.spec.maps)
 
 
@@ -97,10 +97,10 @@ def _point(corner: Sequence[float]) -> Point:
 
 
 def located(rule: EventRule, detector: Detector) -> EventRule:
-    """The rule with what its Detector knows of positions written out.
+    """The rule, completed with the positions of its Detector.
 
-    A position of pairs without axes gets those of its stream, and a rule about pairs that uses `seenFrom` the signals
-    that it reads: yaw (heading on the Earth) and speed, unless it has signals of these names.
+    A position of pairs without axes gets those of its stream. A rule over pairs that uses `seenFrom` gets the signals
+    that this function reads, yaw (on the Earth: heading) and speed, unless it has signals of these names.
     """
     pairs = rule.spec.scope.pairs
     stream = None if pairs is None else detector.spec.stream(pairs.position.stream)
@@ -129,13 +129,14 @@ def _conditions(spec: EventRuleSpec) -> str:
 
 
 def of_conditions(rule: EventRule, known: KnownPlaces) -> NamedPlaces:
-    """What the rule's conditions can name."""
+    """The places and positions that the rule's conditions can use."""
     pairs = rule.spec.scope.pairs
     return NamedPlaces(known.shapes, known.complete, None if pairs is None else pairs.position.latitude is not None)
 
 
 def of_samples(stream: Stream | None, known: KnownPlaces) -> NamedPlaces:
-    """What an expression over a sample of the stream can name; of the start of an episode, there is no stream."""
+    """The places and positions that an expression over a sample of the stream can use. An episode start has no
+    stream."""
     if stream is None:
         return NamedPlaces(known.shapes, known.complete)
     axes = {} if stream.position is None else stream.position.axes

@@ -10,14 +10,14 @@ from wayside.api.documents import FieldPath, field_text
 
 @dataclass(frozen=True, slots=True)
 class RuleProblem:
-    """The reason why a rule cannot be evaluated: the field, and a message with the remedy."""
+    """A reason why a rule cannot be evaluated: the field, and a message with the remedy."""
 
     path: FieldPath
     message: str
     detector: str | None = None
-    """The Detector whose field it is; None: the rule's."""
+    """The Detector that has the field; None: the rule has it."""
     check: str = ""
-    """The name of its finding, where it is a warning."""
+    """The name of the finding, if it is a warning."""
 
     def __str__(self) -> str:
         whose = "" if self.detector is None else f"Detector {self.detector}: "
@@ -25,7 +25,7 @@ class RuleProblem:
 
 
 class RuleError(Exception):
-    """A rule that cannot be evaluated; `problems` has every problem."""
+    """A rule cannot be evaluated; `problems` has every problem."""
 
     def __init__(self, problems: Iterable[RuleProblem]) -> None:
         self.problems = tuple(problems)

@@ -32,7 +32,7 @@ CLOSING_NS = 1_000_000_000
 
 
 def compile_subject(compiler: Compiler) -> CompiledSubject | None:
-    """The scope; None where problems forbid it. Whether `closingSpeed` is used is not known yet."""
+    """The compiled scope; None if it has problems. `with_closing_speed` completes it later."""
     spec = compiler.rule.spec
     element = element_of(spec)
     if spec.scope.pairs is not None:
@@ -90,7 +90,7 @@ def _pairs(compiler: Compiler, pairs: PairsScope, element: str | None) -> PairSu
 
 
 def compile_elements(compiler: Compiler, each: Each | None) -> tuple[CompiledElement, ...]:
-    """The elements that the rule is evaluated for, in order of their names; one without a name where it has no each."""
+    """The elements for which the rule is evaluated, ordered by name; one without a name if the rule has no `each`."""
     if each is None:
         return (CompiledElement(),)
     spec, name, at = compiler.rule.spec, each.as_, ("spec", "each", "as")
@@ -114,7 +114,7 @@ def with_signals(
 
 
 def check_models(compiler: Compiler, elements: Sequence[CompiledElement], models: Sequence[CompiledModel]) -> None:
-    """Report models that would have to be run for each element: they are run once for a client."""
+    """Report models whose inputs depend on the element: a model runs only once per client."""
     own = {signal.name for signal in elements[0].signals}
     for model in models:
         for index, given in enumerate(model.source.inputs):

@@ -1,4 +1,4 @@
-"""A Detector's streams: their expressions (the sender's time, and the client of a message), and their sources."""
+"""The streams of a Detector: their expressions (stamp, position, items and client), and their sources."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from wayside.rules.variables import items_environment, naming_environment, sampl
 
 
 def compile_stream(stream: Stream, index: int, fields: Fields | None = None) -> CompiledStream:
-    """The stream's own expressions.
+    """The compiled expressions of the stream.
 
     Raises:
-        RuleError: with every problem of them.
+        RuleError: with every problem of the expressions.
     """
     problems = list(stream_problems(stream, index, fields))
     if problems:
@@ -34,7 +34,7 @@ def compile_stream(stream: Stream, index: int, fields: Fields | None = None) -> 
 
 
 def stream_problems(stream: Stream, index: int, fields: Fields | None = None) -> Iterable[RuleProblem]:
-    """The problems of a Detector's stream: of its key and its expressions."""
+    """The problems of a Detector's stream: of its key and of its expressions."""
     try:
         KeyPattern.parse(stream.key)
     except KeyPatternError as error:
@@ -60,7 +60,7 @@ def stream_problems(stream: Stream, index: int, fields: Fields | None = None) ->
 
 
 def _sample_problems(path: FieldPath, source: str, stream: Stream, fields: Fields | None) -> Iterable[RuleProblem]:
-    """The problems of an expression for a number of a sample."""
+    """The problems of an expression that computes a number from a sample."""
     try:
         expression = sample_environment(items=stream.items is not None).compile(source, result=CelType.DOUBLE)
     except ExpressionError as error:
@@ -74,7 +74,7 @@ def _sample_problems(path: FieldPath, source: str, stream: Stream, fields: Field
 
 
 def item_fields(stream: Stream, fields: Fields | None) -> Fields | None:
-    """The fields of the stream's items, of whose messages `fields` are known; None where they are not known."""
+    """The fields of the stream's items, from the `fields` of its messages; None if they are unknown."""
     if stream.items is None or fields is None:
         return None
     try:
@@ -119,7 +119,7 @@ def _naming_problems(stream: Stream, path: FieldPath, fields: Fields | None) -> 
 
 
 def source_problems(detector: Detector) -> Iterator[RuleProblem]:
-    """Sources that are named wrongly or not at all, sources without streams, and what only Zenoh can do."""
+    """The problems of sources and of the liveliness key: wrong or unused names, and options that only Zenoh has."""
     names = [source.name for source in detector.spec.sources]
     for index, source in enumerate(detector.spec.sources):
         if source.name == ZENOH:

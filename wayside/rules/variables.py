@@ -1,4 +1,4 @@
-"""The variables that each kind of expression of a rule may use."""
+"""The variables of each kind of expression of a rule."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ MEMBER_OF_CLIENT = ("client", "labels", "streams", "parameters")
 EPISODE_MEMBERS: Fields = dict.fromkeys(
     ("episode", "subject", "subjects", "element", "onsetTime", "startTime", "values")
 )
-"""The fields of msg in a signal over a rule: the start of an episode. Times are seconds since the epoch."""
+"""The fields of msg in a signal over the episode starts of a rule. Times are in seconds since the epoch."""
 
 END_MEMBERS: Fields = {**EPISODE_MEMBERS, "endTime": None, "reason": None}
-"""The same of the end of an episode."""
+"""The fields of msg in a signal over the episode ends of a rule."""
 
 SAMPLE_MEMBERS = ("stamp", "received", "latency", "size")
 
 
 @lru_cache(maxsize=256)
 def sample_environment(element: str | None = None, *, items: bool = False, before: bool = True) -> Environment:
-    """For `value` and `where` of signals, and positions (without an element): one sample.
+    """For `value` and `where` of signals, and for positions (without an element): the variables of one sample.
 
-    msg is the decoded message, key the captured chunks, sample has stamp and received (seconds since the epoch),
-    latency (seconds) and size (bytes); parameters are those of the sample's client. `items`: item is the client's item.
-    `before`: before is the client's message or item before.
+    msg is the decoded message, key has the captured chunks, sample has stamp and received (seconds since the epoch),
+    latency (seconds) and size (bytes); parameters are those of the sample's client. With `items`, item is the client's
+    item. With `before`, before is the client's previous message or item.
     """
     fixed = {"msg": CelType.DYN, "key": CelType.MAP, "sample": CelType.MAP, "parameters": CelType.MAP}
     if items:
@@ -42,7 +42,7 @@ def sample_environment(element: str | None = None, *, items: bool = False, befor
 
 @cache
 def stamp_environment() -> Environment:
-    """For a stream's `stamp`: the decoded message, and when the sample was received."""
+    """For a stream's `stamp`: the decoded message, and the receive time of the sample."""
     return Environment({"msg": CelType.DYN, "sample": CelType.MAP}, {"sample.received": CelType.DOUBLE})
 
 
@@ -60,7 +60,7 @@ def naming_environment(*, items: bool = False) -> Environment:
 
 @lru_cache(maxsize=1024)
 def is_taken(name: str) -> bool:
-    """Whether the name means something to CEL itself, so that no signal can have it."""
+    """Whether the name has a meaning in CEL, so that no signal can have it."""
     try:
         Environment({name: CelType.DYN}).compile(name)
     except (ValueError, ExpressionError):
@@ -77,7 +77,8 @@ def client_environment(signals: tuple[str, ...], element: str | None) -> Environ
 
 @lru_cache(maxsize=256)
 def pairs_environment(element: str | None) -> Environment:
-    """For a pair: a and b (maps of what a client scope has, and position), distance in metres, closingSpeed in m/s."""
+    """For a pair: a and b (maps of the variables of a client scope, with position), distance (m), closingSpeed
+    (m/s)."""
     numbers = {"distance": CelType.DOUBLE, "closingSpeed": CelType.DOUBLE}
     return Environment(
         _with_element({"a": CelType.MAP, "b": CelType.MAP, "parameters": CelType.MAP, **numbers}, element)
@@ -86,12 +87,12 @@ def pairs_environment(element: str | None) -> Environment:
 
 @lru_cache(maxsize=256)
 def fleet_environment(element: str | None) -> Environment:
-    """For the fleet: members (a list of maps of what a client scope has)."""
+    """For the fleet: members (a list of maps of the variables of a client scope)."""
     return Environment(_with_element({"members": CelType.LIST, "parameters": CelType.MAP}, element))
 
 
 def _with_element(variables: dict[str, CelType], name: str | None) -> dict[str, CelType]:
-    """Adds the element of `each`; an element with an invalid name is skipped, and reported elsewhere."""
+    """Adds the element of `each`. An invalid name is skipped here, and reported elsewhere."""
     return variables if name is None or name in variables or is_taken(name) else {**variables, name: CelType.MAP}
 
 
@@ -101,13 +102,13 @@ def element_of(spec: EventRuleSpec) -> str | None:
 
 
 def signal_names(spec: EventRuleSpec) -> tuple[str, ...]:
-    """The signals that each client has and that expressions can name."""
+    """The signals of each client that expressions can name."""
     whole = of_the_subject(spec)
     return tuple(each.name for each in spec.signals if each.name not in whole and not is_taken(each.name))
 
 
 def of_the_subject(spec: EventRuleSpec) -> frozenset[str]:
-    """The signals that the rule's subject has as a whole: in a pairs scope, neither a nor b has them."""
+    """The signals that belong to the rule's subject as a whole. In a pairs scope, a and b do not have them."""
     margin = ("margin",) if spec.margin is not None else ()
     named = (signal.name for signal in spec.signals if signal.plugin is not None or signal.is_derived)
     return frozenset((*named, *margin))
@@ -121,7 +122,7 @@ def condition_environment(spec: EventRuleSpec) -> Environment:
 
 @lru_cache(maxsize=256)
 def _with(environment: Environment, whole: tuple[str, ...]) -> Environment:
-    """And the signals that the subject has as a whole."""
+    """The environment with the signals of the subject as a whole."""
     return Environment({**environment.variables, **dict.fromkeys(whole, CelType.DYN)})
 
 
@@ -136,7 +137,7 @@ def _scope_environment(spec: EventRuleSpec) -> Environment:
 
 
 def known_members(spec: EventRuleSpec) -> Iterator[tuple[str, Fields]]:
-    """The maps among the variables whose fields are known, and these: CEL itself does not know what is in them."""
+    """The map variables whose fields are known, with these fields: CEL does not check them."""
     yield "parameters", dict.fromkeys(spec.parameters)
     if spec.scope.pairs is not None:
         whole = of_the_subject(spec)
@@ -179,12 +180,12 @@ _SAMPLE = {
 
 
 def signal_name_problem(name: str, spec: EventRuleSpec) -> str | None:
-    """Why a signal cannot have the name, and which it could have; None where it can."""
+    """The reason why a signal cannot have the name, with a proposal; None if it can."""
     return _problem(name, spec, _given(spec), "signal")
 
 
 def element_name_problem(name: str, spec: EventRuleSpec) -> str | None:
-    """Why the element of `each` cannot have the name, and which it could have; None where it can."""
+    """The reason why the element of `each` cannot have the name, with a proposal; None if it can."""
     problem = _problem(name, spec, {**_given(spec), **_SAMPLE}, "element")
     if problem is None and any(signal.name == name for signal in spec.signals):
         return f"{name} is also the name of a signal: rename one of them, e.g. to {_free(name, spec, {}, 'element')}"
@@ -192,7 +193,7 @@ def element_name_problem(name: str, spec: EventRuleSpec) -> str | None:
 
 
 def _given(spec: EventRuleSpec) -> Mapping[str, str]:
-    """The names that the rule's scope gives to expressions, and what they are."""
+    """The variables that the rule's scope defines, with their meanings."""
     if spec.scope.pairs is not None:
         return {**_CLIENT, **_PAIRS}
     return {**_CLIENT, **(_FLEET if spec.scope.fleet is not None else {})}
@@ -219,7 +220,7 @@ _ENDINGS = {"signal": "Value", "element": "Element"}
 
 
 def _free(name: str, spec: EventRuleSpec, given: Mapping[str, str], kind: str) -> str:
-    """A name like this one that is free."""
+    """A free name that is similar to this one."""
     used = {*given, *(signal.name for signal in spec.signals), *(() if spec.each is None else (spec.each.as_,))}
     proposal = name + _ENDINGS[kind]
     number = 2

@@ -18,13 +18,13 @@ _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 @dataclass(frozen=True)
 class Case:
-    """A rule that compiles, and what it is evaluated with."""
+    """A rule that compiles, with its Detector and the rules that it names."""
 
     rule: EventRule
     compiled: CompiledRule
     detector: Detector
     others: Mapping[str, EventRule]
-    """The rules that it may name, by name."""
+    """The rules that it can name, by name."""
 
     def given(self, values: type[CharacteristicValue]) -> list[CharacteristicValue]:
         """The values of the classification in the dimension; empty if it has none."""
@@ -63,7 +63,7 @@ def conditions(rule: EventRule) -> Iterator[str]:
 
 
 def detecting(rule: EventRule) -> Iterator[tuple[int, Signal]]:
-    """The signals that decide about episodes, with their places; not those that only actions read.
+    """The signals that decide about episodes, with their indices; without those that only actions read.
 
     A signal decides if its name is in a condition or in the scope, or if it goes into a model or signal that decides.
     """
@@ -79,7 +79,7 @@ def detecting(rule: EventRule) -> Iterator[tuple[int, Signal]]:
 
 
 def span(nanoseconds: int) -> str:
-    """A length of time, as files have it."""
+    """A duration in the syntax of fields."""
     for unit, factor in (("h", 3_600 * 10**9), ("m", 60 * 10**9), ("s", 10**9)):
         if nanoseconds >= factor and nanoseconds % factor == 0:
             return str(Duration(f"{nanoseconds // factor}{unit}"))

@@ -1,7 +1,7 @@
-"""The time span of the data that a rule needs to detect its event, as far as it is known from the rule.
+"""The time span of the data that a rule needs to detect its event, as far as the rule defines it.
 
-A rule that looks at the newest samples alone needs none. Windows need theirs, and `for` comes on top. A plugin, the age
-of a sample and the like may reach back any time: then the time is at least what is known.
+A rule that uses only the newest samples needs none. Windows need their length, and `for` is added. A plugin, the age of
+a sample and the like may look back any time; the known time is then a minimum.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from wayside.api.eventrule import Aggregate, Signal
 from wayside.rules.contradictions.case import conditions, detecting, span
 
 _OF_ANY_TIME = frozenset({Aggregate.FIRST, Aggregate.PREVIOUS, Aggregate.AGE, Aggregate.ACTIVE})
-"""Without a window, these may look at a time long ago."""
+"""Without a window, these aggregates may look back any time."""
 
 _CLOSING_SPEED_NS = 10**9
-"""It is the change of the distance over the last second."""
+"""The closing speed is the change of the distance over the last second."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class _Reach(NamedTuple):
 
 
 def observation(rule: EventRule, others: Mapping[str, EventRule]) -> LookBack:
-    """How far the rule looks back, through the rules that it names as well."""
+    """The time that the rule looks back, including the rules that it names."""
     return _observation(rule, others, frozenset())
 
 
@@ -83,7 +83,7 @@ def _reach(at: str, signal: Signal) -> _Reach:
     if signal.model is not None:
         windows = [each.window for each in signal.model.inputs if each.window is not None]
         longest = max((window.over for window in windows if window.over is not None), key=lambda o: o.ns, default=None)
-        # Of a number of samples it is not known how much time they are.
+        # The time of a number of samples is unknown.
         any_time = any(window.over is None for window in windows)
         return _Reach(0, "", any_time) if longest is None else _Reach(longest.ns, f"{at}.model: {longest}", any_time)
     if signal.lag is not None:

@@ -39,7 +39,7 @@ _SENDERS = {
     "etsi/spatem": TypeOfParticipants.ROAD_INFRASTRUCTURE,
     "etsi/mapem": TypeOfParticipants.ROAD_INFRASTRUCTURE,
 }
-"""The only senders of these messages, by ETSI TS 103 300-3 (VAM) and ETSI TS 103 301 (SPATEM and MAPEM)."""
+"""The only senders of these messages, according to ETSI TS 103 300-3 (VAM) and ETSI TS 103 301 (SPATEM and MAPEM)."""
 
 
 @dataclass(frozen=True)
@@ -50,20 +50,20 @@ class Contradiction:
     """The name of its finding."""
     dimension: type[CharacteristicValue]
     description: str
-    """When there is a warning, for people."""
+    """The condition of the warning, for people."""
     find: Callable[[Case], Iterator[RuleProblem]]
 
 
 def contradictions(
     rule: EventRule, compiled: CompiledRule, detector: Detector, others: Mapping[str, EventRule]
 ) -> list[RuleProblem]:
-    """Every contradiction of a rule that compiles; none where it has no classification.
+    """Every contradiction of a rule that compiles; none if it has no classification.
 
     Args:
-        rule: as written.
-        compiled: the same.
-        detector: the one that it was compiled against.
-        others: the rules that it may name, by name.
+        rule: the rule as written.
+        compiled: the same rule, compiled.
+        detector: the Detector against which it was compiled.
+        others: the rules that it can name, by name.
     """
     if rule.spec.classification is None:
         return []
@@ -165,7 +165,7 @@ def _algorithm(case: Case) -> Iterator[RuleProblem]:
 
 
 def _learnt(rule: EventRule, others: Mapping[str, EventRule], above: frozenset[str]) -> tuple[list[str], bool]:
-    """The fields with models that decide, of the rules that are named as well; and whether a plugin decides."""
+    """The fields of the deciding models, including those of the rules that it names; and whether a plugin decides."""
     models, plugins = [], False
     for index, signal in detecting(rule):
         plugins = plugins or signal.plugin is not None
@@ -236,7 +236,7 @@ def _types(action: ActionSpec) -> _Types:
 
 
 def _delay_ns(action: ActionSpec) -> int:
-    """How long the action waits before it does anything, in nanoseconds."""
+    """The delay before the action has any effect, in nanoseconds."""
     grouping = None if action.notify is None else action.notify.grouping
     return 0 if grouping is None else grouping.wait.ns
 
@@ -246,7 +246,7 @@ def _unnamed_action(case: Case) -> Iterator[RuleProblem]:
     actions = case.rule.spec.actions
     if not given:
         return
-    # A notification that comes with the data is a report, as in the paper's Table 2.
+    # A notification about recorded data is a report, as in the paper's Table 2.
     report = TypeOfAction.NOTIFICATION in given and any(action.notify is not None for action in actions)
     for index, action in enumerate(actions):
         needed, _, does = _types(action)
@@ -326,4 +326,4 @@ CONTRADICTIONS = (
         "classification-unused-action-type", TypeOfAction, "no action of the rule has this type", _unaccounted_type
     ),
 )
-"""All of them, in the order of the scheme."""
+"""All contradictions, in the order of the scheme."""
