@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 from detector.commands.cli import app
 from tests.networks import session
+from tests.patience import PATIENCE
 from tests.ros_messages import cdr, odometry
 from wayside.api import Detector
 from wayside.api.stream import Layout
@@ -19,10 +20,11 @@ ROS = "0/car1/odom/nav_msgs::msg::dds_::Odometry_/RIHS01_0"
 
 
 def test_the_streams_of_a_network_are_proposed_and_detectors_are_left_out(endpoint: str) -> None:
-    over = threading.Event()
+    there, over = threading.Event(), threading.Event()
 
     def drive() -> None:
         with session("peer", listen__endpoints=[endpoint]) as vehicles:
+            there.set()
             while not over.wait(0.02):
                 for car in ("car1", "car2"):
                     value = json.dumps({"v": 3.5})
@@ -33,6 +35,7 @@ def test_the_streams_of_a_network_are_proposed_and_detectors_are_left_out(endpoi
     driving = threading.Thread(target=drive)
     driving.start()
     try:
+        assert there.wait(PATIENCE)
         listed = CliRunner().invoke(app, ["topics", "--live", "--connect", endpoint, "--seconds", "2"])
         proposed = CliRunner().invoke(app, ["topics", "--live", "--connect", endpoint, "--seconds", "2", "--yaml"])
     finally:
