@@ -75,11 +75,6 @@ class Worker:
         self._thread = threading.Thread(target=self._work, name=f"action {which.rule}/{which.action}", daemon=True)
         self._thread.start()
 
-    @property
-    def waiting_bytes(self) -> int:
-        """Size of the samples that are queued for the action."""
-        return self._waiting
-
     def enqueue(self, consequence: Consequence) -> None:
         """Queue what happened."""
         match consequence:

@@ -12,7 +12,7 @@ from detector.engine.engine import Engine, KeyReader
 from detector.engine.samples.liveliness import LIVELINESS
 from detector.engine.samples.sample import Decoder
 from detector.engine.scoping.plugins import PluginHost
-from detector.engine.timing.timeline import ORDER
+from detector.engine.timing.steps import ORDER
 from detector.onnx.binding import bind_models
 from detector.plugins.instances import LocalHost, plugin_problems
 from detector.streams.codecs import DefinitionError, UnknownTypeError, codec_for
@@ -240,7 +240,7 @@ def make_engine(
 ) -> Engine:
     """An engine without rules; `start` is nanoseconds since the epoch. Without a host, plugins run in this process.
 
-    `order`: see `timeline.ORDER`.
+    `order`: see `steps.ORDER`.
     """
     return Engine(
         detector,

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable, Iterator, Sequence, Set
-from contextlib import AbstractContextManager, closing
+from contextlib import AbstractContextManager, ExitStack, closing
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import typer
 from rich.console import Console
@@ -17,6 +18,7 @@ from detector.commands.topics.doubts import topic_doubts
 from detector.commands.topics.survey import survey
 from detector.engine.episodes.demands import from_task
 from detector.engine.episodes.events import Event
+from detector.engine.samples.sample import Arrival
 from detector.engine.scoping.plugins import PluginHost
 from detector.findings.checks import CUT_RECORDING
 from detector.plugins.outages import Outages
@@ -26,7 +28,6 @@ from detector.replay.gathering import Recording, intake_file_of, recording_name,
 from detector.replay.intake_file import read_intake, recorded_outages
 from detector.replay.message import RecordingError
 from detector.replay.playing import PlayResult, play
-from detector.replay.progress import ProgressLine
 from detector.replay.recordings import quick_span_of
 from detector.replay.replaying import ReplayResult, replay_intake
 from detector.replay.variants import Variant, variants_of, with_variants
@@ -275,3 +276,72 @@ def _traced(outcome: ReplayResult) -> tuple[Iterable[Event], Iterable[Applicatio
         demands = ((task, from_task(task)) for task in outcome.tasks.values())
         tasks = [task if demand is None else traces.task(demand, task) for task, demand in demands]
         return [traces.event(event) for event in outcome.events], tasks
+
+
+Record = TypeVar("Record")
+Span = tuple[int, int]
+"""The times of a recording's first and last message, nanoseconds since the epoch."""
+
+_EVERY = 10_000
+
+
+class ProgressLine:
+    """Shows a line that is removed at the end; nothing if the console is not a terminal."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._stack = ExitStack()
+        self._spans: list[Span | None] = []
+        self._watched = 0
+        self._begin = time.monotonic()
+
+    def __enter__(self) -> ProgressLine:
+        self._status = self._console.status("reading the recording")
+        if self._console.is_terminal:
+            self._stack.enter_context(self._status)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    @property
+    def shown(self) -> bool:
+        """Whether the line is visible."""
+        return self._console.is_terminal
+
+    def expect(self, spans: Sequence[Span | None]) -> None:
+        """The recordings that follow, in this order; None: the duration is not known in advance."""
+        self._spans = [*spans]
+
+    def watch(self, records: Iterable[Record]) -> Iterator[Record]:
+        """The records, counted while they pass."""
+        for number, record in enumerate(records, start=1):
+            if number % _EVERY == 0:
+                self._status.update(f"{number:,} messages replayed")
+            yield record
+
+    def watch_batches(self, batches: Iterable[Sequence[Arrival]]) -> Iterator[Sequence[Arrival]]:
+        """The batches of the next recording, their messages counted while they pass."""
+        number, recording = 0, self._watched
+        self._watched += 1
+        for batch in batches:
+            number += len(batch)
+            self._status.update(f"{number:,} messages replayed{self._estimate(recording, batch[-1].received)}")
+            yield batch
+
+    def note(self, what: str) -> None:
+        """Show the current step."""
+        self._status.update(what)
+
+    def _estimate(self, recording: int, now: int) -> str:
+        """The completed share of all recordings, and the remaining time."""
+        spans = [span for span in self._spans if span is not None]
+        if not spans or len(spans) < len(self._spans):
+            return ""
+        lengths = [last - first for first, last in spans]
+        done = sum(lengths[:recording]) + min(max(now - spans[recording][0], 0), lengths[recording])
+        if not done or not sum(lengths):
+            return ""
+        part = done / sum(lengths)
+        left = (time.monotonic() - self._begin) * (1 - part) / part
+        return f", {part:.0%}, about {left:.0f} s left"

@@ -30,8 +30,8 @@ from detector.engine.scoping.plugins import NoPlugins, PluginHost, PluginSignals
 from detector.engine.signals.starts import EpisodeStarts
 from detector.engine.timing.data import DataTimeline
 from detector.engine.timing.schedule import Schedule
+from detector.engine.timing.steps import ORDER
 from detector.engine.timing.ticks import Ticks
-from detector.engine.timing.timeline import ORDER, Timeline
 from detector.engine.timing.wall import WallTimeline
 from wayside.api import Detector
 from wayside.api.detector import Clock
@@ -60,7 +60,7 @@ class Engine:
     ) -> None:
         """`start` is when the detector started, in nanoseconds since the epoch; `decoders` has one for each stream.
 
-        `plugins` runs them; without it, their signals are unknown. `order`: see `timeline.ORDER`.
+        `plugins` runs them; without it, their signals are unknown. `order`: see `steps.ORDER`.
 
         Raises:
             RuleError: an expression of one of the Detector's streams does not compile.
@@ -295,7 +295,7 @@ class Engine:
         return isinstance(self._timeline, WallTimeline)
 
     @property
-    def timeline(self) -> Timeline:
+    def timeline(self) -> WallTimeline | DataTimeline:
         """The time axis; with clock Data it counts dropped samples."""
         return self._timeline
 
@@ -317,7 +317,7 @@ class Engine:
         """Read access to the buffer in its current state."""
         return self._inputs.queries(self.now)
 
-    def _make_timeline(self, start: int) -> Timeline:
+    def _make_timeline(self, start: int) -> WallTimeline | DataTimeline:
         spec = self.detector.spec
         self.consequences.watch_late = spec.clock is Clock.DATA
         if spec.clock is Clock.WALL:

@@ -26,7 +26,7 @@ from detector.engine.evaluation.rule import OnDemandResult
 from detector.engine.samples.intake import Intake
 from detector.engine.samples.sample import Arrival
 from detector.engine.timing.schedule import LONG, Overload
-from detector.engine.timing.timeline import ORDER
+from detector.engine.timing.steps import ORDER
 from detector.findings.losses import Losses
 from detector.live.state import RestoredState
 from detector.plugins.outages import Outages

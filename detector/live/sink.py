@@ -23,6 +23,9 @@ from wayside.api import EventRule
 
 _log = logging.getLogger(__name__)
 
+_CAPACITY = 65536
+"""Maximum number of events that wait to be written to `events.jsonl`."""
+
 
 class LiveSink:
     """Sends events to Zenoh and to the log, demands to the reconciler; nothing here waits."""
@@ -110,10 +113,10 @@ class LiveSink:
 class EventLog:
     """Appends one CloudEvent a line of `events.jsonl`, on a separate thread: a slow disk does not slow the evaluation.
 
-    At most `capacity` events are queued; further ones are dropped and counted.
+    A bounded number of events is queued; further ones are dropped and counted.
     """
 
-    def __init__(self, path: Path, *, capacity: int = 65536) -> None:
+    def __init__(self, path: Path) -> None:
         """Creates the file's folder; existing contents of the file are kept.
 
         Raises:
@@ -122,7 +125,7 @@ class EventLog:
         path.parent.mkdir(parents=True, exist_ok=True)
         self._path = path
         self._file = path.open("a", encoding="utf-8")
-        self._lines: queue.Queue[str | None] = queue.Queue(capacity)
+        self._lines: queue.Queue[str | None] = queue.Queue(_CAPACITY)
         self._thread = threading.Thread(target=self._run, name="event-log", daemon=True)
         self._thread.start()
         self.dropped = 0

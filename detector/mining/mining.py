@@ -21,9 +21,8 @@ import msgspec
 
 from detector.mining.cache import Cache, CacheEntry, job_digest, mined_in, read_entry
 from detector.mining.dataset import EPISODES, TABLES, MinedRecording, write_dataset
-from detector.mining.keys import mined_rule, records, rule_keys, with_dependencies
 from detector.mining.sources import InputRecording, RecordingPreview, look, stamp_of
-from detector.mining.tasks import CutRecording, JobResult, run_jobs
+from detector.mining.tasks import CutRecording, JobResult, mined_rule, records, rule_keys, run_jobs, with_dependencies
 from detector.mining.work import MiningJob, MiningProblem, RecordingResult
 from detector.mining.workers import LostWorker, Workers
 from wayside.api import Detector, EventRule

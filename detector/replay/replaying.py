@@ -21,7 +21,7 @@ from detector.engine.episodes.open_episodes import OpenEpisode, from_document
 from detector.engine.evaluation.observing import Observer
 from detector.engine.samples.sample import Arrival
 from detector.engine.scoping.plugins import PluginHost
-from detector.engine.timing.timeline import ORDER
+from detector.engine.timing.steps import ORDER
 from detector.findings.losses import Losses
 from detector.replay.batches import PAUSE, parts_of
 from detector.replay.clips import Clips, Recorders
@@ -84,7 +84,7 @@ class Replay:
     ) -> None:
         """`start` is when the detector started, in nanoseconds since the epoch; `plugins` runs them.
 
-        `version` is that of the intake file with the rules; `order`: see `timeline.ORDER`. With `clips`, the rules'
+        `version` is that of the intake file with the rules; `order`: see `steps.ORDER`. With `clips`, the rules'
         record actions run.
 
         Raises:

@@ -22,6 +22,9 @@ PROGRAM = "wayside-detector"
 DETECTORS = Resource(API_VERSION, Detector.__name__, Detector.plural)
 EVENT_RULES = Resource(API_VERSION, EventRule.__name__, EventRule.plural)
 
+_RESYNC = 30.0
+"""Seconds after which all is listed again, even if nothing seems to be missing."""
+
 _COALESCING = 0.05
 """Seconds: changes of one `kubectl apply` take effect together."""
 
@@ -35,15 +38,14 @@ class ClusterRules:
     unreadable rule (e.g. of a newer version) is reported and left out; the others are not affected.
     """
 
-    def __init__(self, client: Client, namespace: str, detector_name: str, resync: float = 30.0) -> None:
-        """Prepare; `resync`: seconds after which all is listed again, even if nothing seems to be missing."""
+    def __init__(self, client: Client, namespace: str, detector_name: str) -> None:
         self._name = detector_name
         self._where = f"namespace {namespace}"
         self._detectors = _Known(Detector)
         self._rules = _Known(EventRule)
         only = f"metadata.name={detector_name}"
-        self._detector_source = Reflector(client, DETECTORS, namespace, fields=only, resync=resync)
-        self._rule_source = Reflector(client, EVENT_RULES, namespace, resync=resync)
+        self._detector_source = Reflector(client, DETECTORS, namespace, fields=only, resync=_RESYNC)
+        self._rule_source = Reflector(client, EVENT_RULES, namespace, resync=_RESYNC)
         self._changed = asyncio.Event()
         self._missing = False
 

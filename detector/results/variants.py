@@ -67,11 +67,6 @@ class Comparison:
         return [(second.start - first.start) / 1e9 for first, second in self.both]
 
     @property
-    def end_differences(self) -> list[float]:
-        """The same for the ends, if both episodes ended."""
-        return [(second.end - first.end) / 1e9 for first, second in self.both if not (first.open or second.open)]
-
-    @property
     def agreement(self) -> float | None:
         """The time in which both had an episode of a subject, by that in which either had; None without episodes."""
         shared = sum(first.shared(second) for first, second in self.both)

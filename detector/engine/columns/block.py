@@ -41,7 +41,7 @@ class Context(NamedTuple):
     of_starts: OfStarts
     """Computes signals over other rules' episodes."""
     exact: bool
-    """See `timeline.ORDER`; False is order 1."""
+    """See `steps.ORDER`; False is order 1."""
 
 
 class Track:

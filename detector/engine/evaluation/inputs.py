@@ -49,7 +49,7 @@ class RuleInputs:
         *,
         exact: bool = True,
     ) -> None:
-        """`starts` are the episode starts that signals over rules read. `exact`: see `timeline.ORDER`.
+        """`starts` are the episode starts that signals over rules read. `exact`: see `steps.ORDER`.
 
         Raises:
             RuleError: an expression of one of the Detector's streams does not compile.

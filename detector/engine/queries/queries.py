@@ -11,7 +11,6 @@ import heapq
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import islice
-from operator import attrgetter
 from typing import Any, NamedTuple, Protocol
 
 from detector.engine.buffering.buffer import Buffer, Lane
@@ -21,8 +20,6 @@ from detector.engine.queries.geometry import Pose, pose_in
 from detector.engine.queries.transforms import Transforms
 from detector.engine.samples.sample import Sample
 from wayside.expressions import UNKNOWN
-
-_STAMP = attrgetter("stamp")
 
 
 class QueryError(ValueError):

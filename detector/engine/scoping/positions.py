@@ -150,7 +150,7 @@ def distance(position: CompiledPosition, one: Place, other: Place) -> float:
 
 
 def distance_of_order_1(position: CompiledPosition, one: Place, other: Place) -> float:
-    """The distance for detectors of order 1 (see `timeline.ORDER`): it differs in the last digits."""
+    """The distance for detectors of order 1 (see `steps.ORDER`): it differs in the last digits."""
     return geodesy.surface_distance(*one, *other) if position.geographic else math.dist(one, other)
 
 

@@ -68,7 +68,7 @@ class Views:
         *,
         exact: bool = True,
     ) -> None:
-        """`exact`: see `timeline.ORDER`; False is order 1."""
+        """`exact`: see `steps.ORDER`; False is order 1."""
         self._exact = exact
         self._rule = rule
         self._now = now

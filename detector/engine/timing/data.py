@@ -64,7 +64,7 @@ class DataTimeline:
 
         `maximum_bytes` bounds the waiting payloads; samples that arrive when they are full are dropped and counted.
         `stamp_of` and `client_of` return None for samples that they cannot read; they count these, and the sample is
-        left out. `latched` are the names of the latched streams. `exact`: see `timeline.ORDER`; False is order 1.
+        left out. `latched` are the names of the latched streams. `exact`: see `steps.ORDER`; False is order 1.
         """
         self._ticks = ticks
         self._lateness = lateness

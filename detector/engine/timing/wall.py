@@ -17,7 +17,7 @@ class WallTimeline:
     """Clock Wall: time is when samples were received."""
 
     def __init__(self, ticks: Ticks, start: int, *, exact: bool = True) -> None:
-        """`exact`: see `timeline.ORDER`; False is order 1."""
+        """`exact`: see `steps.ORDER`; False is order 1."""
         self._ticks = ticks
         self._exact = exact
         self.now = start

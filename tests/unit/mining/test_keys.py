@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from detector.mining.keys import mined_rule, rule_keys
+from detector.mining.tasks import mined_rule, rule_keys
 from tests.driving import a_deploy, a_detector, a_rule, a_stream
 
 SIGNALS = [{"name": "v", "stream": "odom", "value": "msg.v"}]

@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from detector.engine.samples.sample import Arrival
-from detector.engine.timing.timeline import ORDER
+from detector.engine.timing.steps import ORDER
 from detector.replay.gathering import recordings_of
 from detector.replay.intake_writer import IntakeWriter
 from detector.replay.message import RecordingError

@@ -16,7 +16,7 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from detector.commands.replay import replay_files
-from detector.engine.timing.timeline import ORDER
+from detector.engine.timing.steps import ORDER
 from detector.replay.intake_writer import IntakeWriter
 from detector.results import kinds
 from detector.results.channels import message_path
