@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
-from detector.engine.consequences.excerpts import EpisodeSample
+from detector.engine.consequences import EpisodeSample
 from detector.engine.episodes.record import EpisodeRecord
 from wayside.api.base import JsonValue
 

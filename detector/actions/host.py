@@ -18,7 +18,7 @@ from detector.actions.base import Action, ActionContext, DetectorConfiguration, 
 from detector.actions.outcomes import ActionKey, Outcomes
 from detector.actions.registry import DEPLOY, prepare_action
 from detector.actions.worker import MAXIMUM_BYTES, Worker
-from detector.engine.consequences.consequences import ActionRun, Consequence, RunStarted
+from detector.engine.consequences import ActionRun, Consequence, RunStarted
 from wayside.api import EventRule
 from wayside.api.actions import action as api
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from detector.engine.consequences.consequences import Consequence, EpisodeOver, RunStarted
+from detector.engine.consequences import Consequence, EpisodeOver, RunStarted
 from detector.engine.episodes.demands import Demand
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.record import EpisodeRecord

@@ -18,7 +18,7 @@ from msgspec.structs import astuple, replace
 from detector.actions.base import Action, ActionError
 from detector.actions.episode import Completion, Episode, Outcome, OutcomeState
 from detector.actions.outcomes import ActionKey, Outcomes
-from detector.engine.consequences.consequences import (
+from detector.engine.consequences import (
     ActionRun,
     Consequence,
     EpisodeOver,

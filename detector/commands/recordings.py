@@ -102,8 +102,7 @@ def _send(
     as_json: bool,
 ) -> None:
     """Print the reports, each with the detector that sent it. Exits with 1 if a recording was refused or has failed."""
-    from detector.actions.trigger.orders import Progress
-    from detector.actions.trigger.requests import RECORDINGS, read_reports, write_request
+    from detector.actions.trigger.requests import RECORDINGS, Progress, read_reports, write_request
 
     answers = query_selected(RECORDINGS, {}, detector, name, connect, timeout, write_request(request))
     reports = [(answer.holder, report) for answer in answers for report in read_reports(answer.payload)]

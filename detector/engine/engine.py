@@ -12,14 +12,13 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 import msgspec
 
 from detector.engine.buffering.messages import KeyReader
-from detector.engine.consequences.consequences import Consequences
+from detector.engine.consequences import Consequences
 from detector.engine.counters import Counters
 from detector.engine.episodes.current import DetectorIdentity
 from detector.engine.episodes.demands import Demand
 from detector.engine.episodes.episodes import EndReason
 from detector.engine.episodes.events import Event
-from detector.engine.episodes.open_episodes import OpenEpisode
-from detector.engine.episodes.record import EpisodeRecord
+from detector.engine.episodes.record import EpisodeRecord, OpenEpisode
 from detector.engine.evaluation.executor import Executor
 from detector.engine.evaluation.inputs import RuleInputs
 from detector.engine.evaluation.observing import Observers
@@ -29,9 +28,8 @@ from detector.engine.samples.sample import Arrival, Decoder, Sample
 from detector.engine.scoping.plugins import NoPlugins, PluginHost, PluginSignals
 from detector.engine.signals.starts import EpisodeStarts
 from detector.engine.timing.data import DataTimeline
-from detector.engine.timing.schedule import Schedule
+from detector.engine.timing.schedule import Schedule, Ticks
 from detector.engine.timing.steps import ORDER
-from detector.engine.timing.ticks import Ticks
 from detector.engine.timing.wall import WallTimeline
 from wayside.api import Detector
 from wayside.api.detector import Clock

@@ -11,8 +11,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import KW_ONLY, dataclass
 
-from detector.engine.counters import RuleCounters
-from detector.engine.counters.ages import OLD
+from detector.engine.counters import OLD, RuleCounters
 from detector.engine.engine import Engine
 from detector.engine.samples.intake import Intake
 from detector.engine.timing.data import DataTimeline

@@ -16,11 +16,11 @@ from typing import Any, Protocol, TypeVar
 from detector.actions.base import DetectorConfiguration
 from detector.assembly import RuleIndex, stream_readers
 from detector.assembly.memory import Sweeper
-from detector.engine.consequences.consequences import Consequence
+from detector.engine.consequences import Consequence
 from detector.engine.engine import Engine, NotEvaluableError
 from detector.engine.episodes.demands import Demand, to_task
 from detector.engine.episodes.events import Event
-from detector.engine.episodes.open_episodes import OpenEpisode
+from detector.engine.episodes.record import OpenEpisode
 from detector.engine.evaluation.observing import Observer
 from detector.engine.evaluation.rule import OnDemandResult
 from detector.engine.samples.intake import Intake

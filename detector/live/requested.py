@@ -16,15 +16,15 @@ from typing import Any
 
 from detector.actions.episode import Outcome, OutcomeState
 from detector.actions.outcomes import ActionKey
-from detector.actions.trigger.orders import Progress
 from detector.actions.trigger.requests import (
+    Progress,
     RecordingReport,
     RecordingRequest,
     read_request,
     time_text,
     write_reports,
 )
-from detector.engine.consequences.consequences import ActionRun
+from detector.engine.consequences import ActionRun
 from detector.engine.engine import Engine
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.record import EpisodeRecord, identifier

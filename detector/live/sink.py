@@ -12,10 +12,10 @@ from detector.actions.base import ActionError, DetectorConfiguration
 from detector.actions.deploy.reconciler import DemandReconciler
 from detector.actions.host import ActionHost
 from detector.actions.tracing import EpisodeTraces
-from detector.engine.consequences.consequences import Consequence
+from detector.engine.consequences import Consequence
 from detector.engine.episodes.demands import Demand
 from detector.engine.episodes.events import Event
-from detector.engine.episodes.open_episodes import OpenEpisode
+from detector.engine.episodes.record import OpenEpisode
 from detector.live.requested import with_requested
 from detector.live.state import StateFile
 from detector.streams.zenoh import EVENT_ENCODING, Network, NetworkError

@@ -20,7 +20,7 @@ from typing import Any
 
 from detector.actions.deploy.stores import Snapshot, TaskStore, live_demands
 from detector.engine.episodes.demands import Demand
-from detector.engine.episodes.open_episodes import OpenEpisode, from_document
+from detector.engine.episodes.record import OpenEpisode, from_document
 from wayside.api import Detector
 from wayside.names import encode
 from wayside.process.backoff import Backoff, retry

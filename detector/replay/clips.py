@@ -12,7 +12,7 @@ from pathlib import Path
 from detector.actions.base import ActionError, DetectorConfiguration
 from detector.actions.host import ActionHost
 from detector.actions.record.destination import finished_recordings
-from detector.engine.consequences.consequences import Consequence
+from detector.engine.consequences import Consequence
 from wayside.api import Detector, EventRule
 from wayside.api.recordings import Recordings
 

@@ -17,7 +17,7 @@ from detector.assembly import RefusedRule, RuleIndex, StreamReaders, make_engine
 from detector.engine.engine import Engine, NotEvaluableError
 from detector.engine.episodes.demands import Demand, from_task, to_task
 from detector.engine.episodes.events import Event
-from detector.engine.episodes.open_episodes import OpenEpisode, from_document
+from detector.engine.episodes.record import OpenEpisode, from_document
 from detector.engine.evaluation.observing import Observer
 from detector.engine.samples.sample import Arrival
 from detector.engine.scoping.plugins import PluginHost

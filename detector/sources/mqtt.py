@@ -14,7 +14,7 @@ from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
 from paho.mqtt.reasoncodes import ReasonCode
 from pydantic import BaseModel, Field, field_validator
 
-from detector.access.mounted import login, tls_files
+from detector.access import login, tls_files
 from detector.sources.base import Feed, Source, SourceError
 from wayside.api.access import Access
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import zenoh
 
-from detector.access.mounted import LoadedCredentials
+from detector.access import LoadedCredentials
 from detector.streams.liveliness import TokenWatch, subscribe_tokens
 from detector.streams.loss_counter import LossCounter
 from detector.streams.query_handler import QueryHandler

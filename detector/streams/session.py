@@ -10,7 +10,7 @@ import time
 
 import zenoh
 
-from detector.access.mounted import AccessError, LoadedCredentials, read_credentials
+from detector.access import AccessError, LoadedCredentials, read_credentials
 from wayside.api.zenoh import Zenoh, ZenohMode
 from wayside.inputerror import InputError
 from wayside.process.backoff import Backoff, retry

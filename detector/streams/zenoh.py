@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable
 
 import zenoh
 
-from detector.access.mounted import LoadedCredentials
+from detector.access import LoadedCredentials
 from detector.engine.samples.intake import Put
 from detector.engine.samples.liveliness import LIVELINESS
 from detector.streams.liveliness import TokenWatch

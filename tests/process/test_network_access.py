@@ -12,7 +12,7 @@ import pytest
 import zenoh
 from pydantic import ValidationError
 
-from detector.access.mounted import AccessError, Login, login, tls_files
+from detector.access import AccessError, Login, login, tls_files
 from detector.actions.deploy.file_store import FileTaskStore
 from detector.actions.deploy.reconciler import DemandReconciler
 from detector.engine.samples.liveliness import LIVELINESS, TokenState

@@ -13,10 +13,10 @@ import pytest
 
 from detector.actions.base import DetectorConfiguration
 from detector.assembly import make_engine, stream_readers
-from detector.engine.consequences.consequences import Consequence
+from detector.engine.consequences import Consequence
 from detector.engine.episodes.demands import Demand
 from detector.engine.episodes.events import Event
-from detector.engine.episodes.open_episodes import OpenEpisode
+from detector.engine.episodes.record import OpenEpisode
 from detector.engine.samples.intake import Intake
 from detector.live.evaluator import Evaluator
 from detector.live.state import RestoredState

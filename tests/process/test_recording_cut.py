@@ -27,7 +27,7 @@ from detector.actions.outcomes import ActionKey, Outcomes
 from detector.actions.record.destination import Destination
 from detector.actions.record.recovery import contents_of, recover, salvage
 from detector.actions.worker import Worker
-from detector.engine.consequences.consequences import ActionRun, RunCompleted, RunSamples, RunStarted
+from detector.engine.consequences import ActionRun, RunCompleted, RunSamples, RunStarted
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.record import EpisodeRecord
 from detector.engine.episodes.rendering import Rendered

@@ -20,8 +20,7 @@ from hypothesis import strategies as st
 
 from detector.actions.deploy.file_store import FileTaskStore
 from detector.engine.episodes.demands import to_task
-from detector.engine.episodes.open_episodes import OpenEpisode, from_document
-from detector.engine.episodes.record import EpisodeRecord
+from detector.engine.episodes.record import EpisodeRecord, OpenEpisode, from_document
 from detector.engine.episodes.subjects import Subject
 from detector.live.state import StateFile, state_file, what_was_open
 from detector.streams.zenoh import open_session

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from detector.actions.tracing import episode_traces
-from detector.engine.consequences.consequences import ActionRun, RunCompleted, RunStarted
+from detector.engine.consequences import ActionRun, RunCompleted, RunStarted
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.record import EpisodeRecord
 from detector.engine.episodes.rendering import Rendered

@@ -14,8 +14,8 @@ from mcap.exceptions import McapError
 from mcap.reader import NonSeekingReader, make_reader
 from typer.testing import CliRunner, Result
 
-from detector.actions.trigger.orders import Progress
 from detector.actions.trigger.requests import (
+    Progress,
     RecordingReport,
     RecordingRequest,
     read_report,

@@ -14,7 +14,7 @@ from typing import Any
 
 import bson
 
-from detector.access.mounted import AccessError, database_uri
+from detector.access import AccessError, database_uri
 from detector.actions.base import ActionError
 from detector.actions.database import scenario as scenarios
 from detector.actions.database.queue import Queue, Write

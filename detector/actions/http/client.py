@@ -24,7 +24,7 @@ import aiohttp
 from aiohttp.abc import AbstractResolver, ResolveResult
 from yarl import URL
 
-from detector.access.mounted import AccessError, TlsFiles, login, secret_text, tls_files, variable_text
+from detector.access import AccessError, TlsFiles, login, secret_text, tls_files, variable_text
 from detector.actions.http.answer import Answer
 from wayside.api.actions.http import HttpAccess, HttpHeader
 

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
-from detector.access.mounted import AccessError, secret_text
+from detector.access import AccessError, secret_text
 from detector.actions.base import Messenger
 from detector.actions.http import Disposition, HttpClient, HttpError, judge
 from detector.actions.http.answer import retry_after_seconds

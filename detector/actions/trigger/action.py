@@ -17,7 +17,7 @@ from detector.actions.base import Action, ActionContext, ActionError
 from detector.actions.episode import Completion, Episode, Outcome, OutcomeState
 from detector.actions.journal import Journal
 from detector.actions.trigger.endpoints import HttpEndpoint, OtherDetector
-from detector.actions.trigger.orders import Order, RecordingSystem, Report, order_from
+from detector.actions.trigger.requests import Order, RecordingSystem, Report, order_from
 from detector.actions.trigger.ros2 import Ros2Services, call_problems
 from detector.actions.trigger.state_machine import FOREVER, NextRequest, RemoteRecording, Timeouts
 from wayside.api import Detector

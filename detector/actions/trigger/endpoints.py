@@ -16,12 +16,15 @@ from yarl import URL
 from detector.actions.base import ActionError, Messenger
 from detector.actions.http import Disposition, HttpClient, HttpError, judge
 from detector.actions.http.client import origin
-from detector.actions.trigger.orders import Order, Progress, Report, nested_value
 from detector.actions.trigger.requests import (
     MAXIMUM_CLIENTS,
     RECORDINGS,
+    Order,
+    Progress,
     RecordingRequest,
+    Report,
     duration,
+    nested_value,
     read_report,
     short,
     write_request,

@@ -20,7 +20,7 @@ from itertools import count
 from typing import Any
 
 from detector.actions.base import ActionError, Messenger
-from detector.actions.trigger.orders import Order, Progress, Report, nested_value
+from detector.actions.trigger.requests import Order, Progress, Report, nested_value
 from detector.actions.trigger.services import ServiceError, service
 from detector.streams.codecs.definitions import Definition, DefinitionsError
 from detector.streams.codecs.ros import RosTypes, types_with

@@ -14,7 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
-from detector.actions.trigger.orders import Order, Progress, Report
+from detector.actions.trigger.requests import Order, Progress, Report
 
 _FIRST_WAIT = 0.5
 _LONGEST_WAIT = 15.0

@@ -15,7 +15,7 @@ from detector.engine.columns.reading import SampleExpression, UsedColumns
 from detector.engine.columns.table import Integers, Truths, rows_between, sorted_rows
 from detector.engine.columns.watching import SampleAges
 from detector.engine.columns.windows import EXTREMES, Ranges, aggregated_ranges, extremes, misfits
-from detector.engine.counters.ages import Ages
+from detector.engine.counters import Ages
 from wayside.api.eventrule import OF_A_SAMPLE, Aggregate
 from wayside.expressions.columns.values import Column, Tag, value_at
 from wayside.rules import CompiledSignal

@@ -1,4 +1,4 @@
-"""The ages of the samples that rules use, for a whole block: see `detector.engine.counters.ages`."""
+"""The ages of the samples that rules use, for a whole block: see `detector.engine.counters.Ages`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from detector.engine.buffering.buffer import HOUSEKEEPING
 from detector.engine.columns.table import Integers, Table, Truths
-from detector.engine.counters.ages import Ages, StreamUse
+from detector.engine.counters import Ages, StreamUse
 
 _POWERS = 10 ** np.arange(19, dtype=np.int64)
 

@@ -13,8 +13,7 @@ from detector.engine.counters import RuleCounters
 from detector.engine.episodes.demands import Demand
 from detector.engine.episodes.episodes import EndReason
 from detector.engine.episodes.events import Event
-from detector.engine.episodes.open_episodes import OpenEpisode
-from detector.engine.episodes.record import EpisodeRecord, episode_id
+from detector.engine.episodes.record import EpisodeRecord, OpenEpisode, episode_id
 from detector.engine.episodes.rendering import Rendered, followed, render_templates
 from detector.engine.episodes.statistics import Statistics
 from detector.engine.episodes.subjects import FLEET, Subject

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from detector.engine.buffering.buffer import HOUSEKEEPING
 from detector.engine.columns.table import LONGEST
-from detector.engine.consequences.consequences import Consequences
+from detector.engine.consequences import Consequences
 from detector.engine.episodes.events import Event, OrderedEvent
 from detector.engine.episodes.subjects import Subject
 from detector.engine.evaluation.blocks import Blocks
@@ -21,9 +21,8 @@ from detector.engine.evaluation.rule import RuleRun
 from detector.engine.samples.sample import Arrival
 from detector.engine.scoping.plugins import PluginSignals
 from detector.engine.signals.starts import EpisodeStarts
-from detector.engine.timing.schedule import Schedule, SubjectFilter
+from detector.engine.timing.schedule import Schedule, SubjectFilter, Ticks
 from detector.engine.timing.steps import Gap, Insert, Step, Tick
-from detector.engine.timing.ticks import Ticks
 from wayside.rules import CompiledRule
 
 

@@ -25,8 +25,7 @@ from detector.engine.episodes.episodes import (
     negation,
 )
 from detector.engine.episodes.events import Event
-from detector.engine.episodes.open_episodes import OpenEpisode
-from detector.engine.episodes.record import EpisodeRecord
+from detector.engine.episodes.record import EpisodeRecord, OpenEpisode
 from detector.engine.episodes.statistics import Statistics
 from detector.engine.episodes.subjects import Subject, fits
 from detector.engine.scoping.plugins import PluginSignals

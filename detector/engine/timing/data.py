@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 from detector.engine.samples.liveliness import LIVELINESS
 from detector.engine.samples.sample import SAMPLE_OVERHEAD, Arrival
+from detector.engine.timing.schedule import Ticks
 from detector.engine.timing.steps import Gap, Insert, Step, Tick
-from detector.engine.timing.ticks import Ticks
 
 
 @dataclass(slots=True)

@@ -9,8 +9,8 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 
 from detector.engine.samples.sample import Arrival
+from detector.engine.timing.schedule import Ticks
 from detector.engine.timing.steps import Gap, Insert, Step, Tick
-from detector.engine.timing.ticks import Ticks
 
 
 class WallTimeline:

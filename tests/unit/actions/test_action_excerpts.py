@@ -12,7 +12,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from detector.engine.consequences.consequences import (
+from detector.engine.consequences import (
     REPLACED,
     ActionRun,
     Consequence,

@@ -7,8 +7,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from detector.actions.episode import Outcome, OutcomeState
-from detector.actions.trigger.orders import Progress
-from detector.actions.trigger.requests import MAXIMUM_BYTES, RecordingRequest, read_request, short, write_request
+from detector.actions.trigger.requests import (
+    MAXIMUM_BYTES,
+    Progress,
+    RecordingRequest,
+    read_request,
+    short,
+    write_request,
+)
 from detector.live.requested import REQUESTED, RecordingIndex, with_requested
 from wayside.api import Detector
 from wayside.api.base import Duration, PositiveDuration

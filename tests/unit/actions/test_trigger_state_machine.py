@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from detector.actions.trigger.orders import Order, Progress, Report
+from detector.actions.trigger.requests import Order, Progress, Report
 from detector.actions.trigger.state_machine import FOREVER, NextRequest, RemoteRecording, Timeouts
 
 RECORDING, DONE = Report(Progress.RECORDING), Report(Progress.DONE, files=("a",))

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from detector.engine.episodes.open_episodes import from_document
+from detector.engine.episodes.record import from_document
 from detector.replay.replaying import replay_intake
 from tests.driving import POSITION, START, Drive, a_deploy, a_detector, a_rule, at, lines, place, speed
 from tests.patience import PATIENCE

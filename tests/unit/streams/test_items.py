@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from detector.assembly import DetectorError, stream_readers
-from detector.engine.consequences.consequences import RunSamples
+from detector.engine.consequences import RunSamples
 from detector.engine.samples.sample import Arrival
 from detector.replay.replaying import replay_intake
 from detector.streams.codecs.definitions import Definition
