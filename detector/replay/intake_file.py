@@ -6,7 +6,7 @@ order in the file counts, not the order of the times.
 
 A file replays with the defaults and the time order of its detector's version. Version 1: a stream becomes stale after
 `clientTimeout`, and a position is known while its stream is not stale. Version 2: `staleAfter` is 5 s and `maxAge` of a
-position 1 s by default; for the order, see `engine.timing.timeline`.
+position 1 s by default; for the order, see `engine.timing.steps`.
 """
 
 from __future__ import annotations
