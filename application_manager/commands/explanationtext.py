@@ -32,9 +32,7 @@ def _lines(explanation: Explanation) -> Iterator[str]:
     if explanation.parameters:
         yield "parameters"
     for each in explanation.parameters:
-        origin = {"default": ", the default", "earlier": ", kept from an earlier state", "none": ""}.get(
-            each.source, ""
-        )
+        origin = {"default": ", the default", "earlier": ", kept from earlier tasks", "none": ""}.get(each.source, "")
         shown = "absent" if each.value is None else values.shown(each.value)
         yield f"  {each.name} = {shown} (merge {each.merge}{origin})" + (f": {each.note}" if each.note else "")
         for part in each.contributions:

@@ -35,7 +35,7 @@ def end_process(reason: str) -> None:
     It takes no lock: the thread that has it may hang.
     """
     when = time.strftime("%Y-%m-%d %H:%M:%S")
-    line = f"{when},000 CRITICAL watchdog: {reason}; ending this manager, to be restarted\n"
+    line = f"{when},000 CRITICAL watchdog: {reason}; ending this manager so that it is restarted\n"
     os.write(2, line.encode())
     faulthandler.dump_traceback(2, all_threads=True)
     os._exit(STALLED)

@@ -90,7 +90,7 @@ def mine_recordings(
     finally:
         workers.close()
     if not run.complete:
-        typer.echo(f"{_did(run)}; other shares are not finished yet, so {output} contains no dataset yet", err=True)
+        typer.echo(f"{_did(run)}; other shares are not finished yet: the last one writes the dataset", err=True)
         return
     summary = summary_of(output)
     if run.changed or not (output / REPORT).exists():

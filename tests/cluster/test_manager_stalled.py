@@ -39,7 +39,7 @@ def test_a_manager_whose_event_loop_hangs_ends_and_another_takes_over(
     assert hanging.wait() == STALLED
     logged = hanging.output()
     assert "CRITICAL watchdog: the event loop has not run for" in logged
-    assert "ending this manager, to be restarted" in logged
+    assert "ending this manager so that it is restarted" in logged
     assert "in hang" in logged, "and where it hangs"
     standby.wait_for_output("active: holds the Lease")
     api.create(task("south"))

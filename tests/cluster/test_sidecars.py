@@ -179,7 +179,7 @@ def test_a_pod_that_cannot_get_a_detector_is_created_with_an_event_that_gives_th
         what="the manager knows that the Detector is Standalone",
     )
     assert not sidecars(api.create(pod("late")))
-    event_of(api, "late", "is of mode Standalone: give it mode Sidecar")
+    event_of(api, "late", "has mode Standalone: give it mode Sidecar")
 
 
 def test_a_detector_applied_just_before_its_pod_is_found(api: Api, requested: Webhook) -> None:

@@ -164,5 +164,7 @@ def fallback_conditions(
     yield from from_first(
         conditions, TIMED_OUT, timed_out, ("InTime", "the instance is ready, or within its readyTimeout")
     )
-    stands_in = ("Fallback", f"this instance serves the tasks of {others}, which is not ready") if others else None
+    stands_in = (
+        ("Fallback", f"this instance serves the tasks of instances that are not ready: {others}") if others else None
+    )
     yield from from_first(conditions, "StandsIn", stands_in, ("NoFallback", "the instance serves only its own tasks"))

@@ -83,8 +83,8 @@ def injection(
 
 def _why_not(name: str, metadata: Mapping[str, Any], spec: Mapping[str, Any], detector: Detector) -> str | None:
     if detector.spec.mode is not DetectorMode.SIDECAR:
-        mode = f"of mode {detector.spec.mode}" if detector.spec.mode else "without a mode"
-        return f"Detector {name} is {mode}: give it mode Sidecar, or remove the label {SIDECAR_LABEL}"
+        mode = f"mode {detector.spec.mode}" if detector.spec.mode else "no mode"
+        return f"Detector {name} has {mode}: give it mode Sidecar, or remove the label {SIDECAR_LABEL}"
     account = str(spec.get("serviceAccountName") or spec.get("serviceAccount") or "default")
     names = detector.spec.service_account_names or []
     if account not in names:

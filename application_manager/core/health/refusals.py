@@ -20,7 +20,7 @@ _RETRIED = 20 * 60.0  # s
 _POD = re.compile(r'^.*?\bpods "[^"]*" is ', re.DOTALL)
 
 _REMEDIES = {
-    QUOTA_EXCEEDED: "raise the ResourceQuota, or wait until other pods or objects end; the manager retries",
+    QUOTA_EXCEEDED: "raise the ResourceQuota, or wait until other objects are deleted; the manager retries",
     ADMISSION_REFUSED: "change the template or the admission policy; the manager retries",
 }
 _NO_RIGHT = re.compile(r"cannot \w+ resource")  # a missing permission of the manager's account

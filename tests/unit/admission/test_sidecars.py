@@ -226,8 +226,8 @@ def test_on_the_host_network_the_sidecar_opens_no_port() -> None:
     ("requested", "of", "logged"),
     [
         (pod(), None, "namespace site has no valid Detector 'town'"),
-        (pod(), detector(mode="Standalone", serviceAccountNames=None), "is of mode Standalone: give it mode Sidecar"),
-        (pod(), detector(mode=None, serviceAccountNames=None), "is without a mode: give it mode Sidecar"),
+        (pod(), detector(mode="Standalone", serviceAccountNames=None), "has mode Standalone: give it mode Sidecar"),
+        (pod(), detector(mode=None, serviceAccountNames=None), "has no mode: give it mode Sidecar"),
         (pod(serviceAccountName="other"), detector(), "has only vehicle, not other"),
         (pod(serviceAccountName=None), detector(), "has only vehicle, not default"),
         (pod(), detector(serviceAccountNames=[]), "has none, not vehicle"),
