@@ -55,15 +55,20 @@ async def repeatedly(look: Callable[[], Awaitable[object]], every: float, proble
         problem: the problem, for the log; empty if failures are reported elsewhere.
     """
     reported = ""
-    while True:
-        pause = every
+
+    async def once() -> float:
+        """Call it once; the seconds until the next call."""
+        nonlocal reported
         try:
             await look()
-            reported = ""
         except _FAILURES as error:
             if problem and str(error) != reported:
                 log.warning("%s: %s", problem, error)
             reported = str(error)
-            if isinstance(error, RequestError):
-                pause = max(every, error.retry_after or 0.0)
+            return max(every, (error.retry_after or 0.0) if isinstance(error, RequestError) else 0.0)
+        reported = ""
+        return every
+
+    while True:
+        pause = await once()
         await asyncio.sleep(pause)
