@@ -112,7 +112,7 @@ class Answers:
             drops=[*latest.drops, *dropped],
             sources=sources,
             actions=actions,
-            tasks=task_status(sink.reconciler),
+            tasks=reconciler_status(sink.reconciler),
             lease=None if self._lease is None else lease_status(self._lease),
         )
 
@@ -196,7 +196,7 @@ class Answers:
                 watching.cancel()
 
 
-def task_status(reconciler: DemandReconciler) -> TaskStatus:
+def reconciler_status(reconciler: DemandReconciler) -> TaskStatus:
     """What the reconciler did so far."""
     counts = reconciler.counts
     return TaskStatus(

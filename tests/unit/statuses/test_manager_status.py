@@ -41,8 +41,8 @@ def test_only_a_changed_status_or_reason_gives_an_event() -> None:
 
 def test_a_tasks_phases_follow_its_instance() -> None:
     phases = [
-        task_status(task("a"), COUNTS, service, NOW, 0).phase
-        for service in (
+        task_status(task("a"), COUNTS, progress, NOW, 0).phase
+        for progress in (
             None,
             InstanceProgress("app", False, False),
             InstanceProgress("app", True, False),
