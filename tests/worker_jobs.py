@@ -1,4 +1,4 @@
-"""Jobs for worker processes, as light as can be to import: what a job does, a template's expression could do."""
+"""Jobs for worker processes with few imports; they do what a template's expression could do."""
 
 from __future__ import annotations
 

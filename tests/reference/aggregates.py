@@ -1,4 +1,4 @@
-"""What a window's values come to, as the documentation has it."""
+"""Aggregates of a window's values, as documented."""
 
 from __future__ import annotations
 

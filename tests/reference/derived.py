@@ -1,4 +1,4 @@
-"""Signals over what conditions see: the values that expressions had at the evaluations of one subject."""
+"""Signals over signals: the values of expressions at the evaluations of one subject."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Evaluations:
     all: list[tuple[int, Values]] = field(default_factory=list)
 
     def look(self, signals: list[dict[str, Any]], look: SubjectView, now: int, kept: int) -> SubjectView:
-        """What there is to be seen with these signals, of which each reads those before it."""
+        """The view with these signals, each of which reads those before it."""
         here: Values = {}
         self.before.append((now, here))
         self.all.append((now, here))
@@ -44,7 +44,7 @@ class Evaluations:
         return SubjectView(look.subject, variables, look.names, look.in_scope, look.near, values)
 
     def statistics(self, signals: list[dict[str, Any]], start: int, now: int) -> Values:
-        """What is known of the episode that started then."""
+        """The statistics of the episode with that start."""
         found: Values = {}
         for signal in signals:
             if signal.get("over") == "Episode":

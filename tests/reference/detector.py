@@ -1,4 +1,4 @@
-"""The whole of it: arrivals go in, events come out, and at each tick everything is recomputed."""
+"""The reference detector: arrivals in, events out; at each tick everything is recomputed."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Reported:
 
 @dataclass
 class Rule:
-    """A rule as written, and all that was ever seen of its subjects."""
+    """A rule as written, and all observations of its subjects."""
 
     name: str
     spec: dict[str, Any]
@@ -83,14 +83,14 @@ class Rule:
 
 @dataclass(frozen=True)
 class Selection:
-    """Those that a rule is evaluated for: who belongs to one of the clients, and the subjects that wake."""
+    """The subjects that a rule is evaluated for: those with one of the clients, and those that wake."""
 
     clients: set[str]
     subjects: set[Subject]
 
 
 class Reference:
-    """A detector of which only the meaning counts."""
+    """A detector that only defines the semantics."""
 
     def __init__(
         self,
@@ -123,7 +123,7 @@ class Reference:
         }
 
     def arrive(self, sample: Sample) -> None:
-        """A sample comes; with clock Wall the ticks before it have run by then, and that at its time has not."""
+        """Add a sample; with clock Wall the ticks before it have run, but not the one at its time."""
         if self.lateness is None:
             self.advance(sample.time - 1)
         elif self._begins(sample.time):
@@ -158,7 +158,7 @@ class Reference:
         return {rule.on_sample for rule in self.rules if rule.on_sample is not None}
 
     def _enter(self, until: int) -> None:
-        """Nobody sees a sample before its time."""
+        """Move samples into the buffer once their time has come."""
         for each in sorted(self.waiting, key=lambda each: (each.time, each.number)):
             if each.time <= until:
                 self.waiting.remove(each)

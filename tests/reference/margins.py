@@ -1,4 +1,4 @@
-"""How nearly a condition holds, from its text as Python reads it."""
+"""The margin of a condition, from its text parsed as Python."""
 
 from __future__ import annotations
 

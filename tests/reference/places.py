@@ -18,7 +18,7 @@ Vector = tuple[Fraction, Fraction]
 
 @dataclass(frozen=True)
 class PlaceContext:
-    """What is known of the road users and places that expressions are about."""
+    """The known positions of road users, and the places that expressions name."""
 
     places: dict[str, dict[str, Any]]
     position: dict[str, str]

@@ -113,7 +113,7 @@ class Received:
         )
 
     def gap(self, time: int) -> None:
-        """Nobody could be heard up to here."""
+        """A gap up to here: ranges do not reach back before it, and no client counts as silent before it."""
         self.floor = time
         for known in self.known.values():
             known.last = time

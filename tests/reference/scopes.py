@@ -20,7 +20,7 @@ Subject = tuple[tuple[str, ...], str | None]
 
 @dataclass(frozen=True)
 class SubjectView:
-    """A subject, and what is to be seen of it."""
+    """A subject and the variables of its conditions."""
 
     subject: Subject
     variables: dict[str, Any]
@@ -174,7 +174,7 @@ def _place(position: dict[str, str], client: str, received: Received, then: int,
 
 
 def only(view: dict[str, Any], names: list[str]) -> dict[str, Any]:
-    """What is known of these."""
+    """The known values of these names."""
     return {name: view[name] for name in names if name in view}
 
 

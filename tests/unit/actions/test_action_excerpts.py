@@ -1,4 +1,4 @@
-"""The input of actions: each sample of an episode's window exactly once, in any order of arrival, on both clocks."""
+"""Actions get each sample of an episode's window exactly once, in any order of arrival, on both clocks."""
 
 from __future__ import annotations
 

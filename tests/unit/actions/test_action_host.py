@@ -1,4 +1,4 @@
-"""Actions at work: each on a thread of its own, and what one does wrong costs nobody else anything."""
+"""Each action runs on its own thread, and its failures affect no other."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class Recorded(Action[ActionParameters]):
 
 
 class Raises(Recorded):
-    """Fails with what its episodes are about car1."""
+    """Raises for episodes of car1."""
 
     def samples(self, episode: Episode, samples: Sequence[EpisodeSample]) -> None:
         if episode.subject == "car1":
@@ -75,14 +75,14 @@ class Raises(Recorded):
 
 
 class Impossible(Recorded):
-    """Cannot be made."""
+    """Raises in its constructor."""
 
     def __init__(self, *_: Any) -> None:
         raise OSError("no paper")
 
 
 class Hangs(Recorded):
-    """Waits for ever, or until it is let go."""
+    """Blocks until it is released."""
 
     def started(self, episode: Episode) -> None:
         SLOW.wait(PATIENCE)
@@ -97,7 +97,7 @@ class Silent(Recorded):
 
 
 class Wakes(Recorded):
-    """Wants to be called again, and fails with it once."""
+    """Requests wake-ups, and raises in one of them."""
 
     calls = 0
 

@@ -1,4 +1,4 @@
-"""The way out to HTTP endpoints: deadlines hold, answers are bounded, certificates are checked, secrets stay secret."""
+"""The HTTP client of actions: deadlines, bounded responses, certificate checks, redacted secrets."""
 
 from __future__ import annotations
 

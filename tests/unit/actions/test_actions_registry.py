@@ -1,4 +1,4 @@
-"""Actions of installed packages: found, given their parameters, and refused with the place of what is wrong."""
+"""Actions of installed packages are found and get their parameters; errors are reported by field."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From samples to documents: nothing changes, and parts that do not fit are moved to files, or cut and reported."""
+"""Samples become documents unchanged; parts that do not fit are stored in files, or truncated and reported."""
 
 from __future__ import annotations
 

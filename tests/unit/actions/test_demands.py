@@ -1,4 +1,4 @@
-"""A demand keeps its name, and comes back whole from its task."""
+"""A demand keeps its name and round-trips through its task."""
 
 from __future__ import annotations
 

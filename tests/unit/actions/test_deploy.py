@@ -1,4 +1,4 @@
-"""The reconciler makes the tasks equal to the demands; here in a folder, which is a store as real as the API server."""
+"""The reconciler makes the tasks equal to the demands, here in a folder instead of the API server."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ async def eventually(holds: Callable[[], bool], what: str) -> None:
 
 
 def stored(folder: Path) -> dict[str, dict[str, Any]]:
-    """The tasks that are there; one that is removed between the look at the folder and the look into it is not."""
+    """The existing tasks; a file removed while the folder is read is skipped."""
     tasks = {}
     for file in sorted(folder.glob("[!.]*.yaml")):
         with suppress(FileNotFoundError):
@@ -71,7 +71,7 @@ def ends(folder: Path) -> dict[str, str | None]:
 
 
 def put(folder: Path, task: Mapping[str, Any]) -> Path:
-    """From one moment to the next: who looks meanwhile finds no half of it."""
+    """Write the file atomically: readers see all of it or nothing."""
     file = folder / f"{task['metadata']['name']}.yaml"
     unfinished = folder / ".unfinished"
     unfinished.write_text(yaml.safe_dump(dict(task)))

@@ -1,4 +1,4 @@
-"""Step by step, any task comes to what is demanded, and then nothing more is done."""
+"""Any task reaches the demanded state step by step, and then nothing more is done."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ STORED = st.builds(lambda demand, ended: StoredTask(to_task(demand, 5 if ended e
 
 
 def after(step: StoreChange, demand: Demand | None, stored: StoredTask | None) -> StoredTask | None:
-    """What a store has when the step is done."""
+    """The stored task after the step."""
     if step is StoreChange.CREATE and demand is not None and stored is None:
         return StoredTask(to_task(demand), 2)
     assert stored is not None

@@ -1,4 +1,4 @@
-"""An action with `follow` is demanded with the parameters of now; what is unknown or fails keeps its last value."""
+"""With `follow`, demands have the current parameters; an unknown or failing one keeps its last value."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The outbox: nothing is lost or sent twice, each episode in order, bounded, and patient with a busy endpoint."""
+"""The outbox loses and duplicates nothing, keeps the order of each episode, is bounded, and backs off."""
 
 from __future__ import annotations
 

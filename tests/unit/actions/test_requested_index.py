@@ -1,4 +1,4 @@
-"""The index of requested recordings: nothing is done twice, and everything has a bound."""
+"""The index of requested recordings: requests are idempotent and bounded."""
 
 from __future__ import annotations
 

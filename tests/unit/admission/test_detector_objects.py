@@ -1,4 +1,4 @@
-"""What a Detector's pod is made of: its folders have volumes, its Secrets are mounted, and nothing else changes it."""
+"""A Detector's pod: its folders have volumes, its Secrets are mounted, and nothing else changes it."""
 
 from __future__ import annotations
 

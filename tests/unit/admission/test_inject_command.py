@@ -1,4 +1,4 @@
-"""`application-manager inject`: what makes pods gets the detector in its template, and all else passes through."""
+"""`application-manager inject`: pod templates get the detector, and other objects pass unchanged."""
 
 from __future__ import annotations
 

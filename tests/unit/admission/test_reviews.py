@@ -1,4 +1,4 @@
-"""The API server's requests before it stores an object, and the responses: only a new spec is ever rejected."""
+"""Admission reviews and their responses: only a changed spec is ever rejected."""
 
 from __future__ import annotations
 
@@ -172,7 +172,7 @@ def raw(model: Kind, version: int = 9) -> dict[str, Any]:
 def reviewed(
     new: Kind, *known: Kind, live: tuple[Kind, ...] = (), old: Kind | None = None, namespaces: tuple[str, ...] = ()
 ) -> dict[str, Any]:
-    """What is answered where the manager knows some objects, and the API server has others."""
+    """The response if the manager's cache and the API server have different objects."""
 
     async def ask() -> dict[str, Any]:
         cache = ClusterCache(Policy())

@@ -1,4 +1,4 @@
-"""The webhook's server: HTTPS with a certificate that is followed, and an answer or none, but never a wait."""
+"""The webhook's server: HTTPS with a reloaded certificate, and immediate responses."""
 
 from __future__ import annotations
 

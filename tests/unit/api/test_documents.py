@@ -1,4 +1,4 @@
-"""Every error of a file names file, line, column and field, the value, and what to do."""
+"""Every error of a file names file, line, column, field, value and remedy."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ DETECTOR = "apiVersion: wayside.dev/v1alpha1\nkind: Detector\nmetadata: {name: d
 
 
 def problems(tmp_path: Path, text: str | bytes) -> list[str]:
-    """What is wrong with a file of that text, without its folder."""
+    """The problems of a file with that text, without its folder."""
     file = tmp_path / "f.yaml"
     file.write_bytes(text.encode() if isinstance(text, str) else text)
     with pytest.raises(DocumentError) as caught:

@@ -1,4 +1,4 @@
-"""`detector schema`: what is right passes, a misspelt field does not."""
+"""`detector schema`: valid files pass, a misspelt field does not."""
 
 from __future__ import annotations
 

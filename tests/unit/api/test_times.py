@@ -1,4 +1,4 @@
-"""Times keep their nanoseconds on the way through text."""
+"""Times keep their nanoseconds in text."""
 
 from __future__ import annotations
 

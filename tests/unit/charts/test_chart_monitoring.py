@@ -1,4 +1,4 @@
-"""The alerts of the chart fire when they should; they and the dashboard ask only for what the programs export."""
+"""The alerts of the chart fire when they should; alerts and dashboard query only exported metrics."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the image is made of: pinned, with hashes, and all that the programs ask for."""
+"""The image's packages are pinned with hashes and cover all dependencies of the programs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The roles follow from the allowed kinds, and are as small as these."""
+"""The roles follow from the allowed kinds and are minimal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What docs/security.md promises stands on tests that exist, and on alerts and metrics that are there."""
+"""docs/security.md refers to existing tests, alerts and metrics."""
 
 from __future__ import annotations
 

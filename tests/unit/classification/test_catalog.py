@@ -98,7 +98,7 @@ def test_rules_of_the_same_name_are_distinguished_by_their_source() -> None:
 
 
 class Page(HTMLParser):
-    """What a browser would see: the elements and texts, and what the page would fetch."""
+    """The elements and texts of a page, and the URLs that it would fetch."""
 
     def __init__(self, text: str) -> None:
         super().__init__()

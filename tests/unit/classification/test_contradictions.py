@@ -1,4 +1,4 @@
-"""Where the classification contradicts the rule: for each way a rule that is warned of, and one that is right."""
+"""Contradictions of classification and rule: for each kind a rule with a warning and a correct one."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def reported(classification: dict[str, list[str]], *others: Any, **spec: Any) ->
 
 
 class ContradictionCase(NamedTuple):
-    """A rule that is warned of: the field, a piece of the text, and what makes it right."""
+    """A rule with a warning: the field, a part of the message, and the correction."""
 
     given: dict[str, list[str]]
     spec: dict[str, Any]

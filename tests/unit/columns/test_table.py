@@ -1,4 +1,4 @@
-"""The table of a stream holds, of each client, what a plain list of its samples in order of time would hold."""
+"""The table of a stream has the same contents as plain ordered lists of samples for each client."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _late = st.sampled_from([0, 0, 0, 1, 1, 2 * SECOND, 5 * SECOND, DAY])
 
 
 class TableMachine(RuleBasedStateMachine):
-    """A table and lists of samples that go the same way."""
+    """A table and lists of samples under the same operations."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -44,7 +44,7 @@ class TableMachine(RuleBasedStateMachine):
 
     @rule(clients=st.integers(1, 3))
     def come(self, clients: int) -> None:
-        """Clients come; what there is of others stays."""
+        """Add clients; others are unchanged."""
         self.rows += [[] for _ in range(clients)]
         self.latest += [NEVER] * clients
         self.dropped += [NEVER] * clients

@@ -1,4 +1,4 @@
-"""The start: what is imported is no garbage, and a command imports only what it needs."""
+"""The start: imported objects are not garbage-collected, and a command imports only what it needs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`application-manager render` prints what would run, from files alone."""
+"""`application-manager render` prints the resulting objects from files alone."""
 
 from __future__ import annotations
 

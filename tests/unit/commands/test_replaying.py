@@ -78,7 +78,7 @@ def test_a_rejected_rule_change_in_an_intake_file_ends_no_episode_as_live() -> N
 
 
 class NullSink:
-    """Takes events and demands, and does nothing with them."""
+    """Discards events and demands."""
 
     def events(self, events: object) -> None: ...
 

@@ -1,4 +1,4 @@
-"""Budgets of tasks: whatever comes and goes in whatever order, the oldest tasks are within."""
+"""Budgets of tasks: in any order of changes, the oldest tasks are within the budget."""
 
 from __future__ import annotations
 

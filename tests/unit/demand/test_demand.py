@@ -1,4 +1,4 @@
-"""Demand: what should run depends on what is live, and on nothing else."""
+"""Demand depends only on the live tasks."""
 
 from __future__ import annotations
 

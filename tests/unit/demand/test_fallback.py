@@ -1,4 +1,4 @@
-"""What is not ready in time turns its demand to another template, and takes it back once it stays ready."""
+"""A demand moves to the fallback template if its instance is not ready in time, and returns once it stays ready."""
 
 from __future__ import annotations
 

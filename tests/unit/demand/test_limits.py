@@ -1,4 +1,4 @@
-"""Limits: who runs where not all can, as a pure function of what is live; and that no limit is ever exceeded."""
+"""Limits select the running instances as a pure function of the live tasks, and are never exceeded."""
 
 from __future__ import annotations
 
@@ -57,12 +57,12 @@ def of(*tasks: ApplicationTask, limit: int | None = 1, **others: Any) -> Namespa
 
 
 def running(outcome: NamespaceOutcome) -> set[str]:
-    """The keys of what may run."""
+    """The keys of the instances that may run."""
     return {str(each.key) for each in outcome.instances.values() if each.wanted}
 
 
 def going(outcome: NamespaceOutcome) -> set[str]:
-    """The keys of what goes now."""
+    """The keys of the instances to release now."""
     ends = {each.key: each.release_time for each in outcome.instances.values()}
     return {str(key) for key, end in ends.items() if end is not None and end <= NOW}
 
@@ -210,7 +210,7 @@ def tasks_of(drawn: Iterable[tuple[str, str, int, int]], prefix: str = "t") -> l
 
 
 class SimulatedNamespace:
-    """A namespace that a manager manages, one step after the other; all that it remembers is what is live."""
+    """A namespace under a simulated manager, step by step; its only state is the live objects."""
 
     def __init__(self, bounds: tuple[int | None, int | None, int | None], uptime: int = 0) -> None:
         self.own = dict(zip(NAMES, bounds, strict=False))
@@ -225,7 +225,7 @@ class SimulatedNamespace:
         return demand(self.templates, live, self.instances.values(), {}, self.now, self.total)
 
     def step(self, live: list[ApplicationTask], source: random.Random | None = None) -> bool:
-        """Do what is decided, or some of it in any order; whether there was anything to do."""
+        """Apply some or all decisions in any order; return whether there was anything to do."""
         decided = list(self.outcome(live).instances.values())
         todo = [each for each in decided if self._is_due(each)]
         acted = todo if source is None else source.sample(todo, source.randint(0, len(todo)))

@@ -1,4 +1,4 @@
-"""Annotations of people: a paused instance is left as it is, a held one stays though nobody demands it."""
+"""Manual annotations: a paused instance is not changed, a held one stays without demand."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Leases lapse by what we observe, on a clock that runs only while we reach the API server."""
+"""Leases expire by observation, on a clock that runs only while the API server is reachable."""
 
 from __future__ import annotations
 

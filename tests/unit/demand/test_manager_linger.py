@@ -1,4 +1,4 @@
-"""Linger: an instance goes when its deadline comes, however late its status is written."""
+"""Linger: an instance is released at its deadline, however late its status is written."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""While it is worked out what a task claims, nothing is decided for want of knowing it."""
+"""While the claim of a task is being computed, no decision treats it as absent."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Deploy, Reconfigure and Suspend together, and the baseline: what runs depends on what lives, and on nothing else."""
+"""Deploy, Reconfigure, Suspend and the baseline: the running applications depend only on the live tasks."""
 
 from __future__ import annotations
 
@@ -266,7 +266,7 @@ def tasks(draw: st.DrawFn) -> list[ApplicationTask]:
 
 
 def applications(decisions: Any) -> dict[str, tuple[Any, ...]]:
-    """What runs: of each wanted instance its values and whether it is at zero."""
+    """The values of each demanded instance, and whether it is suspended."""
     return {
         name: (each.key, each.parameters, each.suspended, each.tasks) for name, each in decisions.items() if each.wanted
     }

@@ -1,4 +1,4 @@
-"""Merged parameters have a bound, and those who go beyond it are named."""
+"""Merged parameters are bounded, and the largest contributors are named."""
 
 from __future__ import annotations
 

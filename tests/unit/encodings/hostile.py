@@ -1,4 +1,4 @@
-"""Payloads that a broken or hostile sender may send: noise, and valid messages that were tampered with."""
+"""Payloads of a broken or hostile sender: noise and tampered messages."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def survive(codec: Decoder, hostile: Iterator[bytes]) -> int:
 
 
 def assert_plain(value: Any) -> None:
-    """Nothing but what the engine's contract allows."""
+    """Check that the value is plain data."""
     if isinstance(value, dict):
         for key, item in value.items():
             assert type(key) is str

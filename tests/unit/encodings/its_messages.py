@@ -101,7 +101,7 @@ def a_cam(
 
 
 def random_message(name: str, chance: random.Random) -> tuple[bytes, dict[str, Any]]:
-    """Bytes, and what a decoder must make of them."""
+    """An encoded message and the expected value."""
     kind = pdu(name)
     value, expected = random_value(kind, chance)
     value["header"] = header(kind, name)

@@ -1,4 +1,4 @@
-"""CBOR reads as JSON would, whatever another encoder makes of it; raw is handed through."""
+"""CBOR of any encoder reads like JSON; raw payloads are passed through."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is around ITS messages on the air: GeoNetworking, BTP and security, built byte by byte or by pycrate."""
+"""The headers of ITS messages: GeoNetworking, BTP and security, built byte by byte or by pycrate."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a reader of fields must give: the same as whole messages, decoded and looked up one by one."""
+"""Field readers must give the same values as decoding whole messages and reading the fields."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An engine on its own thread, with a clock that the test sets: what it consumes and which events it sends."""
+"""An engine on its own thread, with a clock that the test sets: its input and its events."""
 
 from __future__ import annotations
 

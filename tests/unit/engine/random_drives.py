@@ -1,4 +1,4 @@
-"""Random rules and random streams for the test of equivalence: small enough to disagree about, mean enough to do so."""
+"""Random rules and streams for the test of equivalence: small, with many edge cases."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Many ticks evaluated in one go: they see what each of them by itself would see, and what happens keeps its order."""
+"""Many ticks evaluated at once see the same as single ticks, and their events keep their order."""
 
 from __future__ import annotations
 

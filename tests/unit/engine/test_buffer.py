@@ -139,7 +139,7 @@ def test_the_newest_sample_stays_when_the_cap_has_room_for_one() -> None:
 
 @dataclass
 class BufferStep:
-    """A step of the life of a buffer."""
+    """An operation on a buffer."""
 
     what: str
     client: str = ""

@@ -1,4 +1,4 @@
-"""The engine: what open episodes demand, and what a changed rule means for them."""
+"""The engine: demands of open episodes, and the effect of rule changes on them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A Detector that changes while the engine runs: what is read as before stays, the rest is forgotten."""
+"""A Detector that changes while the engine runs: samples with unchanged decoding stay, others are dropped."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bad input: whatever comes in is dropped or unknown, counted, and harms nobody else."""
+"""Bad input is dropped or unknown, counted, and affects no other client."""
 
 from __future__ import annotations
 

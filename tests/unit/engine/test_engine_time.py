@@ -1,4 +1,4 @@
-"""Time: batches make no difference, with clock Data neither does the order of arrival; jumps, gaps and steps back."""
+"""Time: batching and, with clock Data, the order of arrival do not matter; jumps, gaps and steps back."""
 
 from __future__ import annotations
 

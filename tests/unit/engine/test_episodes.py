@@ -1,4 +1,4 @@
-"""When episodes start and end, against a reading of the rules that looks at the whole history each time."""
+"""Starts and ends of episodes, compared with a definition over the whole history."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Happening = tuple[int, str]
 
 @dataclass(frozen=True)
 class Moment:
-    """What was seen at a tick."""
+    """The observation at a tick."""
 
     time: int
     seen: Observation

@@ -1,4 +1,4 @@
-"""A subject that is brought forward over many ticks at once goes the same way as one that is looked at tick by tick."""
+"""Advancing a subject over many ticks at once gives the same states as tick by tick."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _times = st.integers(0, 8)
 
 
 def stepped(state: SubjectState, now: int, timing: Timing, seen: Observation) -> Started | Ended | None:
-    """What one tick does, written down slowly."""
+    """A slow reference of one tick."""
     return open_step(state, now, timing, seen) if state.is_open else idle_step(state, now, timing, seen)
 
 
@@ -76,7 +76,7 @@ def idle_step(state: SubjectState, now: int, timing: Timing, seen: Observation) 
 
 
 def what_is_left(state: SubjectState) -> tuple[object, ...]:
-    """What decides the future."""
+    """The state that decides later ticks."""
     return state.is_open, state.onset, state.rests_until, state.unknown_since if state.is_open or state.onset else None
 
 

@@ -1,4 +1,4 @@
-"""When rules are evaluated: with samples, on demand, not while paused, less often under load; and how often at most."""
+"""Times of evaluation: with samples, on demand, paused, under load; and the maximum rate."""
 
 from __future__ import annotations
 

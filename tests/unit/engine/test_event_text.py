@@ -1,4 +1,4 @@
-"""The text of an event is, byte for byte, what a JSON encoder makes of the CloudEvent; ids are base32 of a SHA-256."""
+"""The text of an event is byte-identical to an encoded CloudEvent; ids are base32 of a SHA-256."""
 
 from __future__ import annotations
 

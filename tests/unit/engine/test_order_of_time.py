@@ -1,4 +1,4 @@
-"""One order of time: a tick sees all samples up to its time, all is evaluated once, and nothing is left at the end."""
+"""One order of time: a tick sees all samples up to its time, each is evaluated once, and the end flushes all."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the intersection's rules must find, in plain numpy and without the detector.
+"""The expected results of the intersection's rules, in plain numpy and without the detector.
 
 A truth is a row of ticks for each subject: 1 where the rule's condition is true, 0 where it is false, NaN where it is
 unknown.

@@ -1,4 +1,4 @@
-"""The case cooperative recording: what must be detected in a drive, and which drives are clear enough to judge."""
+"""The case cooperative recording: the expected detections of a drive, and drives that are clear enough to judge."""
 
 from __future__ import annotations
 

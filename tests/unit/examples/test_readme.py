@@ -1,4 +1,4 @@
-"""The README's commands: those of the first rule run as they stand, those that need a cluster name what there is."""
+"""The README's commands: those of the first rule run unchanged, those for a cluster name existing files and options."""
 
 from __future__ import annotations
 

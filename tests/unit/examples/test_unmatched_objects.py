@@ -1,4 +1,4 @@
-"""unmatched-objects: what one perception sees and the other does not, in one client and between two."""
+"""unmatched-objects: objects that one perception sees and the other does not, in one client and between two."""
 
 from __future__ import annotations
 

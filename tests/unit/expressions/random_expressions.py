@@ -48,7 +48,7 @@ class Table:
         ]
 
     def by_columns(self, expression: Expression) -> list[object] | None:
-        """What the columns yield, or FOREIGN, row by row."""
+        """The results of columns, or FOREIGN, row by row."""
         graph = Graph()
         root = graph.add(expression, by_path)
         if root is None:

@@ -1,4 +1,4 @@
-"""An expression that does not compile is shown in the author's own text, with the remedy."""
+"""Compile errors are shown in the author's text, with the remedy."""
 
 import pytest
 from hypothesis import given, settings

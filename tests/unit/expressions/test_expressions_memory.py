@@ -1,4 +1,4 @@
-"""Evaluating an expression a thousand times leaves nothing behind, whatever it calls and however it ends."""
+"""Evaluating an expression a thousand times leaks nothing, for any function and any outcome."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a failing test prints is short, and names the file with the rest."""
+"""The output of a failing test is short and names the file with the rest."""
 
 from __future__ import annotations
 

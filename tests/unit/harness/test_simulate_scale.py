@@ -1,4 +1,4 @@
-"""The simulation behind docs/scale.md counts what one can count by hand."""
+"""The simulation behind docs/scale.md matches manual counts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The file of all texts has those that users read, and nothing else."""
+"""The file of all texts has exactly the texts for users."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the API server answers, sorted by what to do about it."""
+"""Responses of the API server, classified by the reaction to them."""
 
 from __future__ import annotations
 

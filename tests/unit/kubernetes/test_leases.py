@@ -1,4 +1,4 @@
-"""Never two managers may act at the same time, whatever stands still, is delayed or is lost."""
+"""Two managers never act at the same time, whatever is suspended, delayed or lost."""
 
 from __future__ import annotations
 

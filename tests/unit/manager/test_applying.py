@@ -1,4 +1,4 @@
-"""The objects of an instance: nothing that is not its own is touched, and its status knows of all of them first."""
+"""The objects of an instance: foreign objects are left alone, and its status lists new ones before they are applied."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the manager counts of itself is scraped as Prometheus metrics, each of which the guide describes."""
+"""The manager's Prometheus metrics, each of which the guide describes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The manager ends at its start on a Kubernetes on which it could never release an application."""
+"""The manager refuses to start on a Kubernetes version on which it cannot release applications."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from wayside.kubernetes.errors import ApiError
 
 
 class RejectingServer:
-    """An API server that takes no Event."""
+    """An API server that rejects Events."""
 
     def __init__(self) -> None:
         self.requested = 0
@@ -35,7 +35,7 @@ def report(events: Recorder, first: int, count: int) -> None:
 
 
 class AcceptingServer:
-    """An API server that takes all Events, and notes their namespaces."""
+    """An API server that accepts Events and records their namespaces."""
 
     def __init__(self) -> None:
         self.namespaces: list[str] = []

@@ -1,4 +1,4 @@
-"""An instance that goes while its release is being checked is not made again by it."""
+"""An instance that is deleted during its release check is not recreated."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The manager starts as soon as the API server lets it, and gives up only where waiting is in vain."""
+"""The manager starts as soon as the API server permits, and gives up only on permanent errors."""
 
 from __future__ import annotations
 

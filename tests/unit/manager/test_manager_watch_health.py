@@ -1,4 +1,4 @@
-"""kopf's watches give signs of life, and one that gives none is begun again: around kopf's own function."""
+"""kopf's watches report activity, and a silent watch is restarted: a wrapper of kopf's function."""
 
 from __future__ import annotations
 

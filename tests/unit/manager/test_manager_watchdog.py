@@ -1,4 +1,4 @@
-"""A manager that hangs is ended, whatever of it hangs, and one that works or only stood still is not."""
+"""The watchdog ends a manager of which any part hangs, but not one that works or was suspended."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from wayside.kubernetes.workqueue import WorkQueue
 
 
 def ended_by(stall: watchdog.Stall, *, hangs: bool = False, silent: float = 3600.0) -> str | None:
-    """Why the watchdog ends a loop, which `hangs` until then, if it does."""
+    """The reason for which the watchdog ends a loop that `hangs`, if it does."""
     logged: list[str] = []
     called = threading.Event()
 

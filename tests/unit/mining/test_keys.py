@@ -1,4 +1,4 @@
-"""What makes a result count no longer."""
+"""The cache key of a result."""
 
 from __future__ import annotations
 

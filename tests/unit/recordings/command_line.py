@@ -1,4 +1,4 @@
-"""The command line at work: a folder with a Detector, a rule and recordings."""
+"""Runs the command line in a folder with a Detector, a rule and recordings."""
 
 from __future__ import annotations
 

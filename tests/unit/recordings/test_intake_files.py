@@ -1,4 +1,4 @@
-"""What a detector consumed reads back in the same order, by us and by other tools, also after a kill -9."""
+"""Intake files read back in order, by Wayside and other tools, also after a kill -9."""
 
 import os
 import signal

@@ -1,4 +1,4 @@
-"""How much room recordings take together, and what gives way for new ones."""
+"""The total size of recordings is limited, and the oldest are dropped for new ones."""
 
 from __future__ import annotations
 

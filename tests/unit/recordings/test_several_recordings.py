@@ -1,4 +1,4 @@
-"""`detector replay` over several files: which are one recording, and what the others have to do with each other."""
+"""`detector replay` over several files: their grouping into recordings, which are independent of each other."""
 
 from __future__ import annotations
 

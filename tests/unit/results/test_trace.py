@@ -1,4 +1,4 @@
-"""The trace of a replay: the values and conditions are those that the engine decided by."""
+"""The trace of a replay has the values and conditions that the engine used."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`detector new`: each draft passes the check, and finds in a drive what it is about."""
+"""`detector new`: each draft passes the check and finds its event in a drive."""
 
 from __future__ import annotations
 

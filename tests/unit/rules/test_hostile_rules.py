@@ -1,4 +1,4 @@
-"""What who writes rules or templates cannot have: the detector's own Secrets, all memory, or all time."""
+"""Authors of rules and templates cannot get the detector's own Secrets, unlimited memory or unlimited time."""
 
 from __future__ import annotations
 

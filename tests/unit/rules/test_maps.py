@@ -1,4 +1,4 @@
-"""Places from GeoJSON and lanelet2 maps, in degrees and in metres, and what is wrong with map files."""
+"""Places from GeoJSON and lanelet2 maps, in degrees and in metres, and errors in map files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A Detector and its rules from files: what counts, what is left out, and what is wrong."""
+"""A Detector and its rules from files: selection, skipped rules, and errors."""
 
 from __future__ import annotations
 

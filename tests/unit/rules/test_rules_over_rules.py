@@ -1,4 +1,4 @@
-"""Signals over rules: sequence, count, escalation, absence of a follow-up; their order and what can be wrong."""
+"""Signals over rules: sequence, count, escalation, absence of a follow-up; their order and errors."""
 
 from __future__ import annotations
 

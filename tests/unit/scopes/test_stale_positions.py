@@ -1,4 +1,4 @@
-"""Road users that leave the picture: their last positions expire soon, and uses of older ones are reported."""
+"""Road users that leave the view: their last positions expire soon, and uses of older ones are reported."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class User(NamedTuple):
     speed: float
 
     def sample(self, time: float) -> dict[str, float] | None:
-        """What is seen of them; nothing outside of the picture."""
+        """The observed sample; None outside of the view."""
         x, y, dx, dy = self.lane
         way = (time - self.start) * self.speed
         here = {"x": x + dx * way, "y": y + dy * way, "vx": dx * self.speed, "vy": dy * self.speed}

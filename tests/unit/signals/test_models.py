@@ -1,4 +1,4 @@
-"""Signals that ONNX models compute: real models through onnxruntime, and everything that can be wrong with one."""
+"""Signals from ONNX models: real models through onnxruntime, and their errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The buffer as plugins see it: each query against the list of all that was sent."""
+"""The buffer as plugins see it: each query compared with the list of all samples."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Signals over what conditions see: windows over the values at earlier evaluations, and statistics of the episode."""
+"""Signals over other signals: windows over the values at earlier evaluations, and statistics of the episode."""
 
 from __future__ import annotations
 

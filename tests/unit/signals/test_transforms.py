@@ -1,4 +1,4 @@
-"""The transform tree of a client: chains, interpolation, static transforms, prefixes, and what is unknown."""
+"""The transform tree of a client: chains, interpolation, static transforms, prefixes, and unknown transforms."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Statuses are honest and quiet: conditions keep their time, and are those of now."""
+"""Statuses are current and change rarely: conditions keep their transition times."""
 
 from __future__ import annotations
 

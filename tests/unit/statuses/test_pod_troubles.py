@@ -1,4 +1,4 @@
-"""What keeps a pod from running is reported in words that stay the same while a kubelet retries."""
+"""The reason why a pod does not run is reported in a message that stays constant while a kubelet retries."""
 
 from __future__ import annotations
 

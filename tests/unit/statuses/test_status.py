@@ -1,4 +1,4 @@
-"""A running detector reports what it receives, evaluates and loses; the numbers match what was sent."""
+"""A running detector reports received, evaluated and lost samples; the numbers match those sent."""
 
 from __future__ import annotations
 

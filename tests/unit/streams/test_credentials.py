@@ -1,4 +1,4 @@
-"""What a session proves itself with is of one moment, whole, and known to the end of its life."""
+"""The credentials of a session are read atomically and have a known expiry."""
 
 from __future__ import annotations
 

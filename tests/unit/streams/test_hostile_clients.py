@@ -1,4 +1,4 @@
-"""Names that a vehicle makes up reach nothing that a name could break out of."""
+"""Made-up names of vehicles cannot inject into keys, files or objects."""
 
 from __future__ import annotations
 

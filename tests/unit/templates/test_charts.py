@@ -1,4 +1,4 @@
-"""Charts as applications, as far as they are pure: what Helm wrote becomes objects, or a refusal in words."""
+"""The pure part of charts as applications: Helm's output becomes objects, or a rejection with a reason."""
 
 from __future__ import annotations
 

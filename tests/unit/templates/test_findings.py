@@ -1,4 +1,4 @@
-"""What is wrong with templates, rules and detectors is found before anybody uses them, and distinguished from valid
+"""Errors in templates, rules and detectors are found before their use, and distinguished from valid
 uses."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A template that some task could be served with is never refused, whatever its examples make of it."""
+"""A template that could serve some task is never rejected, whatever the results of its examples."""
 
 from __future__ import annotations
 

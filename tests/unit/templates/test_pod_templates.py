@@ -1,4 +1,4 @@
-"""What reads or changes the pods of a manifest finds them at the same place, whatever its kind."""
+"""All readers and writers of a manifest's pods use the same place for each kind."""
 
 from __future__ import annotations
 

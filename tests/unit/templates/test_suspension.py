@@ -1,4 +1,4 @@
-"""Suspended: which objects are at zero, which are paused, and the instance's condition."""
+"""Suspension: objects scaled to zero, paused objects, and the instance's condition."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`detector topics` and what `detector check --recording` finds: recordings in, keys, fields and doubts out."""
+"""`detector topics` and `detector check --recording`: keys, fields and warnings from recordings."""
 
 from __future__ import annotations
 
