@@ -126,16 +126,8 @@ def parse_object(raw: dict[str, Any]) -> Kind:
         ValueError: it is not of Wayside's kinds, is too large, or has invalid fields; the text names each field.
     """
     kind = _kind_of(raw)
-    if kind.__name__ in _BOUNDED:
-        try:
-            size = len(json.dumps(raw.get("spec"), ensure_ascii=False, separators=(",", ":"), default=str).encode())
-        except RecursionError:
-            raise ValueError("spec: is nested too deeply: flatten it") from None
-        if size > MAXIMUM_BYTES:
-            raise ValueError(
-                f"spec: must have at most {MAXIMUM_BYTES} bytes as JSON; got {size}: "
-                "move data into files, ConfigMaps or charts"
-            )
+    if problem := _size_problem(kind, raw):
+        raise ValueError(f"spec: {problem}")
     try:
         return kind.model_validate(raw)
     except ValidationError as error:
@@ -145,6 +137,19 @@ def parse_object(raw: dict[str, Any]) -> Kind:
                 for path, message in messages(error, raw, partial(field_names_at, kind))
             )
         ) from None
+
+
+def _size_problem(kind: type[Kind], raw: dict[str, Any]) -> str:
+    """Why the spec is too large or too deep to be read; empty if it is neither."""
+    if kind.__name__ not in _BOUNDED:
+        return ""
+    try:
+        size = len(json.dumps(raw.get("spec"), ensure_ascii=False, separators=(",", ":"), default=str).encode())
+    except RecursionError:
+        return "is nested too deeply: flatten it"
+    if size <= MAXIMUM_BYTES:
+        return ""
+    return f"must have at most {MAXIMUM_BYTES} bytes as JSON; got {size}: move data into files, ConfigMaps or charts"
 
 
 def _files(paths: Iterable[str | Path], problems: list[Problem]) -> Iterator[Path]:
@@ -209,6 +214,9 @@ def _document(node: yaml.Node, file: str, problems: list[Problem]) -> Document |
         kind = _kind_of(raw)
     except ValueError as error:
         problems.append(Problem(file, *_mark(marks, ()), "", str(error)))
+        return None
+    if problem := _size_problem(kind, raw):
+        problems.append(Problem(file, *_mark(marks, ("spec",)), "spec", problem))
         return None
     try:
         return Document(kind.model_validate(raw), file, marks)

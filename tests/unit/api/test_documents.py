@@ -38,6 +38,11 @@ def test_a_time_that_does_not_exist_is_rejected(time: str) -> None:
         parse_object(raw | {"spec": {"templateName": "app", "endTime": time}})
 
 
+def test_a_spec_beyond_its_bound_is_rejected_in_a_file_as_in_the_cluster(tmp_path: Path) -> None:
+    (problem,) = problems(tmp_path, f"{HEAD}  when: '{'x' * 262_144}'\n")
+    assert problem.startswith("f.yaml:5:3: spec: must have at most 262144 bytes as JSON; got 262")
+
+
 @pytest.mark.parametrize("name", ["a.b", "A", "-a", "a" * 64])
 def test_the_name_of_an_object_of_ours_is_a_label(tmp_path: Path, name: str) -> None:
     (problem,) = problems(tmp_path, f"{HEAD.replace('name: r', f'name: {name}')}  when: 'true'\n")
