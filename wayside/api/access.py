@@ -32,8 +32,7 @@ class Tls(Model):
     )
 
     ca: FilePath | None = None
-    """The path of the CA certificates with which the certificate of the other side is verified. Default: the public
-    CAs."""
+    """The path of the CA certificates that verify the certificate of the other side. Default: the public CAs."""
     certificate: FilePath | None = None
     """The path of the detector's own certificate. Requires key."""
     key: FilePath | None = None

@@ -109,8 +109,8 @@ class ApplicationInstanceStatus(Model):
     release_time: Time | None = None
     """The end of the linger time. The instance is then removed, unless a new demand arrives first."""
     objects: list[ObjectReference] = Field(default_factory=list, max_length=128, json_schema_extra=ATOMIC_LIST)
-    """The objects of the instance. Each object is listed before it is applied, except those of a new instance: until
-    the list is written, its objects are identified by label and controller reference."""
+    """The objects of the instance. Each object is listed before it is applied. Only the objects of a new instance are
+    listed later; until then, they are identified by label and controller reference."""
     suspended_replicas: list[SuspendedReplicas] = Field(
         default_factory=list, max_length=64, json_schema_extra=ATOMIC_LIST
     )

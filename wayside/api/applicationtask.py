@@ -80,8 +80,8 @@ class ApplicationTaskSpec(Model):
     """The name of the ApplicationTemplate, in the same namespace. Immutable."""
     operation: Operation = Field(default=Operation.DEPLOY, description=MEANING, json_schema_extra=immutable(_IMMUTABLE))
     priority: int = Field(default=0, ge=-1_000_000, le=1_000_000, json_schema_extra=immutable(_IMMUTABLE))
-    """The priority of the task. Higher priorities come first; among equal priorities, the older task, then the smaller
-    name. Immutable."""
+    """The priority of the task. Higher priorities come first; tasks of equal priority are ordered by creation time,
+    then by name. Immutable."""
     parameters: dict[Identifier, NestedValue] = Field(default_factory=dict, max_length=64)
     """The values for the template's parameters, at most 64 KiB in total. Can change while the task is live."""
     requester: Requester = Field(default=Requester(), json_schema_extra=immutable(_IMMUTABLE))

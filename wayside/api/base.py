@@ -66,7 +66,7 @@ class _PatternString(str):
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """The value that the text stands for. Raises ValueError, with the text and what is expected."""
+        """The value of the text. Raises ValueError with the text and the expected form."""
         if len(text) > cls.maximum_length or not re.fullmatch(cls.pattern, text):
             raise ValueError(f"must be {cls.expectation}; got {text!r}")
         return cls(text)
@@ -204,13 +204,13 @@ SUBDOMAIN = rf"{LABEL}(\.{LABEL})*"
 """The pattern of an RFC 1123 subdomain, which has at most 253 characters."""
 
 ObjectName = Annotated[str, Field(min_length=1, max_length=63, pattern=f"^{LABEL}$")]
-"""The name of an object of our kinds, or of an entry of a list: names of Services and values of labels contain it."""
+"""The name of a Wayside object, or of an item of a list. Names of Services and values of labels contain it."""
 
 TemplateName = Annotated[str, Field(min_length=1, max_length=40, pattern=f"^{LABEL}$")]
 """The name of a template. It is shorter, because the names of instances and their objects are derived from it."""
 
 SubdomainName = Annotated[str, Field(min_length=1, max_length=253, pattern=f"^{SUBDOMAIN}$")]
-"""The name of an object of another kind, e.g. of a Secret: Kubernetes allows dots in it."""
+"""The name of an object of another kind, e.g. of a Secret, for which Kubernetes allows dots."""
 
 ClientName = Annotated[str, Field(min_length=1, max_length=63, pattern=r"^[A-Za-z0-9._:-]+$")]
 """The name of a vehicle or station."""
@@ -320,7 +320,7 @@ class Kind(Model):
     @classmethod
     def _is_named_by_a_label(cls, metadata: Metadata) -> Metadata:
         named = len(metadata.name) <= cls.name_limit and re.fullmatch(LABEL, metadata.name)
-        if cls is not Kind and not named:  # Kind itself stands for objects of any kind
+        if cls is not Kind and not named:  # Kind itself is the base of objects of any kind
             raise ValueError(
                 f"name must have at most {cls.name_limit} lower-case letters, digits and -, with a letter or digit at "
                 f"both ends; got {metadata.name!r}"

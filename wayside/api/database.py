@@ -38,7 +38,7 @@ class DatabaseFiles(Model):
 
 
 class DatabaseConnection(Model):
-    """A MongoDB server or replica set, with the storage beside it."""
+    """A MongoDB server or replica set, with the spool and the files of the detector."""
 
     constraints = (exactly_one("uri_secret_name", "uri_variable", "uri_file"),)
 

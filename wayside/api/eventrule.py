@@ -174,7 +174,8 @@ class Signal(Model):
     Such a signal is known only while an episode is open. Events and actions can use it; conditions and other signals
     cannot."""
     lag: PositiveDuration | None = None
-    """Only with of: how long before the tick the window ends. At tick t the window is (t - lag - over, t - lag]."""
+    """Only with of: the time between the end of the window and the tick. At tick t the window is (t - lag - over, t -
+    lag]."""
     aggregate: Aggregate = Aggregate.LAST
     """How the samples become one value. Last, Previous, First: the newest, the second newest, the oldest value. Min,
     Max, Mean, Sum, StdDev (of the population), Quantile: of numbers. Delta: last - first. Rate: Delta per second.
@@ -246,10 +247,10 @@ class Evaluation(Model):
     every: Duration | None = Field(
         default=None, json_schema_extra=checked("duration(self) >= duration('10ms')", "must be 10ms or more")
     )
-    """The period at whose whole multiples the rule is evaluated, 10ms or more. Default: 1s."""
+    """The period of evaluation, 10ms or more. The rule is evaluated at whole multiples of it. Default: 1s."""
     on_sample: ObjectName | None = None
-    """The stream at whose samples the rule is evaluated, for the subjects of the sample's client. The rule is also
-    evaluated whenever a `for`, a cooldown or an unknownTimeout expires."""
+    """The stream whose samples trigger the evaluation of the rule, for the subjects of the sample's client. The rule is
+    also evaluated whenever a `for`, a cooldown or an unknownTimeout expires."""
     on_demand: bool | None = Field(
         default=None, json_schema_extra=checked("self", "must be true: remove it, or set it to true")
     )
@@ -310,7 +311,7 @@ class EventRuleSpec(Model):
     for_: Duration = Field(default=Duration("0s"), alias="for")
     """How long `when` must stay true before an episode starts."""
     cooldown: Duration = Duration("0s")
-    """How long after the end of an episode its subject cannot have a new onset."""
+    """The time after the end of an episode in which its subject cannot have a new onset."""
     max_episodes_per_hour: int | None = Field(default=None, ge=1, le=1_000_000)
     """The maximum number of episodes per client and hour. Further episodes are skipped and counted. Default: no
     limit."""

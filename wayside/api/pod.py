@@ -117,7 +117,7 @@ class DetectorResources(Model):
 
     @model_validator(mode="after")
     def _fits(self) -> DetectorResources:
-        """Refuse what the API server would refuse in the pod."""
+        """Refuse resources that the API server would refuse in the pod."""
         for field, amounts in (("requests", self.requests), ("limits", self.limits)):
             for name in amounts:
                 if name not in _RESOURCES and "/" not in name:
@@ -294,8 +294,8 @@ class DetectorPod(Model):
     """Fields of the pod's security context, as in a PodSpec, e.g. fsGroup. They override the defaults. The defaults
     meet the restricted Pod Security Standard. Not with mode Sidecar."""
     env: list[DetectorVariable] = Field(default_factory=list, max_length=64, json_schema_extra=map_list("name"))
-    """Environment variables, in addition to those of the manager's option --detector-env. On equal names, these here
-    win."""
+    """Environment variables, in addition to those of the manager's option --detector-env. They take precedence over
+    variables of the same name there."""
     volumes: list[DetectorVolume] = Field(default_factory=list, max_length=16, json_schema_extra=map_list("name"))
     """Volumes for volumeMounts."""
     volume_mounts: list[DetectorVolumeMount] = Field(

@@ -100,7 +100,7 @@ class CompiledTemplate:
         return None if isinstance(result, _Dropped) else result
 
 
-Check = Callable[[Embedded], Iterable[InterpolationError]]  # what else is wrong with an expression that compiles
+Check = Callable[[Embedded], Iterable[InterpolationError]]  # finds further problems of an expression that compiles
 
 
 def compile_template(

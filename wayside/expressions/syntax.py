@@ -142,7 +142,7 @@ def calls(node: Node, function: str) -> Iterator[Call]:
 
 
 def path_of(node: Node, free: frozenset[str]) -> Path | None:
-    """The literal path that the node is, below the variables `free`; None if it is something else."""
+    """The literal path of the node, below the variables `free`; None if the node is something else."""
     match node:
         case Name(name):
             name = name.removeprefix(".")

@@ -44,7 +44,7 @@ def compile_subject(compiler: Compiler) -> CompiledSubject | None:
             client_environment(signal_names(spec), element),
         )
         return None if members is None else FleetSubject(members)
-    assert spec.scope.client is not None  # noqa: S101  the model holds exactly one
+    assert spec.scope.client is not None  # noqa: S101  the model has exactly one
     return ClientSubject(
         compiler.condition(
             ("spec", "scope", "client", "where"), spec.scope.client.where, client_environment((), element)

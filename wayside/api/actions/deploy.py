@@ -16,8 +16,8 @@ class Deploy(Model):
     """The name of the ApplicationTemplate, in the namespace of the rule."""
     operation: Operation = Field(default=Operation.DEPLOY, description=MEANING)
     priority: int = Field(default=0, ge=-1_000_000, le=1_000_000)
-    """The priority of the task. Higher priorities come first; among equal priorities, the older task, then the smaller
-    name."""
+    """The priority of the task. Higher priorities come first; tasks of equal priority are ordered by creation time,
+    then by name."""
     parameters: NamedData = Field(default_factory=dict)
     """The values for the template's parameters. They can contain ${…} with the rule's variables at the start of the
     episode."""

@@ -53,9 +53,9 @@ class TriggerDetector(Model):
     with_clients: list[ClientName] = Field(default_factory=list, max_length=64, json_schema_extra=SET_LIST)
     """Additional clients. Only with `clients: Subjects`."""
     before: Duration = Duration("0s")
-    """How long before the onset the recording starts. The buffer of the other detector limits this time."""
+    """The length of the recording before the onset. The buffer of the other detector limits it."""
     after: Duration = Duration("0s")
-    """How long after the end of the episode the recording ends."""
+    """The length of the recording after the end of the episode."""
 
 
 class ServiceCall(Model):

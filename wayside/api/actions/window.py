@@ -26,7 +26,7 @@ class Window(Model):
     with_clients: list[ClientName] = Field(default_factory=list, max_length=64, json_schema_extra=SET_LIST)
     """Additional clients, such as a roadside unit that observes the scene."""
     before: Duration = Duration("0s")
-    """How long before the onset the window starts. The sum of this time and the rule's `for` must not exceed the buffer
-    duration of the streams."""
+    """The length of the window before the onset. Together with the rule's `for`, it must not exceed the buffer duration
+    of the streams."""
     after: Duration = Duration("0s")
-    """How long after the end of the episode the window ends."""
+    """The length of the window after the end of the episode."""
