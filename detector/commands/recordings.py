@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 app = typer.Typer(help="Request recordings of running detectors that permit it (spec.recordings.onRequest).")
 
 Id = Annotated[str, typer.Argument(help="The id of the recording.", show_default=False)]
+Recorder = Annotated[str | None, typer.Option(help="The holder that records. Default: the holder in the file.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON, a line for each recording.")]
 
 
@@ -31,7 +32,7 @@ def start(
     ] = "0s",
     maximum_duration: Annotated[str, typer.Option(help="The maximum duration of the recording.")] = "10m",
     detector: DetectorFile = None,
-    name: Name = None,
+    name: Recorder = None,
     connect: Connect = None,
     as_json: Json = False,
     timeout: Timeout = 3.0,
@@ -55,7 +56,7 @@ def stop(
     identity: Id,
     after: Annotated[str, typer.Option(help="How long after now the recording ends.")] = "0s",
     detector: DetectorFile = None,
-    name: Name = None,
+    name: Recorder = None,
     connect: Connect = None,
     as_json: Json = False,
     timeout: Timeout = 3.0,
