@@ -22,7 +22,7 @@ START = 1_767_225_600_000_000_000
 
 
 class Undecoded:
-    """Nothing is decoded here: no rule needs it."""
+    """A decoder that is never called, since no rule reads fields."""
 
     def decode(self, payload: bytes) -> object:
         raise AssertionError(payload)
@@ -53,7 +53,7 @@ def engine_holding(size: int) -> tuple[Engine, list[Arrival]]:
 
 
 def take_out(engine: Engine, count: int) -> None:
-    """Leave the buffer as it was before the last inserts."""
+    """Undo the last inserts into the buffer."""
     lane = engine.buffer.lane("car", "pose")
     assert lane is not None
     for _ in range(count):

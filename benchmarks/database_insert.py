@@ -1,4 +1,4 @@
-"""The database action writes as fast as bare pymongo bulk inserts of the same documents, but for a fifth at most.
+"""The database action is at most a fifth slower than bare pymongo bulk inserts of the same documents.
 
 Both write to the same server, round about, each round into fresh collections. The action begins with the messages as
 they were received: decoding, conversion and its queue are part of what is measured. The baseline inserts the documents
@@ -75,7 +75,7 @@ def the_samples(count: int) -> list[EpisodeSample]:
 
 
 class NoMessenger:
-    """There is no Zenoh here."""
+    """A messenger without Zenoh."""
 
     def publish(self, *_: Any) -> None:
         raise AssertionError

@@ -1,4 +1,4 @@
-"""Start of a detector → its first subscription, beside the least that any program with Zenoh takes; the image's size.
+"""Start of a detector → its first subscription, compared with a minimal Zenoh program; the image's size.
 
 Ours: `detector run` with the cooperative-recording example, from its start until a publisher in this process sees that
 somebody subscribes to its key. The baseline: a Python program that opens a session and subscribes, seen the same way.

@@ -53,7 +53,7 @@ PLAIN_UP_TO = 5
 
 
 class Message(msgspec.Struct):
-    """What the baseline decodes."""
+    """The struct that the baseline decodes."""
 
     speed: float
 

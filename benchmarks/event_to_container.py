@@ -132,7 +132,7 @@ def _by_request(api: Api, made: Object) -> float:
 
 
 def _alike(made: Object) -> Object:
-    """A Deployment like the one made, that nobody takes for it."""
+    """A copy of the Deployment under another name and labels."""
     spec = copy.deepcopy(made["spec"])
     labels = spec["template"]["metadata"]["labels"] | {"app.kubernetes.io/instance": "by-hand"}
     spec["template"]["metadata"]["labels"] = {k: v for k, v in labels.items() if "wayside" not in k}
@@ -141,7 +141,7 @@ def _alike(made: Object) -> Object:
 
 
 def _running(api: Api) -> float:
-    """Wait until a recorder's container runs; when that was seen, in seconds since the epoch."""
+    """Wait until a recorder's container runs; return the time in seconds since the epoch."""
     deadline = time.monotonic() + PATIENCE
     while time.monotonic() < deadline:
         for pod in api.list("Pod", labels="app.kubernetes.io/name=scene-recorder"):

@@ -1,4 +1,4 @@
-"""Making an event and printing it, beside `json.dumps` of a dict that is there already.
+"""Creating and encoding an event, compared with `json.dumps` of an existing dict.
 
 An event is that of a rule over single clients with one number, once small and once with a classification. Making counts
 from the start of the episode on: its id, the episode, and the event. Each round measures all; ratios are to the

@@ -25,7 +25,7 @@ Path = tuple[str | int, ...]
 
 
 class Case(NamedTuple):
-    """Payloads, and what is read of them."""
+    """Payloads, and the paths that are read."""
 
     name: str
     decoder: FieldDecoder
@@ -81,7 +81,7 @@ def cases() -> list[Case]:
 
 
 def copies(payload: bytes, count: int) -> list[bytes]:
-    """Each in memory of its own, as they come from the network."""
+    """Copies in separate memory, as received from the network."""
     return [bytes(bytearray(payload)) for _ in range(count)]
 
 

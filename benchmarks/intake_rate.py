@@ -46,7 +46,7 @@ MARK = "benchmark: "
 
 
 class Run(NamedTuple):
-    """What one receiver took."""
+    """The result of one receiver."""
 
     rate: float
     """Samples a second."""

@@ -28,7 +28,7 @@ HZ = 100
 
 
 class Message(msgspec.Struct):
-    """What the baseline decodes."""
+    """The struct that the baseline decodes."""
 
     speed: float
 

@@ -1,4 +1,4 @@
-"""What a live view costs: `detector run --foxglove` with a client of 20 channels attached against the same without.
+"""The cost of a live view: `detector run --foxglove` with a client of 20 channels, compared with none.
 
 A hundred vehicles send at 10 Hz; eight rules are about each of them, two about pairs. One detector runs throughout, and
 a client that is not the SDK's own connects and leaves in turn; measured is the detector's CPU time. The aim: at most 10

@@ -1,4 +1,4 @@
-"""What mining gains from processes, and loses to Dask; and a fleet's dataset, whichever way it comes about.
+"""The gain of mining with processes, the overhead of Dask, and identical datasets from each way of mining.
 
 A seeded generator writes 200 recordings (MCAP and JSON lines, some broken, one of an hour). They are mined by one
 process, by two, by a Dask cluster of two worker processes, and by two processes of which one is killed: the datasets

@@ -1,4 +1,4 @@
-"""What one reconcile of an instance costs the manager, beside an older revision, in CPU time.
+"""The CPU time of one reconcile of an instance, compared with an older revision.
 
 The manager's parts are wired as in the cluster, over an API server in memory. Each case makes the instances of as many
 tasks, and then reconciles each of them again and again, with nothing left to do: that is what most reconciles are. The

@@ -1,4 +1,4 @@
-"""What recording costs: the record action against a bare MCAP writer, and what the evaluation notices of it.
+"""The cost of recording: the record action against a bare MCAP writer, and the effect on the evaluation.
 
     python benchmarks/recording.py [--megabytes 400] [--folder DIR]           # writes; both on the same disk
     python benchmarks/recording.py --latency [--rate 200] [--seconds 10]      # a detector process, clouds over Zenoh
@@ -38,7 +38,7 @@ _BATCH = 10
 
 
 def clouds(number: int) -> list[EpisodeSample]:
-    """Each a payload of its own, as they come from the network."""
+    """Samples with separate payloads, as received from the network."""
     return [
         EpisodeSample(
             "car1", "points", "vehicles/car1/points", at(1 + k / 200), at(1 + k / 200), bytes(bytearray(CLOUD))

@@ -1,4 +1,4 @@
-"""What the results of a replay cost: `detector replay` with all results against the same replay without them.
+"""The cost of results: `detector replay` with all results, compared with the same replay without them.
 
 Twenty vehicles drive for an hour at 10 Hz; eight rules are about each of them, two about pairs. Both replays are
 processes, from a file of JSON lines; measured is their CPU time. The aim: at most 1.5 times that without, and 5 s.

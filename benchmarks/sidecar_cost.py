@@ -1,4 +1,4 @@
-"""What a detector costs beside another program of a pod: memory and CPU, idle and with 20 streams at 50 Hz.
+"""The cost of a detector as a sidecar: memory and CPU, idle and with 20 streams at 50 Hz.
 
 Ours: `detector run --name … --as-pod` as in an injected container, with a real API server. The baseline: a Python
 program that subscribes to the same keys over Zenoh and does nothing with what comes. Each in turn, idle and then under

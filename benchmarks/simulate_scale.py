@@ -1,4 +1,4 @@
-"""What 1,000, 100,000 and 10 million vehicles need: unit costs measured here, then a simulation of an hour.
+"""The resources for 1,000, 100,000 and 10 million vehicles: measured unit costs, then a simulation of an hour.
 
 Measured: CPU time and memory of a message, a vehicle and a task (`benchmarks/workloads/unit_costs.py`). Assumed: how
 vehicles drive, send and need applications; every assumption is printed and can be changed. Simulated: each episode of

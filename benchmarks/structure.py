@@ -1,4 +1,4 @@
-"""How large the code base is, and how hard to find one's way in: the working tree beside an older revision.
+"""The size and complexity of the code base, compared with an older revision.
 
     python -m benchmarks.structure [REVISION]
 

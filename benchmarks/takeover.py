@@ -1,4 +1,4 @@
-"""The active manager vanishes → its standby serves a new task, beside the same task with an active manager.
+"""The active manager is killed → its standby serves a new task, compared with the same task under an active manager.
 
 Each round starts two managers. A task is created and the time until its Deployment exists is taken; then the active
 manager is killed with SIGKILL (or stopped with SIGSTOP, in turns), a task is created at once, and the time is taken

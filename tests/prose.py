@@ -45,8 +45,11 @@ RETIRED = {
 RETIRED_NAMES = {
     "aspect": "name the part",
     "courier": "publisher, sender",
+    "deed": "action, outcome",
     "desk": "server, handler",
     "inflow": "intake, input",
+    "onlooker": "observer",
+    "outlet": "publisher, sender",
     "sight": "view, visibility",
     "standing": "status, condition; stationary",
     "tally": "counters, total",

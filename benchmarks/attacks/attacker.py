@@ -51,7 +51,7 @@ def large(namespace: str, number: int) -> dict[str, Any]:
 
 
 class Attacker:
-    """Who may write tasks and templates in a namespace."""
+    """An account that may write tasks and templates in a namespace."""
 
     def __init__(self, client: Client, namespace: str) -> None:
         self._client = client

@@ -1,4 +1,4 @@
-"""A small cluster with the rights and the fairness that the chart installs, for a manager and for two of its tenants.
+"""A small cluster with the roles and flow schemas of the chart, for a manager and two tenants.
 
 The API server takes as many requests at once as suit two cores: its default of 600 is for a machine with dozens. API
 Priority and Fairness shares out this number. The controller manager sends 20 requests a second, as it does by default.

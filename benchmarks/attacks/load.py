@@ -57,7 +57,7 @@ class Measured:
         self._seen = seen
 
     async def times(self, prefix: str, more: Callable[[int], bool]) -> dict[str, list[float]]:
-        """The times of each of STAGES, of one task after the other while `more` has it so; raw calls are in between."""
+        """The times of each of STAGES, task by task while `more` returns true, with raw calls in between."""
         found: dict[str, list[float]] = {stage: [] for stage in STAGES}
         index = -1
         while more(index := index + 1):
@@ -92,9 +92,9 @@ class Measured:
 
 
 class Usage:
-    """What each program uses of a core, and where requests wait, from its making to `report`.
+    """The CPU share of each program, and the queues of requests, from its creation to `report`.
 
-    What all else on the machine uses is that of strangers: where it is much, the times are of no use.
+    The rest of the machine's CPU time belongs to other programs: if it is large, the times mean little.
     """
 
     def __init__(self, cluster: Cluster, programs: Mapping[str, int]) -> None:

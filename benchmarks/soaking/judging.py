@@ -1,4 +1,4 @@
-"""What a soak run must have shown: memory, drops, streams, rules and the replay, each compared with what was sent."""
+"""The verdict of a soak run: memory, drops, streams, rules and the replay, compared with the sent messages."""
 
 from __future__ import annotations
 

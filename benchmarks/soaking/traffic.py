@@ -1,4 +1,4 @@
-"""The traffic of a soak run: the cooperative-recording drive, telemetry, and now and then what must be dropped."""
+"""The traffic of a soak run: the cooperative-recording drive, telemetry, and occasional invalid messages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What one message, one vehicle and one task cost on this machine, in CPU time: the units of `simulate_scale`.
+"""The CPU time of one message, one vehicle and one task on this machine: the unit costs of `simulate_scale`.
 
 CPU times and not rates: a rate on a machine that does other work means little. The cost of a message or a
 task includes all threads of the program.

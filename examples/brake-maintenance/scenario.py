@@ -1,4 +1,4 @@
-"""A day of three vans' brakings. The brakes of one wear out; another one's get hot on a pass.
+"""A day of braking of three vans. The brakes of one wear out; another one's get hot on a pass.
 
 The truth is how much deceleration a bar of brake pressure gives, over the hours. What is measured at each braking is
 noisy.

@@ -1,4 +1,4 @@
-"""The main job without a cluster: vehicles, events, tasks, and what would run.
+"""The whole chain without a cluster: vehicles, events, tasks, and the applications that would run.
 
 Three parts that know nothing of each other: fifteen vehicles (drive.py), a detector (`detector run`), and here the
 core of the application manager, which looks at the tasks that the detector leaves in a folder. The vehicles' data and

@@ -1,4 +1,4 @@
-"""The main job against a real API server: vehicles, both programs, and the Deployments that come and go.
+"""The whole chain against a real API server: vehicles, both programs, and the resulting Deployments.
 
 By default a control plane of its own is started (and built first, where it is missing); with `--current` the cluster of
 the current kubeconfig is used, in a namespace that is made for the demo and deleted afterwards. On a control plane

@@ -1,4 +1,4 @@
-"""What the application manager would run for the tasks in a folder, step by step; the manager's own core decides."""
+"""The applications for the tasks in a folder, step by step, computed by the manager's core."""
 
 from __future__ import annotations
 

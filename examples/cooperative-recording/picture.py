@@ -1,4 +1,4 @@
-"""Draw the demo's drive as drive.svg: the network, the lidar vehicles' tracks, and below what should run when."""
+"""Draw the demo's drive as drive.svg: the network, the lidar vehicles' tracks, and the expected applications."""
 
 from __future__ import annotations
 

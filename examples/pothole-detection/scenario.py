@@ -23,7 +23,7 @@ IMU = "sensor_msgs/msg/Imu"
 
 @dataclass(frozen=True, slots=True)
 class Obstacle:
-    """What a car drives over, from one second to another."""
+    """An obstacle that a car drives over, from one second to another."""
 
     car: str
     kind: str

@@ -1,4 +1,4 @@
-"""How a vehicle shakes: the vertical acceleration, without gravity, over what it drives over. 50 samples a second."""
+"""The vertical acceleration of a vehicle over road surfaces, without gravity, at 50 samples a second."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`python -m examples.running`: runs use cases and prints what was expected and what came of it."""
+"""`python -m examples.running`: runs use cases and prints expected and actual results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the tasks of a scenario come to: what would run at a moment, by the application manager's own pure functions."""
+"""The applications that would run for a scenario's tasks at a moment, by the application manager's pure functions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Compares what came of a scenario with what must."""
+"""Compares the actual results of a scenario with the expected ones."""
 
 from __future__ import annotations
 

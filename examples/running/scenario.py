@@ -1,4 +1,4 @@
-"""What a use case's `scenario.py` makes: what is sent, and what must come of it."""
+"""A use case's `scenario.py`: its messages and its expected results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Vehicles that stand where they are put, until they are put elsewhere: for looking at one thing after the other.
+"""Vehicles that stay at the positions set last, to look at one step after the other.
 
 They send what moving vehicles send, as often: a pose ten times a second, a point cloud twice a second.
 """

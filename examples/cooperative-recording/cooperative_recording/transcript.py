@@ -1,4 +1,4 @@
-"""What one run prints, made so that another run prints the same: names that chance gave, times and ages.
+"""Normalises the output of a run, so that another run prints the same: random names, times and ages.
 
 Names keep their look and their length; a time becomes the minute of the step in which it was first seen.
 """

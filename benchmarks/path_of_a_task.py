@@ -1,11 +1,11 @@
-"""The way of one task through the manager, from its watch event to the apply of its Deployment, visit by visit.
+"""The path of one task through the manager's modules, from its watch event to the apply of its Deployment.
 
 The manager's parts are wired as in the cluster, over an API server in memory. A visit of a module begins when another
 module calls into it, or the event loop does. Calls in a row from one module into another are one visit. These calls are
 not counted: calls into the pure core, calls between the cache and its indexes, and calls back into a module that waits
 for the caller. Requests to the API server are listed. Exits with 1 where a module is visited more than twice.
 
-    python -m benchmarks.way_of_a_task [--calls]
+    python -m benchmarks.path_of_a_task [--calls]
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ MOST = 2  # visits of a module
 Call = tuple[str, str, str]
 """The module that calls, the module that is called, and the function."""
 
-_on_the_way: ContextVar[bool] = ContextVar("on the way", default=False)  # tasks inherit it
+_on_path: ContextVar[bool] = ContextVar("on the way", default=False)  # tasks inherit it
 
 
 class Trace:
@@ -45,8 +45,8 @@ class Trace:
         if event != "call" or frame in self._frames:
             return
         if frame.f_code is WorkQueue._once.__code__ and frame.f_locals["self"].name == "instance":
-            _on_the_way.set(True)
-        if not _is_ours(frame) or not _on_the_way.get():
+            _on_path.set(True)
+        if not _is_ours(frame) or not _on_path.get():
             return
         self._frames.add(frame)
         module, callers = _module(frame), list(_callers(frame))
@@ -120,10 +120,10 @@ async def traced() -> tuple[Trace, list[str]]:
         raw = task(NAMESPACE, name)
         raw = server.put({**raw, "metadata": {**raw["metadata"], "generation": 1}})
         trace = Trace()
-        on_the_way = _on_the_way.set(True)
+        on_path = _on_path.set(True)
         sys.setprofile(trace)
         made.router.observe(raw)
-        _on_the_way.reset(on_the_way)
+        _on_path.reset(on_path)
         await server.applied.wait()
         await asyncio.sleep(1.0)  # until statuses are written, which would wake workers of the next trace
     for each in running:
