@@ -1,7 +1,7 @@
 """CPU time of a tick of rules about the fleet, in columns and with CEL for every member.
 
 The speeds of engine_speed at 10 Hz. Rule k checks whether a number of clients had a maximum above a limit in the last
-1 to 5 s, each 100 ms. The baseline is the same engine with a witness of each evaluation: it evaluates rules one by one.
+1 to 5 s, each 100 ms. The baseline is the same engine with `on_evaluated`, which makes it evaluate rules one by one.
 
     python -m benchmarks.fleet_speed [--rules 10] [--clients 100] [--ticks 30]
 

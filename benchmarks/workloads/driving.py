@@ -39,7 +39,7 @@ class Live:
     def watch(self) -> None:
         """Look at each evaluation by itself, so that no rule is evaluated in columns."""
         for run in self._engine.rules.values():
-            run.witness = _nobody
+            run.on_evaluated = _nobody
 
     def advance(self, arrivals: Sequence[Arrival], until: int) -> list[Event]:
         """Take in what arrived, and run the ticks up to `until`, in nanoseconds since the epoch."""

@@ -154,7 +154,7 @@ class Answers:
     def _evaluate(self, given: Mapping[str, str]) -> bytes:
         """A list with an entry for each subject; times are RFC 3339."""
         rule = _rule(given)
-        answers = self._in_time(self._evaluator.ask(rule))
+        answers = self._in_time(self._evaluator.evaluate_rule(rule))
         return msgspec.json.encode(
             [
                 {

@@ -186,7 +186,7 @@ class Evaluator:
             self._wake.notify()
         return future
 
-    def ask(self, rule: str) -> Future[list[OnDemandResult]]:
+    def evaluate_rule(self, rule: str) -> Future[list[OnDemandResult]]:
         """Evaluate a rule with onDemand now; thread-safe. The future has a result by subject, or NotEvaluableError."""
         return self.call(lambda: self._evaluate_on_demand(rule))
 

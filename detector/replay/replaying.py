@@ -123,7 +123,7 @@ class Replay:
         """The driven engine."""
         return self._engine
 
-    def ask(self, rule: str) -> None:
+    def evaluate_rule(self, rule: str) -> None:
         """A rule was evaluated on demand; if other rules were recorded, it may not exist here."""
         with contextlib.suppress(NotEvaluableError):
             self._note(self._engine.evaluate_now(rule)[0])
@@ -301,7 +301,7 @@ def _control(
         case "paused":
             replay.engine.set_paused(frozenset(document["rules"]))
         case "ask":
-            replay.ask(str(document["rule"]))
+            replay.evaluate_rule(str(document["rule"]))
         case "cut":
             outcome.cut = True
         case "lost":

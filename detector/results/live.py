@@ -143,7 +143,7 @@ class LiveView:
         """The engine uses other rules from now on."""
         for name, run in engine.rules.items():
             if name not in engine.in_columns:
-                run.witness = self._witness(run.rule)
+                run.on_evaluated = self._recorder_of(run.rule)
 
     def looked(self, engine: Engine, events: Sequence[Event]) -> None:
         """The engine has taken in the arrivals, and these events occurred."""
@@ -179,7 +179,7 @@ class LiveView:
         else:
             self._events = []
 
-    def _witness(self, rule: CompiledRule) -> Any:
+    def _recorder_of(self, rule: CompiledRule) -> Any:
         def saw(evaluated: Evaluated) -> None:
             if self._tracer is not None and self._tracer.looks_at(rule.name):
                 self._tracer.recorded(rule).saw(evaluated)

@@ -99,7 +99,7 @@ class Tracer:
         self.engine = engine
         for name, run in engine.rules.items():
             if name not in engine.in_columns:
-                run.witness = self.recorded(run.rule).saw
+                run.on_evaluated = self.recorded(run.rule).saw
 
     def recorded(self, rule: CompiledRule) -> RecordedValues:
         """The record of a rule that is not in columns."""

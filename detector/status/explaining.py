@@ -34,7 +34,7 @@ class RuleWatch:
         run = engine.rules.get(rule)
         if run is None:
             raise ValueError(f"rule {rule} is not evaluated: see its state and message")
-        if run.witness is not None:
+        if run.on_evaluated is not None:
             raise ValueError(f"another request about rule {rule} is in progress: try again")
         self.future: Future[RuleExplanation] = Future()
         self._engine = engine
@@ -42,7 +42,7 @@ class RuleWatch:
         self._subject = subject
         self._ticks = run.counters.ticks
         self._seen: list[tuple[int, SubjectStatus]] = []
-        run.witness = self._see
+        run.on_evaluated = self._see
         run.counters.notes = []
 
     def is_over(self) -> bool:
@@ -50,7 +50,7 @@ class RuleWatch:
         gone = self._engine.rules.get(self._run.rule.name) is not self._run
         if self._run.counters.ticks == self._ticks and not gone and not self.future.cancelled():
             return False
-        notes, self._run.witness, self._run.counters.notes = self._run.counters.notes or [], None, None
+        notes, self._run.on_evaluated, self._run.counters.notes = self._run.counters.notes or [], None, None
         if self.future.set_running_or_notify_cancel():
             tick = self._run.counters.last_tick / 1e9
             self.future.set_result(RuleExplanation(tick, self._statuses(), [*dict.fromkeys(notes)][:_MAXIMUM_NOTES]))

@@ -56,7 +56,7 @@ class Clients:
         self._labels, self._timeout = labels, timeout
         self._loss = NEVER
         for client in self._expected.difference(expected):
-            self.still_heard(client, now)
+            self.still_present(client, now)
         self._expected = frozenset(expected)
         for client in self._expected:
             if client not in self._present:
@@ -64,7 +64,7 @@ class Clients:
                 self._sorted = None
                 self.newest = max(self.newest, now)
 
-    def heard(self, client: str, time: int, patience: int | None = None) -> None:
+    def seen(self, client: str, time: int, patience: int | None = None) -> None:
         """The first sample of the client on a stream, or its liveliness token.
 
         `patience` (ns) is given for a stream with items: a client of several streams gets the longest of all.
@@ -81,15 +81,15 @@ class Clients:
             self._loss = NEVER
         elif presence.patience is not None:
             presence.patience = None if patience is None else max(patience, presence.patience)
-        self.still_heard(client, time)
+        self.still_present(client, time)
 
     def restore(self, client: str, time: int) -> None:
         """An episode about the client was restored: without samples, it stays known until `clientTimeout`."""
         known = client in self._present
-        self.heard(client, time)
+        self.seen(client, time)
         self._present[client].restored = not known
 
-    def still_heard(self, client: str, time: int) -> None:
+    def still_present(self, client: str, time: int) -> None:
         """The client's newest sample has this time; an unknown client stays unknown."""
         presence = self._present.get(client)
         if presence is not None and time > presence.last:

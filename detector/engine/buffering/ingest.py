@@ -240,7 +240,7 @@ class Ingest:
         if token is not TokenState.DECLARED:
             client = tokens.withdraw(key, lost=token is TokenState.DROPPED)
             if client is not None:
-                self._clients.still_heard(client, time)  # the timeout counts from here
+                self._clients.still_present(client, time)  # the timeout counts from here
             return
         whose = self._read_key(LIVELINESS, key)
         if whose is None:
@@ -251,7 +251,7 @@ class Ingest:
             self._counters.crowded[LIVELINESS] += 1
         else:
             self._lost.pop(whose[0], None)
-            self._clients.heard(whose[0], time)
+            self._clients.seen(whose[0], time)
 
     def _route(self, stream: str, key: str, time: int) -> Lane | None:
         """The lane for a key that is not cached: a new key, or one of a client that was lost."""
@@ -280,7 +280,7 @@ class Ingest:
             self._lanes[stream].clear()
         self._lanes[stream][key] = lane
         self._lost.pop(client, None)
-        self._clients.heard(client, time, self._patience.get(stream))
+        self._clients.seen(client, time, self._patience.get(stream))
         return lane
 
     def _read_items(self, stream: str, key: str, payload: bytes) -> dict[str, int]:

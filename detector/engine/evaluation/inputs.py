@@ -83,7 +83,7 @@ class RuleInputs:
         self.tables.forget()
         if detector.spec.zenoh.liveliness != before.zenoh.liveliness:
             for client in self.clients.tokens.forget():
-                self.clients.still_heard(client, now)
+                self.clients.still_present(client, now)
         for lane in self.buffer:
             self._lane_makers[lane.stream].limit(lane)
 

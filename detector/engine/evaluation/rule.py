@@ -63,7 +63,7 @@ class RuleRun:
         self._follows = any(deploy.follow for deploy in rule.deploys)
         self.earlier = EarlierValues()
         """Earlier values for signals over other signals."""
-        self.witness: Callable[[Evaluated], None] | None = None
+        self.on_evaluated: Callable[[Evaluated], None] | None = None
         """If set, called with each evaluation. It influences no result."""
         self.version = 0
         """Changes whenever the demands do."""
@@ -127,7 +127,7 @@ class RuleRun:
     @property
     def alone(self) -> bool:
         """Whether an observer needs each evaluation separately."""
-        return self.witness is not None or self.counters.notes is not None
+        return self.on_evaluated is not None or self.counters.notes is not None
 
     def wakes(self, now: int, subjects: Iterable[Subject]) -> Iterator[tuple[Subject, int | None]]:
         """When each of the subjects must be evaluated again; nanoseconds after `now`, None: never."""
@@ -272,8 +272,8 @@ class RuleRun:
             self.stays(now, candidate)
         elif (event := self.happened(now, happened, candidate)) is not None:
             yield event
-        if self.witness is not None:
-            self.witness(Evaluated(now, candidate, when, until, state.is_open, state.onset))
+        if self.on_evaluated is not None:
+            self.on_evaluated(Evaluated(now, candidate, when, until, state.is_open, state.onset))
         if self._answers is not None:
             self._answers.append(self._answer(candidate, when))
 

@@ -157,7 +157,7 @@ def driven(scene: Scene, cut: Callable[[], int], *, one_by_one: bool = False) ->
             case "rules":
                 found += engine.set_rules(index.compile(what, scene.detector, readers.fields)[0])
                 for run in engine.rules.values() if one_by_one else ():
-                    run.witness = _nobody
+                    run.on_evaluated = _nobody
             case "pause":
                 engine.set_paused(what)
             case "level":

@@ -234,7 +234,7 @@ def test_a_replay_with_pauses_requests_and_skipped_evaluations_gives_the_same_ev
         live.put([(f"vehicles/{client}/speed", payload) for client in ("a", "b")])
         if n in (10, 20):
             live.evaluator.pause_rule("p", n == 10).result(PATIENCE)
-        assert [each.subject for each in live.evaluator.ask("q").result(PATIENCE)] == ["a", "b"]
+        assert [each.subject for each in live.evaluator.evaluate_rule("q").result(PATIENCE)] == ["a", "b"]
     recording = live.stop()
     assert {event.episode.rule for event in recording.logged} == {"r", "q", "p"}
     levels = [

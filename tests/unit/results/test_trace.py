@@ -24,9 +24,9 @@ class OneByOne(Tracer):
     def attend(self, engine: Engine) -> None:
         super().attend(engine)
         for name, run in engine.rules.items():
-            run.witness = self._recorded.setdefault(name, self._witness(run.rule)).saw
+            run.on_evaluated = self._recorded.setdefault(name, self._recorder_of(run.rule)).saw
 
-    def _witness(self, rule: object) -> object:
+    def _recorder_of(self, rule: object) -> object:
         from detector.results.recorded_values import RecordedValues
 
         return RecordedValues(rule)  # type: ignore[arg-type]

@@ -59,7 +59,7 @@ def walk(seed: int, clients: int, side: float, steps: int) -> Iterator[Arrival]:
 def test_all_pairs_at_once_give_the_events_of_single_pairs(seed: int, clients: int, side: float, steps: int) -> None:
     together, one_by_one = (Drive(a_detector(clients=CLIENTS, clientTimeout="2s"), *rules()) for _ in range(2))
     for run in one_by_one.engine.rules.values():
-        run.witness = lambda evaluation: None  # an observer of each evaluation gets each one separately
+        run.on_evaluated = lambda evaluation: None  # an observer of each evaluation gets each one separately
     for drive in (together, one_by_one):
         drive.take(*walk(seed, clients, side, steps), until=steps / 10 + 3)
     assert [event.to_json() for event in together.events] == [event.to_json() for event in one_by_one.events]

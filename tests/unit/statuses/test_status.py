@@ -243,7 +243,7 @@ def test_an_explained_evaluation_reports_values_and_reasons_of_unknowns() -> Non
     assert later.unknown == {"gap": "stream pose of a is stale: its newest sample is 2.8 s old, more than staleAfter"}
     (third,) = explained(drive, "r", "b", until=4, sent=[arrival(3.5, "b", {"other": 1}, "pose")]).subjects
     assert third.unknown == {"gap": "the samples of stream pose from b have no such value in the window"}
-    assert drive.engine.rules["r"].witness is None
+    assert drive.engine.rules["r"].on_evaluated is None
 
 
 def test_missing_inputs_and_errors_of_expressions_are_reported() -> None:

@@ -170,7 +170,7 @@ def test_live_and_replay_give_the_same_events() -> None:
         items = [item(1, n % 7, n % 13), item(2, 3, n % 11), *([item(3, 9, 12)] if n % 40 < 5 else [])]
         put([("stations/n/list", sent(0, *items).payload)])
         if n % 7 == 0:
-            live.evaluator.ask("ask").result(PATIENCE)
+            live.evaluator.evaluate_rule("ask").result(PATIENCE)
     recording = live.stop()
     assert {event.episode.subject for event in recording.logged} >= {"1", "2", "3", "1+2"}
     assert {str(event.reason) for event in recording.logged} >= {"ClientLost", "Until"}
