@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 _WIDTH = 160
 """Width in columns of a table that goes into a pipe or a file."""
 
+_OTHERWISE = "give either files or folders with EventRules, or --cluster"
+
 
 class Format(StrEnum):
     """The output format of the catalog."""
@@ -54,13 +56,15 @@ def command(
     if namespace is not None and not cluster:
         refuse("--namespace requires --cluster; rules in files name their namespace themselves")
     with importing():
+        import asyncio
+
         from detector.commands.catalog.catalog import ChoiceError, catalog, choose, read_files
 
     try:
         chosen = choose(only or ())
     except ChoiceError as error:
         refuse(f"--only {error}")
-    read = _read_cluster(namespace) if cluster else read_files(files or ())
+    read = asyncio.run(_read_cluster(namespace)) if cluster else read_files(files or ())
     for text in read.unreadable:
         typer.echo(f"left out, because it cannot be read: {text}", err=True)
     found = catalog(read.entries, chosen)
@@ -72,12 +76,44 @@ def command(
     typer.echo(f"{len(found.entries)} of {len(read.entries)} rules" + (f": {output}" if output else ""), err=True)
 
 
-def _read_cluster(namespace: str | None) -> Read:
-    import asyncio
+async def _read_cluster(namespace: str | None) -> Read:
+    """The EventRules of the namespace. Unreadable ones, e.g. of a newer version, are reported and left out.
 
-    from detector.commands.catalog.cluster import read_cluster
+    Args:
+        namespace: default: the kubeconfig context's, or the pod's own.
 
-    return asyncio.run(read_cluster(namespace))
+    Raises:
+        ConfigurationError: there is neither a kubeconfig nor a pod's account, or the API server forbids the list.
+    """
+    from detector.commands.catalog.catalog import CatalogEntry, Read, entry
+    from detector.resources.kubernetes import EVENT_RULES, PROGRAM
+    from wayside.api import API_VERSION, EventRule
+    from wayside.api.documents import parse_object
+    from wayside.kubernetes.connection import ConfigurationError, connect
+    from wayside.kubernetes.errors import RequestError
+
+    entries: list[CatalogEntry] = []
+    unreadable: list[str] = []
+    async with connect(PROGRAM, namespace, otherwise=_OTHERWISE) as cluster:
+        try:
+            listed, _ = await cluster.client.list(EVENT_RULES, cluster.namespace)
+        except RequestError as error:
+            raise ConfigurationError(
+                f"cannot list the EventRules of namespace {cluster.namespace}: {error}. Check that "
+                "KUBECONFIG points to the right cluster, and that its account may list "
+                "eventrules.wayside.dev there"
+            ) from error
+        for each in listed:
+            # The manager owns the status, and a newer manager's may have unknown fields.
+            read = {name: value for name, value in each.items() if name != "status"}
+            try:
+                rule = parse_object({"apiVersion": API_VERSION, "kind": EventRule.__name__} | read)
+            except ValueError as error:
+                unreadable.append(f"EventRule {each['metadata']['name']}: {error}")
+                continue
+            assert isinstance(rule, EventRule)  # noqa: S101  the resource defines it
+            entries.append(entry(rule, f"namespace {rule.namespace}"))
+    return Read(tuple(entries), tuple(unreadable))
 
 
 def _text(found: Catalog, form: Format, *, into_file: bool) -> str:
