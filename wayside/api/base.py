@@ -253,8 +253,7 @@ ATOMIC_MAP: JsonDict = {"x-kubernetes-map-type": "atomic"}
 
 
 def map_list(key: str) -> JsonDict:
-    """The schema of a list that server-side apply merges by this field of its items; the values of the field are
-    unique."""
+    """The schema of a list that server-side apply merges by this field of its items, which is unique."""
     return {"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": [key]}
 
 

@@ -46,8 +46,10 @@ def immutable(message: str) -> JsonDict:
 def constraint(
     rule: str, message: str, field: str = "", reason: str = "", *, holds: Callable[[Any], bool] = lambda _: True
 ) -> Constraint:
-    """As `validation`. `holds` is the rule in Python; without it, a validator of the model checks the rule in more
-    detail."""
+    """As `validation`.
+
+    `holds` is the rule in Python; without it, a validator of the model checks the rule in more detail.
+    """
     return Constraint(validation(rule, message, field, reason), lambda given: None if holds(given) else message)
 
 

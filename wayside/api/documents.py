@@ -88,8 +88,7 @@ class Document:
         return check in ignored_by(self.object.metadata.annotations)
 
     def problem(self, path: FieldPath, message: str, check: str = "") -> Problem:
-        """A problem at a field, e.g. ("spec", "signals", 0, "value"), or at its closest ancestor if the field is
-        absent."""
+        """A problem at a field, e.g. ("spec", "signals", 0, "value"), or at its closest existing ancestor."""
         line, column = _mark(self.marks, path)
         return Problem(self.file, line, column, field_text(path), message, check)
 

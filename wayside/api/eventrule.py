@@ -190,8 +190,7 @@ class Signal(Model):
 
     @property
     def is_derived(self) -> bool:
-        """Whether it belongs to the rule's subject: it is computed from the variables of conditions, or from the
-        episode."""
+        """Whether it belongs to the subject: it is computed from the variables of conditions, or the episode."""
         return self.of is not None or (self.over is not None and self.over.is_episode)
 
     @model_validator(mode="after")

@@ -165,8 +165,10 @@ class Environment:
         return expression
 
     def _reads(self, node: Node) -> tuple[frozenset[Path], Mapping[Path, Leaf]]:
-        """The paths that are read, and how each is read. A path can become a handle only if CEL knows no type for
-        it."""
+        """The paths that are read, and how each is read.
+
+        A path can become a handle only if CEL knows no type for it.
+        """
         names = frozenset(self.variables)
         leaves = dict.fromkeys(arguments(node, names, _ORDERING), Leaf.ORDERED)
         for path in nothing_but_arguments(node, names, TAKING_HANDLES):

@@ -130,8 +130,7 @@ def _is_call(source: str, at: int, name: str) -> bool:
 
 
 def _after(source: str, at: int) -> str | None:
-    """The remedy for an error whose cause is the token before: CEL parses `not` as a name, and reports the next
-    token."""
+    """The remedy for an error caused by the token before: CEL parses `not` as a name, and reports the next token."""
     before = [token for token in tokens(source) if token.end <= at and token.kind is not TokenKind.SPACE]
     if not before:
         return None
@@ -196,8 +195,10 @@ def reports_absent(message: str) -> bool:
 
 
 def _no_overload(operation: str) -> str:
-    """The message for wrong argument types: for a Wayside function, the types that it takes and those given. For an
-    operation of CEL on bytes, it names the functions to use instead."""
+    """The message for wrong argument types: for a Wayside function, the types that it takes and those given.
+
+    For an operation of CEL on bytes, it names the functions to use instead.
+    """
     if operation.startswith(f"{DIGITS}("):
         operation = operation.replace(DIGITS, "string", 1)
     call = _CALL.search(operation)

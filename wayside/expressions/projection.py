@@ -73,8 +73,10 @@ def project(read: Tree, values: Mapping[str, object], *, known: bool) -> dict[st
 
 
 def normalise(value: object) -> object:
-    """A whole decoded value in the types of CEL. Null and NaN are kept; bytes become null in lists, and absent in
-    maps."""
+    """A whole decoded value in the types of CEL.
+
+    Null and NaN are kept; bytes become null in lists, and absent in maps.
+    """
     result = _convert(value, known=False)
     return None if result is _ABSENT else result
 
@@ -164,8 +166,7 @@ def _members(members: Iterable[tuple[Step, object, Tree | Leaf | None]], known: 
 
 
 def _items(below: Tree, items: list[object], known: bool) -> list[object]:
-    """The list up to the last index that is read. Items that are not read are null, so that the others keep their
-    index."""
+    """The list up to the last index that is read; items that are not read are null, to keep the indices."""
     indices = [step for step in below if isinstance(step, int) and step < len(items)]
     result: list[object] = [None] * (max(indices) + 1 if indices else 0)
     for index in indices:
@@ -254,8 +255,7 @@ def _is_record(value: object) -> bool:
 
 
 def _field_names(record: object) -> frozenset[str]:
-    """The names of a dataclass's fields, looked up once per class, since messages are projected many times per
-    second."""
+    """The names of a dataclass's fields, looked up once per class, since projections are frequent."""
     names = _FIELD_NAMES.get(type(record))
     if names is None:
         names = frozenset(field.name for field in dataclasses.fields(cast("type", type(record))))

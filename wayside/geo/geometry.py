@@ -86,8 +86,10 @@ def contains(rings: Iterable[Sequence[Point]], point: Point) -> bool:
 
 
 def side(a: Point, b: Point, point: Point) -> float:
-    """Positive if the point is left of the line from a to b, 0 on the line, negative if it is right of it. If the sign
-    is uncertain, it is computed with exact fractions."""
+    """Positive if the point is left of the line from a to b, 0 on the line, negative if it is right of it.
+
+    If the sign is uncertain, it is computed with exact fractions.
+    """
     (ax, ay), (bx, by), (x, y) = a, b, point
     left, right = (bx - ax) * (y - ay), (by - ay) * (x - ax)
     value = left - right

@@ -55,8 +55,7 @@ class Positions:
         return found
 
     def inside(self, u: Doubles, v: Doubles) -> Bools:
-        """bool[n]: whether positions are inside, or on the edge. The test is exact for an area; a lane has only its
-        width."""
+        """bool[n]: whether positions are inside, or on the edge: exact for an area; a lane has only its width."""
         if self._rings:
             return self._in_rings(u, self._unrolled(v))
         found: Bools = self._beside(self.arc(u, v)) == 0

@@ -134,11 +134,11 @@ class Client:
     async def pages(
         self, resource: Resource, namespace: str | None, *, labels: str = "", fields: str = "", size: int = _FIRST
     ) -> AsyncIterator[tuple[Iterator[Object], str]]:
-        """Yields the pages of a list, each with the resourceVersion of the list. The first page has `size` objects,
-        later pages about 4 MiB.
+        """Yields the pages of a list, each with the resourceVersion of the list.
 
-        Each object is decoded when it is iterated, since decoding multiplies its size by up to twenty. If the remaining
-        pages have expired (410), the list restarts, and objects may be yielded twice.
+        The first page has `size` objects, later pages about 4 MiB. Each object is decoded when it is iterated, since
+        decoding multiplies its size by up to twenty. If the remaining pages have expired (410), the list restarts, and
+        objects may be yielded twice.
         """
         kind = {"apiVersion": resource.api_version, "kind": resource.kind}
         query = {"labelSelector": labels, "fieldSelector": fields}
@@ -163,8 +163,7 @@ class Client:
     async def list(
         self, resource: Resource, namespace: str | None, *, labels: str = "", fields: str = "", limit: int = 0
     ) -> tuple[list[Object], str]:
-        """The objects, with apiVersion and kind, and the resourceVersion of the list. It is a consistent read from the
-        storage.
+        """The objects, with apiVersion and kind, and the resourceVersion of the list: a consistent read.
 
         `limit`: the maximum number of objects; 0: no limit.
         """
@@ -255,8 +254,7 @@ class Client:
         return await self._request("PATCH", resource.path(namespace, name, "scale"), self._ours, body, _MERGE)
 
     async def delete(self, resource: Resource, namespace: str, name: str, uid: str) -> bool:
-        """Delete the object with this uid, and the objects that it owns in the background. Returns whether it
-        existed."""
+        """Delete the object with this uid, and in the background its dependents. Returns whether it existed."""
         options = {
             "apiVersion": "v1",
             "kind": "DeleteOptions",

@@ -53,8 +53,7 @@ class ApiAccess:
 
 
 async def load_access(kubeconfig: Path | None = None, otherwise: str = "") -> ApiAccess:
-    """The access by the kubeconfig of KUBECONFIG; without it, by the service account in a pod, else by the default
-    kubeconfig.
+    """The access by KUBECONFIG; without it, by the service account in a pod, else by the default kubeconfig.
 
     Args:
         kubeconfig: a file to use instead of these.

@@ -82,8 +82,7 @@ class LeaseCandidate:
             self.until = _ANCIENT  # another holder or none: this process may no longer act
 
     def may_take(self, now: float) -> bool:
-        """Whether it may write itself into the Lease: it is the holder, there is none, or the Lease was unchanged for
-        its duration."""
+        """Whether it may write itself into the Lease: it is the holder, there is none, or the Lease has expired."""
         if self.holder == self.identity:
             return True
         if self._seen is None:

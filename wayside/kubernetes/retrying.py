@@ -46,8 +46,7 @@ async def until_answered(request: Callable[[], Awaitable[Answer]], pause: float 
 
 
 async def repeatedly(look: Callable[[], Awaitable[object]], every: float, problem: str) -> None:
-    """Call `look` periodically, until cancelled. A failure is logged once for each reason, and retried at the next
-    call.
+    """Call `look` periodically, until cancelled. Each reason of failure is logged once.
 
     Args:
         look: one attempt.

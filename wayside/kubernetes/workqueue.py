@@ -139,8 +139,7 @@ class WorkQueue(Generic[Key]):
         self._wake.set()
 
     async def run(self) -> None:
-        """Work until cancelled or finished. After a cancellation it can run again, and continues with the waiting
-        keys."""
+        """Work until cancelled or finished. After a cancellation, it can run again with the waiting keys."""
         try:
             async with asyncio.TaskGroup() as group:
                 for index in range(self._concurrency):

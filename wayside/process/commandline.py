@@ -91,8 +91,9 @@ def table_console(*, stderr: bool = False) -> Console:
 
 
 def log_as(wanted: LogFormat) -> None:
-    """Write log lines in this format from now on. JSON: one object per line with `time`, `level`, `logger` and
-    `message`.
+    """Write log lines in this format from now on.
+
+    JSON: one object per line with `time`, `level`, `logger` and `message`.
 
     The object also contains an exception, as `exc_info`, so that a log collector receives it as one record.
     """

@@ -30,8 +30,7 @@ class ServingCertificate:
     """A TLS context for servers, whose certificate and key are those in the folder."""
 
     def __init__(self, folder: Path, option: str) -> None:
-        """`option` names the folder in messages. Raises CertificateError if the folder has no valid certificate and
-        key."""
+        """`option` names the folder in messages. Raises CertificateError without a valid certificate and key."""
         self._files = folder / CERTIFICATE, folder / KEY
         self._option = option
         self._logged = ""

@@ -1,5 +1,4 @@
-"""Rules, validated and compiled against a Detector: the manager reports the problems, the engine evaluates the
-result."""
+"""Rules, compiled against a Detector: the manager reports the problems, the engine evaluates the result."""
 
 from wayside.rules.compiled import (
     ClientSubject,

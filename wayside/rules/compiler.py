@@ -164,8 +164,7 @@ class Compiler:
         return self.detector.spec.buffer_duration_ns(stream)
 
     def not_kept(self, path: FieldPath, problem: str, stream: Stream) -> None:
-        """Report that a time exceeds the duration for which the Detector keeps a stream. The message begins with
-        `problem`."""
+        """Report that a time exceeds the buffer duration of a stream. The message begins with `problem`."""
         self.problem(
             path,
             f"{problem} the {self.kept_ns(stream) / 1e9:g} s that Detector {self.detector.name} keeps of stream "
@@ -173,8 +172,7 @@ class Compiler:
         )
 
     def _members(self, path: FieldPath, paths: Iterable[Path]) -> None:
-        """Check the fields of a pair's a and b, and of the element of `each`: they are maps, which CEL does not
-        check."""
+        """Check the fields of a pair's a and b, and of the element of `each`: CEL does not check maps."""
         for name, members in known_members(self.spec):
             for text in unknown_fields(paths, name, members):
                 self.problem(path, text)

@@ -82,8 +82,7 @@ def unknown_rules(detector: Detector, rules: Iterable[str]) -> Iterator[tuple[Fi
 
 
 def _misfits(name: str, own: object, other: object, rule: str) -> Iterator[str]:
-    """The differences of type between an override and the rule's own value; for lists and maps, also between their
-    items."""
+    """The differences of type between an override and the rule's own value, also between their items."""
     wanted, given = _kind(own).name, _kind(other).name
     if wanted != given:
         yield f"{name} must be a {wanted}, as in EventRule {rule}; got a {given}, {other!r:.60}"

@@ -135,8 +135,7 @@ def of_conditions(rule: EventRule, known: KnownPlaces) -> NamedPlaces:
 
 
 def of_samples(stream: Stream | None, known: KnownPlaces) -> NamedPlaces:
-    """The places and positions that an expression over a sample of the stream can use. An episode start has no
-    stream."""
+    """The places and positions that an expression over a sample can use; `stream` is None for an episode start."""
     if stream is None:
         return NamedPlaces(known.shapes, known.complete)
     axes = {} if stream.position is None else stream.position.axes

@@ -77,8 +77,7 @@ def client_environment(signals: tuple[str, ...], element: str | None) -> Environ
 
 @lru_cache(maxsize=256)
 def pairs_environment(element: str | None) -> Environment:
-    """For a pair: a and b (maps of the variables of a client scope, with position), distance (m), closingSpeed
-    (m/s)."""
+    """For a pair: a and b (maps of a client scope's variables, with position), distance (m), closingSpeed (m/s)."""
     numbers = {"distance": CelType.DOUBLE, "closingSpeed": CelType.DOUBLE}
     return Environment(
         _with_element({"a": CelType.MAP, "b": CelType.MAP, "parameters": CelType.MAP, **numbers}, element)

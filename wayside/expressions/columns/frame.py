@@ -62,8 +62,7 @@ class Sizes:
 
 
 class Memory:
-    """Memory for frames. It is reused once nothing refers to it, since new pages take more time than the
-    computation."""
+    """Memory for frames, reused once nothing refers to it: new pages take more time than the computation."""
 
     def __init__(self) -> None:
         self._spare: list[Bytes] = []
@@ -90,8 +89,10 @@ _SMALL: Final = 1 << 20
 
 
 class Frame:
-    """The arrays of one run. `tagged`: whether any leaf has values other than numbers; otherwise some work is
-    skipped."""
+    """The arrays of one run.
+
+    `tagged`: whether any leaf has values other than numbers; otherwise some work is skipped.
+    """
 
     def __init__(self, sizes: Sizes, values: Doubles, tags: Bytes | None, block: Bytes) -> None:
         n = values.shape[1]

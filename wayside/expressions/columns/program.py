@@ -222,8 +222,10 @@ class Results:
         return _spread(true, shape), _spread(false, shape)
 
     def column(self, root: int) -> Column:
-        """The values of a root. NaN, the result of 0/0, is absent. A leaf has its input, without the values tagged
-        OTHER."""
+        """The values of a root. NaN, the result of 0/0, is absent.
+
+        A leaf has its input, without the values tagged OTHER.
+        """
         n = self._frame.leaves.shape[1]
         several, several_tags = self._frame.anything(self._program.operand((root,)))
         values = _spread(several[0], (n,))

@@ -70,8 +70,10 @@ def called_by_cel(function: Callable[[Arguments], object]) -> Callable[..., obje
 
 
 def drop_lost_references() -> None:
-    """Drop the references that CEL leaked, after the outermost evaluation on this thread, when its outcome is
-    deleted."""
+    """Drop the references that CEL leaked.
+
+    To be called after the outermost evaluation on this thread, when its outcome is deleted.
+    """
     noted = _noted
     if not noted.arguments:
         return

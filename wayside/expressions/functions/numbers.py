@@ -10,8 +10,7 @@ from wayside.expressions.functions.members import number, sequence
 
 
 def of_list(calculate: Callable[[list[float]], float]) -> Callable[[object], float]:
-    """A calculation over the numbers of a list. Null and NaN are ignored; if no number remains, it raises
-    ValueError."""
+    """A calculation over the numbers of a list, without null and NaN; ValueError if no number remains."""
 
     def calculated(values: object) -> float:
         items = sequence(values, "values")

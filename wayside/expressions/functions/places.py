@@ -22,8 +22,10 @@ def wgs84_distance(latitude1: float, longitude1: float, latitude2: float, longit
 
 
 def wgs84_bearing(latitude1: float, longitude1: float, latitude2: float, longitude2: float) -> float:
-    """The initial bearing of the great circle, in degrees in [0, 360) clockwise from north. The error is up to 0.2
-    degrees."""
+    """The initial bearing of the great circle, in degrees in [0, 360) clockwise from north.
+
+    The error is up to 0.2 degrees.
+    """
     _check(latitude1, longitude1)
     _check(latitude2, longitude2)
     phi1, phi2 = math.radians(latitude1), math.radians(latitude2)
