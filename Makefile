@@ -10,7 +10,7 @@ BIN := $(VENV)/bin
 # Hundreds of tests start programs: compiling them each time would double the time of the tests.
 unexport PYTHONDONTWRITEBYTECODE
 
-# Tests that wait on other processes: two a core. Three leave too little time for worker processes, which run when idle.
+# Tests that wait on other processes: two a core. Three leave too little time for those processes.
 WAITING := $(BIN)/python -m pytest -n 4 --dist loadgroup
 
 .PHONY: help demo demo-cluster tutorial examples test unit process cluster compat e2e lint bench load mutants soak requirements wheels image crds clean

@@ -260,10 +260,15 @@ def test_the_installed_rights_suffice_for_the_manager_and_the_test_pod_reaches_i
         assert done.returncode == 0, done.stderr
         assert "the manager is ready" in done.stdout
         assert "the webhook refuses what is wrong" in done.stdout
-        stranger = bare.kubeconfig_of_service_account(there.namespace, "default")
-        with pytest.raises(ApiError, match="cannot create resource"):
-            Api(stranger, there.namespace).create(TASK)
-        assert served_by(there) == {f"{hook}-{what}" for what in ("lease", "manager", "tasks")}
+        stranger = Api(bare.kubeconfig_of_service_account(there.namespace, "default"), there.namespace)
+        schemas = {f"{hook}-{what}" for what in ("lease", "manager", "tasks")}
+
+        def served() -> set[str]:
+            with pytest.raises(ApiError, match="cannot create resource"):
+                stranger.create(TASK)
+            return served_by(there)
+
+        wait_until(served, schemas.__eq__, what="each flow schema has served requests")
         # What is about to expire is renewed, and the API server trusts both before the next one is shown.
         dying = issued((service,), datetime.timedelta(minutes=20))
         data = {name: base64.b64encode(content).decode() for name, content in dying.items()}

@@ -13,7 +13,11 @@ _NOT_COUNTED = {"APIService", "Event"}
 
 
 def inventory(node: Node) -> set[Found]:
-    """All objects of all kinds that can be listed, in all namespaces."""
+    """All objects of all kinds that can be listed, in all namespaces; where a kind goes meanwhile, it looks again."""
+    return wait_until(lambda: _listed(node), bool, what="all kinds can be listed", transient=(RuntimeError,))
+
+
+def _listed(node: Node) -> set[Found]:
     served = node.plane.kubectl("api-resources", "--verbs=list", "--output=name").split()
     listed = node.plane.kubectl(
         "get", ",".join(sorted(served)), "--all-namespaces", "--ignore-not-found", f"--output=jsonpath={_TEMPLATE}"
@@ -30,7 +34,7 @@ def inventory(node: Node) -> set[Found]:
 def wait_left(node: Node, before: set[Found], kinds: set[str], timeout: float) -> set[Found]:
     """Wait until nothing is new since `before` but objects of `kinds`; return those. Raises TimeoutError with all."""
     return wait_until(
-        lambda: inventory(node) - before,
+        lambda: _listed(node) - before,
         lambda new: {kind for kind, _, _ in new} <= kinds,
         timeout=timeout,
         what=f"nothing new is left but {', '.join(sorted(kinds)) or 'nothing'}",
