@@ -127,11 +127,11 @@ class Conditions:
             for row, condition in these.by_cel:
                 self._evaluate_by_cel(block, row, condition, true[row], false[row])
             for row, condition, node in these.in_columns if strange else ():
-                foreign = results.foreign(node)
-                if foreign is not None:
+                cel_rows = results.cel_rows(node)
+                if cel_rows is not None:
                     own = block.points(row)
-                    foreign = foreign if own is None else foreign & own
-                    for point in np.flatnonzero(foreign).tolist():
+                    cel_rows = cel_rows if own is None else cel_rows & own
+                    for point in np.flatnonzero(cel_rows).tolist():
                         self._evaluate_point_by_cel(block, row, condition, point, true[row], false[row])
             unknown = ~(true | false)
             if unknown.any():

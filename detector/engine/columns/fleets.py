@@ -224,11 +224,11 @@ class FleetGroup:
         """The ticks that the columns cannot decide."""
         assert condition.node is not None  # noqa: S101  only conditions in columns come here
         found = np.zeros(len(fleet.ticks), bool)
-        if (foreign := outer.foreign(condition.node)) is not None:
-            found |= foreign
+        if (cel_rows := outer.cel_rows(condition.node)) is not None:
+            found |= cel_rows
         for _, node in condition.folds.values() if inner is not None else ():
-            if node is not None and inner is not None and (foreign := inner.foreign(node)) is not None:
-                found |= (foreign.reshape(fleet.members[row].shape) & fleet.members[row]).any(axis=0)
+            if node is not None and inner is not None and (cel_rows := inner.cel_rows(node)) is not None:
+                found |= (cel_rows.reshape(fleet.members[row].shape) & fleet.members[row]).any(axis=0)
         return found
 
     def _kinds(self, fleet: FleetBlock, row: int, *, exact: bool) -> Integers:

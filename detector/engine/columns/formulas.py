@@ -68,10 +68,10 @@ class Formulas:
             else:
                 true, false = results.truths([node])
                 verdict = Ternary(true[0].copy(), false[0].copy())
-                foreign = results.foreign(node)
-                self._note_unknown(field, rows, verdict, foreign, tags)
-                if foreign is not None:
-                    self._evaluate_by_cel(field, rows, np.flatnonzero(foreign), verdict)
+                cel_rows = results.cel_rows(node)
+                self._note_unknown(field, rows, verdict, cel_rows, tags)
+                if cel_rows is not None:
+                    self._evaluate_by_cel(field, rows, np.flatnonzero(cel_rows), verdict)
             found[field] = verdict
         return found
 
@@ -84,10 +84,10 @@ class Formulas:
                 rows.note(field, row, *why, 1)
 
     def _note_unknown(
-        self, field: str, rows: Rows, verdict: Ternary, foreign: Truths | None, tags: NDArray[np.uint8] | None
+        self, field: str, rows: Rows, verdict: Ternary, cel_rows: Truths | None, tags: NDArray[np.uint8] | None
     ) -> None:
         unknown = ~(verdict.true | verdict.false)
-        at = np.flatnonzero(unknown if foreign is None else unknown & ~foreign)
+        at = np.flatnonzero(unknown if cel_rows is None else unknown & ~cel_rows)
         _note_unknown(field, self._conditions[field], rows, at, tags)
 
 
@@ -111,18 +111,18 @@ class Formula:
             return self._with_values_by_cel(rows, np.arange(rows.size), empty) if rows.size else empty
         columns = [rows.column(leaf) for leaf in self._program.leaves]
         if self._is_leaf:
-            column, tags, foreign = columns[0], columns[0].tags, None
+            column, tags, cel_rows = columns[0], columns[0].tags, None
         else:
             values, tags = stacked(columns, rows.size)
             results = self._program.run(values, tags)
-            column, foreign = results.column(self._node), results.foreign(self._node)
+            column, cel_rows = results.column(self._node), results.cel_rows(self._node)
             tags = column.tags
         if tags is not None:
             unknown = (tags == Tag.ABSENT) | (tags == Tag.UNREACHABLE)
-            at = np.flatnonzero(unknown if foreign is None else unknown & ~foreign)
+            at = np.flatnonzero(unknown if cel_rows is None else unknown & ~cel_rows)
             kinds = [each.tags if each.tags is not None else np.ones(rows.size, np.uint8) for each in columns]
             _note_unknown(self._name, self._expression, rows, at, np.stack(kinds) if kinds else None)
-        return column if foreign is None else self._with_values_by_cel(rows, np.flatnonzero(foreign), column)
+        return column if cel_rows is None else self._with_values_by_cel(rows, np.flatnonzero(cel_rows), column)
 
     def _with_values_by_cel(self, rows: Rows, at: NDArray[np.intp], column: Column) -> Column:
         """The column, with the values from CEL for some rows."""

@@ -181,9 +181,9 @@ class Reader:
         if leaves.errors:
             nothing = Column(np.zeros(len(leaves.errors)), np.zeros(len(leaves.errors), np.uint8), None)
             column = _replaced(column, np.array([*leaves.errors]), nothing)
-        foreign = leaves.results.foreign(node)
-        if foreign is not None:
-            odd.update(np.flatnonzero(foreign).tolist())
+        cel_rows = leaves.results.cel_rows(node)
+        if cel_rows is not None:
+            odd.update(np.flatnonzero(cel_rows).tolist())
         odd.difference_update(leaves.errors)
         if odd:
             ordered = sorted(odd)

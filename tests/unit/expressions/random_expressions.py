@@ -55,10 +55,10 @@ class Table:
             return None
         truth = graph.truth(root)
         results = self.run(graph, (root, truth))
-        column, foreign = results.column(root), results.foreign(root)
+        column, cel_rows = results.column(root), results.cel_rows(root)
         values: list[object] = []
         for row in range(len(self.rows)):
-            if foreign is not None and foreign[row]:
+            if cel_rows is not None and cel_rows[row]:
                 values.append(FOREIGN)
             elif column.tags is not None and column.tags[row] == Tag.OTHER:
                 values.append(OTHER)

@@ -193,7 +193,7 @@ def test_has_distinguishes_a_missing_field_from_a_missing_parent() -> None:
     column = column_of(leaves, texts)
     assert column.tags is not None
     results = Program(graph, [root], texts).run(column.values[np.newaxis], column.tags[np.newaxis])
-    assert results.foreign(root) is None
+    assert results.cel_rows(root) is None
     found = [value_at(results.column(root), row, texts) for row in range(len(leaves))]
     assert found == [expression.evaluate_or_unknown({"m": message}) for message in messages]
     assert found == [True, True, False, False, UNKNOWN, UNKNOWN]
@@ -228,16 +228,16 @@ def test_only_rows_that_columns_cannot_decide_are_foreign(source: str, row: Row,
     table, graph = Table([plain, row, {}]), Graph()
     root = graph.add(ENVIRONMENT.compile(source), by_path)
     assert root is not None
-    foreign = table.run(graph, [root]).foreign(root)
-    assert ([False] * 3 if foreign is None else foreign.tolist()) == [False, expected, False]
+    cel_rows = table.run(graph, [root]).cel_rows(root)
+    assert ([False] * 3 if cel_rows is None else cel_rows.tolist()) == [False, expected, False]
 
 
 def test_a_foreign_value_of_a_leaf_with_two_names_is_foreign_under_both() -> None:
     table, graph = Table([{"x": 1.0}, {"x": 2**60}, {"x": "y"}]), Graph()
     roots = [graph.add(ENVIRONMENT.compile(source), lambda _: "x") for source in ("m.a > 1", "d > 1", "m.a > m.b")]
     results = table.run(graph, [root for root in roots if root is not None])
-    foreign = [results.foreign(root) for root in roots if root is not None]
-    assert [None if each is None else each.tolist() for each in foreign] == [
+    cel_rows = [results.cel_rows(root) for root in roots if root is not None]
+    assert [None if each is None else each.tolist() for each in cel_rows] == [
         [False, True, False],
         [False, True, True],
         [False, True, True],

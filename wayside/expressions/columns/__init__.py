@@ -7,7 +7,7 @@
 
 `values` defines columns, `nodes` the elements of a graph; `lowering` turns syntax into nodes, `program` groups them
 into steps, and `operations` runs a step. If columns cannot decide a row, such as the order of two strings,
-`Results.foreign` marks the row, and the caller evaluates the expression with CEL there.
+`Results.cel_rows` marks the row, and the caller evaluates the expression with CEL there.
 """
 
 from wayside.expressions.columns.lowering import Constant, Graph

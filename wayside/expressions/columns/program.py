@@ -48,7 +48,7 @@ class Program:
             elif node.op is Op.EXPECT:
                 self._places[number] = self._places[node.operands[0]]
         self._steps, self._sizes = self._put_into_steps(wanted)
-        self._foreign = CelChecks(graph, roots, self._places)
+        self._checks = CelChecks(graph, roots, self._places)
         self._memory = Memory()
         self._rows: dict[tuple[int, ...], Operand] = {}
 
@@ -62,7 +62,7 @@ class Program:
         with np.errstate(all="ignore"):
             for step in self._steps:
                 step(frame)
-        return Results(self, frame, self._foreign)
+        return Results(self, frame, self._checks)
 
     def operand(self, roots: Sequence[int]) -> Operand:
         """Nodes of the program that are in one array, as one operand.
@@ -195,12 +195,12 @@ def _spread(array: NDArray[_Scalar], shape: tuple[int, ...]) -> NDArray[_Scalar]
 class Results:
     """The results of the roots for the n rows of a run."""
 
-    __slots__ = ("_foreign", "_found", "_frame", "_program")
+    __slots__ = ("_checks", "_found", "_frame", "_program")
 
-    def __init__(self, program: Program, frame: Frame, foreign: CelChecks) -> None:
+    def __init__(self, program: Program, frame: Frame, checks: CelChecks) -> None:
         self._program = program
         self._frame = frame
-        self._foreign = foreign
+        self._checks = checks
         self._found: CelRows | None = None
 
     def truths(self, roots: Sequence[int]) -> tuple[Bools, Bools]:
@@ -236,12 +236,12 @@ class Results:
             values = np.where(absent, 0.0, values)
         return Column(values, tags)
 
-    def foreign(self, root: int) -> Bools | None:
+    def cel_rows(self, root: int) -> Bools | None:
         """bool[n]: the rows that CEL has to decide, because the columns cannot; None: no row.
 
         In these rows, two strings are concatenated or compared by order, a value tagged OTHER is used by anything
         but `has()`, or a variable has another type than its environment declares.
         """
         if self._found is None:
-            self._found = self._foreign.find(self._frame)
-        return self._foreign.rows(root, self._found) if self._found else None
+            self._found = self._checks.find(self._frame)
+        return self._checks.rows(root, self._found) if self._found else None
