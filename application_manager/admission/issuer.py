@@ -16,7 +16,7 @@ import logging
 import secrets
 from collections.abc import AsyncIterator, Mapping, Sequence
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -52,50 +52,43 @@ _CONFIGURATIONS = (
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
-class CertificateIssuer:
-    """Keeps the certificate valid, the files in the folder equal to the Secret, and the CA in the webhooks.
+async def renew(client: Client, options: WebhookOptions) -> None:
+    """Create a certificate if it is due, write the CA into the webhooks, and write the files as they are in the Secret.
 
-    The Secret must exist. `client` also writes while this manager is not the active one.
+    `client` also writes while this manager is not the active one. Raises ConfigurationError if the Secret does not
+    exist.
     """
+    namespace, name = options.secret
+    secret = await client.get(_SECRETS, namespace, name)
+    if secret is None:
+        raise ConfigurationError(f"Secret {namespace}/{name} for the webhook's certificate does not exist: create it")
+    files = {key: base64.b64decode(value) for key, value in (secret.get("data") or {}).items()}
+    if _due(files, now := datetime.datetime.now(datetime.UTC)):
+        files = issued(WebhookClientConfig.of_service(options.service).hosts)
+        files[AUTHORITY] += _trusted(secret, now)
+        data = {key: base64.b64encode(content).decode() for key, content in files.items()}
+        try:
+            await client.replace(_SECRETS, secret | {"data": data})
+        except ApiError as error:
+            if error.code == 409:  # another manager was first
+                return await renew(client, options)
+            raise
+        log.info("created a certificate for the webhook, valid for %d days", VALID.days)
+    await _trust(client, options.webhooks, base64.b64encode(files[AUTHORITY]).decode())
+    write_whole(options.certificates, {each: files[each] for each in (AUTHORITY, CERTIFICATE, KEY)})
 
-    client: Client
-    options: WebhookOptions
 
-    async def look(self) -> None:
-        """Check once: create a certificate if it is due, write the CA into the webhooks, and write the files."""
-        namespace, name = self.options.secret
-        secret = await self.client.get(_SECRETS, namespace, name)
-        if secret is None:
-            raise ConfigurationError(
-                f"Secret {namespace}/{name} for the webhook's certificate does not exist: create it"
-            )
-        files = {key: base64.b64decode(value) for key, value in (secret.get("data") or {}).items()}
-        if _due(files, now := datetime.datetime.now(datetime.UTC)):
-            files = issued(WebhookClientConfig.of_service(self.options.service).hosts)
-            files[AUTHORITY] += _trusted(secret, now)
-            data = {key: base64.b64encode(content).decode() for key, content in files.items()}
-            try:
-                await self.client.replace(_SECRETS, secret | {"data": data})
-            except ApiError as error:
-                if error.code == 409:  # another manager was first
-                    return await self.look()
-                raise
-            log.info("created a certificate for the webhook, valid for %d days", VALID.days)
-        await self._trust(base64.b64encode(files[AUTHORITY]).decode())
-        write_whole(self.options.certificates, {each: files[each] for each in (AUTHORITY, CERTIFICATE, KEY)})
-
-    async def _trust(self, bundle: str) -> None:
-        """Write the CA into the existing webhook configurations."""
-        for resource in _CONFIGURATIONS:
-            found: Object | None = await self.client.get(resource, "", self.options.webhooks)
-            if found is None:
-                continue
-            webhooks: list[Any] = found.get("webhooks") or []
-            if any(each["clientConfig"].get("caBundle") != bundle for each in webhooks):
-                changed = [{"name": each["name"], "clientConfig": {"caBundle": bundle}} for each in webhooks]
-                await self.client.merge_members(resource, self.options.webhooks, {"webhooks": changed})
-                log.info("wrote the CA of the webhook's certificate into the %s", resource.kind)
+async def _trust(client: Client, name: str, bundle: str) -> None:
+    """Write the CA into the existing webhook configurations of this name."""
+    for resource in _CONFIGURATIONS:
+        found: Object | None = await client.get(resource, "", name)
+        if found is None:
+            continue
+        webhooks: list[Any] = found.get("webhooks") or []
+        if any(each["clientConfig"].get("caBundle") != bundle for each in webhooks):
+            changed = [{"name": each["name"], "clientConfig": {"caBundle": bundle}} for each in webhooks]
+            await client.merge_members(resource, name, {"webhooks": changed})
+            log.info("wrote the CA of the webhook's certificate into the %s", resource.kind)
 
 
 def _due(files: dict[str, bytes], now: datetime.datetime) -> bool:
@@ -130,7 +123,7 @@ async def issuing(client: Client, options: WebhookOptions | None) -> AsyncIterat
     if options is None or not options.service:
         yield
         return
-    look = CertificateIssuer(client, options).look
+    look = partial(renew, client, options)
     await until_answered(look)
     renewing = repeatedly(look, EVERY, "cannot renew the webhook's certificate")
     following = asyncio.create_task(renewing, name="issuing")
