@@ -172,7 +172,7 @@ def start_receiver(receiver: str, endpoint: str, folder: Path, rules: int, log: 
         detector.write_text(yaml.safe_dump(document))
         files = ["--detector", str(detector), "--rules", str(rule_file), "--output", str(folder / "out")]
         command = [*module("intake_stages"), "run", *files]
-    with log.open("wb") as file:  # a pipe that nobody reads would stop the detector
+    with log.open("wb") as file:  # an unread pipe would block the detector
         return subprocess.Popen(command, stderr=file)
 
 

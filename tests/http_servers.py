@@ -28,7 +28,7 @@ class Received:
 
 
 Behaviour = Callable[["Endpoint", socket.socket, Received], None]
-"""What is done about a request, on the connection's own thread; the connection is closed afterwards."""
+"""Handles a request on the connection's own thread; the connection is closed afterwards."""
 
 
 def answers(status: int = 200, body: bytes = b"", **headers: str) -> Behaviour:

@@ -1,4 +1,4 @@
-"""How long tests wait for what must happen. A test that passes waits for none of this to pass."""
+"""The timeouts of tests. A test that passes does not wait for them."""
 
 from __future__ import annotations
 

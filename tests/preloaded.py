@@ -1,4 +1,4 @@
-"""What a fork server of `tests.programs` imports before it forks: all modules of both programs."""
+"""The modules that a fork server of `tests.programs` imports before it forks: those of both programs."""
 
 from __future__ import annotations
 

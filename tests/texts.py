@@ -32,7 +32,7 @@ _CODE = re.compile(r"\(self\.|self\.\w+ (==|!=|in|\|\|) |=> |color-scheme|len\(|
 
 
 class Use(StrEnum):
-    """What a text is used for."""
+    """The use of a text."""
 
     LOG = "Log messages"
     ERROR = "Errors"

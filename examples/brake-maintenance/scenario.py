@@ -33,7 +33,7 @@ VANS = ("van-1", "van-2", "van-3")
 
 
 def gives(van: str, hours: float) -> float:
-    """What a bar of pressure gives with brakes that are not hot, in m/s²."""
+    """The deceleration for each bar of pressure with cool brakes, in m/s²."""
     return AS_NEW - (WEAR_PER_HOUR * max(0.0, hours - WEARS_FROM_H) if van == "van-2" else 0.0)
 
 

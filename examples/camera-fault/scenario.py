@@ -113,7 +113,7 @@ def episodes() -> list[Episode]:
 
 
 def moment(at_s: float) -> Moment:
-    """What must run at a second that is not within two of a change."""
+    """The expected applications at a time that is more than two seconds from any change."""
     runs: dict[str, dict[str, object]] = {}
     for shuttle in SHUTTLES:
         broken = [each.camera for each in TRUTH if each.shuttle == shuttle and each.at(at_s)]

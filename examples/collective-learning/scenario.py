@@ -42,7 +42,7 @@ class StreetObject:
     vy: float = 0.0
 
     def at(self, t: float) -> tuple[float, float]:
-        """Where it is at that second."""
+        """The position at that time."""
         return self.x + self.vx * t, self.y + self.vy * t
 
     def in_scene(self, t: float) -> bool:
@@ -133,20 +133,20 @@ def messages(seed: int) -> Iterator[Message]:
 
 
 def _from(vehicle: StreetObject, heading: float, thing: StreetObject, t: float) -> tuple[float, float]:
-    """Where the thing is as seen from the vehicle: metres ahead and to the left."""
+    """The position of the object relative to the vehicle: metres ahead and to the left."""
     (x, y), (vx, vy) = thing.at(t), vehicle.at(t)
     cosine, sine = math.cos(heading), math.sin(heading)
     return cosine * (x - vx) + sine * (y - vy), -sine * (x - vx) + cosine * (y - vy)
 
 
 def _near(vehicle: StreetObject, t: float) -> list[StreetObject]:
-    """What the vehicle can see: things, and other vehicles."""
+    """The visible objects, including other vehicles."""
     others = [each for each in VEHICLES if each is not vehicle]
     return [each for each in (*THINGS, *others) if math.dist(each.at(t), vehicle.at(t)) < REACH_M]
 
 
 def _listed(vehicle: StreetObject, t: float) -> list[StreetObject]:
-    """What stands in its list of objects."""
+    """The vehicle's list of objects."""
     wrong = {each.thing for each in TRUTH if each.vehicle == vehicle.name and each.start_s <= t < each.end_s}
     return [each for each in _near(vehicle, t) if each.name not in wrong] + [GHOST] * (GHOST.name in wrong)
 
@@ -181,7 +181,7 @@ def check(played: Played, sent: list[Message]) -> Iterator[str]:
 
 
 def picture(due: list[Episode]) -> str:
-    """How far everybody is from the crossroads, who is wrong when, and what is recorded."""
+    """The distances from the crossroads, the errors over time, and the recordings."""
     chart = Chart(DURATION_S)
     curves = [
         (each.name, [(t / 2, math.hypot(*each.at(t / 2))) for t in range(DURATION_S * 2)])

@@ -31,11 +31,11 @@ from wayside.manifests import to_yaml
 
 HERE = Path(__file__).resolve().parent
 ENDPOINT = "tcp/127.0.0.1:7447"
-"""Where detector.yaml listens."""
+"""The endpoint at which the detector of detector.yaml listens."""
 INTAKE = "intake.mcap"
-"""What the detector took in, for the report."""
+"""The recorded intake of the detector, for the report."""
 WRITTEN = ("events.jsonl", "tasks.yaml", "manifests.yaml", "detector.log", INTAKE, "report.html")
-"""What comes out, beside the folder tasks."""
+"""The output files, in addition to the folder tasks."""
 DURATION_S = 22.5
 """Of the drive: by then all have parted, and the demo is no longer than it must be."""
 PATIENCE_S = 60.0
@@ -158,7 +158,7 @@ def _session(config: zenoh.Config, detector: subprocess.Popen[bytes]) -> zenoh.S
 
 
 class Timeline:
-    """What happens, a line each: events as they are published, instances as the tasks demand them."""
+    """Lines about published events and demanded instances, in order."""
 
     def __init__(self, console: Console, folder: Path) -> None:
         self._console = console

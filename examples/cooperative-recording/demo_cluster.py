@@ -128,12 +128,12 @@ def _report(console: Console, api: Api, drive: subprocess.Popen[bytes]) -> list[
 
 
 def _running(states: dict[str, str]) -> list[str]:
-    """What is not over: all but tasks that have ended."""
+    """All objects except ended tasks."""
     return sorted(name for name, state in states.items() if state != "Finished")
 
 
 def _states(api: Api) -> dict[str, str]:
-    """What there is, and its state in a few words."""
+    """The existing objects with a short state."""
     states: dict[str, str] = {}
     for task in api.list("ApplicationTask"):
         event = task["spec"]["event"]

@@ -15,7 +15,7 @@ from cooperative_recording.seeds import DEMO_DURATION_S, DEMO_SEED
 from cooperative_recording.vehicles import simulate
 
 DETECTOR = "tcp/127.0.0.1:7447"
-"""Where detector.yaml listens."""
+"""The endpoint at which the detector of detector.yaml listens."""
 
 
 def main() -> int:

@@ -39,7 +39,7 @@ class Foresight:
     """The latest manifests of every instance that there was."""
 
     def look(self, tasks: Mapping[str, ApplicationTask], now: float) -> Iterator[Change]:
-        """What the tasks change; `now` is in seconds since the epoch."""
+        """The changes of applications due to the tasks; `now` is in seconds since the epoch."""
         outcome = demand(self.templates, tasks.values(), self.instances.values(), {}, now)
         for name, decision in outcome.instances.items():
             yield from self._decided(name, decision, now)

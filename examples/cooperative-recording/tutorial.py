@@ -345,7 +345,7 @@ def _of_namespace(api: Api, folder: Path) -> Path:
 
 
 def blocks(guide: str) -> list[str]:
-    """What the tutorial shows, a text a step."""
+    """The texts of the tutorial, one for each step."""
     return [f"$ {each}" for each in BLOCK.findall(guide)]
 
 

@@ -53,7 +53,7 @@ def scenario(seed: int = SEED) -> Scenario:
 
 
 def messages(seed: int) -> Iterator[Message]:
-    """What each vehicle measures, ten times a second."""
+    """The measurements of each vehicle, ten times a second."""
     for number, vehicle in enumerate(TRUTH):
         rng = np.random.default_rng([seed, number])
         for index in range(DURATION_S * SECOND // PERIOD_NS):
@@ -96,12 +96,12 @@ def episodes() -> list[Episode]:
 
 
 def place(vehicle: str, t: float) -> str:
-    """Where the vehicle's application must be wanted."""
+    """The expected place of the vehicle's application."""
     return "edge" if any(start <= t < (end or DURATION_S) for start, end in edge_times(vehicle)) else "cloud"
 
 
 def moment(at_s: float) -> Moment:
-    """What must run at a second that is not within one of a change."""
+    """The expected applications at a time that is more than a second from any change."""
     runs = {
         f"vision/{vehicle}-{place(vehicle, at_s)}": {"answers": f"vehicles/{vehicle}/vision/{place(vehicle, at_s)}"}
         for vehicle in TRUTH
@@ -124,7 +124,7 @@ def check(played: Played) -> Iterator[str]:
 
 
 def picture(seed: int, due: Sequence[Episode]) -> str:
-    """What is measured, and where the application is."""
+    """The measured values, and the place of the application."""
     chart = Chart(DURATION_S)
     curves = []
     for number, vehicle in enumerate(TRUTH):

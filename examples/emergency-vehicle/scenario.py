@@ -25,7 +25,7 @@ LIGHT_BAR_S, LIT_S = 13.0, 3.0
 EARLIER_OVER_S = 3.0
 """The end of another operation."""
 LASTING_S = 4.0
-"""Who is on the route for less only crosses it."""
+"""A car that is on the route for a shorter time only crosses it."""
 HALF_WIDTH = 12.0
 LENGTH, HEIGHT = 800.0, 600.0
 ROADS = ("Ring", "Station Street")
@@ -144,7 +144,7 @@ def episodes() -> list[Episode]:
 
 
 def moment(at_s: float) -> Moment:
-    """What each car's navigation avoids at a second that is not close to a change."""
+    """The area that each car's navigation avoids, at a time without a change nearby."""
     avoiding = [car for car, (start, end) in spans().items() if start <= at_s < end]
     return Moment(
         at_s,

@@ -68,7 +68,7 @@ RED = ((8.8, 12.0), (38.0, 49.0))
 
 
 class Sent(NamedTuple):
-    """What one client sends on one stream."""
+    """The samples of a client on a stream."""
 
     client: str
     stream: str
@@ -79,7 +79,7 @@ class Sent(NamedTuple):
 
 
 def sent(seed: int = SEED) -> list[Sent]:
-    """All that is sent."""
+    """All samples of the drive."""
     rng = np.random.default_rng(seed)
     light = _tenths(0.0, SECONDS - STEP_S)
     red = np.zeros(len(light), bool)

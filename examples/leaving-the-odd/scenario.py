@@ -73,7 +73,7 @@ CARS = {
 
 
 def _latest(values: Mapping[float, Value], t: float) -> Value:
-    """What counts from the last second on that is over."""
+    """The state that counts from the last whole second on."""
     begins = sorted(values)
     return values[begins[bisect_right(begins, t) - 1]]
 

@@ -27,9 +27,9 @@ LATENCY_NS = 50_000_000
 STEP_S = 0.01
 EGO_SPEED = 10.0
 AHEAD, BEHIND = 60.0, 15.0
-"""How far the vehicle sees, in metres."""
+"""The range of the vehicle's perception, in metres."""
 SURE_M = 40.0
-"""How far it is sure of what it sees."""
+"""The range within which perception is certain, in metres."""
 GIVEN_UP_S = 3.0
 """An object that the tracker has not seen for this time leaves its list; seen again, it has a new number."""
 MISSED_S, LOOKS_BACK_S = 1.0, 6.0
@@ -50,7 +50,7 @@ class StreetObject:
     speed: float = 0.0
 
     def ahead(self, t: float) -> float | None:
-        """How far ahead of the vehicle it is, in metres; None where that is too far."""
+        """The distance ahead of the vehicle in metres; None if out of range."""
         found = self.x + (self.speed - EGO_SPEED) * t
         return found if -BEHIND <= found <= AHEAD else None
 
@@ -125,7 +125,7 @@ def messages(seed: int) -> Iterator[Message]:
 
 
 def _track(rng: np.random.Generator, thing: StreetObject, t: float) -> dict[str, object] | None:
-    """What stands about the thing in the list; None where nothing does."""
+    """The object's entry in the list; None if it has none."""
     ahead = thing.ahead(t)
     wrong = next((each for each in TRUTH if each.thing == thing.name and each.start_s <= t < each.end_s), None)
     overlooked = wrong is not None and not wrong.mistaken_for
@@ -201,7 +201,7 @@ def check(played: Played, sent: list[Message]) -> Iterator[str]:
 
 
 def picture(due: list[Episode]) -> str:
-    """What there is ahead, what is wrong when, and what is recorded."""
+    """The objects ahead, the errors over time, and the recordings."""
     chart = Chart(DURATION_S)
     curves = []
     for thing in THINGS:

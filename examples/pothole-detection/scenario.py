@@ -131,7 +131,7 @@ def _labels(content: dict[str, dict[str, dict[str, dict[str, str]]]]) -> dict[st
 
 
 def picture(seed: int, due: list[Episode]) -> str:
-    """How the cars shake, what they drive over, and what is found."""
+    """The accelerations of the cars, the obstacles, and the detections."""
     chart = Chart(DURATION_S)
     for car in CARS[:2]:
         values = [(index / RATE_HZ, float(value)) for index, value in enumerate(shaking(car, seed))]

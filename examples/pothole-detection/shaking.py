@@ -16,7 +16,7 @@ def asphalt(count: int, rng: np.random.Generator) -> Samples:
 
 
 def cobbles(count: int, rng: np.random.Generator) -> Samples:
-    """What cobblestones add: much shaking, without any shape."""
+    """The noise of cobblestones."""
     return rng.normal(0.0, rng.uniform(1.0, 1.8), count)
 
 

@@ -85,7 +85,7 @@ def _logistic(x: Array) -> Array:
 
 
 def answers(model: dict[str, Array], samples: Array) -> Array:
-    """How likely a pothole is in each window, from 0 to 1: what the model must compute."""
+    """The probability of a pothole in each window, which the model must compute."""
     matches = sliding_window_view(samples, LONG, axis=1) @ model["shapes"].T + model["offsets"]
     return _logistic(np.maximum(matches, 0).max(axis=1) @ model["weights"] + model["bias"])
 

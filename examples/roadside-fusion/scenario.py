@@ -83,7 +83,7 @@ def messages() -> Iterator[Message]:
 
 
 def taking_part(site: str, t: float) -> list[str]:
-    """Who approaches the site, or is there."""
+    """The vehicles that approach the site or are there."""
     return [name for name, vehicle in VEHICLES.items() if vehicle.takes_part(SITES[site], t)]
 
 
@@ -104,7 +104,7 @@ def episodes() -> list[Episode]:
 
 
 def moment(at_s: float) -> Moment:
-    """What must run at a second that is not within one of a change."""
+    """The expected applications at a time that is more than a second from any change."""
     runs: dict[str, dict[str, object]] = {}
     for site, unit in UNITS.items():
         names = taking_part(site, at_s)
@@ -115,7 +115,7 @@ def moment(at_s: float) -> Moment:
 
 
 def picture(due: list[Episode]) -> str:
-    """How far everybody is from the intersections, who takes part, and when there is a fusion."""
+    """The distances from the intersections, the participants, and the times of each fusion."""
     chart = Chart(DURATION_S)
     for site, place in SITES.items():
         curves = [

@@ -20,7 +20,7 @@ SCENARIO = "scenario.py"
 
 @dataclass(frozen=True, slots=True)
 class CaseResult:
-    """What became of a use case."""
+    """The result of a use case."""
 
     name: str
     scenario: Scenario

@@ -21,12 +21,12 @@ from wayside.api.documents import load_documents
 
 @dataclass(frozen=True, slots=True)
 class RunningTask:
-    """What an instance consists of."""
+    """The content of an instance."""
 
     kinds: tuple[str, ...]
     """Of its objects, sorted."""
     configuration: Mapping[str, Any] = field(default_factory=dict)
-    """What stands in its ConfigMap, all files together."""
+    """The merged files of its ConfigMap."""
     suspended: bool = False
 
 
@@ -59,7 +59,7 @@ def running_at(folder: Path, history: Iterable[tuple[float, ApplicationTask]], a
 
 
 def consists_of(manifests: Sequence[Mapping[str, Any]], *, suspended: bool = False) -> RunningTask:
-    """What an instance with these objects is."""
+    """The content of an instance with these objects."""
     configuration: dict[str, Any] = {}
     for manifest in manifests:
         if manifest["kind"] == "ConfigMap":
@@ -70,7 +70,7 @@ def consists_of(manifests: Sequence[Mapping[str, Any]], *, suspended: bool = Fal
 
 
 def unlike(moment: Moment, found: Mapping[str, RunningTask]) -> Iterator[str]:
-    """How what runs differs from what must run at the moment, a line each."""
+    """The differences between running and expected applications at the moment, a line each."""
     for name in sorted({*moment.runs, *found}):
         if name not in found:
             yield f"at {moment.at_s:g} s {name} does not run"

@@ -17,7 +17,7 @@ _EARLY_S = 1e-6
 
 @dataclass(slots=True)
 class Verdict:
-    """What was expected and found, as numbers, and each difference as a line."""
+    """The expected and actual numbers, and each difference as a line."""
 
     expected: int = 0
     """Events: starts and ends."""

@@ -44,7 +44,7 @@ _PATIENCE = 60.0
 
 @dataclass(frozen=True, slots=True)
 class Notice:
-    """What an action published."""
+    """A message that an action published."""
 
     key: str
     content: Any
@@ -52,22 +52,22 @@ class Notice:
 
 @dataclass(slots=True)
 class Played:
-    """What came of it."""
+    """The results of a played scenario."""
 
     folder: Path
-    """What was recorded is below it."""
+    """The folder of the recordings."""
     events: list[Event] = field(default_factory=list)
     tasks: list[ApplicationTask] = field(default_factory=list)
-    """As they were last, in the order of their names."""
+    """The last states of the tasks, ordered by name."""
     history: list[tuple[float, ApplicationTask]] = field(default_factory=list)
     """Each version of each task, with the second at which it was there; parameters may follow what happens."""
     outcomes: list[tuple[ActionKey, ActionOutcome]] = field(default_factory=list)
-    """What became of each episode at each action that is no deploy."""
+    """The outcome of each episode at each action except deploy."""
     notices: list[Notice] = field(default_factory=list)
     samples: int = 0
 
     def done(self) -> Counter[str]:
-        """How often each `<rule>/<action>` did its work, or emitted a task."""
+        """The number of outcomes or tasks of each `<rule>/<action>`."""
         done = Counter(f"{which.rule}/{which.action}" for which, each in self.outcomes if _is_done(each))
         for task in self.tasks:
             if task.spec.event is not None:
@@ -75,7 +75,7 @@ class Played:
         return done
 
     def failures(self) -> list[str]:
-        """What went wrong at actions, a line each."""
+        """The failures of actions, a line each."""
         return [f"{which.rule}/{which.action}: {each.message}" for which, each in self.outcomes if not _is_done(each)]
 
     def recordings(self, rule: str) -> list[Path]:

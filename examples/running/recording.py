@@ -51,7 +51,7 @@ def write_recording(messages: Iterable[Message], path: Path) -> int:
 
 
 def read_recording(path: Path) -> list[Recorded]:
-    """What stands in an MCAP file, or in all those of a folder, by time and key."""
+    """The messages of an MCAP file or of all MCAP files in a folder, by time and key."""
     found = []
     for each in sorted(path.glob("*.mcap")) if path.is_dir() else [path]:
         with each.open("rb") as file:
@@ -71,7 +71,7 @@ def within(messages: Iterable[Message], clients: Collection[str], first_s: float
 
 
 def missing_messages(expected: Iterable[Message], found: Iterable[Recorded], what: str) -> list[str]:
-    """How what was recorded differs from the messages that must be in it: a line, or none."""
+    """The difference between recorded and expected messages: a line, or none."""
     must = sorted(Recorded(each.after_ns, each.key, each.payload) for each in expected)
     there = sorted(found)
     if must == there:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 SECOND = 1_000_000_000
 """Nanoseconds."""
 START_NS = int(datetime(2026, 1, 1, tzinfo=UTC).timestamp()) * SECOND
-"""What second 0 of each scenario is called in stamps, nanoseconds since the epoch."""
+"""The stamp of second 0 of each scenario, in nanoseconds since the epoch."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,18 +44,18 @@ class Episode:
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """What must run at a moment at which nothing is about to change."""
+    """The applications that must run at a moment without a change nearby."""
 
     at_s: float
     runs: Mapping[str, Mapping[str, Any]]
     """By `<template>/<key>`: the expected values of its configuration. Nothing else runs."""
     suspended: Collection[str] = ()
-    """Those of them that must be suspended; the others must not."""
+    """The suspended ones; the others must not be suspended."""
 
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """What happens, and what must come of it; neither knows the detector."""
+    """The messages and the expected results, both independent of the detector."""
 
     title: str
     seed: int
@@ -63,14 +63,14 @@ class Scenario:
     """In any order; the same each time."""
     episodes: Sequence[Episode]
     actions: Mapping[str, int]
-    """How many episodes each `<rule>/<action>` deals with; of deploy actions, how many tasks they emit."""
+    """The expected number of episodes of each `<rule>/<action>`; of tasks for deploy actions."""
     picture: Callable[[], str]
     """An SVG."""
     picture_file: str = "scenario.svg"
     real_time: bool = False
     """Whether it can only be played in real time, because its messages contain only a part of the time."""
     moments: Sequence[Moment] = ()
-    """What must run; of a use case with templates."""
+    """The expected applications, for a use case with templates."""
     check: Callable[[Played], Iterable[str]] = field(default=lambda played: ())
     """Other differences from the expected results, one line each: recordings, notifications, applications."""
 

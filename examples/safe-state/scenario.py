@@ -31,7 +31,7 @@ Curve = Sequence[tuple[float, float]]
 
 @dataclass(frozen=True, slots=True)
 class Shuttle:
-    """How far its perception sees, in metres, and how fast it goes, in m/s."""
+    """The range of its perception in metres, and its speed in m/s."""
 
     seen: Curve
     speed: Curve
@@ -82,7 +82,7 @@ def scenario(seed: int = SEED) -> Scenario:
 
 
 def messages(seed: int) -> Iterator[Message]:
-    """What each shuttle sees and how fast it goes, ten times a second; and the operator's word."""
+    """The range and speed of each shuttle, ten times a second, and the operator's release."""
     for number, (name, shuttle) in enumerate(SHUTTLES.items()):
         rng = np.random.default_rng([seed, number])
         for index in range(DURATION_S * SECOND // PERIOD_NS):
@@ -118,7 +118,7 @@ def episodes() -> list[Episode]:
 
 
 def moment(at_s: float, due: Sequence[Episode]) -> Moment:
-    """What must run at a second that is not within one of a change."""
+    """The expected applications at a time that is more than a second from any change."""
     now = {(each.rule, each.subject) for each in due if each.start_s <= at_s < (each.end_s or DURATION_S)}
     runs: dict[str, dict[str, object]] = {}
     for name in SHUTTLES:
@@ -138,7 +138,7 @@ def check(played: Played) -> Iterator[str]:
 
 
 def picture(due: Sequence[Episode]) -> str:
-    """What is seen and what is needed to stop, and what follows."""
+    """The visible range, the stopping distance, and the results."""
     chart = Chart(DURATION_S)
     times = [each / 4 for each in range(DURATION_S * 4)]
     for name in ("shuttle-1", "shuttle-2"):

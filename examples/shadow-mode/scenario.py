@@ -23,7 +23,7 @@ DURATION_S = 40
 PERIOD_NS = SECOND // 10
 EGO_SPEED = 8.0
 AHEAD, BEHIND = 50.0, 20.0
-"""How far the vehicle sees, in metres."""
+"""The range of the vehicle's perception, in metres."""
 EXISTING, SHADOW = "perception", "shadow-perception"
 LATENCY_NS = {EXISTING: 40_000_000, SHADOW: 70_000_000}
 NOISE_M = 0.15
@@ -41,7 +41,7 @@ class StreetObject:
     speed: float = 0.0
 
     def seen_from(self, t: float) -> tuple[float, float] | None:
-        """Where it is as seen from the vehicle; None where that is too far."""
+        """The position relative to the vehicle; None if out of range."""
         ahead = self.x + self.speed * t - EGO_SPEED * t
         return (ahead, self.y) if -BEHIND <= ahead <= AHEAD else None
 
@@ -145,7 +145,7 @@ def check(played: Played, sent: list[Message]) -> Iterator[str]:
 
 
 def picture(due: list[Episode]) -> str:
-    """What there is ahead, who is wrong when, and what is recorded."""
+    """The objects ahead, the errors over time, and the recordings."""
     chart = Chart(DURATION_S)
     curves = []
     for thing in THINGS:

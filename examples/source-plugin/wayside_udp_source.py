@@ -11,7 +11,7 @@ from detector.sources import Feed, Source
 
 
 class UdpParameters(BaseModel):
-    """What `spec.sources[].parameters` may hold; what this model refuses, `detector check` reports."""
+    """The fields of `spec.sources[].parameters`; `detector check` reports validation errors of this model."""
 
     model_config = ConfigDict(extra="forbid")
 

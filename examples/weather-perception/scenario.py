@@ -17,7 +17,7 @@ SEED = 6
 DURATION_S = 110
 PERIOD_NS = SECOND // 2
 TIMES = [each / 20 for each in range(20, DURATION_S * 20)]
-"""Those that the truth is looked at, in seconds."""
+"""The times at which the truth is evaluated, in seconds."""
 NOISE_S = 0.6
 """By how much earlier or later means of noisy measurements cross a threshold than the true ones."""
 LOOKS_S = 1.0
@@ -29,7 +29,7 @@ Curve = Sequence[tuple[float, float]]
 
 @dataclass(frozen=True, slots=True)
 class Weather:
-    """How hard it rains (mm/h), how far one sees (m), and from when to when the wipers go."""
+    """Rain (mm/h), visibility (m), and the times at which the wipers run."""
 
     rain: Curve
     visibility: Curve
@@ -121,7 +121,7 @@ def _spans(rule: str, car: str, begins: Sequence[float], ends: Sequence[float]) 
 
 
 def moment(at_s: float, due: Sequence[Episode]) -> Moment:
-    """What must run at a second that is not within two of a change."""
+    """The expected applications at a time that is more than two seconds from any change."""
     runs: dict[str, dict[str, object]] = {}
     for car in TRUTH:
         bad = {each.rule for each in due if each.subject == car and each.start_s <= at_s < (each.end_s or DURATION_S)}

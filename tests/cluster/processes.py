@@ -17,7 +17,7 @@ SCHEDULING = Path(__file__).with_name("scheduling")
 
 
 def environment_of(kubeconfig: Path) -> dict[str, str]:
-    """What the programs of a test get: the way to the API server, and worker processes that share the CPU."""
+    """The environment of the programs of a test: the kubeconfig, and worker processes that share the CPU."""
     path = (str(SCHEDULING), os.environ.get("PYTHONPATH"))
     return {"KUBECONFIG": str(kubeconfig), "PYTHONPATH": os.pathsep.join(filter(None, path))}
 

@@ -341,7 +341,7 @@ def test_tasks_instances_statuses_and_deletions_are_never_reviewed(
 
 
 def holds_lease(api: Api) -> str:
-    """Who is active."""
+    """The identity of the active manager."""
     found = api.wait_for(
         "Lease",
         "application-manager",

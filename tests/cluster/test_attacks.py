@@ -102,7 +102,7 @@ BY_TEMPLATE: dict[str, tuple[Object, str]] = {
     ),
     "finalizer": (named("${instance.name}", finalizers=["a.example/b"]), "metadata.finalizers"),
 }
-"""What the manager refuses: a manifest, and part of the reason."""
+"""Manifests that the manager rejects, and a part of the reason."""
 
 HOST: dict[str, tuple[Object, Object, str]] = {
     "network": ({"hostNetwork": True}, {}, "hostNetwork=true"),

@@ -93,7 +93,7 @@ def test_an_invalid_value_is_rejected_by_its_name(helm: Helm, values: Values, me
 
 
 def test_the_pods_of_the_mining_job_make_one_dataset(helm: Helm, tmp_path: Path) -> None:
-    """What their containers run, here, one after another."""
+    """The test runs the containers' commands one after another."""
     write_fleet(tmp_path, 4, 5.0, broken=1)
     given: Values = {"enabled": True, "shares": 2, "claim": "datasets", "recordings": [str(tmp_path / "drives")]}
     given |= {name: (tmp_path / f"{name}.yaml").read_text() for name in ("detector", "rules")}

@@ -107,7 +107,7 @@ def test_an_expired_resource_version_is_reported_as_such(
     for x in "23":
         api.patch("ConfigMap", "a", {"data": {"x": x}})
     with control_plane.outage():
-        pass  # a fresh API server knows what is, not what was
+        pass  # a fresh API server has the current objects but no history
 
     async def watch() -> None:
         while True:

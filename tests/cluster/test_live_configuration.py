@@ -219,7 +219,7 @@ class Mount:
         self._versions = 0
 
     def sync(self, api: Api) -> None:
-        """What the kubelet does when the pod has changed since."""
+        """Update the files as the kubelet does if the pod has changed since."""
         pod = wait_for_pod(api)
         annotation = pod["metadata"].get("annotations", {}).get(ANNOTATION, "")
         if annotation == self._seen:

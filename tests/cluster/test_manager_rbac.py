@@ -51,7 +51,7 @@ Verb = tuple[str, str, str]
 
 
 def printed(*arguments: str) -> list[Object]:
-    """What the command prints, without any cluster at hand."""
+    """The output of the command without a cluster."""
     environment = {"KUBECONFIG": "/nonexistent"}
     done = programs.run("application-manager", "rbac", *arguments, check=True, environment=environment)
     return list(yaml.safe_load_all(done.stdout))
@@ -139,7 +139,7 @@ def granted(manifests: list[Object]) -> set[Verb]:
 
 
 def verbs(manifests: list[Object]) -> Iterator[tuple[Object, Verb]]:
-    """All that the roles give, each with its rule."""
+    """All verbs of the roles, each with its rule."""
     for role in manifests:
         for rule in role.get("rules", []):
             for each in itertools.product(rule["apiGroups"], rule["resources"], rule["verbs"]):

@@ -42,7 +42,7 @@ SAMPLING = 0.2  # s: a pose is up to 0.1 s old, and so is what the observer saw
 
 @dataclass
 class Snapshot:
-    """What existed at one moment."""
+    """The objects at one moment."""
 
     since_ns: int  # the epoch
     took_s: float  # to look
@@ -142,7 +142,7 @@ def test_the_deployments_over_time_match_the_vehicles_positions(
 
 @dataclass
 class Timeline:
-    """What was seen, in seconds into the drive, and how late it may have been at most.
+    """The snapshots by seconds into the drive, and their maximum delay.
 
     A machine that is slow is so for vehicles and observer too: by how much poses were sent late, by how much longer
     the API server takes, and for how long the observer itself was kept from looking, what comes of them may be late

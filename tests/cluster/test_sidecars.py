@@ -136,7 +136,7 @@ def test_a_second_webhook_call_for_the_same_pod_adds_nothing(
 
 
 def reviews_of_pods(port: int) -> int:
-    """How many questions about pods the manager has answered."""
+    """The number of reviews of pods that the manager has answered."""
     with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=PATIENCE) as response:
         lines = response.read().decode().splitlines()
     name = 'wayside_manager_reviews_total{answer="'

@@ -26,7 +26,7 @@ MERGED = {"vehicles": {"type": "array", "items": "string", "merge": "Union"}, "r
 
 @pytest.fixture
 def receiver(processes: Processes) -> Iterator[Receiver]:
-    """What both programs send their spans to."""
+    """An OTLP receiver for both programs."""
     with Receiver() as running:
         processes.environment |= {"OTEL_EXPORTER_OTLP_ENDPOINT": running.endpoint, "OTEL_BSP_SCHEDULE_DELAY": "100"}
         yield running

@@ -137,7 +137,7 @@ def wait_runs(api: Api, moment: Moment) -> None:
 
 
 def running(api: Api) -> dict[str, RunningTask]:
-    """What is there in the namespace, by template and key."""
+    """The applications in the namespace, by template and key."""
     found = {}
     for instance in api.list("ApplicationInstance"):
         spec, status = instance["spec"], instance.get("status", {})

@@ -95,7 +95,7 @@ class PairsOnNode(PairsNamespace):
         wait_until(self.programs, holds, timeout=NODE_PATIENCE, what=what, diagnose=self.reported)
 
     def metrics(self, labels: str = DETECTOR) -> Mapping[str, float]:
-        """What the program in the pod with these labels measures, by name with labels, as it stands in `/metrics`."""
+        """The metrics of the program in the pod with these labels, by name with labels as in `/metrics`."""
         (pod,) = self.api.list("Pod", labels=labels)
         path = f"/api/v1/namespaces/{self.api.namespace}/pods/{pod['metadata']['name']}:{METRICS_PORT}/proxy/metrics"
         lines = [line for line in self.api.raw(path).splitlines() if line and not line.startswith("#")]
@@ -142,7 +142,7 @@ class PublishedEvents:
         wait_until(lambda: self.kinds(pair), lambda found: found == list(kinds), timeout=NODE_PATIENCE, what=what)
 
     def __enter__(self) -> PublishedEvents:
-        # It connects in the background, and what is published before, nobody hears.
+        # It connects in the background; earlier messages are lost.
         wait_until(self._session.info.peers_zid, bool, timeout=NODE_PATIENCE, what="the detector is connected")
         return self
 
@@ -161,5 +161,5 @@ def is_ready(pod: Object) -> bool:
 
 
 def restarts_of(pod: Object) -> int:
-    """How often its containers were restarted."""
+    """The number of restarts of its containers."""
     return sum(status["restartCount"] for status in pod["status"].get("containerStatuses", []))

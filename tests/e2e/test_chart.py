@@ -140,7 +140,7 @@ def test_the_example_from_nothing_by_mutual_tls_through_an_upgrade_until_nothing
 
 
 def logged(node: Node, pod: Object) -> str:
-    """What the pod has written; it waits until that is something."""
+    """The log of the pod, once it is not empty."""
     metadata = pod["metadata"]
     log = ("--namespace", metadata["namespace"], "logs", metadata["name"])
     return wait_until(lambda: node.plane.kubectl(*log), bool, what=f"pod {metadata['name']} has written")

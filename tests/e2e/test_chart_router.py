@@ -82,6 +82,6 @@ def test_a_vehicle_with_a_certificate_has_an_application_run_and_others_do_not_g
 
 
 def log_of(api: Api, deployment: str) -> str:
-    """What the pods of a Deployment have written."""
+    """The logs of the pods of a Deployment."""
     pods = [pod["metadata"]["name"] for pod in api.list("Pod") if pod["metadata"]["name"].startswith(f"{deployment}-")]
     return "".join(api.raw(f"/api/v1/namespaces/{api.namespace}/pods/{name}/log") for name in pods)

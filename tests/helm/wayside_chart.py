@@ -52,7 +52,7 @@ class Helm:
     def rendered(
         self, values: Values | None = None, *options: str, name: str = "wayside", namespace: str = "town"
     ) -> Rendered:
-        """What the chart renders with the values."""
+        """The rendered chart with the values."""
         text = self("template", name, str(CHART), "--namespace", namespace, *options, values=values or {})
         return Rendered([each for each in yaml.safe_load_all(text) if each])
 

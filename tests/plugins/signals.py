@@ -20,7 +20,7 @@ class CountingParameters(PluginParameters):
 
 
 class Counting(Plugin[CountingParameters]):
-    """How many evaluations the subject has had, until the newest value of the stream requests a failure."""
+    """Counts the evaluations of a subject; fails if the newest value of the stream requests it."""
 
     Parameters = CountingParameters
     count = 0

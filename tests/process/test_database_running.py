@@ -147,7 +147,7 @@ class Drive:
 
 
 def check(database: Any) -> int:
-    """How many scenarios call themselves complete; each of them is."""
+    """The number of scenarios marked as complete; check that each of them is."""
     complete = [each for each in scenarios(database).values() if each["complete"]]
     written: dict[str, list[float]] = {}
     for document in database["json/speed"].find():

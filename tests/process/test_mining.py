@@ -69,7 +69,7 @@ def files(dataset: Path) -> dict[str, bytes]:
 
 
 def requested(folder: Path, question: str) -> list[tuple[Any, ...]]:
-    """What DuckDB answers in that folder."""
+    """The result of a DuckDB query in that folder."""
     with duckdb.connect() as database:
         table = database.sql(re.sub("'(?=[a-z0-9]+/)", f"'{folder}/", question)).to_arrow_table()
         return [tuple(row.values()) for row in table.to_pylist()]

@@ -39,7 +39,7 @@ OTHER = plugin_rule("other", when="p.count - 4 * double(int(p.count / 4)) >= 2",
 
 
 class CollectingSink:
-    """Where events go."""
+    """Collects events and discards everything else."""
 
     def __init__(self) -> None:
         self.all: list[Event] = []

@@ -178,7 +178,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     if os.geteuid() != 0 or subprocess.run(mount, check=False).returncode:
         pytest.skip("a disk of its own needs root")
     yield disk
-    subprocess.run(["umount", "--lazy", disk], check=True)  # somebody may still look at it
+    subprocess.run(["umount", "--lazy", disk], check=True)  # a process may still use it
 
 
 def somebody_else_fills_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:

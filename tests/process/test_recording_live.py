@@ -143,7 +143,7 @@ def until_written(process: Process, payload: bytes) -> None:
 
 
 def stored(process: Process, database: Any, scenario: dict[str, Any]) -> list[Recorded]:
-    """What the database has of a scenario; a cloud by its points alone, from the file beside it."""
+    """The stored documents of a scenario; a cloud only by its points, from its file."""
     found = []
     for collection in scenario["messages"]:
         for document in database[collection].find({"scenario": scenario["_id"]}):
@@ -222,7 +222,7 @@ def contents(recording: Path) -> tuple[Any, list[Recorded]]:
 
 
 def clips_of(process: Process) -> dict[str, tuple[Any, list[Recorded]]]:
-    """What a replay cuts from the intake that the detector recorded."""
+    """The clips that a replay extracts from the recorded intake."""
     command = ["detector", "replay", "intake", "--output", "replayed", "--record"]
     replay = programs.Program(command, process.folder / "replay.log", folder=process.folder)
     assert replay.wait(PATIENCE) == 0, (process.folder / "replay.log").read_text()

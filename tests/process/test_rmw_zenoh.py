@@ -44,7 +44,7 @@ MOVED = a_rule("moved", signals=[{"name": "x", "stream": "pose", "value": "msg.p
 
 
 def attachment(number: int, gid: bytes, *, named: bool = False) -> zenoh.ZBytes:
-    """As rmw_zenoh writes it, with Zenoh's own serializer; `named`: as its earlier versions did."""
+    """The attachment in the format of rmw_zenoh; `named`: of its earlier versions."""
     values = {"sequence_number": zenoh.ext.Int64(number), "source_timestamp": zenoh.ext.Int64(1_767_225_600 * 10**9)}
     parts = [
         part.to_bytes()

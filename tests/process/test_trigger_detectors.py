@@ -250,7 +250,7 @@ def test_a_restarted_requester_without_its_episode_stops_the_recording(rsu: Peer
 
 
 def test_a_recorder_that_is_killed_continues_when_it_is_back(rsu: Peer, town: Peer) -> None:
-    """What it had is kept as cut; the requester repeats the start within seconds."""
+    """The existing part is kept as truncated; the requester repeats the start within seconds."""
     town.send("car1", {"v": 20})
     wait_for(lambda: recording(town.endpoint), PATIENCE)
     town.send("car1", {"n": 1}, "pose")

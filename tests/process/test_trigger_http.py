@@ -29,7 +29,7 @@ from wayside.api.actions import trigger as api
 
 
 class NoMessenger:
-    """Where no Zenoh session is needed."""
+    """A messenger for actions that use no Zenoh."""
 
     def publish(self, key: str, payload: bytes, encoding: str) -> None:
         raise AssertionError(key)

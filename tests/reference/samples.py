@@ -105,7 +105,7 @@ class Received:
                     self.gone[each.number] = now
 
     def _held(self, client: str, stream: str, then: int | None = None) -> list[Sample]:
-        """What the buffer has of a client's stream, in order; `then`: what it had at that time."""
+        """The buffered samples of a client's stream, in order; `then`: those at that time."""
         mine = [each for each in self.samples if (each.client, each.stream) == (client, stream)]
         return sorted(
             (each for each in mine if each.number not in self.gone or self.gone[each.number] > (then or math.inf)),
@@ -119,7 +119,7 @@ class Received:
             known.last = time
 
     def lose(self, now: int) -> set[str]:
-        """Who has been silent for too long."""
+        """Remove and return the clients that were silent for too long."""
         stale = [limit for limit in (self.stale_after[stream] for stream in self.items) if limit is not None]
         patience = min([*stale, self.timeout])
         lost = {
@@ -137,7 +137,7 @@ class Received:
         return sorted(mine, key=lambda each: (each.time, each.number))
 
     def kept(self, client: str, stream: str, now: int) -> list[Sample]:
-        """Those that the buffer still shows: of the last seconds, and the newest in any case."""
+        """The visible samples: those of the last seconds, and always the newest."""
         mine = [each for each in self._held(client, stream, now) if each.time <= now]
         return [each for each in mine if each.time > now - self.durations[stream]] or mine[-1:]
 

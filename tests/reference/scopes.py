@@ -150,7 +150,7 @@ def _closing_speed(position: dict[str, str], a: str, b: str, received: Received,
 
 
 def _limits(position: dict[str, str], received: Received) -> list[int]:
-    """How old a place may be; none of these where it has no age."""
+    """The age limits of a position; none if it never expires."""
     stale = received.stale_after[position["stream"]]
     oldest = nanoseconds(position["maxAge"]) if "maxAge" in position else None if stale is None else SECOND
     return [limit for limit in (stale, oldest) if limit is not None]

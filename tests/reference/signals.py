@@ -59,7 +59,7 @@ class Start:
 
 @dataclass(frozen=True)
 class Item:
-    """What a signal looks at: a sample, or a start."""
+    """The input of a signal: a sample or a start."""
 
     time: int
     message: Any
@@ -76,7 +76,7 @@ def of_rule(signal: dict[str, Any]) -> tuple[str, bool]:
 
 @dataclass
 class Sources:
-    """All that signals are computed from."""
+    """The inputs of signals."""
 
     received: Received
     starts: list[Start]

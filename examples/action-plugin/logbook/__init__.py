@@ -22,7 +22,7 @@ from detector.actions import (
 
 
 class LogbookParameters(ActionParameters):
-    """Where the logbook is."""
+    """The path of the logbook."""
 
     path: str = Field(min_length=1)
     """A file, one line of JSON an episode; its folder must be there."""

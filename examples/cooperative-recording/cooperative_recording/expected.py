@@ -1,4 +1,4 @@
-"""What the applications should do, computed from the simulated positions alone.
+"""The expected applications, computed from the simulated positions alone.
 
 This is the judge of the whole chain, so it shares nothing with it: no engine, no rules, no merging, only geometry and
 interval arithmetic. Times are seconds into the drive, exact crossings of the thresholds; comparisons must allow for

@@ -20,7 +20,7 @@ class UnreachableError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Published:
-    """What was published: stamps begin at start_ns; lag_s is how late the latest message was sent, in seconds."""
+    """The published drive: stamps begin at start_ns; lag_s is the delay of the latest message, in seconds."""
 
     start_ns: int
     messages: int

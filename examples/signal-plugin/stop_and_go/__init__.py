@@ -12,7 +12,7 @@ MetresPerSecond = Annotated[float, Field(ge=0, le=100)]
 
 
 class StopAndGoParameters(PluginParameters):
-    """What counts as a stop."""
+    """The definition of a stop."""
 
     stream: StreamName
     """Its messages have the speed in `v`, in m/s."""
@@ -21,7 +21,7 @@ class StopAndGoParameters(PluginParameters):
     going: MetresPerSecond = 3.0
     """Above this speed it is going again."""
     over: Seconds = 60.0
-    """How long a stop is remembered."""
+    """The time for which a stop counts."""
 
 
 class StopAndGo(Plugin[StopAndGoParameters]):

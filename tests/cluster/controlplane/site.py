@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Site:
-    """What differs between the places.
+    """The settings that differ between the places.
 
     Attributes:
         address: that the API server listens on.

@@ -56,7 +56,7 @@ class Enclosure:
 
     @property
     def enter(self) -> tuple[str, ...]:
-        """What to put before a command line, so that it runs inside."""
+        """The prefix of a command line that runs it inside."""
         assert self._target, "the enclosure is not open"
         return ("nsenter", f"--target={self._target}", "--mount", "--net", "--pid", "--")
 

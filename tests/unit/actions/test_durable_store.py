@@ -12,7 +12,7 @@ from detector.actions.store import DurableStore, StoreError, StoreInUseError, ac
 
 
 class Losses(list[tuple[int, str]]):
-    """What a store lost."""
+    """Counts and reasons of a store's losses."""
 
     def __call__(self, count: int, why: str) -> None:
         self.append((count, why))

@@ -48,7 +48,7 @@ def pod(one: Detector, defaults: PodDefaults = DEFAULTS) -> dict[str, Any]:
 
 
 def mounted(one: Detector) -> dict[str, Any]:
-    """What is mounted, by path."""
+    """The volume mounts by path."""
     spec = pod(one)
     volumes = {each["name"]: each for each in spec["volumes"]}
     (container,) = spec["containers"]

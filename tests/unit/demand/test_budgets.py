@@ -31,7 +31,7 @@ def made(name: str) -> ApplicationTask:
 
 
 def expected(live: set[str]) -> set[str]:
-    """Those within both budgets, counted from the beginning."""
+    """The tasks within both budgets, counted from the oldest."""
     within: list[str] = []
     taken: dict[str | None, int] = {}
     for name in sorted(live, reverse=True):

@@ -11,7 +11,7 @@ from detector.engine.samples.sample import DecodeError, Decoder
 from wayside.expressions.numbers import MAX_EXACT
 
 _LARGE = (b"\xff\xff\xff\xff", b"\xff\xff\xff\x7f", b"\x00\x00\x00\x80", b"\x7f\xff\xff\xff\xff\xff\xff\xff")
-"""What makes a length or a count enormous, or negative."""
+"""Bytes that make a length or a count huge or negative."""
 
 
 def payloads(valid: Sequence[bytes], count: int, seed: int) -> Iterator[bytes]:

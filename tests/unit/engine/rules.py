@@ -24,7 +24,7 @@ def near(name: str = "near", **spec: Any) -> Any:
 
 
 def demanded(drive: Drive) -> dict[str, Any]:
-    """What is demanded, by action."""
+    """The demands by action."""
     return {demand.action: (demand.template, demand.parameters) for demand in drive.engine.demands().values()}
 
 

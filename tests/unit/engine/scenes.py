@@ -28,7 +28,7 @@ _VALUES: list[dict[str, Any]] = [
 
 
 class Operation(NamedTuple):
-    """What is done to the engine."""
+    """An operation on the engine."""
 
     kind: str
     what: Any
@@ -133,7 +133,7 @@ def a_scene(seed: int) -> Scene:
 
 
 class Outcome(NamedTuple):
-    """What came of a scene."""
+    """The result of a scene."""
 
     events: list[str]
     demands: list[list[tuple[str, str]]]

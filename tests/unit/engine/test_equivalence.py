@@ -107,7 +107,7 @@ def by_the_engine(scene: Scene, cut: int) -> list[Event]:
 
 
 def _given(fields: dict[str, Any]) -> dict[str, Any]:
-    """Those that are given; numbers of bytes as the kind wants them."""
+    """The given fields, with byte counts in the form of the kind."""
     return {name: str(value) if name == "bytes" else value for name, value in fields.items() if value is not None}
 
 

@@ -32,7 +32,7 @@ class Span(NamedTuple):
 
 
 class User:
-    """What is known of a road user at each tick: its newest sample, and how old that is."""
+    """A road user at each tick: its newest sample and the age of that."""
 
     def __init__(self, name: str, times: Doubles, fields: dict[str, Any]) -> None:
         self.name = name

@@ -38,7 +38,7 @@ def steps(text: str) -> Iterator[Step]:
 
 
 def run(command: list[str]) -> str:
-    """What it prints; `>` sends it into a file."""
+    """The output of the command; `>` redirects it into a file."""
     target = None
     if command[-2:-1] == [">"]:
         command, target = command[:-2], Path(command[-1])

@@ -36,7 +36,7 @@ def test_open_tasks_are_counted_at_their_most() -> None:
 
 def test_a_simulated_manager_serves_tasks_one_by_one() -> None:
     found = waits(np.array([0.0, 1, 1, 10]), 2.0, 1, np.random.default_rng(SEED))
-    assert sorted(found) == [0, 0, 0, 1, 3]  # the first 0 is of nobody: an empty queue
+    assert sorted(found) == [0, 0, 0, 1, 3]  # the first 0 stands for an empty queue
 
 
 def test_an_unknown_or_non_numeric_assumption_is_rejected() -> None:

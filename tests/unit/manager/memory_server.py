@@ -29,7 +29,7 @@ class MemoryServer:
     def __init__(self, *objects: Object) -> None:
         self.objects: dict[tuple[str, str], Object] = {}
         self.written: list[tuple[str, str, str]] = []
-        """What was done, to which kind and name, in order."""
+        """The operations with kind and name, in order."""
         self._number = 0
         for each in objects:
             self.put(each)

@@ -37,7 +37,7 @@ def answering(monkeypatch: pytest.MonkeyPatch, *events: Event) -> None:
 
 
 async def watched(taken: list[Event], measures: Measures, *, unreachable: bool = False) -> list[Any]:
-    """What kopf sees of a watch; what is relayed goes into `taken`."""
+    """The events of a watch that kopf sees; relayed events go into `taken`."""
 
     def observe(raw: Any) -> None:
         taken.append(("there", raw["metadata"]["name"]))

@@ -40,7 +40,7 @@ CLOSING: dict[str, Any] = {
 
 
 class User(NamedTuple):
-    """Somebody who goes straight over the crossing: in the middle of the lane at `start` (s), at a speed (m/s)."""
+    """A road user that crosses straight: in the middle of the lane at `start` (s), at a speed (m/s)."""
 
     name: str
     start: float

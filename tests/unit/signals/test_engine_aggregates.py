@@ -71,7 +71,7 @@ class Sent:
 
     @property
     def value(self) -> Any:
-        """What VALUE makes of it; None where that is unknown."""
+        """The result of VALUE; None if unknown."""
         if not isinstance(self.payload, dict):
             return None
         if "z" in self.payload:
@@ -80,7 +80,7 @@ class Sent:
 
     @property
     def truth(self) -> bool | None:
-        """What TRUTH makes of it; None where that is unknown or a text."""
+        """The result of TRUTH; None if unknown or a text."""
         if not isinstance(self.payload, dict):
             return None
         if "z" in self.payload:

@@ -40,7 +40,7 @@ def test_the_signal_is_unknown_while_stale_or_while_its_client_is_unknown() -> N
     count.pop("value")
     never = a_rule("never", signals=[SPEED, count], when="speed > 1 && reds == 0", evaluation={"every": "1s"})
     drive = Drive(DETECTOR, RED, never)
-    assert drive.take(*(speed(n / 2, "a", 5) for n in range(1, 4)), until=1.9) == []  # nobody knows of the light
+    assert drive.take(*(speed(n / 2, "a", 5) for n in range(1, 4)), until=1.9) == []  # the light is not known yet
     reported = drive.take(light(2.5, "green"), *(speed(n / 2, "a", 5) for n in range(5, 9)), until=4)
     assert reported == ["never a started 3"]
     reported = drive.take(light(4.1, "red"), *(speed(n / 2, "a", 5) for n in range(9, 20)), until=9.9)
