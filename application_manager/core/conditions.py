@@ -47,6 +47,8 @@ def updated(
     """
     states = list(states)
     gone = set(only_while) - {each.type for each in states}
+    # Also gone is what becomes known only now: the default of a new object would be in front of what it follows from.
+    gone |= {each.type for each in known if each.status == "Unknown"} & {s.type for s in states if not s.unknown}
     by_type = {each.type: each for each in known if each.type not in gone}
     for state in states:
         old = by_type.get(state.type)

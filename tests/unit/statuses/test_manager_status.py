@@ -39,6 +39,12 @@ def test_only_a_changed_status_or_reason_gives_an_event() -> None:
     assert changed(first, updated(first, [ConditionState("Ready", False, "NotReady", "0 of 2")], 2, NOW)) == []
 
 
+def test_the_conditions_of_a_new_object_come_in_the_order_in_which_they_follow() -> None:
+    (pending,) = updated((), [ConditionState("Ready", False, "Pending", unknown=True)], 0, NOW)
+    written = updated([pending], [ConditionState("Accepted", True, "A"), ConditionState("Ready", True, "R")], 1, NOW)
+    assert [(each.type, each.status) for each in written] == [("Accepted", "True"), ("Ready", "True")]
+
+
 def test_a_tasks_phases_follow_its_instance() -> None:
     phases = [
         task_status(task("a"), COUNTS, progress, NOW, 0).phase
