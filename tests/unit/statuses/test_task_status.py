@@ -12,7 +12,7 @@ from rich.console import Console, RenderableType
 from detector.actions.deploy.file_store import FileTaskStore
 from detector.actions.deploy.lease import HolderLease, ProcessIdentity
 from detector.actions.deploy.reconciler import DemandReconciler
-from detector.live.answers import lease_status, task_status
+from detector.live.answers import lease_status, reconciler_status
 from detector.status.model import LeaseStatus, Status, TaskStatus, read_status, to_json
 from detector.status.table import status_view, total_view
 from detector.status.total import total
@@ -46,7 +46,7 @@ def test_the_status_has_the_counts_of_the_reconciler(tmp_path: Path) -> None:
             await eventually(lambda: ends(tmp_path)[A.name] is not None, "the first has ended")
         return reconciler
 
-    assert task_status(asyncio.run(drive())) == TaskStatus(created=2, ended=1)
+    assert reconciler_status(asyncio.run(drive())) == TaskStatus(created=2, ended=1)
 
 
 def test_tasks_that_wait_for_a_change_are_pending_and_refusals_have_reasons(tmp_path: Path) -> None:
@@ -56,7 +56,7 @@ def test_tasks_that_wait_for_a_change_are_pending_and_refusals_have_reasons(tmp_
         reconciler.update(by_name(A, B), {})
         await eventually(lambda: reconciler.pending == 2, "both wait for the Lease")
         reconciler.counts.refused["Forbidden"] += 1
-        status = task_status(reconciler)
+        status = reconciler_status(reconciler)
         reconciler.stop()
         await running
         return status
