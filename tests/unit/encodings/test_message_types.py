@@ -166,9 +166,9 @@ A, B = "a_msgs/msg/A", "a_msgs/msg/B"
         ("int32 x\nfloat64\n", "line 2: 'float64' is not a line"),
         ("int32 x\n\n# ok\nint32 ü", "line 4: 'int32 ü' is not a line"),
         ("int32 x\nint64 x", "line 1: x is given twice"),
-        ("int32 x\nB b", "line 2: b is of a_msgs/msg/B, which is unknown"),
-        ("other/B[] b", "line 1: b is of other/msg/B, which is unknown"),
-        ("int32 x\n===\nMSG: other/B\nint8 y\nC c", "line 5: c is of other/msg/C, which is unknown"),
+        ("int32 x\nB b", "line 2: b has the type a_msgs/msg/B, which is unknown"),
+        ("other/B[] b", "line 1: b has the type other/msg/B, which is unknown"),
+        ("int32 x\n===\nMSG: other/B\nint8 y\nC c", "line 5: c has the type other/msg/C, which is unknown"),
         ("wstring w", "wide strings"),
         ("int32[99999999999] x", "x has 99999999999 elements"),
         ("A a", r"contains itself (a_msgs/msg/A → a_msgs/msg/A)"),
@@ -236,7 +236,7 @@ def problems(path: Path, text: str) -> list[str]:
 def test_check_reports_where_a_definition_is_missing_or_wrong(tmp_path: Path) -> None:
     path = tmp_path / "d.yaml"
     others, tracks = sorted(problems(path, DETECTOR))
-    assert others.startswith("10:19: spec.messages[0].definition: line 2: tracks is of fleet_msgs/msg/Track, which is")
+    assert others.startswith("10:19: spec.messages[0].definition: line 2: tracks has the type fleet_msgs/msg/Track")
     assert tracks.startswith("7:79: spec.streams[1].type: streams[others].type: unknown message type")
     assert "give its definition in spec.messages" in tracks
     whole = DETECTOR.replace("Others}", "Tracks}").replace("Track[] tracks", "float64[] tracks")
@@ -378,7 +378,9 @@ def test_a_definition_that_cannot_be_read_is_an_error_unless_the_type_is_known(
 
 
 def test_an_incomplete_definition_in_a_recording_is_reported(tmp_path: Path) -> None:
-    with pytest.raises(DetectorError, match=r"spec\.messages\[0\]\.definition: line 1: x is of fleet_msgs/msg/Nowhere"):
+    with pytest.raises(
+        DetectorError, match=r"messages\[0\]\.definition: line 1: x has the type fleet_msgs/msg/Nowhere"
+    ):
         stream_readers(with_recorded(mcap(tmp_path / "a.mcap", "Nowhere x")))
 
 

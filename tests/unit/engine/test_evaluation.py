@@ -249,7 +249,7 @@ def test_a_replay_with_pauses_requests_and_skipped_evaluations_gives_the_same_ev
     ("evaluation", "message"),
     [
         ({"every": "1s", "onSample": "speed"}, "at most one of every, onSample and onDemand"),
-        ({"onDemand": False}, "onDemand: write true"),
+        ({"onDemand": False}, "onDemand: must be true; got false"),
         ({"every": "1ms"}, "every: must be 10ms or more; got 1ms"),
     ],
 )

@@ -64,7 +64,11 @@ def test_a_missing_plugin_is_reported_with_the_existing_ones(tmp_path: Path) -> 
         ("counting", "{stream: spede}", "parameters.stream: the Detector has no stream spede; did you mean speed?"),
         ("counting", "{stream: speed, limit: x}", "parameters.limit: must be a valid number"),
         ("counting", "{stream: speed, raisAt: 3}", "parameters.raisAt: unknown field"),
-        ("not-a-plugin", "{}", "plugin.name: plugin not-a-plugin is tests.plugins.signals:CountingParameters"),
+        (
+            "not-a-plugin",
+            "{}",
+            "plugin.name: plugin not-a-plugin must be a complete subclass of detector.plugins.base.Plugin",
+        ),
         ("broken", "{}", "plugin.name: cannot load plugin broken: ModuleNotFoundError"),
     ],
 )
