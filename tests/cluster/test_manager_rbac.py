@@ -331,9 +331,7 @@ def test_a_missing_essential_right_ends_the_start_with_one_line(
     environment = {"KUBECONFIG": str(account)}
     manager = processes.start("application-manager", "run", "--namespace", namespace, *ALLOWED, environment=environment)
     assert manager.wait() == 2
-    logged = (
-        f"its service account cannot watch applicationtasks of wayside.dev in namespace {namespace}, so nothing can"
-    )
+    logged = f"its service account cannot watch applicationtasks of wayside.dev in namespace {namespace}, so no task is"
     assert logged in manager.output()
     assert "apply the output of `application-manager rbac`" in manager.output()
 

@@ -104,7 +104,7 @@ def test_an_alert_whose_end_comes_while_it_is_sent_as_firing_is_resolved_next(th
     first, second = posted(there, 2)
     assert parse_time(first["endsAt"]) > parse_time(second["endsAt"])
     failed = harness.outcome("e1", OutcomeState.FAILED)
-    assert "accepted only after the end of the episode" in failed.message
+    assert "accepted the alert only after the end of the episode" in failed.message
     assert harness.lost[NOBODY] == 1
     harness.end()
 
