@@ -14,8 +14,8 @@ from cryptography.x509.oid import NameOID
 from hypothesis import given
 from hypothesis import strategies as st
 
+from detector import access as mounted_files
 from detector.access import AccessError, LoadedCredentials, expiry, read_credentials
-from detector.access import mounted as mounted_files
 from tests.certificates import Authority
 from wayside.api.access import Access
 
