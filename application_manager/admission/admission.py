@@ -36,7 +36,7 @@ from application_manager.core.findings.injections import (
     injection,
     read_pod,
 )
-from application_manager.core.findings.reviews import OverloadedError, Request, Weight, answer, read
+from application_manager.core.findings.reviews import OverloadedError, Request, ReviewEffect, answer, read
 from application_manager.core.findings.rulefindings import RuleContext
 from application_manager.core.findings.templatefindings import template_findings
 from application_manager.core.objects.detectors import deployment_to_try
@@ -86,7 +86,7 @@ class Admission:
         request = read(review)
         looked_after = not self.namespaces or request.namespace in self.namespaces
         findings = Findings()
-        if request.weight is not Weight.NONE and looked_after:
+        if request.weight is not ReviewEffect.NONE and looked_after:
             findings = await self._in_turn(request)
         response = answer(request, findings)
         given = response["response"]

@@ -18,7 +18,7 @@ from wayside.kubernetes.resources import Object
 
 
 @dataclass(frozen=True, slots=True)
-class Processed:
+class ProcessedState:
     """The condition Running of one generation of a Detector."""
 
     uid: str
@@ -41,7 +41,7 @@ class DetectorIndex:
 
     defaults: PodDefaults | None = None
     objects: MembersByGroup[str, str, Object] = field(default_factory=MembersByGroup)
-    processed: dict[Name, Processed] = field(default_factory=dict)
+    processed: dict[Name, ProcessedState] = field(default_factory=dict)
     requesting: dict[Name, list[Object]] = field(default_factory=dict)
     _troubles: dict[Name, list[Trouble]] = field(default_factory=dict)
 

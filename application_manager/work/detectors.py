@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
 from application_manager.cache.cluster_cache import DETECTOR, ClusterCache
-from application_manager.cache.detector_index import DetectorIndex, Processed
+from application_manager.cache.detector_index import DetectorIndex, ProcessedState
 from application_manager.core.conditions import ConditionState
 from application_manager.core.findings.injections import injection
 from application_manager.core.findings.rulefindings import detector_findings
@@ -81,7 +81,7 @@ class DetectorWork:
             self.index.processed.pop(name, None)
             return
         running = await self._make(name, detector)
-        processed = Processed(entry.uid, detector.metadata.generation, running)
+        processed = ProcessedState(entry.uid, detector.metadata.generation, running)
         if self.index.processed.get(name) != processed:
             self.index.processed[name] = processed
             self.validate(name)

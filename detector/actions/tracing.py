@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from detector.engine.consequences import Consequence, EpisodeOver, RunStarted
+from detector.engine.consequences import Consequence, EpisodeEnded, RunStarted
 from detector.engine.episodes.demands import Demand
 from detector.engine.episodes.events import Event
 from detector.engine.episodes.record import EpisodeRecord
@@ -40,7 +40,7 @@ class EpisodeTraces:
     def consequences(self, consequences: Sequence[Consequence]) -> list[Consequence]:
         """The same for the consequences of actions."""
         return [
-            replace(each, event=self.event(each.event)) if isinstance(each, RunStarted | EpisodeOver) else each
+            replace(each, event=self.event(each.event)) if isinstance(each, RunStarted | EpisodeEnded) else each
             for each in consequences
         ]
 

@@ -21,7 +21,7 @@ from detector.actions.outcomes import ActionKey, Outcomes
 from detector.engine.consequences import (
     ActionRun,
     Consequence,
-    EpisodeOver,
+    EpisodeEnded,
     RunCompleted,
     RunSamples,
     RunStarted,
@@ -179,7 +179,7 @@ class Worker:
                 action.started(episode)
             case RunSamples(samples=samples):
                 action.samples(episode, samples)
-            case EpisodeOver(event=event):
+            case EpisodeEnded(event=event):
                 reason = None if event.reason is None else event.reason.value
                 ended = replace(episode, end_time=event.end_time, reason=reason, ended=event.cloud_event())
                 if (again := event.rendered.get(run.action)) is not None:

@@ -185,7 +185,7 @@ class RunSamples:
 
 
 @dataclass(frozen=True, slots=True)
-class EpisodeOver:
+class EpisodeEnded:
     """The episode ended."""
 
     run: ActionRun
@@ -202,7 +202,7 @@ class RunCompleted:
     """Why the window ended early; empty if it did not."""
 
 
-Consequence = RunStarted | RunSamples | EpisodeOver | RunCompleted
+Consequence = RunStarted | RunSamples | EpisodeEnded | RunCompleted
 
 
 class Consequences:
@@ -324,7 +324,7 @@ class Consequences:
         excerpt = self._running[run]
         if excerpt is not None and excerpt.until is not None:
             return  # it has ended already; its window is still open
-        self._noted.append(EpisodeOver(run, event))
+        self._noted.append(EpisodeEnded(run, event))
         if excerpt is None or event.end_time is None:
             self._complete(run, "")
         else:
@@ -335,7 +335,7 @@ class Consequences:
         begun = self._requested.pop(run, None)
         if begun is not None and excerpt is not None and not cut:
             self._noted.append(
-                EpisodeOver(run, msgspec.structs.replace(begun, end_time=excerpt.until, reason=EndReason.UNTIL))
+                EpisodeEnded(run, msgspec.structs.replace(begun, end_time=excerpt.until, reason=EndReason.UNTIL))
             )
         if excerpt is not None and self.watch_late and not cut:
             self._complete_ones.append(excerpt)

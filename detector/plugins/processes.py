@@ -23,7 +23,7 @@ from typing import Any
 from detector.engine.queries.queries import Queries
 from detector.engine.scoping.plugins import PluginCall, PluginFailedError
 from detector.plugins.outages import Outages
-from detector.plugins.wire import ClosedError, Wire
+from detector.plugins.wire import ClosedError, PluginConnection
 from wayside.expressions import Reason, Value
 from wayside.rules import CompiledPlugin, CompiledRule
 
@@ -56,7 +56,7 @@ class SignalProcess:
         self._plugin = plugin
         self._monotonic = monotonic
         self._process: subprocess.Popen[bytes] | None = None
-        self._wire: Wire | None = None
+        self._wire: PluginConnection | None = None
         self._ready = False
         self._subjects: set[str] = set()
         self._starts = 0
@@ -80,7 +80,7 @@ class SignalProcess:
                 pass_fds=(theirs.fileno(),),
                 env={**os.environ, "PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))},
             )
-        self._wire = Wire(ours)
+        self._wire = PluginConnection(ours)
         self._wire.send("start", self._plugin.plugin, self._plugin.parameters)
 
     def is_ready(self, within: float, *, again: bool) -> bool:
@@ -172,7 +172,9 @@ class SignalProcess:
         return self.why
 
 
-def _reply(wire: Wire, queries: Queries, method: str, arguments: list[Any], options: Mapping[str, Any]) -> None:
+def _reply(
+    wire: PluginConnection, queries: Queries, method: str, arguments: list[Any], options: Mapping[str, Any]
+) -> None:
     try:
         if method not in _QUERIES:
             raise ValueError(f"there is no query {method}")

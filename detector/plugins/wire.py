@@ -26,7 +26,7 @@ class ClosedError(Exception):
     """The other side has closed the connection."""
 
 
-class Wire:
+class PluginConnection:
     """One end of the connection.
 
     A message may arrive in pieces, and the time of a `receive` may end in between: the pieces are kept for the next

@@ -23,7 +23,7 @@ from detector.engine.queries.transforms import TransformError
 from detector.plugins.base import PluginSubject
 from detector.plugins.entrypoints import PluginError
 from detector.plugins.instances import Instances, failure_text
-from detector.plugins.wire import ClosedError, Wire
+from detector.plugins.wire import ClosedError, PluginConnection
 
 _RAISED = {kind.__name__: kind for kind in (TransformError, PoseError, QueryError)}
 
@@ -33,7 +33,7 @@ _Samples = list[DecodedSample]
 class RemoteQueries:
     """The queries of Queries, sent to the detector."""
 
-    def __init__(self, wire: Wire, now: int) -> None:
+    def __init__(self, wire: PluginConnection, now: int) -> None:
         self._wire = wire
         self._now = now
 
@@ -100,7 +100,7 @@ class RemoteQueries:
         return msgspec.convert(content[0], kind)
 
 
-def _serve(wire: Wire) -> None:
+def _serve(wire: PluginConnection) -> None:
     """Respond until the detector closes the connection."""
     _, plugin, parameters = wire.receive()
     try:
@@ -124,7 +124,7 @@ def _serve(wire: Wire) -> None:
 
 
 def _value(
-    instances: Instances, wire: Wire, subject: str, element: str | None, clients: list[str], now: int
+    instances: Instances, wire: PluginConnection, subject: str, element: str | None, clients: list[str], now: int
 ) -> tuple[str, Any]:
     try:
         return "result", instances.value(PluginSubject(subject, element), tuple(clients), RemoteQueries(wire, now))
@@ -147,7 +147,7 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_leave_with_the_detector, daemon=True).start()
     with contextlib.suppress(ClosedError):
-        _serve(Wire(socket.socket(fileno=int(sys.argv[1]))))
+        _serve(PluginConnection(socket.socket(fileno=int(sys.argv[1]))))
 
 
 if __name__ == "__main__":

@@ -37,7 +37,7 @@ class OverloadedError(Exception):
     """Too many reviews are in progress."""
 
 
-class Weight(Enum):
+class ReviewEffect(Enum):
     """The effect of findings on a review."""
 
     NONE = "not checked"
@@ -61,7 +61,7 @@ class Request:
     namespace: str
     object: Json
     old: Json | None
-    weight: Weight
+    weight: ReviewEffect
 
 
 def request_in(review: Any) -> Json:
@@ -87,27 +87,27 @@ def read(review: Any) -> Request:
         new |= {"apiVersion": API_VERSION, "kind": name}
         named = {"name": raw.get("name") or "unnamed", **_metadata(new), "namespace": namespace}
         new["metadata"] = named
-    weight = _weight(raw, new, old) if ours else Weight.NONE
+    weight = _weight(raw, new, old) if ours else ReviewEffect.NONE
     return Request(raw["uid"], name, namespace, new, old, weight)
 
 
-def _weight(raw: Mapping[str, Any], new: Json, old: Json | None) -> Weight:
+def _weight(raw: Mapping[str, Any], new: Json, old: Json | None) -> ReviewEffect:
     operation = raw.get("operation")
     if operation not in ("CREATE", "UPDATE") or raw.get("subResource") or not new:
-        return Weight.NONE
+        return ReviewEffect.NONE
     if _metadata(new).get("deletionTimestamp"):
-        return Weight.NONE
+        return ReviewEffect.NONE
     if operation == "CREATE" or old is None or new.get("spec") != old.get("spec"):
-        return Weight.REFUSED
+        return ReviewEffect.REFUSED
     # Labels determine which Detectors select a rule.
-    return Weight.WARNED if _metadata(new).get("labels") != _metadata(old).get("labels") else Weight.NONE
+    return ReviewEffect.WARNED if _metadata(new).get("labels") != _metadata(old).get("labels") else ReviewEffect.NONE
 
 
 def answer(request: Request, findings: Findings) -> Json:
     """The AdmissionReview of the response."""
-    if request.weight is Weight.NONE:
+    if request.weight is ReviewEffect.NONE:
         findings = Findings()
-    refused = request.weight is Weight.REFUSED and bool(findings.problems)
+    refused = request.weight is ReviewEffect.REFUSED and bool(findings.problems)
     response: Json = {"uid": request.uid, "allowed": not refused}
     warnings = findings.warnings if refused else findings.all
     if warnings:

@@ -15,7 +15,7 @@ _BUSY = frozenset({429, 502, 503, 504})
 """Responses of an endpoint that is busy, whatever the request."""
 
 
-class Disposition(Enum):
+class ResponseOutcome(Enum):
     """The consequence of a response."""
 
     DONE = "done"
@@ -50,16 +50,16 @@ class Answer:
         return self.status in _BUSY
 
 
-def judge(answer: Answer) -> tuple[Disposition, str]:
+def judge(answer: Answer) -> tuple[ResponseOutcome, str]:
     """The consequence, and a reason for users."""
     if 200 <= answer.status < 300:
-        return Disposition.DONE, f"answered {answer.status}"
+        return ResponseOutcome.DONE, f"answered {answer.status}"
     response = f"answered {answer.status}" + (f": {answer.excerpt}" if answer.excerpt else "")
     if 300 <= answer.status < 400:
-        return Disposition.FINAL, f"{response}: redirects are not followed: give the new URL"
+        return ResponseOutcome.FINAL, f"{response}: redirects are not followed: give the new URL"
     if answer.status in _AGAIN or answer.status >= 500:
-        return Disposition.AGAIN, response
-    return Disposition.FINAL, response
+        return ResponseOutcome.AGAIN, response
+    return ResponseOutcome.FINAL, response
 
 
 def retry_after_seconds(retry_after: str, now: float) -> float:

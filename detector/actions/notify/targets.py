@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 from detector.access import AccessError, secret_text
 from detector.actions.base import Messenger
-from detector.actions.http import Disposition, HttpClient, HttpError, judge
+from detector.actions.http import HttpClient, HttpError, ResponseOutcome, judge
 from detector.actions.http.answer import retry_after_seconds
 from detector.actions.notify.outbox import AttemptResult, Delivery
 from wayside.api.actions.http import HttpAccess
@@ -69,9 +69,9 @@ class Poster:
         except HttpError as error:
             return Delivery(AttemptResult.AGAIN, str(error), whole=True)
         verdict, why = judge(answer)
-        if verdict is Disposition.DONE:
+        if verdict is ResponseOutcome.DONE:
             return Delivery(AttemptResult.DELIVERED, why)
-        if verdict is Disposition.FINAL:
+        if verdict is ResponseOutcome.FINAL:
             return Delivery(AttemptResult.REFUSED, why)
         return Delivery(
             AttemptResult.AGAIN,

@@ -14,7 +14,7 @@ import time
 from yarl import URL
 
 from detector.actions.base import ActionError, Messenger
-from detector.actions.http import Disposition, HttpClient, HttpError, judge
+from detector.actions.http import HttpClient, HttpError, ResponseOutcome, judge
 from detector.actions.http.client import origin
 from detector.actions.trigger.requests import (
     MAXIMUM_CLIENTS,
@@ -71,7 +71,7 @@ class HttpEndpoint:
             raise
         repeated = again or order.id in self._unanswered
         self._unanswered.discard(order.id)
-        if verdict is Disposition.DONE or (status == _CONFLICT and repeated):
+        if verdict is ResponseOutcome.DONE or (status == _CONFLICT and repeated):
             return Report(Progress.RECORDING)
         return Report(Progress.FAILED, message)
 
@@ -80,7 +80,7 @@ class HttpEndpoint:
         if self._wanted.stop is None:
             return Report(Progress.DONE)
         status, verdict, message = self._send("stop", self._wanted.stop, order)
-        if verdict is Disposition.DONE:
+        if verdict is ResponseOutcome.DONE:
             return Report(Progress.DONE)
         return Report(Progress.DONE if status in _GONE else Progress.REFUSED, message)
 
@@ -88,7 +88,7 @@ class HttpEndpoint:
         """There is no more information than in the responses."""
         return Report(Progress.DONE)
 
-    def _send(self, name: str, call: HttpCall, order: Order) -> tuple[int, Disposition, str]:
+    def _send(self, name: str, call: HttpCall, order: Order) -> tuple[int, ResponseOutcome, str]:
         """The status, its consequence and the message. Raises ActionError if a retry is worthwhile."""
         body = nested_value(order.rendered, "http", name, "body")
         if body is None:
@@ -106,7 +106,7 @@ class HttpEndpoint:
         except (HttpError, ValueError) as error:
             raise ActionError(str(error)) from error
         verdict, message = judge(answer)
-        if verdict is Disposition.AGAIN:
+        if verdict is ResponseOutcome.AGAIN:
             raise ActionError(f"{self.place(order)} {message}")
         return answer.status, verdict, f"{self.place(order)} {message}"
 

@@ -13,7 +13,7 @@ import zenoh
 
 from detector.assembly import DetectorError, stream_readers
 from detector.commands.topics.proposal import Proposal, detector_document, proposals
-from detector.commands.topics.survey import Survey, Topic, message_paths, survey, topic_shape
+from detector.commands.topics.survey import SurveyResult, Topic, message_paths, survey, topic_shape
 from detector.replay.gathering import Recording, intake_file_of, recordings_of
 from detector.replay.message import RecordingError
 from detector.replay.recorded_types import with_recorded_types
@@ -73,7 +73,9 @@ def list_live_topics(connect: Sequence[str], seconds: float, *, as_yaml: bool) -
     _show(found, (), network, as_yaml=as_yaml)
 
 
-def _show(found: Survey, gathered: Sequence[Recording], network: Mapping[str, Any] | None, *, as_yaml: bool) -> None:
+def _show(
+    found: SurveyResult, gathered: Sequence[Recording], network: Mapping[str, Any] | None, *, as_yaml: bool
+) -> None:
     streams = proposals(found.topics)
     if as_yaml:
         typer.echo(yaml_of(streams, gathered, network), nl=False)
@@ -87,7 +89,7 @@ _OURS = "wayside/"
 _ENCODINGS = {"application/json": Encoding.JSON, "application/cbor": Encoding.CBOR, "application/cdr": Encoding.CDR}
 
 
-def listen(config: Zenoh, seconds: float) -> Survey:
+def listen(config: Zenoh, seconds: float) -> SurveyResult:
     """The samples on all keys within `seconds`. Raises NetworkError if there is no session."""
     came: queue.SimpleQueue[tuple[int, zenoh.Sample]] = queue.SimpleQueue()
     topics: dict[str, Topic] = {}
@@ -106,7 +108,7 @@ def listen(config: Zenoh, seconds: float) -> Survey:
             if topic is None:
                 topic = topics[key] = _topic(key, str(sample.encoding).partition(";")[0])
             topic.add(at, sample.payload.to_bytes())
-    return Survey(sorted(topics.values(), key=lambda topic: topic.key), [])
+    return SurveyResult(sorted(topics.values(), key=lambda topic: topic.key), [])
 
 
 def _topic(key: str, encoding: str) -> Topic:

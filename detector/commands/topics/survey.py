@@ -166,7 +166,7 @@ class Topic:
 
 
 @dataclass(frozen=True, slots=True)
-class Survey:
+class SurveyResult:
     """The result for some recordings."""
 
     topics: Sequence[Topic]
@@ -174,7 +174,7 @@ class Survey:
     cuts: Sequence[Truncation]
 
 
-def survey(recordings: Iterable[Recording]) -> Survey:
+def survey(recordings: Iterable[Recording]) -> SurveyResult:
     """Survey recordings, each a sequence of files. Raises RecordingError."""
     topics: dict[tuple[str, str, str | None], Topic] = {}
     cuts: list[Truncation] = []
@@ -184,7 +184,7 @@ def survey(recordings: Iterable[Recording]) -> Survey:
         by_channel: dict[Channel, Topic] = {}
         for batch in open_recordings(recording, on_cut=cuts.append):
             _add(batch, topics, by_channel)
-    return Survey([topics[at] for at in sorted(topics, key=str)], cuts)
+    return SurveyResult([topics[at] for at in sorted(topics, key=str)], cuts)
 
 
 def _add(batch: Batch, topics: dict[tuple[str, str, str | None], Topic], by_channel: dict[Channel, Topic]) -> None:

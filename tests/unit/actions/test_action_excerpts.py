@@ -16,7 +16,7 @@ from detector.engine.consequences import (
     REPLACED,
     ActionRun,
     Consequence,
-    EpisodeOver,
+    EpisodeEnded,
     RunCompleted,
     RunSamples,
     RunStarted,
@@ -128,7 +128,7 @@ def test_exactly_the_samples_of_a_window_are_delivered_once_each(
         each.run for each in reported if isinstance(each, RunStarted) and not completed(reported, each.run)
     }
     begun = [each for each in reported if isinstance(each, RunStarted)]
-    ends = {each.run: each.event.end_time for each in reported if isinstance(each, EpisodeOver)}
+    ends = {each.run: each.event.end_time for each in reported if isinstance(each, EpisodeEnded)}
     for each in begun:
         end = ends.get(each.run)
         expected = [
@@ -168,7 +168,7 @@ PLAIN = a_detector(a_stream("speed"), a_stream("map", latched=True), buffer=BUFF
 def test_a_run_is_passed_on_in_order_and_completed_once_time_has_passed_its_window() -> None:
     engine = an_engine(PLAIN, fast(an_action(before="1s", after="1s")))
     reported = run(engine, speeds((0.55, 0.0), (1.05, 1.0), (2.05, 0.0), (2.55, 0.0)), 3.0)
-    assert order(reported) == ["RunStarted", "RunSamples", "EpisodeOver", "RunSamples"]
+    assert order(reported) == ["RunStarted", "RunSamples", "EpisodeEnded", "RunSamples"]
     engine.advance((), at(3.1))
     assert order(engine.consequences.take(engine.now)) == ["RunCompleted"]
     assert not engine.consequences.running
@@ -227,7 +227,7 @@ def test_a_changed_rule_ends_its_episodes_and_their_windows_continue() -> None:
     run(engine, speeds((0.05, 1.0)), 1.0)
     engine.set_rules([])
     reported = run(engine, speeds((1.5, 1.0), (2.5, 1.0)), 3.0)
-    assert order(reported) == ["EpisodeOver", "RunSamples", "RunCompleted"]
+    assert order(reported) == ["EpisodeEnded", "RunSamples", "RunCompleted"]
     assert [len(each.samples) for each in reported if isinstance(each, RunSamples)] == [1]
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from detector.actions.http import Answer, Disposition, HttpClient, HttpError, judge
+from detector.actions.http import Answer, HttpClient, HttpError, ResponseOutcome, judge
 from detector.actions.http.answer import retry_after_seconds
 from tests.certificates import Authority
 from tests.http_servers import Behaviour, answers, drips, echoes_headers, endpoint, endpoint_for, hangs, nobody, sends
@@ -94,13 +94,13 @@ def test_a_refusal_that_never_ends_is_reported_with_its_status() -> None:
     with endpoint(drips(b"HTTP/1.1 500 No\r\nContent-Type: text/plain\r\n\r\nthe disk is full", b"")) as there:
         answer = send(client("20s"), there.url)
     assert answer.status == 500
-    assert judge(answer)[0] is Disposition.AGAIN
+    assert judge(answer)[0] is ResponseOutcome.AGAIN
 
 
 def test_redirects_are_not_followed() -> None:
     with endpoint() as elsewhere, endpoint(answers(307, Location=elsewhere.url)) as there:
         verdict, why = judge(send(client(), there.url))
-        assert verdict is Disposition.FINAL
+        assert verdict is ResponseOutcome.FINAL
         assert "redirects are not followed" in why
         assert elsewhere.requests == []
 

@@ -11,7 +11,7 @@ import yaml
 from pydantic import ValidationError
 from typer.testing import CliRunner
 
-from application_manager.cache.detector_index import DetectorIndex, Processed
+from application_manager.cache.detector_index import DetectorIndex, ProcessedState
 from application_manager.commands.cli import app
 from application_manager.commands.options import PullPolicy
 from application_manager.core.conditions import find
@@ -315,7 +315,7 @@ def test_a_detector_is_not_ready_before_this_generation_of_it_was_processed() ->
     metadata = restarted.metadata.model_copy(update={"generation": 2})
     changed = restarted.model_copy(update={"metadata": metadata})
     assert readiness(detector_status(changed, [], NOW)) == pending
-    index = DetectorIndex(processed={("site", changed.name): Processed("u-1", 1, runs)})
+    index = DetectorIndex(processed={("site", changed.name): ProcessedState("u-1", 1, runs)})
     assert index.running(restarted) == runs
     assert index.running(changed) is None
     namesake = changed.metadata.model_copy(update={"uid": "u-2", "generation": 1})

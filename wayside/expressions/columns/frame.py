@@ -49,7 +49,7 @@ class Operand:
 
 
 @dataclass(frozen=True, slots=True)
-class Sizes:
+class NodeCounts:
     """The number of nodes of each type."""
 
     numbers: int
@@ -67,7 +67,7 @@ class Memory:
     def __init__(self) -> None:
         self._spare: list[Bytes] = []
 
-    def frame(self, sizes: Sizes, values: Doubles, tags: Bytes | None) -> Frame:
+    def frame(self, sizes: NodeCounts, values: Doubles, tags: Bytes | None) -> Frame:
         """A frame in memory that no other run uses. Thread-safe."""
         needed = sizes.bytes(values.shape[1])
         try:
@@ -94,7 +94,7 @@ class Frame:
     `tagged`: whether any leaf has values other than numbers; otherwise some work is skipped.
     """
 
-    def __init__(self, sizes: Sizes, values: Doubles, tags: Bytes | None, block: Bytes) -> None:
+    def __init__(self, sizes: NodeCounts, values: Doubles, tags: Bytes | None, block: Bytes) -> None:
         n = values.shape[1]
         self.tagged = tags is not None and not bool((tags == NUMBER).all())
         self.leaves = values

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wayside.expressions.columns.cel_fallback import CelChecks, CelRows
-from wayside.expressions.columns.frame import ABSENT, NUMBER, Array, Frame, Memory, Operand, Rows, Sizes
+from wayside.expressions.columns.frame import ABSENT, NUMBER, Array, Frame, Memory, NodeCounts, Operand, Rows
 from wayside.expressions.columns.functions import Called
 from wayside.expressions.columns.nodes import GIVEN, Node, Nodes, NodeType, Op
 from wayside.expressions.columns.operations import UNKNOWN_OF_NUMBERS, Step
@@ -99,7 +99,7 @@ class Program:
                 typed = True
         return not typed or any(self._partial[each] for each in node.operands)
 
-    def _put_into_steps(self, wanted: Sequence[int]) -> tuple[list[Step], Sizes]:
+    def _put_into_steps(self, wanted: Sequence[int]) -> tuple[list[Step], NodeCounts]:
         groups: dict[tuple[object, ...], list[int]] = {}
         depths: dict[int, list[tuple[object, ...]]] = {}
         for number in wanted:
@@ -123,7 +123,7 @@ class Program:
             for key in depths[depth]:
                 numbers = sorted(groups[key], key=lambda each: [self._places[o] for o in self._nodes[each].operands])
                 steps.append(self._step(numbers, counts))
-        return steps, Sizes(counts[Array.NUMBERS], counts[Array.TRUTHS], counts[Array.MIXED])
+        return steps, NodeCounts(counts[Array.NUMBERS], counts[Array.TRUTHS], counts[Array.MIXED])
 
     def _shape(self, node: Node) -> tuple[object, ...]:
         """The common properties of the operands of the nodes in one step."""

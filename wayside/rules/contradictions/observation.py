@@ -22,7 +22,7 @@ _CLOSING_SPEED_NS = 10**9
 
 
 @dataclass(frozen=True)
-class LookBack:
+class LookBackTime:
     """The time that a rule looks back."""
 
     ns: int
@@ -39,18 +39,18 @@ class _Reach(NamedTuple):
     any_time: bool = False
 
 
-def observation(rule: EventRule, others: Mapping[str, EventRule]) -> LookBack:
+def observation(rule: EventRule, others: Mapping[str, EventRule]) -> LookBackTime:
     """The time that the rule looks back, including the rules that it names."""
     return _observation(rule, others, frozenset())
 
 
-def _observation(rule: EventRule, others: Mapping[str, EventRule], above: frozenset[str]) -> LookBack:
+def _observation(rule: EventRule, others: Mapping[str, EventRule], above: frozenset[str]) -> LookBackTime:
     reaches = list(_reaches(rule, others, above | {rule.name}))
     longest = max(reaches, key=lambda reach: reach.ns, default=_Reach(0, ""))
     why = [longest.why] if longest.ns else []
     if rule.spec.for_.ns:
         why.append(f"spec.for: {rule.spec.for_}")
-    return LookBack(
+    return LookBackTime(
         longest.ns + rule.spec.for_.ns,
         " and ".join(why) or "it uses only the newest samples",
         any(reach.any_time for reach in reaches),
@@ -96,7 +96,7 @@ def _reach(at: str, signal: Signal) -> _Reach:
     return _Reach(0, "", any_time=signal.aggregate in _OF_ANY_TIME or signal.rule_name is not None)
 
 
-def looks_back(observed: LookBack) -> str:
+def looks_back(observed: LookBackTime) -> str:
     """The text of an observation, for a warning."""
     if not observed.ns:
         return observed.why
