@@ -44,7 +44,7 @@ async def reconciling(folder: Path, interval: float = 0.02, **options: Any) -> A
     reconciler = DemandReconciler(FileTaskStore(folder, HOLDER, interval), **options)
     running = asyncio.create_task(reconciler.run())
     yield reconciler
-    reconciler.stop()
+    reconciler.stop(deadline=PATIENCE)
     await running
 
 
