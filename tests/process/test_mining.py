@@ -17,6 +17,7 @@ from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
+import dask
 import duckdb
 import pyarrow.parquet as pq
 import pytest
@@ -30,6 +31,7 @@ from detector.results.kinds import ResultKind
 from tests import s3
 from tests.cluster.waiting import wait_until
 from tests.fleets import HARSH, write_fleet, write_mcap
+from tests.patience import PATIENCE
 from wayside.process import commandline
 
 pytestmark = pytest.mark.xdist_group("mining")  # one fleet for all
@@ -225,7 +227,9 @@ def test_a_worker_that_is_killed_changes_nothing(fleet: Path) -> None:
 
 
 def test_a_dask_cluster_of_which_a_worker_is_killed_gives_the_same(fleet: Path) -> None:
-    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+    # A local cluster gives up a worker that is not back in time, and a busy machine starts it slowly.
+    back = dask.config.set({"distributed.deploy.lost-worker-timeout": PATIENCE})
+    with back, LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
         calls = [RemoteCall(end_once, str(fleet / "ended"))] + [RemoteCall(end, number) for number in range(3)]
         workers = DaskWorkers(cluster.scheduler_address)
         assert sorted(result for _, result in workers.run(calls)) == [-1, 0, 1, 2]

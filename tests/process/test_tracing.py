@@ -88,7 +88,7 @@ def test_an_unsupported_protocol_and_a_missing_extra_are_reported(
     monkeypatch.setenv("OTEL_EXPORTER_OTLP_ENDPOINT", "http://127.0.0.1:1")
     monkeypatch.setenv("OTEL_EXPORTER_OTLP_PROTOCOL", "grpc")
     assert tracing("x") is None
-    assert "OTEL_EXPORTER_OTLP_PROTOCOL is grpc, but only http/protobuf is supported" in caplog.text
+    assert "OTEL_EXPORTER_OTLP_PROTOCOL must be http/protobuf; got grpc" in caplog.text
     monkeypatch.setenv("OTEL_EXPORTER_OTLP_PROTOCOL", "http/protobuf")
     monkeypatch.setitem(sys.modules, "wayside.process.spans", None)  # as if it could not be imported
     assert tracing("x") is None
