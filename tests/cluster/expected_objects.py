@@ -233,6 +233,11 @@ def condition(raw: Object, type_: str) -> Object:
     return found
 
 
+def has_status(raw: Object) -> bool:
+    """Whether the manager has written the status: a new object has Ready Unknown, of generation 0."""
+    return condition(raw, "Ready").get("observedGeneration", 0) > 0
+
+
 def only_instance(api: Api) -> Object:
     """The one instance that there is."""
     (found,) = api.wait_list("ApplicationInstance", lambda found: len(found) == 1, what="there is one instance")

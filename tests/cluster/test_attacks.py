@@ -14,7 +14,16 @@ import yaml
 from application_manager.core.claims.claims import instance_name
 from tests.cluster.api import Api, ApiError, Object
 from tests.cluster.controlplane import ControlPlane
-from tests.cluster.expected_objects import condition, config, deployment, start_manager, task, template, wait_settled
+from tests.cluster.expected_objects import (
+    condition,
+    config,
+    deployment,
+    has_status,
+    start_manager,
+    task,
+    template,
+    wait_settled,
+)
 from tests.cluster.manifests import DETECTOR
 from tests.cluster.namespaces import new_namespace
 from tests.cluster.processes import Process, Processes
@@ -307,7 +316,7 @@ def test_900_kb_in_every_field_that_takes_free_data_harms_no_other(api: Api, att
             stored.append((kind, f"large-{index}"))
     assert len(stored) > 20
     for kind, name in stored:
-        api.wait_for(kind, name, lambda raw: bool(raw.get("status")), what=f"{kind} {name} has a status")
+        api.wait_for(kind, name, has_status, what=f"{kind} {name} has a status")
     served(api, "later")
     assert attacked.alive
     assert 0 < attacked.resident_bytes() < MEMORY
@@ -335,7 +344,7 @@ def test_expensive_expressions_in_a_rule_delay_nothing_else(api: Api, attacked: 
         rule |= action(deploy={"templateName": "good", "parameters": {"region": f"${{{bomb}}}"}})
         manifest = {"apiVersion": "wayside.dev/v1alpha1", "kind": "EventRule", "metadata": {"name": f"bomb-{index}"}}
         if not refused(api, manifest | {"spec": rule}):
-            api.wait_for("EventRule", f"bomb-{index}", lambda raw: bool(raw.get("status")), what="it is judged")
+            api.wait_for("EventRule", f"bomb-{index}", has_status, what="it is judged")
     served(api, "later")
     assert attacked.alive
     assert 0 < attacked.resident_bytes() < MEMORY

@@ -28,6 +28,7 @@ from tests.cluster.expected_objects import (
     config,
     deployment,
     end,
+    has_status,
     start_manager,
     task,
     template,
@@ -196,7 +197,7 @@ def test_a_life_cycle_needs_exactly_the_printed_rights(
         for each in (DETECTOR, EVENT_RULE):
             api.create(each)
             judged = each["metadata"]["name"]
-            api.wait_for(each["kind"], judged, lambda raw: bool(raw.get("status")), what=f"{judged} is judged")
+            api.wait_for(each["kind"], judged, has_status, what=f"{judged} is judged")
         for name in ("held", "north", "wrong"):
             end(api, name)
         api.wait_gone("Deployment", NORTH)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from application_manager.core.claims.claims import instance_name
 from tests.cluster.api import Api
 from tests.cluster.controlplane import ControlPlane
-from tests.cluster.expected_objects import condition, start_manager, task, template, wait_settled
+from tests.cluster.expected_objects import condition, has_status, start_manager, task, template, wait_settled
 from tests.cluster.faulty_proxy import ProxiedRequest, Proxy, faulty_proxy
 from tests.cluster.processes import Processes
 from tests.cluster.waiting import wait_until
@@ -52,12 +52,8 @@ def test_a_task_with_an_instance_of_its_own_takes_two_applies_and_four_other_req
             since = len(proxy.seen)
             api.create(task(f"t{number}"))
             name = instance_name("app", f"t{number}")
-            api.wait_for(
-                "ApplicationInstance", name, lambda raw: bool(condition(raw, "Ready")), what="the instance has it"
-            )
-            api.wait_for(
-                "ApplicationTask", f"t{number}", lambda raw: bool(condition(raw, "Ready")), what="so does the task"
-            )
+            api.wait_for("ApplicationInstance", name, has_status, what="the instance has it")
+            api.wait_for("ApplicationTask", f"t{number}", has_status, what="so does the task")
             wait_settled(api)
             seen = [each for each in about_tasks(proxy, since) if "/applicationtemplates/" not in each.path]
             if is_quick(seen):
