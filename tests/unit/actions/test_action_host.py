@@ -127,10 +127,9 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     before = threading.enumerate()
     yield
     SLOW.set()
+    # A thread that has just been released must not write into the notes of the next test.
     for thread in set(threading.enumerate()).difference(before):
-        thread.join(
-            PATIENCE
-        )  # what was let go just now is still to note its words, and not among those of the next test
+        thread.join(PATIENCE)
 
 
 class HostHarness:
