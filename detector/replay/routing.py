@@ -66,10 +66,6 @@ class MessageRouter:
         """Whether the key belongs to any stream."""
         return bool(self._route(key))
 
-    def route(self, key: str) -> tuple[str, ...]:
-        """The names of all streams that the key belongs to, in the Detector's order."""
-        return tuple(stream.name for stream in self._route(key))
-
     @property
     def unrouted(self) -> list[str]:
         """Keys that belong to no stream, at most twenty, sorted."""
