@@ -1,8 +1,8 @@
 """The webhook: AdmissionReviews over HTTPS, in the manager's event loop.
 
 If a review fails here, the API server gets an error. With failurePolicy Ignore it then stores the object, and the
-object's condition later reports the findings. So no request waits in a queue: requests beyond the maximum get 503 with
-Retry-After.
+object's condition later reports the findings. So no request waits in a queue: requests beyond the maximum get 503,
+without Retry-After, which would make the API server hold the request and send it again.
 """
 
 from __future__ import annotations
@@ -27,7 +27,6 @@ from wayside.process.servingcertificate import ServingCertificate
 AT_ONCE = 32
 """The maximum number of concurrent reviews of one kind; further ones get 503 immediately."""
 
-_RETRY_AFTER = "1"  # s; a review takes less
 
 LARGEST = 8 * 1024 * 1024  # bytes of a request: etcd accepts 1.5 MiB per object, and an update contains two
 
@@ -93,8 +92,7 @@ class ReviewHandler:
 
     def _none(self, status: int, why: str) -> web.Response:
         self._measures.reviewed("", "failed")
-        headers = {"Retry-After": _RETRY_AFTER} if status == 503 else None
-        return web.Response(status=status, text=f"{why}\n", headers=headers)
+        return web.Response(status=status, text=f"{why}\n")
 
 
 @asynccontextmanager

@@ -95,7 +95,7 @@ class TaskWork:
             if self.traces is not None:
                 self.traces.status_written(task, old, new)
             if verdict.kind is VerdictKind.FINISHED:
-                await self._expire(name)
+                await self._expire(name, task.model_copy(update={"status": new}))
         except ApiError as error:
             if not error.terminating:
                 raise
@@ -146,10 +146,9 @@ class TaskWork:
         if instead is not None:
             yield namespace, instead
 
-    async def _expire(self, name: Name) -> None:
-        task = self.cache.task(name)
-        since = finished_since(task) if task is not None else None
-        if task is None or since is None:
+    async def _expire(self, name: Name, task: ApplicationTask) -> None:
+        since = finished_since(task)
+        if since is None:
             return
         if time.time() < since + self.ttl:
             self.again(name, since + self.ttl)

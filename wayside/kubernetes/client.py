@@ -215,7 +215,7 @@ class Client:
         metadata = manifest["metadata"]
         path = resource.path(metadata["namespace"], metadata["name"])
         query = {**self._strictly, "force": "true", **({"dryRun": "All"} if dry_run else {})}
-        return await self._request("PATCH", path, query, manifest, _APPLY)
+        return await self._request("PATCH", path, query, manifest, _APPLY, writes=not dry_run)
 
     async def patch_status(self, resource: Resource, namespace: str, name: str, uid: str, status: Object) -> Object:
         """Merge into the status of the object with this uid; null removes a field."""

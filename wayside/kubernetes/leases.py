@@ -3,9 +3,9 @@
 Each process measures time on its own monotonic clock, and ignores the times that others write. The holder renews the
 Lease, and may act until a deadline after it *sent* its last successful renewal. Another process takes the Lease after
 it has *observed it unchanged* for its duration, or at once if it was released. A renewal is sent before anyone can
-observe it, and the deadline is shorter than the duration. So the old holder stops before a new one starts, even if
-clocks differ or a process was suspended. Every write of the Lease carries the resourceVersion that was read, so only
-one of two concurrent writes succeeds.
+observe it, and the deadline is not longer than the duration. So a holder that checks `remaining` stops before a new one
+starts, even if clocks differ or a process was suspended. Every write of the Lease carries the resourceVersion that was
+read, so only one of two concurrent writes succeeds.
 """
 
 from __future__ import annotations

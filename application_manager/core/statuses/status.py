@@ -108,7 +108,11 @@ def task_status(
             states.append(ConditionState(STALLED, True, verdict.reason, verdict.message))
     # A task that counts keeps its known progress until there is a newer one.
     only_while = (STALLED,) if verdict.kind is VerdictKind.COUNTS else ("Applied", "Ready", STALLED)
-    conditions = updated(old.conditions, states, generation, now, only_while=only_while)
+    known = old.conditions
+    if verdict.kind is VerdictKind.LAPSED:
+        # The condition's time is that of the loss, not that of an earlier refusal.
+        known = [each for each in known if each.type != "Accepted" or each.reason == verdict.reason]
+    conditions = updated(known, states, generation, now, only_while=only_while)
     instance = old.instance_name or verdict.instance if finished else verdict.instance
     return ApplicationTaskStatus(
         phase=_task_phase(verdict, progress, suspends),

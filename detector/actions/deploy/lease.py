@@ -106,7 +106,7 @@ class HolderLease:
         self._backoff = Backoff(0.2, duration / 3)
         self._stopping = asyncio.Event()
         self.held = asyncio.Event()
-        """Set while this process may emit tasks. No outage of the API server clears it: nobody takes over then."""
+        """Set while this process may emit tasks. Cleared when the Lease expires: another process may hold it then."""
         self.attempts = 0
         """Number of attempts to renew or acquire it."""
         self.failures = 0
@@ -128,6 +128,9 @@ class HolderLease:
         if not self._backoff.failures:
             _log.warning("cannot renew the Lease %s; retrying with backoff: %s", self.name, error)
         self.failures += 1
+        if self.held.is_set() and self._candidate.remaining(self._monotonic()) <= 0:
+            self.held.clear()
+            _log.error("the Lease %s has expired; this process changes no tasks until it renews the Lease", self.name)
         return self._backoff.fail(error.retry_after or 0.0)
 
     async def _pause(self, seconds: float) -> None:

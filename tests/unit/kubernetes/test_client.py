@@ -127,11 +127,12 @@ def test_a_client_that_may_not_act_reads_but_does_not_write() -> None:
         async with serving(handle, may_act=lambda: 0.0) as client:
             await client.get(LEASES, "n", "x")
             await client.review(LEASES, {})
+            await client.apply(LEASES, BODY, dry_run=True)
             with pytest.raises(NotActive):
                 await client.create(LEASES, BODY)
 
     asyncio.run(scenario())
-    assert methods == ["GET", "POST"]
+    assert methods == ["GET", "POST", "PATCH"]
 
 
 @pytest.mark.parametrize("looks", [1, 2])

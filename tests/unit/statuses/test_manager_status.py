@@ -116,6 +116,16 @@ def test_a_task_that_does_not_count_is_not_ready_for_the_same_reason(kind: Verdi
     assert again == status
 
 
+def test_a_refused_task_whose_holder_is_lost_counts_the_loss_from_its_beginning() -> None:
+    refused = task_status(task("a"), Verdict(VerdictKind.REFUSED, "Conflict", "why"), None, NOW, 0)
+    held, lapsed = task("a").model_copy(update={"status": refused}), Verdict(VerdictKind.LAPSED, "HolderLost", "why")
+    lost = task_status(held, lapsed, None, NOW + 7200, 0)
+    again = task_status(held.model_copy(update={"status": lost}), lapsed, None, NOW + 7300, 0)
+    for each in (lost, again):
+        (accepted,) = [each for each in each.conditions if each.type == "Accepted"]
+        assert (accepted.reason, accepted.last_transition_time) == ("HolderLost", format_seconds(NOW + 7200))
+
+
 def test_a_tasks_conditions_name_the_trouble_of_its_instance_before_and_after_it_was_ready() -> None:
     pulling = InstanceProgress("app", True, False, "cannot pull image app:1: not found", "ImagePullFailed")
     waiting = task_status(task("a"), COUNTS, pulling, NOW, 0)
