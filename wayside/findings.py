@@ -26,7 +26,7 @@ class Check:
 
     Attributes:
         name: words in lower case, joined by hyphens; it never changes.
-        severity: errors fail the check; warnings fail `detector check --strict` only, and can be ignored.
+        severity: errors fail the check; warnings fail it only with `--strict`, and can be ignored.
         meaning: the condition under which it is reported, without a full stop.
     """
 

@@ -126,7 +126,7 @@ class Admission:
 
     async def _of_rule(self, rule: EventRule) -> Findings:
         findings = await self._check(rule)
-        if not findings.all:
+        if findings == Findings():
             return findings
         if (await self._run(rule.namespace, partial(RuleContext().findings, rule))).problems:
             return findings  # it has them by itself

@@ -293,12 +293,13 @@ def check(
     files: commandline.CheckedFiles = None,
     allowed_kinds: AllowedKinds = None,
     service_accounts: ServiceAccounts = None,
+    strict: commandline.StrictCheck = False,
     ignore: commandline.IgnoredFindings = None,
     listing: commandline.ListFindings = False,
 ) -> None:
     """Check templates, rules and detectors as the webhook would, without a cluster.
 
-    Exits with 1 if the webhook would refuse an object; warnings are only printed.
+    Exits with 1 if the webhook would refuse an object, or with --strict warn of one.
     """
     with importing():
         from application_manager.commands.checking import review_files
@@ -322,7 +323,7 @@ def check(
         typer.echo(line, err=True)
     for line in checked.warnings:
         typer.echo(f"warning: {line}", err=True)
-    if checked.problems:
+    if checked.problems or (strict and checked.warnings):
         raise typer.Exit(1)
     typer.echo(f"checked {checked.looked_at}: nothing would be refused", err=True)
 

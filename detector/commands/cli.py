@@ -320,7 +320,7 @@ def check(
             ),
         ),
     ] = None,
-    strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 if there are warnings.")] = False,
+    strict: commandline.StrictCheck = False,
     ignore: commandline.IgnoredFindings = None,
     listing: commandline.ListFindings = False,
 ) -> None:

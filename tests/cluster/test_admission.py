@@ -183,7 +183,8 @@ def test_kubectl_prints_rejections_and_warnings_as_the_guide_shows(
                 assert part in logged
         code, logged = kubectl_apply(control_plane, rule(), namespace)
         assert (code, api.get("EventRule", "close")["spec"]["when"]) == (0, "distance < 150")
-        assert f"Warning: no valid Detector in namespace {namespace} selects the rule: create a Detector" in logged
+        warning = f"no valid Detector in namespace {namespace} selects the rule: create a Detector"
+        assert f"Warning: {warning} [rule-not-selected]" in logged
         code, logged = kubectl_apply(control_plane, doubtful, namespace)
         assert code == 0
         for part in ("Warning: spec.manifests[0].data.lane", "`parameters.lane` is null", "when tasks give no param"):

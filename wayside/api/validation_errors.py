@@ -65,12 +65,13 @@ def messages(
 
 
 def _unknown(name: str, fields: Collection[str]) -> str:
-    """The message for a field that does not exist. It names the most similar field, if there is one."""
+    """The message for a field that does not exist. It names the most similar field, or all where there is none."""
     stem = name.lower().rstrip("s")
     similar = [*(each for each in fields if each.lower().startswith(stem)), *difflib.get_close_matches(name, fields, 1)]
-    return (
-        f"unknown field: did you mean {similar[0]}?" if similar else "unknown field: check its spelling and indentation"
-    )
+    if similar:
+        return f"unknown field: did you mean {similar[0]}?"
+    there = f"; the fields here are {', '.join(sorted(fields))}" if fields else ""
+    return f"unknown field: check its spelling and indentation{there}"
 
 
 def _message(item: ErrorDetails) -> str:

@@ -39,6 +39,7 @@ CheckedFiles = Annotated[list[Path] | None, typer.Argument(help="YAML files or f
 IgnoredFindings = Annotated[
     list[str] | None, typer.Option(metavar="NAME", help="Do not report warnings of this name; may be repeated.")
 ]
+StrictCheck = Annotated[bool, typer.Option("--strict", help="Exit with 1 if there are warnings.")]
 ListFindings = Annotated[bool, typer.Option("--list", help="Print the names of all findings, and exit.")]
 
 _WIDTH = 160

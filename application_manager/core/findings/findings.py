@@ -6,6 +6,7 @@ The condition Accepted, the webhook's response and the output of `application-ma
 from __future__ import annotations
 
 import re
+from collections.abc import Set
 from dataclasses import dataclass
 
 from wayside.findings import Finding
@@ -34,15 +35,13 @@ class Findings:
         """All findings that prevent the use of the object, each once."""
         return _texts(*self.problems, *self.doubts)
 
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """All findings that are no reason to refuse the object, each once."""
-        return _texts(*self.doubts, *self.remarks)
+    def warnings(self, ignored: Set[str]) -> tuple[str, ...]:
+        """All findings that are no reason to refuse the object, each once, with their names.
 
-    @property
-    def all(self) -> tuple[str, ...]:
-        """All findings, each once."""
-        return _texts(*self.problems, *self.doubts, *self.remarks)
+        `ignored`: the names of those to leave out.
+        """
+        found = (each for each in (*self.doubts, *self.remarks) if each.check not in ignored)
+        return _texts(*(f"{each} [{each.check}]" for each in found))
 
 
 def _texts(*findings: str | Finding) -> tuple[str, ...]:

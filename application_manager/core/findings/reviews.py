@@ -15,6 +15,7 @@ from typing import Any
 from application_manager.core.conditions import cut
 from application_manager.core.findings.findings import Findings, field_of
 from wayside.api.base import API_VERSION, GROUP
+from wayside.findings import IGNORE_ANNOTATION, ignored_by
 
 REVIEW_VERSION = "admission.k8s.io/v1"
 REVIEWED = {"ApplicationTemplate": "applicationtemplates", "Detector": "detectors", "EventRule": "eventrules"}
@@ -109,7 +110,9 @@ def answer(request: Request, findings: Findings) -> Json:
         findings = Findings()
     refused = request.weight is ReviewEffect.REFUSED and bool(findings.problems)
     response: Json = {"uid": request.uid, "allowed": not refused}
-    warnings = findings.warnings if refused else findings.all
+    warnings = findings.warnings(_ignored(request.object))
+    if not refused:
+        warnings = *findings.problems, *warnings
     if warnings:
         response["warnings"] = shortened(warnings)
     if refused:
@@ -140,6 +143,13 @@ def shortened(texts: tuple[str, ...]) -> list[str]:
     lines = [_line(each) for each in texts[:MOST_REPORTED]]
     left = len(texts) - len(lines)
     return [*lines, f"and {left} more: correct these first"] if left else lines
+
+
+def _ignored(raw: Json) -> frozenset[str]:
+    """The names of the warnings that the object's annotation ignores."""
+    annotations = _metadata(raw).get("annotations")
+    names = annotations.get(IGNORE_ANNOTATION) if isinstance(annotations, dict) else None
+    return ignored_by({IGNORE_ANNOTATION: names}) if isinstance(names, str) else frozenset()
 
 
 def _line(text: str) -> str:

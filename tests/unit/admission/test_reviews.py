@@ -22,11 +22,13 @@ from tests.inprocess import InProcess, Result
 from tests.unit.manager_objects import template
 from tests.unit.templates.test_findings import counting, deploying, detector, rule
 from wayside.api import Kind
+from wayside.findings import Finding
 from wayside.kubernetes.client import Client
 from wayside.kubernetes.errors import ApiError
 from wayside.kubernetes.resources import Resource
 
-WRONG = Findings(("spec.when: is wrong",), ("it is early",))
+EARLY = Finding("rule-not-selected", "it is early")
+WRONG = Findings(("spec.when: is wrong",), (EARLY,))
 
 
 def question(
@@ -57,15 +59,22 @@ OBJECT: dict[str, Any] = {"metadata": {"name": "fast", "labels": {"a": "b"}}, "s
 
 def test_an_invalid_new_object_is_rejected_by_field() -> None:
     response = answered(question(new=OBJECT))
-    assert (response["allowed"], response["warnings"]) == (False, ["it is early"])
+    assert (response["allowed"], response["warnings"]) == (False, ["it is early [rule-not-selected]"])
     assert (response["status"]["code"], response["status"]["message"]) == (422, "spec.when: is wrong")
     (cause,) = response["status"]["details"]["causes"]
     assert (cause["field"], cause["message"]) == ("spec.when", "is wrong")
 
 
 def test_a_finding_of_severity_warning_is_only_a_warning() -> None:
-    response = answered(question(new=OBJECT), Findings((), ("it is early",)))
-    assert (response["allowed"], response["warnings"]) == (True, ["it is early"])
+    response = answered(question(new=OBJECT), Findings((), (EARLY,)))
+    assert (response["allowed"], response["warnings"]) == (True, ["it is early [rule-not-selected]"])
+
+
+def test_a_warning_that_the_annotation_names_is_left_out_and_an_error_is_not() -> None:
+    ignoring = {"annotations": {"wayside.dev/ignore-findings": "invalid-rule, rule-not-selected"}}
+    response = answered(question(new=OBJECT | {"metadata": OBJECT["metadata"] | ignoring}))
+    assert (response["allowed"], response["status"]["message"]) == (False, "spec.when: is wrong")
+    assert "warnings" not in response
 
 
 METADATA = st.fixed_dictionaries(
@@ -106,7 +115,8 @@ def test_kinds_without_checks_are_allowed_silently(review: dict[str, Any]) -> No
 
 @given(st.lists(st.text(max_size=40).map(lambda text: text * 60), max_size=40))
 def test_warnings_are_limited_in_number_and_length(texts: list[str]) -> None:
-    warnings = answered(question(new=OBJECT), Findings((), tuple(texts))).get("warnings", [])
+    found = Findings((), tuple(Finding("early", each) for each in texts))
+    warnings = answered(question(new=OBJECT), found).get("warnings", [])
     assert len(warnings) <= MOST_REPORTED + 1
     assert all(len(each) <= LONGEST and each.isprintable() for each in warnings)
 
