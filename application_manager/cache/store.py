@@ -117,7 +117,7 @@ class Store:
         return self._objects[kind_of(raw)].pop(name_of(raw))
 
     def missing(self, kind: KindKey, present: Set[Name], version: str, scope: str | None) -> list[Entry]:
-        """Remove the entries that are missing in a list (of the namespace `scope`, None for all); returns them."""
+        """The entries that are missing in a list (of the namespace `scope`, None for all)."""
         return [
             entry
             for name, entry in self.all(kind)

@@ -242,7 +242,7 @@ class Assembly:
             await self._rule_work.reconcile(key)
 
     def _validate(self, key: RuleKey) -> None:
-        """Enqueue the check of a rule or Detector; a Detector's objects are reconciled first."""
+        """Enqueue the check of a rule or Detector; a Detector's objects are usually reconciled first."""
         self._rules.add_at(key, time.time() + _VALIDATION_PAUSE)
         if key[0] == DETECTOR:
             self.detectors.add(key[1])

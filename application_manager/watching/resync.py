@@ -52,7 +52,7 @@ class Resync:
             try:
                 await self._everything()
             except RequestError as error:
-                log.warning("resync: %s", error)
+                log.warning("cannot list all objects; retrying at the next resync, in %g s: %s", self.every, error)
                 self.measures.resynced(well=False)
             else:
                 self.measures.resynced(well=True)

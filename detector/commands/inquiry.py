@@ -43,7 +43,8 @@ def status(
     connect: Connect = None,
     rule: Annotated[str | None, typer.Option(help="Show only this rule.")] = None,
     subject: Annotated[
-        str | None, typer.Option(help=("With --rule: the subject, e.g. car1, car1+car2 or ~fleet. Default: the first."))
+        str | None,
+        typer.Option(help="With --rule: the subject, e.g. car1, car1+car2 or ~fleet. Default: the first 20."),
     ] = None,
     everything: Annotated[
         bool,

@@ -30,7 +30,7 @@ def start(
     before: Annotated[
         str, typer.Option(help=("How long before now the recording starts, as far as the buffer reaches."))
     ] = "0s",
-    maximum_duration: Annotated[str, typer.Option(help="The maximum duration of the recording.")] = "10m",
+    max_duration: Annotated[str, typer.Option(help="The maximum duration of the recording.")] = "10m",
     detector: DetectorFile = None,
     name: Recorder = None,
     connect: Connect = None,
@@ -44,7 +44,7 @@ def start(
         streams=stream or None,
         clients=client or None,
         before=before,
-        maximumDuration=maximum_duration,
+        maxDuration=max_duration,
     )
     if detector is None and name is None:
         refuse("the detector is missing: give --name NAME or --detector FILE")

@@ -1,7 +1,7 @@
 """The thread that drives the engine live: it reads the wall clock, drains the intake and runs due ticks.
 
-All input of the engine passes through here in one order, so it is also recorded here: arrivals, and between them the
-controls (start, rules, restore, gap, level, paused, ask, end). The replay of such a recording makes the same calls.
+All input of the engine passes through here in one order, and is also recorded here: arrivals, and the controls between
+them (start, rules, restore, gap, level, paused, ask, plugin, end). The replay of such a recording makes the same calls.
 """
 
 from __future__ import annotations

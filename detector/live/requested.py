@@ -38,7 +38,7 @@ _log = logging.getLogger(__name__)
 _REMEMBERED = 1000
 """Maximum number of finished recordings in the index."""
 
-BY_ITSELF = "ended by its maximumDuration"
+BY_ITSELF = "ended by its maxDuration"
 
 
 @dataclass(slots=True)
@@ -93,7 +93,7 @@ class RecordingIndex:
         if allowed is None or refusal:
             return RecordingReport(identity, Progress.REFUSED, refusal), None
         chosen = request.streams or allowed.streams or sorted(streams)
-        longest = min(request.maximum_duration.ns, allowed.maximum_duration.ns)
+        longest = min(request.max_duration.ns, allowed.max_duration.ns)
         since = now - request.ago.ns - request.before.ns
         entry = RequestedRecording(identity, Progress.RECORDING, tuple(chosen), since, now + longest)
         self._entries[identity] = entry
@@ -143,8 +143,8 @@ class RecordingIndex:
         if allowed is None:
             return "this detector accepts no recording requests: allow them in its spec.recordings.onRequest"
         open_ones = sum(not entry.state.over for entry in self._entries.values())
-        if open_ones >= allowed.maximum_recordings:
-            return f"{open_ones} recordings are in progress, the maximum (recordings.onRequest.maximumRecordings)"
+        if open_ones >= allowed.max_recordings:
+            return f"{open_ones} recordings are in progress, the maximum (recordings.onRequest.maxRecordings)"
         may = streams if allowed.streams is None else allowed.streams
         for name in request.streams or ():
             if name not in may:

@@ -110,9 +110,9 @@ def test_the_namespace_limit_covers_all_templates(api: Api, processes: Processes
         wait_settled(api, limit=2)
 
 
-def test_nothing_is_preempted_before_its_minimum_uptime(api: Api, processes: Processes, namespace: str) -> None:
+def test_nothing_is_preempted_before_its_min_uptime(api: Api, processes: Processes, namespace: str) -> None:
     manager = start_manager(processes, namespace)
-    api.create(limited(1, minimumUptime="6h"))
+    api.create(limited(1, minUptime="6h"))
     api.create(wanting("low"))
     wait_task(api, "low", "Active")
     api.create(wanting("high", 5))
@@ -126,7 +126,7 @@ def test_nothing_is_preempted_before_its_minimum_uptime(api: Api, processes: Pro
     )
     assert released["metadata"]["uid"] == uid
     wait_settled(api)
-    api.patch("ApplicationTemplate", "app", {"spec": {"lifecycle": {"minimumUptime": "0s"}}})
+    api.patch("ApplicationTemplate", "app", {"spec": {"lifecycle": {"minUptime": "0s"}}})
     wait_task(api, "high", "Active")
     wait_settled(api)
 

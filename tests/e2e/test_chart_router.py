@@ -39,7 +39,7 @@ def test_a_vehicle_with_a_certificate_has_an_application_run_and_others_do_not_g
     given = values(api.namespace, image, DETECTOR_SPEC) | {"eventRules": [{"name": "fast", "spec": RULE}]}
     given["crds"] = {"install": False}  # the node has them
     helm("install", RELEASE, str(CHART), "--namespace", api.namespace, values=given)
-    lifecycle = {"linger": "0s", "minimumUptime": "0s"}
+    lifecycle = {"linger": "0s", "minUptime": "0s"}
     template = {"apiVersion": "wayside.dev/v1alpha1", "kind": "ApplicationTemplate", "metadata": {"name": "watch"}}
     api.apply(template | {"spec": {"lifecycle": lifecycle, "manifests": [application]}})
     wait_installed(api)

@@ -188,7 +188,7 @@ def test_notifications_of_a_hundred_vehicles_are_grouped_into_one_message(there:
             "events": ["Started"],
             "text": "${client} stands",
             "labels": {"road": "${road}"},
-            "grouping": {"wait": "3s", "by": ["road"], "maximum": 3},
+            "grouping": {"wait": "3s", "by": ["road"], "maxEvents": 3},
         }
     )
     for number in range(100):

@@ -199,12 +199,12 @@ def test_a_start_and_a_stop_may_come_twice_and_in_any_order(unhurt: Peer) -> Non
 
 
 def test_a_recording_whose_stop_never_comes_ends_by_itself(unhurt: Peer) -> None:
-    request = RecordingRequest(do="start", id="long", maximum_duration=PositiveDuration("1s"))
+    request = RecordingRequest(do="start", id="long", max_duration=PositiveDuration("1s"))
     report = requested(unhurt.endpoint, request)
     assert report.state is Progress.RECORDING
     wait_for(lambda: requested(unhurt.endpoint, RecordingRequest(id="long")).state is Progress.DONE, PATIENCE)
     done = requested(unhurt.endpoint, RecordingRequest(id="long"))
-    assert (done.message, done.until) == ("ended by its maximumDuration", report.until)
+    assert (done.message, done.until) == ("ended by its maxDuration", report.until)
 
 
 def test_a_request_that_is_not_allowed_is_rejected(rsu: Peer, town: Peer) -> None:
@@ -218,7 +218,7 @@ def test_a_request_that_is_not_allowed_is_rejected(rsu: Peer, town: Peer) -> Non
     for number in range(8):
         assert requested(rsu.endpoint, RecordingRequest(do="start", id=f"x{number}")).state is Progress.RECORDING
     full = requested(rsu.endpoint, RecordingRequest(do="start", id="x8"))
-    assert full.message == "8 recordings are in progress, the maximum (recordings.onRequest.maximumRecordings)"
+    assert full.message == "8 recordings are in progress, the maximum (recordings.onRequest.maxRecordings)"
     with pytest.raises(ValueError, match="start requires the id of the recording"):
         requested(rsu.endpoint, RecordingRequest(do="start"))
 
@@ -300,7 +300,7 @@ def test_people_request_recordings_by_commands(unhurt: Peer) -> None:
     assert refused.exit_code == 1
     assert "stream poes may not be recorded here" in refused.stdout
     wrong = command("recordings", "start", "x", "--name", "rsu", "--maximum-duration", "1 hour")
-    assert "maximumDuration: must be a duration" in wrong.output
+    assert "maxDuration: must be a duration" in wrong.output
     shown = command("status", "--name", "rsu").stdout
     assert "_requested/record" in shown
 

@@ -104,7 +104,7 @@ def end(episode: Episode) -> Episode:
 
 def test_an_endpoint_is_called_at_the_start_and_at_the_end() -> None:
     with endpoint() as there:
-        driven = DrivenAction(http(there.url, maximumDuration="5m"))
+        driven = DrivenAction(http(there.url, maxDuration="5m"))
         episode = an_episode(driven.parameters)
         driven.action.started(episode)
         driven.until(driven.recording)
@@ -120,7 +120,7 @@ def test_an_endpoint_is_called_at_the_start_and_at_the_end() -> None:
     assert json.loads(first.body) == {
         "id": identity,
         "do": "start",
-        "maximumDuration": "5m",
+        "maxDuration": "5m",
         "event": {"id": "e1.started", "subject": "car1"},
     }
 
@@ -179,19 +179,19 @@ def test_a_stop_that_is_never_confirmed_is_counted() -> None:
         assert "gave up waiting for the confirmation of the stop" in driven.outcomes[-1].message
     (lost,) = driven.lost
     assert lost.startswith(
-        "1 recordings on other systems whose stop was not confirmed: their maximumDuration ends them: h.r."
+        "1 recordings on other systems whose stop was not confirmed: their maxDuration ends them: h.r."
     )
 
 
-def test_a_recording_ends_after_its_maximum_duration_also_while_the_episode_lasts() -> None:
+def test_a_recording_ends_after_its_max_duration_also_while_the_episode_lasts() -> None:
     with endpoint() as there:
-        driven = DrivenAction(http(there.url, maximumDuration="1s"))
+        driven = DrivenAction(http(there.url, maxDuration="1s"))
         driven.action.started(an_episode(driven.parameters))
         outcome = driven.finished()
         assert [request.method for request in there.requests] == ["PUT", "DELETE"]
     assert (outcome.state, outcome.message) == (
         OutcomeState.DONE,
-        "the recording reached its maximumDuration before the episode ended",
+        "the recording reached its maxDuration before the episode ended",
     )
 
 

@@ -89,7 +89,7 @@ class ApplicationTaskSpec(Model):
     event: TaskEvent | None = None
     """The event that caused the task. Immutable."""
     end_time: Time | None = None
-    """The end of the demand. Absent while the demand is live; immutable once set."""
+    """When the demand ended. Setting it ends the demand at once, even with a future time. Immutable once set."""
 
 
 class TaskPhase(StrEnum):

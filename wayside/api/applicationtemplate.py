@@ -64,7 +64,7 @@ class Lifecycle(Model):
 
     linger: Duration = Duration("30s")
     """How long an instance keeps running after its last demand has ended."""
-    minimum_uptime: Duration = Duration("0s")
+    min_uptime: Duration = Duration("0s")
     """The minimum lifetime of an instance, from its creation. During this time, the instance is neither released nor
     preempted."""
     ready_timeout: PositiveDuration | None = None

@@ -62,7 +62,7 @@ Amounts = Annotated[
 
 
 class DetectorVolume(Model):
-    """A volume, as in a PodSpec, of one of the sources that the restricted Pod Security Standard allows."""
+    """A volume, as in a PodSpec, with one of these sources."""
 
     constraints = (
         exactly_one("persistent_volume_claim", "ephemeral", "empty_dir", "config_map", "secret", "projected", "csi"),

@@ -22,9 +22,9 @@ class OnRequest(Model):
 
     streams: list[ObjectName] | None = Field(default=None, min_length=1, max_length=128, json_schema_extra=SET_LIST)
     """The streams that may be recorded. Latched streams are always included. Default: all."""
-    maximum_duration: PositiveDuration = PositiveDuration("1h")
+    max_duration: PositiveDuration = PositiveDuration("1h")
     """The maximum duration of a recording. A recording ends after this time, even if the request exceeds it."""
-    maximum_recordings: int = Field(default=8, ge=1, le=100)
+    max_recordings: int = Field(default=8, ge=1, le=100)
     """The maximum number of concurrent recordings on request. Further requests are refused."""
 
 

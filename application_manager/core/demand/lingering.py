@@ -1,4 +1,4 @@
-"""How long an instance exists: its linger, its minimumUptime, and the annotations of people. Pure.
+"""How long an instance exists: its linger, its minUptime, and the annotations of people. Pure.
 
 An annotation counts if it is present, whatever its value, which may name its author and the reason; only the value
 `false` counts as absent. Both annotations have a condition in the instance's status, which is False after the
@@ -51,10 +51,10 @@ def linger_of(instance: ApplicationInstance, template: ApplicationTemplate | Non
 
 
 def protected_until(instance: ApplicationInstance, template: TemplateState) -> float:
-    """The end of the instance's minimumUptime, in seconds since 1970; 0 if its template has none."""
+    """The end of the instance's minUptime, in seconds since 1970; 0 if its template has none."""
     if not isinstance(template, ApplicationTemplate) or not instance.metadata.creation_timestamp:
         return 0.0
-    uptime = template.spec.lifecycle.minimum_uptime.seconds
+    uptime = template.spec.lifecycle.min_uptime.seconds
     return parse_seconds(instance.metadata.creation_timestamp) + uptime if uptime else 0.0
 
 

@@ -1,7 +1,7 @@
 """Decides which of the demanded or existing instances run within limits. Pure.
 
 Two limits may apply at once: a template's `maxInstances`, and the namespace's limit. The order is: first, instances
-that may not be stopped (held or paused by a person, or younger than their `minimumUptime`); then the demanded ones, by
+that may not be stopped (held or paused by a person, or younger than their `minUptime`); then the demanded ones, by
 the priority of their first task, with equal priority those that run already, then the older demand; last, the lingering
 ones, the latest deadline first. So a higher priority preempts, an equal one never does, and lingering instances yield
 first.
@@ -33,7 +33,7 @@ class PlaceCandidate:
         exists: whether it exists, or is being created.
         leaving: whether it is being deleted: it still counts, but not as running already.
         kept: whether it stays whatever the limit: a person holds or pauses it, or it waits for its template.
-        protected_until: the end of its minimumUptime, in seconds since 1970.
+        protected_until: the end of its minUptime, in seconds since 1970.
         deadline: the end of its linger, in seconds since 1970.
         ran: whether it served its demand before.
     """

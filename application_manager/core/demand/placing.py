@@ -100,9 +100,7 @@ def _why(decision: Decision, place: GrantedPlace) -> tuple[str, str]:
         message = f"instance {decision.name} was preempted by {place.yields_to}, since {place.limit}: {remedy}"
         return PREEMPTED, message
     if place.outbid_from is not None and place.outbid_from <= -decision.rank[0] and place.next_change is not None:
-        remedy = (
-            f"it can start after {format_seconds(place.next_change)}, when the minimumUptime of another instance ends"
-        )
+        remedy = f"it can start after {format_seconds(place.next_change)}, when the minUptime of another instance ends"
     elif place.outbid_from is not None:
         remedy = f"{remedy}, or set a priority of {place.outbid_from} or more"
     return LIMIT_REACHED, f"instance {decision.name} waits, since {place.limit}: {remedy}"

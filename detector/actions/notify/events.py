@@ -169,7 +169,7 @@ class EventQueue:
         if self._grouping is None:
             event = event_of(notices[0])
         else:
-            event = event_of_group(notices, self._action, self._grouping.by, self._grouping.maximum)
+            event = event_of_group(notices, self._action, self._grouping.by, self._grouping.max_events)
         message = OutboxMessage(event, notices)
         if not self._outbox.add(message):
             self._lose(message, FULL)

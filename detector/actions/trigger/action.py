@@ -55,7 +55,7 @@ class Trigger(Action[api.TriggerAction]):
         super().__init__(parameters, context)
         self._system = self._make_system()
         self._limits = Timeouts(
-            FOREVER if self._system.ends_by_itself else parameters.maximum_duration.seconds,
+            FOREVER if self._system.ends_by_itself else parameters.max_duration.seconds,
             parameters.give_up_after.seconds,
             self._system.renew,
         )
@@ -103,7 +103,7 @@ class Trigger(Action[api.TriggerAction]):
             return
         if self.context.closing.is_set() and self._outlives():
             del self._recordings[identity], self._episodes[identity]  # but not in the journal
-            message = "the recording continues until the restarted detector stops it, or until its maximumDuration"
+            message = "the recording continues until the restarted detector stops it, or until its maxDuration"
             self.context.report(episode, self._outcome(OutcomeState.DONE, recording, message))
         else:
             now = time.monotonic()
@@ -243,7 +243,7 @@ class Trigger(Action[api.TriggerAction]):
             self._journal.drop(finished)
 
     def _lose(self, recording: RemoteRecording, why: str) -> None:
-        what = "recordings on other systems whose stop was not confirmed: their maximumDuration ends them"
+        what = "recordings on other systems whose stop was not confirmed: their maxDuration ends them"
         self.context.lose(what, 1, f"{recording.order.id}: {why}")
 
     def _report_progress(self, recording: RemoteRecording, message: str) -> None:

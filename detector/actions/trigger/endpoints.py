@@ -49,7 +49,7 @@ class HttpEndpoint:
         """Once `closing` is set, a running request is aborted; a later one may take its full time."""
         assert parameters.http is not None  # noqa: S101  the caller checked it
         self._wanted = parameters.http
-        self._maximum = parameters.maximum_duration
+        self._maximum = parameters.max_duration
         self.timeout = parameters.http.timeout.seconds
         self._closing = closing
         self._client = HttpClient(parameters.http, "trigger.http")
@@ -92,7 +92,7 @@ class HttpEndpoint:
         """The status, its consequence and the message. Raises ActionError if a retry is worthwhile."""
         body = nested_value(order.rendered, "http", name, "body")
         if body is None:
-            body = {"id": order.id, "do": name, "maximumDuration": str(self._maximum), "event": order.event}
+            body = {"id": order.id, "do": name, "maxDuration": str(self._maximum), "event": order.event}
         headers = {"Content-Type": "application/json", "Idempotency-Key": f"{order.id}.{name}"}
         url = call.url.replace("{id}", encode(order.id))
         end, closing = time.monotonic() + self.timeout, self._closing.is_set()
@@ -126,7 +126,7 @@ class OtherDetector:
     def __init__(self, parameters: TriggerAction, messenger: Messenger) -> None:
         assert parameters.detector is not None  # noqa: S101  the caller checked it
         self._wanted = parameters.detector
-        self._maximum = parameters.maximum_duration
+        self._maximum = parameters.max_duration
         self.timeout = parameters.timeout.seconds
         self._messenger = messenger
 
@@ -153,7 +153,7 @@ class OtherDetector:
             clients=clients,
             before=Duration("0s") if again else wanted.before,
             ago=Duration("0s") if again else duration(ago),
-            maximum_duration=self._maximum,
+            max_duration=self._maximum,
             event=short(order.event),
         )
         return self._request(order, request)

@@ -78,7 +78,7 @@ class RecordingSystem(Protocol):
     timeout: float
     """Seconds to wait for a response."""
     ends_by_itself: bool
-    """Whether it ends a recording by itself after maximumDuration."""
+    """Whether it ends a recording by itself after maxDuration."""
 
     def place(self, order: Order) -> str:
         """The system that receives the order: if it does not respond, all orders with this place wait. Raises
@@ -130,7 +130,7 @@ class RecordingRequest(Model):
     """For a stop: the duration after `ago` that is still recorded."""
     ago: Duration = Duration("0s")
     """How long ago the cause of a start began, or that of a stop ended. Relative: clocks of machines differ."""
-    maximum_duration: PositiveDuration = PositiveDuration("10m")
+    max_duration: PositiveDuration = PositiveDuration("10m")
     """For a start: the maximum duration."""
     event: dict[str, JsonValue] = Field(default_factory=dict)
     """For a start: the CloudEvent that causes it; it is stored in the recording."""

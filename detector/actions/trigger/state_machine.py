@@ -4,7 +4,7 @@ Level-triggered: the other system should record as long as the episode lasts, an
 are retried with backoff until they are given up. A start is requested even if the episode has ended in the meantime,
 because the other system may have the time before in its buffer.
 
-    START ─confirmed→ HOLD ─end or maximumDuration→ STOP ─confirmed→ AWAIT ─over→ FINISHED
+    START ─confirmed→ HOLD ─end or maxDuration→ STOP ─confirmed→ AWAIT ─over→ FINISHED
 
 Pure: the caller passes times, in seconds of a monotonic clock.
 """
@@ -92,9 +92,7 @@ class RemoteRecording:
         """The request to send now; None: none is due."""
         if self.step is NextRequest.HOLD and now >= self._limit:
             self.note = (
-                "the recording reached its maximumDuration before the episode ended"
-                if self.ended is None
-                else self.note
+                "the recording reached its maxDuration before the episode ended" if self.ended is None else self.note
             )
             self._to(NextRequest.STOP, now)
         return self.step if now >= self.due and not self.finished else None

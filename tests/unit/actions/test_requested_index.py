@@ -34,16 +34,14 @@ def stop(identity: str, **fields: object) -> RecordingRequest:
 
 
 def test_times_are_relative_to_the_own_clock() -> None:
-    _, entry = RecordingIndex().start(
-        start("x", before="5s", ago="2s", maximumDuration="1m"), OnRequest(), STREAMS, NOW
-    )
+    _, entry = RecordingIndex().start(start("x", before="5s", ago="2s", maxDuration="1m"), OnRequest(), STREAMS, NOW)
     assert entry is not None
     assert (entry.since, entry.until) == (NOW - 7 * SECOND, NOW + 60 * SECOND)
 
 
 def test_the_duration_of_a_request_is_limited() -> None:
-    allowed = OnRequest(maximum_duration=PositiveDuration("10s"))
-    _, entry = RecordingIndex().start(start("x", maximumDuration="1h"), allowed, STREAMS, NOW)
+    allowed = OnRequest(max_duration=PositiveDuration("10s"))
+    _, entry = RecordingIndex().start(start("x", maxDuration="1h"), allowed, STREAMS, NOW)
     assert entry is not None
     assert entry.until == NOW + 10 * SECOND
 
@@ -56,7 +54,7 @@ def test_a_stop_counts_from_the_end_of_its_cause_and_never_extends_the_recording
         ({"ago": "1h"}, -10),
     ):
         index = RecordingIndex()
-        index.start(start("x", before="10s", maximumDuration="1m"), OnRequest(), STREAMS, NOW)
+        index.start(start("x", before="10s", maxDuration="1m"), OnRequest(), STREAMS, NOW)
         report, entry = index.stop(stop("x", **fields), NOW)
         assert entry is not None
         assert entry.until == NOW + until * SECOND
@@ -66,7 +64,7 @@ def test_a_stop_counts_from_the_end_of_its_cause_and_never_extends_the_recording
 
 @given(st.lists(st.tuples(st.sampled_from(["start", "stop", "done", "failed", "running"]), st.integers(0, 4))))
 def test_an_id_starts_one_recording_and_concurrent_recordings_are_limited(happenings: list[tuple[str, int]]) -> None:
-    index, allowed, open_ones, begun = RecordingIndex(), OnRequest(maximum_recordings=2), set[str](), set[str]()
+    index, allowed, open_ones, begun = RecordingIndex(), OnRequest(max_recordings=2), set[str](), set[str]()
     for what, number in happenings:
         identity = f"x{number}"
         if what == "start":

@@ -104,15 +104,15 @@ def test_a_system_that_does_not_count_the_time_is_stopped_after_it() -> None:
     assert recording.look(29.9) is None
     assert recording.look(30) is NextRequest.STOP
     recording.answered(30, DONE)
-    assert recording.note == "the recording reached its maximumDuration before the episode ended"
+    assert recording.note == "the recording reached its maxDuration before the episode ended"
 
 
 def test_a_system_that_counts_the_time_itself_reports_it() -> None:
     recording = a_recording()
     recording.answered(0, RECORDING)
-    recording.answered(10, Report(Progress.DONE, "ended by its maximumDuration"))
+    recording.answered(10, Report(Progress.DONE, "ended by its maxDuration"))
     assert recording.finished
-    assert (recording.problem, recording.note) == ("", "ended by its maximumDuration")
+    assert (recording.problem, recording.note) == ("", "ended by its maxDuration")
 
 
 @given(st.lists(st.tuples(st.sampled_from(["ask", "end"]), st.sampled_from([*Progress, None])), max_size=40))

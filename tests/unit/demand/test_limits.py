@@ -167,24 +167,24 @@ def test_tasks_that_act_on_an_instance_without_a_place_wait_too() -> None:
     assert "does not run" in verdict.message
 
 
-# --- minimumUptime
+# --- minUptime
 
 
-def test_nothing_is_preempted_before_its_minimum_uptime_and_then_it_is() -> None:
-    templates = [limited(1, minimumUptime="60s")]
+def test_nothing_is_preempted_before_its_min_uptime_and_then_it_is() -> None:
+    templates = [limited(1, minUptime="60s")]
     tasks = [wants("low"), wants("high", priority=5)]
     young = [runs("low", created=NOW - 59)]
     outcome = of(*tasks, templates=templates, instances=young)
     assert running(outcome) == {"low"}
     assert outcome.next_change == NOW + 1
-    assert f"after {format_seconds(NOW + 1)}, when the minimumUptime of another" in outcome.verdicts["high"].message
+    assert f"after {format_seconds(NOW + 1)}, when the minUptime of another" in outcome.verdicts["high"].message
     later = of(*tasks, templates=templates, instances=young, now=NOW + 1)
     assert going(later) == set()
     assert later.verdicts["low"].reason == "Preempted"
 
 
-def test_nothing_is_released_before_its_minimum_uptime() -> None:
-    templates = [limited(None, minimumUptime="60s", linger="5s")]
+def test_nothing_is_released_before_its_min_uptime() -> None:
+    templates = [limited(None, minUptime="60s", linger="5s")]
     (decision,) = of(templates=templates, instances=[runs("a", created=NOW - 10)]).instances.values()
     assert decision.release_time == NOW + 50
     (decision,) = of(templates=templates, instances=[runs("a", created=NOW - 58)]).instances.values()
@@ -215,9 +215,7 @@ class SimulatedNamespace:
     def __init__(self, bounds: tuple[int | None, int | None, int | None], uptime: int = 0) -> None:
         self.own = dict(zip(NAMES, bounds, strict=False))
         self.total = bounds[2]
-        self.templates = [
-            limited(count, name, minimumUptime=f"{uptime}s", linger="3s") for name, count in self.own.items()
-        ]
+        self.templates = [limited(count, name, minUptime=f"{uptime}s", linger="3s") for name, count in self.own.items()]
         self.instances: dict[str, ApplicationInstance] = {}
         self.now = NOW
 

@@ -69,7 +69,7 @@ class Grouping(Model):
     by: list[Identifier] = Field(default_factory=list, max_length=8, json_schema_extra=SET_LIST)
     """The names of labels. Events with the same values of these labels form a group. Default: all events of the rule
     form one group."""
-    maximum: int = Field(default=20, ge=1, le=1000)
+    max_events: int = Field(default=20, ge=1, le=1000)
     """The maximum number of events that a message contains in full. Further events are only counted."""
 
 

@@ -121,7 +121,7 @@ class HttpCall(Model):
     """The URL, e.g. https://recorder/recordings/{id}. {id} is replaced with the ID of the recording."""
     body: FreeData | None = None
     """The JSON body. Values can contain ${…} with the rule's variables at the start of the episode. Default: an object
-    with id, do (start or stop), maximumDuration, and event (the CloudEvent of the start)."""
+    with id, do (start or stop), maxDuration, and event (the CloudEvent of the start)."""
 
     @field_validator("url")
     @classmethod
@@ -160,7 +160,7 @@ class TriggerAction(Model):
     """Calls ROS 2 services, e.g. those of the rosbag2 recorder."""
     http: TriggerHttp | None = None
     """Sends requests to an HTTP endpoint."""
-    maximum_duration: PositiveDuration = PositiveDuration("10m")
+    max_duration: PositiveDuration = PositiveDuration("10m")
     """The maximum duration of the recording. Another detector enforces the limit itself. For ROS 2 services and HTTP
     endpoints, this detector sends the stop when the time is over, and must be running then."""
     give_up_after: PositiveDuration = PositiveDuration("5m")
