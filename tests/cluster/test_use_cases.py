@@ -1,8 +1,9 @@
 """The use cases that deploy or reconfigure, on a real control plane: what runs at each of their scenario's moments.
 
 The scenario is played to a running detector over Zenoh, up to a moment; then time stands still (`clock: Data`) until
-the cluster matches the scenario's own truth. So the speed of the machine does not matter. If messages do not contain
-the whole time, as with CAM, the clock advances, but nobody sends anything: nothing starts or ends while all is unknown.
+the cluster matches the scenario's own truth. So the speed of the machine does not matter: an overloaded detector skips
+evaluations of the rules of lowest priority, which are spare ones here. If messages do not contain the whole time, as
+with CAM, the clock advances, but nobody sends anything: nothing starts or ends while all is unknown.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from tests.ports import free_endpoint
 PACE = 2.5  # times as fast as it happens
 STEP_NS = SECOND // 20  # what is published at once
 DATA = {"clock": "Data", "lateness": "100ms"}
+SPARE = (-3, -2, -1)  # priorities: three levels of overload each
 WALL = {"clock": "Wall", "clientTimeout": "30m"}  # nobody is lost while the cluster is waited for
 
 
@@ -113,7 +115,7 @@ def looking(look: Callable[[], dict[str, bool]]) -> Iterator[list[dict[str, bool
 
 def apply_use_case(api: Api, name: str, endpoint: str, folder: Path, clock: dict[str, str]) -> str:
     """The use case's own files, but for where the detector listens and writes, and its clock. Gives its name."""
-    holder = ""
+    holder, labels = "", {}
     for file in ("templates.yaml", "rules.yaml", "detector.yaml"):
         for document in yaml.safe_load_all((folder_of(name) / file).read_text(encoding="utf-8")):
             document["metadata"]["namespace"] = api.namespace
@@ -123,7 +125,13 @@ def apply_use_case(api: Api, name: str, endpoint: str, folder: Path, clock: dict
                 spec |= {"zenoh": {"mode": "peer", "listen": [endpoint]}, **clock}
                 if "recordings" in spec:
                     spec["recordings"]["path"] = str(folder / "recordings")
+            elif document["kind"] == "EventRule":
+                labels = document["metadata"]["labels"]
             api.apply(document)
+    for priority in SPARE:
+        metadata = {"name": f"spare{priority}", "namespace": api.namespace, "labels": labels}
+        spec = {"when": "false", "evaluation": {"priority": priority}}
+        api.apply({"apiVersion": "wayside.dev/v1alpha1", "kind": "EventRule", "metadata": metadata, "spec": spec})
     return holder
 
 

@@ -299,7 +299,7 @@ def test_people_request_recordings_by_commands(unhurt: Peer) -> None:
     refused = command("recordings", "start", "other", "--stream", "poes", "--name", "rsu")
     assert refused.exit_code == 1
     assert "stream poes may not be recorded here" in refused.stdout
-    wrong = command("recordings", "start", "x", "--name", "rsu", "--maximum-duration", "1 hour")
+    wrong = command("recordings", "start", "x", "--name", "rsu", "--max-duration", "1 hour")
     assert "maxDuration: must be a duration" in wrong.output
     shown = command("status", "--name", "rsu").stdout
     assert "_requested/record" in shown

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from application_manager.core.findings.findings import Findings
 from application_manager.core.findings.rulefindings import deploy_remarks, detector_findings, rule_findings
 from application_manager.core.findings.templatefindings import template_findings
 from application_manager.core.objects.policy import Policy
@@ -45,7 +46,7 @@ def container(**fields: Any) -> dict[str, Any]:
 
 
 def test_a_rule_that_a_detector_can_evaluate_has_no_findings() -> None:
-    assert not rule_findings(rule(), [detector()]).all
+    assert rule_findings(rule(), [detector()]) == Findings()
 
 
 def test_errors_of_the_rule_alone_are_problems_without_a_detector_too() -> None:
@@ -83,7 +84,7 @@ def test_a_missing_rule_is_a_warning_and_a_cycle_a_problem() -> None:
     missing = rule_findings(counting("many", "fast"), [detector()])
     assert not missing.problems
     assert "there is no rule fast" in str(missing.doubts[0])
-    assert not rule_findings(counting("many", "fast"), [detector()], (), [rule()]).all
+    assert rule_findings(counting("many", "fast"), [detector()], (), [rule()]) == Findings()
     circle = rule_findings(counting("many", "fast"), [detector()], (), [counting("fast", "many")])
     assert "cycle" in circle.problems[0]
     assert "cycle" in rule_findings(counting("many", "many"), [detector()]).problems[0]
@@ -102,11 +103,11 @@ def test_a_detectors_own_streams_are_checked() -> None:
     raw["spec"]["streams"][0]["stamp"] = "msg.t +"
     found = detector_findings(Detector.model_validate(raw))
     assert "spec.streams[0].stamp" in found.problems[0]
-    assert not detector_findings(detector()).all
+    assert detector_findings(detector()) == Findings()
 
 
 def test_templates_of_the_guide_have_no_findings() -> None:
-    assert not template_findings(template(parameters=REGION, key="${parameters.region}"), Policy()).all
+    assert template_findings(template(parameters=REGION, key="${parameters.region}"), Policy()) == Findings()
 
 
 @pytest.mark.parametrize(
@@ -146,7 +147,7 @@ def test_errors_that_depend_on_values_of_tasks_are_warnings() -> None:
     for part in ("args[0]", "`parameters.lane` is null", "when tasks give only region"):
         assert part in str(found.remarks[0])
     metadata = made.metadata.model_copy(update={"annotations": {IGNORE_ANNOTATION: "failing-example"}})
-    assert not template_findings(made.model_copy(update={"metadata": metadata}), Policy()).all
+    assert template_findings(made.model_copy(update={"metadata": metadata}), Policy()) == Findings()
 
 
 @pytest.mark.parametrize(
@@ -161,14 +162,13 @@ def test_values_of_unknown_shape_give_no_findings(parameter: dict[str, Any]) -> 
         "object": "${parameters.x.a}",
     }
     manifest = container(args=[expression[parameter["type"]]])
-    assert not template_findings(
-        template(parameters={"x": {"required": True, **parameter}}, manifests=[manifest]), Policy()
-    ).all
+    made = template(parameters={"x": {"required": True, **parameter}}, manifests=[manifest])
+    assert template_findings(made, Policy()) == Findings()
 
 
 def test_a_name_from_a_text_parameter_is_not_a_problem() -> None:
     named = {**DEPLOYMENT, "metadata": {"name": "${instance.name}-${parameters.region}"}}
-    assert not template_findings(template(parameters=REGION, manifests=[named]), Policy()).all
+    assert template_findings(template(parameters=REGION, manifests=[named]), Policy()) == Findings()
     twice = [named, {**named, "metadata": {"name": "${instance.name}-${parameters.lane}"}}]
     declared = {**REGION, "lane": {"type": "string", "required": True}}
     assert not template_findings(template(parameters=declared, manifests=twice), Policy()).problems
