@@ -231,7 +231,7 @@ class TestKubectl:
             ("eventrule.spec.when", "the condition that starts an episode"),
             ("detector.spec.streams.key", "captures the name of the client"),
             ("applicationtemplate.spec.parameters.merge", "Union: the items that occur in any array"),
-            ("applicationtask.spec.endTime", "Absent while the demand is live"),
+            ("applicationtask.spec.endTime", "Setting it ends the demand at once"),
             ("applicationinstance.status.releaseTime", "The end of the linger time"),
         ],
     )

@@ -116,7 +116,10 @@ def test_the_printed_rights_suffice_to_inject_sidecars(
         api.create(pod(account="other"))
         event_of(api, "car", "has only vehicle")
     api.wait_for(
-        "Detector", HOLDER, lambda raw: condition(raw, "Running").get("reason") == "InPods", what="it runs in pods"
+        "Detector",
+        HOLDER,
+        lambda raw: "1 without a detector" in condition(raw, "Running").get("message", ""),
+        what="the manager has seen the pod without a sidecar",
     )
     assert webhook.manager.terminate() == 0
     assert "orbidden" not in webhook.manager.output()

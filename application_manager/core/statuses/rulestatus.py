@@ -139,7 +139,7 @@ def carried(detector: Detector, pods: Sequence[Mapping[str, Any]]) -> ConditionS
             RUNNING, False, troubles[0].reason.value, f"it runs in {running} {of}: {troubles[0].text}"
         )
     missing = len(pods) - len(sidecars)
-    but = f"; {missing} of them have no detector: their Events report why" if missing else ""
+    but = f"; {missing} without a detector: their Events report why" if missing else ""
     if pods and not running:
         return ConditionState(RUNNING, False, "NotReady", f"it runs in 0 {of}{but}")
     return ConditionState(RUNNING, True, "InPods", f"it runs in {running} {of}{but}")

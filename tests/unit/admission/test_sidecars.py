@@ -328,7 +328,7 @@ def test_the_condition_reports_the_number_of_running_pods_and_the_reasons_of_oth
     logged = carried(of, [runs, pod()])
     assert (logged.holds, logged.message) == (
         True,
-        "it runs in 1 of 2 pods with its label; 1 of them have no detector: their Events report why",
+        "it runs in 1 of 2 pods with its label; 1 without a detector: their Events report why",
     )
     waiting = {"waiting": {"reason": "ErrImagePull", "message": "not found"}}
     logged = carried(of, [runs, state(injected(pod(), of), state=waiting)])
