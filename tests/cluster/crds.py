@@ -48,6 +48,25 @@ def apply_crds(api: Api, folder: Path = CRDS, timeout: float = PATIENCE) -> Mapp
     return refused
 
 
+def wait_garbage_collected(api: Api, timeout: float = 2 * PATIENCE) -> None:
+    """Wait until Kubernetes' garbage collector watches our kinds. Raises TimeoutError.
+
+    It looks for new kinds every 30 s. Only what it watches leaves its finalizer for a deletion in the foreground. If
+    the CRDs go before, it may keep what objects of these kinds own until the CRDs are installed again.
+    """
+    name = "garbage-collector-probe"
+    config_map = {"apiVersion": "v1", "kind": "ConfigMap", "metadata": {"name": name}}
+    template = {"kind": "ApplicationTemplate", "metadata": {"name": name}, "spec": {"manifests": [config_map]}}
+    api.create({"apiVersion": "wayside.dev/v1alpha1", **template})
+    api.delete("ApplicationTemplate", name, propagation="Foreground")
+    wait_until(
+        lambda: api.find("ApplicationTemplate", name),
+        lambda found: found is None,
+        timeout=timeout,
+        what="the garbage collector watches our kinds",
+    )
+
+
 def remove_crds(api: Api, names: Iterable[str], timeout: float = 2 * PATIENCE) -> None:
     """Delete those of the CRDs that there are, and wait until none is left. Raises TimeoutError."""
     names = list(names)

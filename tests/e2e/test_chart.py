@@ -12,7 +12,7 @@ import yaml
 
 from tests.certificates import Authority
 from tests.cluster.api import Api, ApiError, Object, Objects
-from tests.cluster.crds import CRD_NAMES, apply_crds, remove_crds, wait_crd_gone
+from tests.cluster.crds import CRD_NAMES, apply_crds, remove_crds, wait_crd_gone, wait_garbage_collected
 from tests.cluster.waiting import wait_until
 from tests.e2e.inventory import inventory, wait_left
 from tests.e2e.node import Node
@@ -155,6 +155,8 @@ def test_a_release_that_was_never_upgraded_leaves_no_detector_behind(
     given = values(bare.namespace, image, DETECTOR_SPEC) | {"crds": {"keep": keep}}
     helm("install", RELEASE, str(CHART), "--namespace", bare.namespace, *AS_THE_GUIDE, values=given)
     wait_installed(bare)
+    if not keep:
+        wait_garbage_collected(bare)
     helm("uninstall", RELEASE, "--namespace", bare.namespace)
     for name in ("router-tls", "town-tls"):
         bare.delete("Secret", name)
