@@ -179,13 +179,16 @@ class ClusterCache:
         record = self.records.get((instance.namespace, instance.name))
         return record if record is not None and record.uid == instance.metadata.uid else None
 
-    def decide(self, name: Name, now: float) -> Decided:
-        """The decision about the instance at `now`, in seconds since 1970, and the other instances to enqueue."""
+    def decide(self, name: Name, now: float) -> tuple[Decided, set[Name]]:
+        """The decision about the instance at `now`, in seconds since 1970, and the other instances to enqueue.
+
+        These are to be decided again, because this decision changes what theirs depends on.
+        """
         decided = decide(name[1], _NamespaceIndexes(self, name[0]), now)
         moved = self.fallbacks.moved(name, _fallback(decided))
         if decided.placement is not None:
             moved |= decided.placement.moved(self.places.placement(name[0]))
-        return replace(decided, enqueue=frozenset(moved - {name[1]}))
+        return decided, {(name[0], each) for each in moved - {name[1]}}
 
     def note(self, name: Name, decided: Decided) -> None:
         """Note a decision in the indexes that further decisions read."""

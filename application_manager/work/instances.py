@@ -301,10 +301,10 @@ class InstanceWork:
 
     def _decide(self, name: Name) -> Decision | None:
         """Decide, and enqueue the other instances that the decision concerns."""
-        decided = self.cache.decide(name, time.time())
+        decided, others = self.cache.decide(name, time.time())
         self.cache.note(name, decided)
-        for each in decided.enqueue:
-            self.enqueue((name[0], each))
+        for other in others:
+            self.enqueue(other)
         return decided.decision
 
     def _is_over(self, name: Name, decision: Decision | None) -> bool:

@@ -63,13 +63,11 @@ class Decided:
         decision: the decision; None if the instance neither exists nor is demanded.
         unlimited: the decision without limits.
         placement: the placement of the namespace; None if there are no limits.
-        enqueue: the names of other instances to decide again, because this decision affects theirs.
     """
 
     decision: Decision | None
     unlimited: Decision | None = None
     placement: Placement | None = None
-    enqueue: frozenset[str] = frozenset()
 
 
 def decide(name: str, indexes: Indexes, now: float) -> Decided:

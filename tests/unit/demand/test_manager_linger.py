@@ -33,7 +33,7 @@ def claim(cache: ClusterCache, wanted: ApplicationTask) -> None:
 
 
 def decided(cache: ClusterCache, at: float) -> Decision:
-    found = cache.decide(NAME, NOW + at)
+    found, _ = cache.decide(NAME, NOW + at)
     cache.note(NAME, found)
     assert found.decision is not None
     return found.decision
@@ -75,7 +75,7 @@ def test_the_deadline_of_a_deleted_instance_is_forgotten() -> None:
     entry = cache.store.get(INSTANCE, NAME)
     assert entry is not None
     cache.store.remove(entry.raw)
-    found = cache.decide(NAME, NOW + 11)
+    found, _ = cache.decide(NAME, NOW + 11)
     cache.note(NAME, found)
     assert found.decision is None
     assert cache.deadlines == {}

@@ -83,10 +83,10 @@ class Manager:
         decided: dict[str, Decision | None] = {}
         while self.enqueued:
             name = self.enqueued.pop()
-            found = self.cache.decide(name, NOW)
-            assert self.cache.decide(name, NOW) == found  # it changes nothing
+            found, others = self.cache.decide(name, NOW)
+            assert self.cache.decide(name, NOW) == (found, others)  # it changes nothing
             self.cache.note(name, found)
-            self.enqueued |= {(name[0], each) for each in found.enqueue}
+            self.enqueued |= others
             decided[name[1]] = found.decision
         return decided
 
