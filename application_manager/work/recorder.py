@@ -27,7 +27,7 @@ from application_manager.core.health.pods import TroubleReason
 from application_manager.measures import Measures
 from wayside.api.base import Condition, Kind
 from wayside.kubernetes.client import Client
-from wayside.kubernetes.errors import ApiError, Unreachable
+from wayside.kubernetes.errors import ApiError, RequestError
 from wayside.kubernetes.pacing import FairQueue
 from wayside.kubernetes.resources import EVENTS
 from wayside.times import format_microseconds
@@ -282,7 +282,7 @@ class Recorder:
             self._measures.unposted("failed")
             if not error.terminating:
                 self._drops.note(f"{event.reason} about {event.regarding.name}: {error}")
-        except Unreachable as error:
+        except RequestError as error:
             self._measures.unposted("failed")
             self._drops.note(str(error))
 

@@ -26,14 +26,14 @@ class Unreachable(RequestError):  # noqa: N818  a state, not a fault
     reason = "NoAnswer"
 
 
-class NotActive(Unreachable):
+class NotActive(RequestError):  # noqa: N818  a state, not a fault
     """Another manager is active, or may be: nothing is written."""
 
     def __init__(self) -> None:
         super().__init__("this manager is not the active one and writes nothing")
 
 
-class NotGranted(Unreachable):
+class NotGranted(RequestError):  # noqa: N818  a state, not a fault
     """The account may not write in this namespace: nothing is written there, and a retry is useless."""
 
     def __init__(self, namespace: str) -> None:
