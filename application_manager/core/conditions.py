@@ -41,14 +41,12 @@ def updated(
     *,
     only_while: Iterable[str] = (),
 ) -> list[Condition]:
-    """The updated conditions; one keeps its time of transition while its status stays.
+    """The updated conditions, sorted by type; one keeps its time of transition while its status stays.
 
     Conditions of other types are kept, except for the types `only_while`. `now` is in seconds since 1970.
     """
     states = list(states)
     gone = set(only_while) - {each.type for each in states}
-    # Also gone is what becomes known only now: the default of a new object would be in front of what it follows from.
-    gone |= {each.type for each in known if each.status == "Unknown"} & {s.type for s in states if not s.unknown}
     by_type = {each.type: each for each in known if each.type not in gone}
     for state in states:
         old = by_type.get(state.type)
@@ -61,7 +59,7 @@ def updated(
             observed_generation=generation,
             last_transition_time=old.last_transition_time if old is not None and kept else format_seconds(now),
         )
-    return list(by_type.values())
+    return sorted(by_type.values(), key=lambda each: each.type)
 
 
 def find(conditions: Iterable[Condition], type_: str) -> Condition | None:
