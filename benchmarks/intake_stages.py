@@ -107,7 +107,7 @@ def clock_all() -> None:
     Intake.putter = clocked_putter  # type: ignore[method-assign]
     Intake.drain = clocked("drain", "evaluator", Intake.drain)  # type: ignore[method-assign]
     Ingest.insert = clocked("insert", "evaluator", clocked_insert)  # type: ignore[method-assign]
-    RuleInputs.settle = clocked("tables", "evaluator", RuleInputs.settle)  # type: ignore[method-assign]
+    RuleInputs.update_tables = clocked("tables", "evaluator", RuleInputs.update_tables)  # type: ignore[method-assign]
     Blocks.run = clocked("evaluation", "evaluator", clocked_run)  # type: ignore[method-assign]
     Engine.advance = clocked("advance", "evaluator", Engine.advance)  # type: ignore[method-assign]
     StreamInput.bursts = clocked_bursts  # type: ignore[method-assign]

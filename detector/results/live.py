@@ -170,7 +170,7 @@ class LiveView:
         return Tracer(subjects, paths=SCENE in topics)
 
     def _hand_over(self, tracer: Tracer, engine: Engine) -> None:
-        tracer.settle()
+        tracer.flush()
         rules = {name: run.rule for name, run in engine.rules.items()}
         try:
             self._slices.put_nowait(_Slice(tracer, rules, self._events))

@@ -110,7 +110,7 @@ class Tracer:
         self._time(block.ticks[0], block.ticks[-1])
         plan = self._plans.get(id(tracks))
         if plan is None:
-            self.settle()  # for rules that were evaluated differently until now
+            self.flush()  # for rules that were evaluated differently until now
             plan = self._plans[id(tracks)] = self._plan(tracks)
         if not plan.conditions:
             return
@@ -118,18 +118,18 @@ class Tracer:
         if looked is None and not _has_texts(plan, block):  # codes of texts may not last
             plan.waiting.append(EvaluatedBlock(block, codes, numbers))
             if sum(len(each.block.ticks) for each in plan.waiting) * len(numbers) >= _POINTS:
-                self._flush(plan)
+                self._flush_plan(plan)
             return
-        self._flush(plan)
+        self._flush_plan(plan)
         self._note(plan, JoinedBlock([block]), codes, numbers, looked)
 
-    def settle(self) -> None:
-        """Record what is queued. After this call, the trace no longer needs the engine."""
+    def flush(self) -> None:
+        """Record all queued blocks. After this call, the trace no longer needs the engine."""
         for plan in self._plans.values():
-            self._flush(plan)
+            self._flush_plan(plan)
 
-    def _flush(self, plan: _Plan) -> None:
-        """Record the queued blocks."""
+    def _flush_plan(self, plan: _Plan) -> None:
+        """Record the queued blocks of a plan."""
         for joined in joined_blocks(plan.waiting):
             self._note(plan, joined.block, joined.codes, joined.numbers, None)
         plan.waiting.clear()
@@ -201,7 +201,7 @@ class Tracer:
 
     def trace(self, wanted: Wanted = lambda rule, subject: True) -> Trace:
         """The trace of the wanted subjects."""
-        self.settle()
+        self.flush()
         found: dict[tuple[str, str], SubjectTrace] = {}
         self._of_clients(found, wanted)
         for (name, _), log in self._pairs.items():

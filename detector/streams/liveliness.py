@@ -19,8 +19,8 @@ from wayside.keys import KeyPattern
 
 log = logging.getLogger(__name__)
 
-_SETTLE = 0.2
-"""Seconds until a reported loss of a token takes effect."""
+_LOSS_DELAY = 0.2
+"""Seconds until a reported loss of a token takes effect: a token that is declared again by then is not lost."""
 
 _DOUBT = 10.0
 """Seconds after a router left in which losses of tokens declared earlier are ignored."""
@@ -115,7 +115,7 @@ class TokenWatch:
 
     def _apply(self, reports: list[Report], tokens: zenoh.handlers.Handler[zenoh.Sample]) -> None:
         """Apply a report and the immediately following ones, one token at a time."""
-        if reports[0][1] == zenoh.SampleKind.DELETE and not self._stop.wait(_SETTLE):
+        if reports[0][1] == zenoh.SampleKind.DELETE and not self._stop.wait(_LOSS_DELAY):
             reports.extend(_report(each) for each in iter(tokens.try_recv, None))
         newest = dict(reports)
         for key, kind in newest.items():

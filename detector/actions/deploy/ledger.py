@@ -135,10 +135,11 @@ class Ledger:
         demand, stored = self.demands.get(name), self.stored.get(name)
         step = next_step(demand, stored, name in self.held)
         if step is StoreChange.NOTHING and stored is not None:
-            self._settled(name, demand, stored)
+            self._note_in_sync(name, demand, stored)
         return step
 
-    def _settled(self, name: str, demand: Demand | None, stored: StoredTask) -> None:
+    def _note_in_sync(self, name: str, demand: Demand | None, stored: StoredTask) -> None:
+        """No change is needed: note that the task is held, that its end was written, or that another client ended it."""
         if stored.leaving:
             return
         if demand is None:

@@ -314,7 +314,7 @@ class Resolver(AbstractResolver):
             except (OSError, UnicodeError) as error:
                 answer = error if isinstance(error, OSError) else OSError(f"{host!r} is not a host name")
             try:
-                loop.call_soon_threadsafe(_settle, found, answer)
+                loop.call_soon_threadsafe(_set_answer, found, answer)
             except RuntimeError:  # the loop is closed: nothing waits any more
                 return
 
@@ -334,7 +334,7 @@ def _addresses(host: str, port: int, family: socket.AddressFamily) -> list[Resol
     ]
 
 
-def _settle(found: asyncio.Future[list[ResolveResult]], answer: list[ResolveResult] | OSError) -> None:
+def _set_answer(found: asyncio.Future[list[ResolveResult]], answer: list[ResolveResult] | OSError) -> None:
     if found.done():
         return
     if isinstance(answer, OSError):

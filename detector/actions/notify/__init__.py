@@ -47,8 +47,8 @@ class SendQueue(Protocol[T]):
     def wait(self, now: float) -> float | None:
         """Seconds until `take` may return something; None: not before something new is added."""
 
-    def settle(self, sent: T, delivery: Delivery, now: float) -> None:
-        """Apply the result."""
+    def record_result(self, sent: T, delivery: Delivery, now: float) -> None:
+        """Apply the result of an attempt."""
 
     def hurry(self) -> None:
         """The end is near: return each queued item once more."""
@@ -96,7 +96,7 @@ class Sender(Generic[T]):
                 _log.error("cannot send a notification", exc_info=error)
                 delivery = Delivery(AttemptResult.AGAIN, f"{type(error).__name__}: {error}")
             with self._changed:
-                self._queue.settle(parcel, delivery, time.monotonic())
+                self._queue.record_result(parcel, delivery, time.monotonic())
 
     def _next(self) -> T | None:
         """The next item, after waiting for it; None at the end."""

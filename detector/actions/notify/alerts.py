@@ -120,7 +120,7 @@ class Alerts:
         due = min((alert.due for alert in self._alerts.values()), default=None)
         return None if due is None else max(0.0, due - now, self._paused_until - now)
 
-    def settle(self, sent: AlertBatch, delivery: Delivery, now: float) -> tuple[list[Alert], list[Alert]]:
+    def record_result(self, sent: AlertBatch, delivery: Delivery, now: float) -> tuple[list[Alert], list[Alert]]:
         """The resolved alerts that were delivered, and those that were given up; both are removed.
 
         Firing alerts stay: after a refusal they are sent again when they are next due.
@@ -201,9 +201,9 @@ class AlertQueue:
         """Try undelivered alerts once more."""
         self._alerts.hurry()
 
-    def settle(self, sent: AlertBatch, delivery: Delivery, now: float) -> None:
+    def record_result(self, sent: AlertBatch, delivery: Delivery, now: float) -> None:
         """Apply the result of a request."""
-        ended, given_up = self._alerts.settle(sent, delivery, now)
+        ended, given_up = self._alerts.record_result(sent, delivery, now)
         if delivery.result is AttemptResult.REFUSED:
             self._context.lose("alerts rejected by the Alertmanager", len(sent.alerts), delivery.why)
         for alert in given_up:

@@ -50,7 +50,7 @@ class DeliveryLedger:
         """No further messages of the episode will follow."""
         if episode in self._entries:
             self._entries[episode].open = False
-            self._settle(episode)
+            self._report_finished(episode)
 
     def expect(self, episode: str) -> None:
         """A message of the episode was queued."""
@@ -65,7 +65,7 @@ class DeliveryLedger:
         entry.bytes += size
         if entry.open or entry.waiting:
             self._report_entry(entry, OutcomeState.RUNNING, f"{entry.delivered} delivered")
-        self._settle(episode)
+        self._report_finished(episode)
 
     def retried(self, episode: str, why: str) -> None:
         """A message was not delivered, and will be retried."""
@@ -86,12 +86,13 @@ class DeliveryLedger:
         entry.failures.append(why)
         if entry.open or entry.waiting:
             self._report_entry(entry, OutcomeState.RUNNING, f"not delivered: {why}")
-        self._settle(episode)
+        self._report_finished(episode)
 
     def _entry(self, episode: str) -> _Entry:
         return self._entries.setdefault(episode, _Entry())
 
-    def _settle(self, episode: str) -> None:
+    def _report_finished(self, episode: str) -> None:
+        """Report the outcome of the episode, if it is finished."""
         entry = self._entries[episode]
         if entry.open or entry.waiting > 0:
             return
@@ -185,9 +186,9 @@ class EventQueue:
         waits = [self._outbox.wait(now), None if group is None else max(0.0, group - now)]
         return min((wait for wait in waits if wait is not None), default=None)
 
-    def settle(self, sent: OutboxMessage, delivery: Delivery, now: float) -> None:
+    def record_result(self, sent: OutboxMessage, delivery: Delivery, now: float) -> None:
         """Apply the result of an attempt."""
-        result = self._outbox.settle(sent, delivery, now, time.time())
+        result = self._outbox.record_result(sent, delivery, now, time.time())
         if result is AttemptResult.DELIVERED:
             size = len(event_json(sent.event))
             for notice in sent.notices:

@@ -108,7 +108,7 @@ class Outbox:
         self._last_tries = set()
 
     def take(self, now: float) -> OutboxMessage | None:
-        """The message to send now; call `settle` with the result before the next."""
+        """The message to send now; call `record_result` with the result before the next."""
         if self._budget is not None and self._budget.wait(now) > 0:
             return None
         if self._last_tries is None and now < self._paused_until:
@@ -144,7 +144,7 @@ class Outbox:
         wait = max(0.0, due - now, self._paused_until - now)
         return wait if self._budget is None else max(wait, self._budget.wait(now))
 
-    def settle(self, message: OutboxMessage, delivery: Delivery, now: float, wall: float) -> AttemptResult:
+    def record_result(self, message: OutboxMessage, delivery: Delivery, now: float, wall: float) -> AttemptResult:
         """Apply the result for the message from `take`: DELIVERED or REFUSED remove it; AGAIN queues it again."""
         if not delivery.whole:
             self._pause.succeed()

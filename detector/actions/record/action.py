@@ -74,7 +74,7 @@ class Record(Action[api.RecordAction]):
             self._lose(len(samples))
             return
         current.series.take(samples, self.context.configuration())
-        self._settle(current)
+        self._report_finished(current)
 
     def ended(self, episode: Episode) -> None:
         """Samples of `after` may follow."""
@@ -87,7 +87,7 @@ class Record(Action[api.RecordAction]):
             self._lose(completion.missing)
             return
         current.series.finish(completion.cut, completion.missing)
-        self._settle(current, over=True)
+        self._report_finished(current, over=True)
 
     def wake(self) -> float | None:
         """Flushes queued samples, reports the progress of recordings, and deletes those that are too old."""
@@ -106,7 +106,7 @@ class Record(Action[api.RecordAction]):
         """Completes the open recordings, marked as cut."""
         for current in [*self._open.values()]:
             current.series.finish("the detector stopped", 0)
-            self._settle(current, over=True)
+            self._report_finished(current, over=True)
 
     def _know(self, episode: Episode) -> _Open | None:
         """Update the recording's description with the current state of the episode."""
@@ -118,13 +118,13 @@ class Record(Action[api.RecordAction]):
 
     def _flush(self, current: _Open, now: float) -> None:
         current.series.flush()
-        self._settle(current)
+        self._report_finished(current)
         if now - current.reported >= _REPORT_SECONDS and not current.series.over:
             current.reported = now
             self.context.report(current.episode, current.series.outcome(OutcomeState.RUNNING))
 
-    def _settle(self, current: _Open, *, over: bool = False) -> None:
-        """Reports the outcome of a finished recording: done if it is complete, otherwise failed."""
+    def _report_finished(self, current: _Open, *, over: bool = False) -> None:
+        """Reports the outcome if the recording is finished: done if it is complete, otherwise failed."""
         series, episode = current.series, current.episode
         lost, series.lost = series.lost, 0
         self._lose(lost)

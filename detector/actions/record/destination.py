@@ -97,8 +97,8 @@ class Destination:
             self._ahead += later
             return dropped
 
-    def settle(self, claimed: tuple[int, int, int], kept: FinishedRecording | None) -> None:
-        """A recording is no longer in progress: replace its claims by its actual size, or by nothing."""
+    def release(self, claimed: tuple[int, int, int], kept: FinishedRecording | None) -> None:
+        """Release the claims of a recording that is no longer in progress; `kept` counts with its actual size."""
         now, later, files = claimed
         with self._lock:
             self._bytes -= now + later

@@ -107,20 +107,20 @@ class RecordingFolder:
         sync_folder(final.parent)
         size = sum(each.stat().st_size for each in final.iterdir())
         kept = FinishedRecording(time.time(), final, size, len(parts))
-        self._settle(kept)
+        self._release(kept)
         return kept
 
     def remove(self) -> None:
         """Remove the folder, because nothing in it is worth keeping. Raises OSError."""
         shutil.rmtree(self.path, ignore_errors=True)
-        self._settle(None)
+        self._release(None)
 
     def leave(self) -> None:
         """Leave it for the next start of the detector; its room stays claimed."""
         os.close(self._lock)
 
-    def _settle(self, kept: FinishedRecording | None) -> None:
-        self._destination.settle(self._claimed, kept)
+    def _release(self, kept: FinishedRecording | None) -> None:
+        self._destination.release(self._claimed, kept)
         os.close(self._lock)
 
 

@@ -145,8 +145,8 @@ class Tables:
         """Whether the buffer has dropped samples that are still in the tables."""
         return self._stale or self._evictions != self._buffer.evictions
 
-    def settle(self, samples: list[Sample], lanes: list[Lane]) -> None:
-        """Add the samples that entered the buffer since the last call, each with its lane."""
+    def update(self, samples: list[Sample], lanes: list[Lane]) -> None:
+        """Add the samples that entered the buffer since the last call, each with its lane; drop evicted ones."""
         for table, reader in zip(self._tables.values(), self.readers.values(), strict=True):
             if len(table.columns) != reader.count:
                 table.set_columns(reader.count)

@@ -98,7 +98,7 @@ class Executor:
         self._alone = {name for name, run in self._runs.items() if run.alone}
         for run in self._runs.values():
             run.journal = self._instruments.journal
-        self._inputs.settle()
+        self._inputs.update_tables()
 
     def _make_blocks(self) -> None:
         self._blocks = Blocks(self._inputs.context, lambda: self._inputs.floor, self._instruments.observer)
@@ -138,11 +138,11 @@ class Executor:
         """Evaluate the queued ticks."""
         if not self._blocks.waiting:
             return []
-        self._inputs.settle()
+        self._inputs.update_tables()
         happened = self._in_columns()
         self._inputs.forget_rows(self._last_wait)
         self._inputs.looked(self._now())
-        self._starts.settle(self._last_wait)
+        self._starts.expire(self._last_wait)
         events = [each.event for each in happened]
         if self._consequences.wanted:
             for event in events:
@@ -176,7 +176,7 @@ class Executor:
         groups = self._blocks.due(time)
         if self._is_alone(tick, groups):
             events += self._evaluate_waiting()
-            self._inputs.settle()
+            self._inputs.update_tables()
             return events + self._tick_alone(tick, regular, groups)
         self._last_wait = time
         if self._blocks.wait(time, groups) or self._consequences.wanted:
@@ -184,7 +184,7 @@ class Executor:
         elif self._blocks.hurries:
             if self._unsorted is None and self._instruments.journal is not None:
                 self._unsorted = len(self._instruments.journal)
-            self._inputs.settle()
+            self._inputs.update_tables()
             self._blocks.run_ahead(self._instruments.stopwatch)
             self._inputs.looked(self._now())
         return events
@@ -220,7 +220,7 @@ class Executor:
                     events += own
                     for event in own:
                         self._consequences.note(run.rule, event)
-        self._starts.settle(time)
+        self._starts.expire(time)
         self._inputs.forget_rows(time)
         self._inputs.looked(self._now())
         return events

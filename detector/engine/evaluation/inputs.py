@@ -129,10 +129,10 @@ class RuleInputs:
         """Windows start after this time; nanoseconds."""
         return self._floor
 
-    def settle(self) -> None:
-        """Bring the tables up to date with the buffer."""
+    def update_tables(self) -> None:
+        """Add the samples that entered the buffer to the tables, and drop those that it evicted."""
         ingest = self.ingest
-        self.tables.settle(ingest.came, ingest.lanes)
+        self.tables.update(ingest.came, ingest.lanes)
         ingest.came, ingest.lanes = [], []
         ingest.noting = not self.tables.empty
 
@@ -153,7 +153,7 @@ class RuleInputs:
         """Forget lost clients and, at whole seconds, old samples; returns the lost clients."""
         if time % HOUSEKEEPING == 0:  # not at rule ticks: evictions must not depend on rules
             if self.tables.behind:
-                self.settle()  # while the buffer still has what the queued ticks read
+                self.update_tables()  # while the buffer still has what the queued ticks read
             self.buffer.expire(time)
         lost = self.clients.lose(time) if self.clients.may_lose(time) else []
         if lost:

@@ -2,8 +2,9 @@
 
 The thread that receives a message stamps and queues it without a lock: a lock would cost more than all the rest. Two
 threads may therefore queue out of order by a few microseconds, and a thread may pause between stamping and queueing.
-`drain` settles the times: they never go back, and all are later than what was drained before and than the last `until`.
-No sample ever belongs to a time whose tick has run, and samples of equal time are drained together, in their order.
+`drain` makes the times monotonic: they never go back, and all are later than those drained before and than the last
+`until`. No sample ever belongs to a time whose tick has run. Samples of equal time are drained together, in their
+order.
 """
 
 from __future__ import annotations
@@ -97,7 +98,7 @@ class Intake:
         self._room = self._maximum_bytes
         if arrivals:
             if not _in_order(arrivals, self._last):
-                arrivals = _settled(arrivals, self._last)
+                arrivals = _monotonic(arrivals, self._last)
             self._last = arrivals[-1].received
         self._last = max(self._last, until)
         return arrivals
@@ -122,11 +123,11 @@ def _in_order(arrivals: list[Arrival], last: int) -> bool:
     return times[0] > last and times == sorted(times)  # sorting a sorted list is the fastest check
 
 
-def _settled(arrivals: list[Arrival], last: int) -> list[Arrival]:
+def _monotonic(arrivals: list[Arrival], last: int) -> list[Arrival]:
     """The same arrivals, with times that are later than `last` and never go back."""
-    settled = []
+    adjusted = []
     time = last + 1
     for arrival in arrivals:
         time = max(arrival.received, time)
-        settled.append(replace(arrival, received=time))
-    return settled
+        adjusted.append(replace(arrival, received=time))
+    return adjusted

@@ -36,7 +36,7 @@ class EpisodeStarts:
         self._open: dict[str, dict[str, dict[str, int]]] = {}
         """When open episodes started, by stream name of the starts, client and episode; nanoseconds."""
         self._ended: dict[str, dict[str, list[tuple[int, int]]]] = {}
-        """Start and end of the episodes that ended since `settle`, by stream name of the starts and client."""
+        """Start and end of the episodes that ended since the last `expire`, by stream name of the starts and client."""
         self._number = 0
         self._expired = NEVER
         self.is_known: Callable[[str], bool] = lambda client: True
@@ -115,8 +115,8 @@ class EpisodeStarts:
             sample = StampedSample(time, self._number, payload, event.key)
             self.buffer.grew(lane.insert(sample))
 
-    def settle(self, now: int) -> None:
-        """All ticks up to `now` were evaluated, in nanoseconds: forget what later ones do not read."""
+    def expire(self, now: int) -> None:
+        """All ticks up to `now` (nanoseconds) were evaluated: drop starts and ends that later ticks do not read."""
         self._ended.clear()
         if not 0 <= now - self._expired < HOUSEKEEPING:
             self._expired = now

@@ -58,7 +58,7 @@ def test_each_message_is_settled_once_and_each_episode_in_order(
         now += wait
         taken = box.take(now)
         assert taken is not None, "what wait promises is there"
-        if box.settle(taken, answer, now, wall=0.0) is not AttemptResult.AGAIN:
+        if box.record_result(taken, answer, now, wall=0.0) is not AttemptResult.AGAIN:
             settled.append(taken)
     assert sorted(map(id, settled)) == sorted(map(id, waiting))
     for episode in "abc":
@@ -80,7 +80,7 @@ def test_an_absent_endpoint_is_retried_with_growing_backoff_for_all_messages() -
     for _ in range(14):
         taken = box.take(now)
         assert taken is not None
-        box.settle(taken, AWAY, now, wall=0.0)
+        box.record_result(taken, AWAY, now, wall=0.0)
         assert box.take(now) is None
         waits.append(box.wait(now) or 0.0)
         now += waits[-1]
@@ -95,7 +95,7 @@ def test_a_rejected_message_delays_no_other() -> None:
         box.add(message(name))
     first = box.take(0.0)
     assert first is not None
-    box.settle(first, AGAIN, 0.0, wall=0.0)
+    box.record_result(first, AGAIN, 0.0, wall=0.0)
     second = box.take(0.0)
     assert second is not None
     assert second is not first
@@ -107,7 +107,7 @@ def test_retry_after_is_honoured_up_to_a_bound(retry_after: float, waited: float
     box.add(message("a"))
     taken = box.take(0.0)
     assert taken is not None
-    box.settle(taken, Delivery(AttemptResult.AGAIN, retry_after=retry_after, whole=True), 0.0, wall=0.0)
+    box.record_result(taken, Delivery(AttemptResult.AGAIN, retry_after=retry_after, whole=True), 0.0, wall=0.0)
     assert box.wait(0.0) == waited
 
 
@@ -116,10 +116,10 @@ def test_an_expired_message_is_given_up_after_an_attempt() -> None:
     box.add(message("a"))
     taken = box.take(0.0)
     assert taken is not None
-    assert box.settle(taken, AWAY, 0.0, wall=59.0) is AttemptResult.AGAIN
+    assert box.record_result(taken, AWAY, 0.0, wall=59.0) is AttemptResult.AGAIN
     again = box.take(10.0)
     assert again is taken
-    assert box.settle(taken, AWAY, 10.0, wall=60.0) is AttemptResult.REFUSED
+    assert box.record_result(taken, AWAY, 10.0, wall=60.0) is AttemptResult.REFUSED
     assert len(box) == 0
 
 
