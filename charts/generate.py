@@ -1,4 +1,4 @@
-"""`python -m charts.generate`: write the files of the chart that follow from the code (`make crds` does it).
+"""`python -m charts.generate`: write the generated files of the chart (`make crds` runs it).
 
 `files/crds/` are the CRDs as in crds/; `files/rights.yaml` is the manager's table of rights, from which the chart makes
 its roles as `application-manager rbac` does.
@@ -16,8 +16,8 @@ from wayside.manifests import to_yaml
 
 FILES = Path(__file__).parent / "wayside" / "files"
 LEASE = "NAME-OF-THE-LEASE"
-"""What stands for the name of the managers' Lease."""
-SECRET_NAME = "NAME-OF-THE-SECRET"  # noqa: S105  stands for the name of one
+"""The placeholder for the name of the managers' Lease."""
+SECRET_NAME = "NAME-OF-THE-SECRET"  # noqa: S105  the placeholder for a name
 WEBHOOKS = "NAME-OF-THE-WEBHOOKS"
 
 _POD = ("v1", "Pod")
@@ -31,7 +31,7 @@ def chart_files() -> dict[str, str]:
 
 
 def _rights() -> dict[str, Any]:
-    """Rules as roles have them: those that are always needed, and what each kind and running detectors bring."""
+    """The rules of roles: those that are always needed, and those that each kind and running detectors add."""
     secret, webhooks = certificate_rights(SECRET_NAME, WEBHOOKS)
     without_pods, pods = rights({}), rights({_POD: "pods"})
     return {
@@ -55,7 +55,7 @@ def _added(kind: KindKey, plural: str) -> list[dict[str, Any]]:
 
 
 def main() -> None:
-    """Write the files, and remove CRDs of kinds that there are no more."""
+    """Write the files, and remove the CRDs of former kinds."""
     files = chart_files()
     for old in (FILES / "crds").glob("*.yaml"):
         if f"crds/{old.name}" not in files:
