@@ -119,10 +119,9 @@ class Action(ABC, Generic[P]):
         """No more samples or events follow. The episode may still be open if the detector or the action ends."""
 
     def wake(self) -> float | None:
-        """Called between the other methods: do what is due now, and return the maximum number of seconds until the next
-        call.
+        """Called between the other methods: run due work, and return the maximum number of seconds until the next call.
 
-        None: when there is new input. Exceptions are counted, and it is called again after a second.
+        None: not before new input. Exceptions are counted, and it is called again after a second.
         """
         return None
 

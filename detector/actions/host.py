@@ -80,13 +80,13 @@ class ActionHost:
                 self._leaving.append(assignment.worker)
         for which, (rule, action) in wanted.items():
             if which not in self._assignments:
-                self.outcomes.know(which, action.kind)
+                self.outcomes.register(which, action.kind)
                 worker = Worker(which, self._maker(rule, action), self.outcomes, self._maximum, patient=self._patient)
                 self._assignments[which] = _Assignment(rule, action, worker)
         self._dismiss()
 
     def dispatch(self, consequences: Sequence[Consequence]) -> None:
-        """Pass on what happened, in order."""
+        """Pass the consequences to the workers, in order."""
         for each in consequences:
             if isinstance(each, RunStarted):
                 assignment = self._assignments.get(ActionKey(each.run.rule, each.run.action))

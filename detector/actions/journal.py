@@ -1,6 +1,7 @@
 """The documents of an action that its next run needs, on the state volume (`spec.state`).
 
-Without a state volume, or if its disk fails, everything else continues: what would not survive a restart is counted.
+Without a state volume, or if its disk fails, everything else continues; documents that would not survive a restart are
+counted.
 """
 
 from __future__ import annotations
@@ -70,7 +71,7 @@ class Journal:
             self._context.lose(self._unkept, 1, str(error))
 
     def load(self, key: str, make: Callable[[Any], T]) -> T | None:
-        """What `make` returns for the document; None if there is none, or none that can be read."""
+        """The document, converted by `make`; None if there is none, or if it cannot be read."""
         if self._store is None:
             return None
         try:

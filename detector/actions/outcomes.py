@@ -51,7 +51,7 @@ class ActionCounts:
 
 @dataclass(frozen=True, slots=True)
 class _Lost:
-    """What an action lost."""
+    """The losses of an action, of one kind."""
 
     which: ActionKey
     what: str
@@ -76,7 +76,7 @@ class Outcomes:
         self.on_outcome: Callable[[ActionKey, str, Outcome], None] = lambda which, episode, outcome: None
         """Called with each new outcome and the id of the episode, on the thread that reports it."""
 
-    def know(self, which: ActionKey, kind: str) -> None:
+    def register(self, which: ActionKey, kind: str) -> None:
         """Register the action, whether or not it ever runs."""
         with self._lock:
             if which not in self._counts or self._counts[which].kind != kind:

@@ -37,8 +37,8 @@ class Sweeper:
         self._trim = _trimming()
         self._sweep_due, self._trim_due = now + _SWEEP, now + _TRIM
 
-    def look(self) -> None:
-        """Do what is due."""
+    def run_due(self) -> None:
+        """Collect garbage and trim the heap, if due."""
         now = time.monotonic()
         if now >= self._sweep_due:
             gc.collect(0)

@@ -1,6 +1,6 @@
 """The messages that the actions of rules receive, in order: an episode begins, its samples, its end, completion.
 
-The engine only queues these messages. The shell takes them and passes them to the actions, which may be slow.
+The engine only queues these messages. The caller drains them and passes them to the actions, which may be slow.
 """
 
 from __future__ import annotations
@@ -52,11 +52,11 @@ class Excerpt:
     until: int | None = None
     """Samples up to this time belong to it; None while the episode is open."""
     waiting: list[tuple[Lane, Sample]] = field(default_factory=list)
-    """Samples that time has not reached yet, or that have not been taken."""
+    """Samples that are later than the engine's time, or not drained yet."""
     lanes: list[Lane] = field(default_factory=list)
     """The lanes of its samples."""
 
-    def wants(self, lane: Lane) -> bool:
+    def matches(self, lane: Lane) -> bool:
         """Whether the lane belongs to the window's streams and clients."""
         if lane.stream in self.window.shared:
             return True
@@ -64,8 +64,8 @@ class Excerpt:
             return False
         return self.clients is None or lane.client in self.clients
 
-    def take(self, now: int) -> list[EpisodeSample]:
-        """The samples that time has reached, in time order; samples outside of the window are discarded."""
+    def drain(self, now: int) -> list[EpisodeSample]:
+        """Remove and return the samples up to `now`, in time order; samples outside of the window are discarded."""
         reached = now if self.until is None else min(now, self.until)
         taken: list[EpisodeSample] = []
         listed: dict[tuple[str, int], EpisodeSample] = {}
@@ -100,14 +100,14 @@ class Excerpts:
         buffer.on_added = self._added
 
     def begin(self, window: CompiledWindow, clients: frozenset[str] | None, begin: int) -> Excerpt:
-        """Begin another excerpt: it contains the samples in the buffer, and those that arrive from now on."""
+        """Begin an excerpt: it contains the samples in the buffer, and those that arrive from now on."""
         self.distribute()
         excerpt = Excerpt(window, clients, begin)
         self._excerpts.append(excerpt)
         # There may be many clients, and an episode is about one or two of them.
         every = clients is None or window.shared
         for lane in self._buffer if every else self._buffer.of(sorted(clients or ())):
-            if excerpt.wants(lane):
+            if excerpt.matches(lane):
                 self._watch(lane, excerpt)
                 excerpt.waiting.extend((lane, sample) for sample in lane.samples)
         return excerpt
@@ -124,7 +124,7 @@ class Excerpts:
     def _added(self, lane: Lane) -> None:
         """Add a lane that is new in the buffer."""
         for excerpt in self._excerpts:
-            if excerpt.wants(lane):
+            if excerpt.matches(lane):
                 self._watch(lane, excerpt)
 
     def _watch(self, lane: Lane, excerpt: Excerpt) -> None:
@@ -136,17 +136,17 @@ class Excerpts:
 
     def distribute(self) -> None:
         """Give each excerpt the samples that arrived since the last call."""
-        for lane, came in self._came():
+        for lane, inserted in self._inserted():
             for excerpt in self._watchers[lane]:
-                excerpt.waiting.extend((lane, sample) for sample in came)
+                excerpt.waiting.extend((lane, sample) for sample in inserted)
 
-    def _came(self) -> Iterator[tuple[Lane, list[Sample]]]:
+    def _inserted(self) -> Iterator[tuple[Lane, list[Sample]]]:
         """The samples inserted into the lanes since the last call."""
         for lane in self._watchers:
-            came = lane.came
-            if came:
+            inserted = lane.inserted
+            if inserted:
                 lane.record([])
-                yield lane, came
+                yield lane, inserted
 
 
 _WATCHED = 100
@@ -157,7 +157,7 @@ REPLACED = "the action was changed or removed"
 
 
 class ActionRun(NamedTuple):
-    """One action at work for one episode."""
+    """A run of one action, for one episode."""
 
     rule: str
     action: str
@@ -210,7 +210,7 @@ class Consequences:
 
     def __init__(self, buffer: Buffer) -> None:
         self.wanted = False
-        """Whether anybody takes the messages; otherwise none are queued, as in a replay."""
+        """Whether the caller drains the messages; otherwise none are queued, as in a replay without actions."""
         self._excerpts = Excerpts(buffer)
         self._running: dict[ActionRun, Excerpt | None] = {}
         """With the excerpt, if the action has a window."""
@@ -222,7 +222,7 @@ class Consequences:
         self.watch_late = False
         """Whether samples may come late, as with clock Data."""
         self.too_late = 0
-        """Number of samples that came after their window was complete."""
+        """Number of samples that arrived after their window was complete."""
 
     def note(self, rule: CompiledRule, event: Event) -> None:
         """Queue the start or end of an episode, before or after a change of its rule."""
@@ -284,13 +284,13 @@ class Consequences:
         for event in open_starts:
             self.begin(new, rule, event, resumed=True)
 
-    def take(self, now: int) -> list[Consequence]:
-        """The messages for the actions up to the engine's time `now`; nanoseconds."""
+    def drain(self, now: int) -> list[Consequence]:
+        """Remove and return the messages for the actions, up to the engine's time `now`; nanoseconds."""
         if self._running:
             self._excerpts.distribute()
             for run, excerpt in list(self._running.items()):
                 if excerpt is not None:
-                    if samples := excerpt.take(now):
+                    if samples := excerpt.drain(now):
                         self._noted.append(RunSamples(run, samples))
                     if excerpt.until is not None and now >= excerpt.until:
                         self._complete(run, "")
@@ -302,18 +302,18 @@ class Consequences:
     def _count_late(self, now: int) -> None:
         self._excerpts.distribute()
         for excerpt in self._complete_ones:
-            self.too_late += len(excerpt.take(now))
+            self.too_late += len(excerpt.drain(now))
         while self._complete_ones and (
             len(self._complete_ones) > _WATCHED or now - (self._complete_ones[0].until or 0) > _WATCHED_FOR
         ):
             self._excerpts.stop(self._complete_ones.popleft())
 
     def cut(self, now: int, why: str) -> list[Consequence]:
-        """The same, and the end of all runs, because the detector stops."""
-        noted = self.take(now)
+        """The same, and complete all runs, because the detector stops."""
+        noted = self.drain(now)
         for run in list(self._running):
             self._complete(run, why)
-        return noted + self.take(now)
+        return noted + self.drain(now)
 
     @property
     def running(self) -> Mapping[ActionRun, Excerpt | None]:

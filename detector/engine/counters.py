@@ -21,7 +21,7 @@ class AgedSample(Protocol):
 
     @property
     def time(self) -> int:
-        """When it came, in nanoseconds."""
+        """Its time, in nanoseconds."""
 
 
 class AgedLane(Protocol):

@@ -190,18 +190,18 @@ class Engine:
         for _, of_one in sorted(demanded.items()):
             record = of_one[0].episode
             if record.subject == record.about.text:
-                events += self._take_up(OpenEpisode(record, statistics.get(record.id)), of_one, now)
+                events += self._restore(OpenEpisode(record, statistics.get(record.id)), of_one, now)
             else:  # the text is part of the event's key
                 record = msgspec.structs.replace(record, subject=record.about.text)
                 events.append(self._ended_while_away(record, now))
         known = {demand.episode.id for demand in demands}
         for episode in sorted(episodes, key=lambda each: (each.record.rule, each.record.subject, each.record.id)):
             if episode.record.id not in known:
-                events += self._take_up(episode, (), now)
+                events += self._restore(episode, (), now)
         self._rules_version += 1
         return events
 
-    def _take_up(self, episode: OpenEpisode, demands: Sequence[Demand], now: int) -> list[Event]:
+    def _restore(self, episode: OpenEpisode, demands: Sequence[Demand], now: int) -> list[Event]:
         record = episode.record
         run = self._runs.get(record.rule)
         if run is None or not run.can_restore(record):
@@ -261,7 +261,7 @@ class Engine:
             raise NotEvaluableError(f"rule {name} is {'paused: resume it' if run.rule.enabled else 'not enabled'}")
         events, answers = run.answer(self.now, self._inputs.views(run, self.now), self.clients, self._plugins)
         self._executor.noted(run, events)
-        self._inputs.looked(self.now)
+        self._inputs.end_tick(self.now)
         return events, answers
 
     def demands(self) -> dict[str, Demand]:

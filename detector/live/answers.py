@@ -197,7 +197,7 @@ class Answers:
 
 
 def reconciler_status(reconciler: DemandReconciler) -> TaskStatus:
-    """What the reconciler did so far."""
+    """The counts of the reconciler."""
     counts = reconciler.counts
     return TaskStatus(
         **{name: getattr(counts, name) for name in (*TASK_CHANGES, "retried")},

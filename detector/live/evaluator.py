@@ -47,7 +47,7 @@ _READ_EVERY = 0.05
 """The same with clock Data, where samples determine when a tick is due: how late it may be evaluated."""
 
 _LOG_EVERY = 1.0
-"""Seconds between two checks for losses: there are counters for each rule and stream."""
+"""Seconds between two checks for losses: not in each cycle, because each rule and stream has counters."""
 
 _STALL = 1_000_000_000
 """Nanoseconds: a tick that is overdue by more is skipped, and a larger step back of the clock is accepted."""
@@ -70,13 +70,13 @@ class IntakeRecorder(Protocol):
 
 
 class EventSink(Protocol):
-    """Receives events and demands. Never waits."""
+    """Receives events and demands. Its methods never block."""
 
     def events(self, events: Sequence[Event]) -> None:
         """The starts and ends of episodes, in order."""
 
     def open_episodes(self, episodes: Callable[[], Sequence[OpenEpisode]]) -> None:
-        """Open episodes may have changed; `episodes` returns them, and must be called immediately or not at all."""
+        """Open episodes may have changed; `episodes` returns them, and is only valid during this call."""
 
     def follow(self, rules: Sequence[EventRule], configuration: DetectorConfiguration) -> None:
         """These rules are evaluated from now on."""
@@ -94,8 +94,8 @@ class LiveObserver(Observer, Protocol):
     def attend(self, engine: Engine) -> None:
         """The engine uses other rules from now on."""
 
-    def looked(self, engine: Engine, events: Sequence[Event]) -> None:
-        """The engine has consumed the arrivals, and these events occurred."""
+    def cycle_finished(self, engine: Engine, events: Sequence[Event]) -> None:
+        """The engine has consumed the arrivals of a cycle, and these events occurred."""
 
 
 class Evaluator:
@@ -221,14 +221,14 @@ class Evaluator:
                     wanted, self._wanted = self._wanted, None
                     calls, self._calls = self._calls, []
                     stopping = self._stopping
-                self._look(wanted)
+                self._run_cycle(wanted)
                 for future, work in calls:
                     _answer(future, work)
-                self.status.looked()
+                self.status.cycle_finished()
                 if time.monotonic() >= log_due:
                     log_due = time.monotonic() + _LOG_EVERY
                     self.losses.log_new()
-                self._sweeper.look()
+                self._sweeper.run_due()
             self._finish()
             self._sink.consequences(self._engine.consequences.cut(self._engine.now, "the detector stopped"))
         except BaseException as error:  # noqa: BLE001  the supervisor must learn of any end of the evaluation
@@ -262,7 +262,7 @@ class Evaluator:
             return _READ_EVERY
         return min(_DRAIN_EVERY, max(0.0, (self._engine.next_tick() - self._now()) / 1e9))
 
-    def _look(self, wanted: RuleSet | None) -> None:
+    def _run_cycle(self, wanted: RuleSet | None) -> None:
         """One cycle: consume the arrivals and run the due ticks."""
         now = self._now()
         events: list[Event] = []
@@ -363,14 +363,14 @@ class Evaluator:
 
     def _hand_over(self, events: Sequence[Event]) -> None:
         if self._observer is not None:
-            self._observer.looked(self._engine, events)
+            self._observer.cycle_finished(self._engine, events)
         if events:
             self._sink.events(events)
         if events or abs(self._engine.now - self._saved) >= _SAVE_EVERY:
             self._saved = self._engine.now
             if events or self._engine.measures:
                 self._sink.open_episodes(self._engine.open_episodes)
-        if consequences := self._engine.consequences.take(self._engine.now):
+        if consequences := self._engine.consequences.drain(self._engine.now):
             self._sink.consequences(consequences)
         version = self._engine.demands_version
         if version != self._version:

@@ -273,8 +273,7 @@ class RequestedRecordings:
     def _begin(self, entry: RequestedRecording, request: RecordingRequest) -> None:
         """Begin to pass on the samples of the recording, on the evaluation thread.
 
-        Nothing in the requester's event is trusted. The end of a recording that was stopped by now is known: it is so
-        short.
+        Nothing in the requester's event is trusted. The end is already known if the recording was stopped before.
         """
         detector, cause, now = self._engine.detector, request.event, self._engine.now
         subject, subjects = _about(cause)

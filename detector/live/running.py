@@ -71,7 +71,7 @@ class RunOptions:
 
 
 class Running:
-    """Inside the `with`, the detector's threads run."""
+    """A context manager: the detector's threads run inside the `with` block."""
 
     def __init__(
         self,
@@ -85,7 +85,7 @@ class Running:
         traces: EpisodeTraces | None = None,
         lease: HolderLease | None = None,
     ) -> None:
-        """Starts nothing yet.
+        """Start nothing; `with` does.
 
         Raises:
             DetectorError: the Detector cannot run.

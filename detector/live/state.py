@@ -135,7 +135,7 @@ class StateFile:
             closing = retry(self._attempt, OSError, self._failed, self._pause)
 
     def _attempt(self) -> bool:
-        """Write the newest set, if there is one; whether it was the last attempt."""
+        """Write the newest set, if there is one; returns whether it was the last attempt."""
         with self._changed:
             wanted, self._wanted = self._wanted, None
             closing = self._closing
@@ -161,7 +161,7 @@ class StateFile:
         return self._backoff.fail()
 
     def _pause(self, seconds: float) -> None:
-        """Wait, but not for more than a newer set or the end."""
+        """Wait for at most this time: a newer set, or `close`, ends the wait."""
         with self._changed:
             if not self._closing:
                 self._changed.wait(seconds)
@@ -180,7 +180,7 @@ class StateFile:
 
 @dataclass(frozen=True, slots=True)
 class RestoredState:
-    """The input of the engine's restore."""
+    """The input of `Engine.restore`."""
 
     demands: Sequence[Demand] = ()
     """Of live tasks, oldest first."""

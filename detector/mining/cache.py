@@ -39,7 +39,7 @@ class Cache:
         self._folder = folder
         self._entries = folder / "mined"
         self._entries.mkdir(parents=True, exist_ok=True)
-        self._seen: dict[str, tuple[str, RecordingPreview]] = self._read_seen()
+        self._previews: dict[str, tuple[str, RecordingPreview]] = self._read_previews()
 
     def put(self, content: str, entry: CacheEntry) -> None:
         """Store the result of a job. Raises OSError."""
@@ -60,19 +60,19 @@ class Cache:
 
     # What recordings are known by
 
-    def seen(self, source: InputRecording, stamp: str | None) -> RecordingPreview | None:
+    def preview(self, source: InputRecording, stamp: str | None) -> RecordingPreview | None:
         """The result of an earlier look at the recording, if its files are unchanged."""
-        before = self._seen.get("\0".join(source.files))
+        before = self._previews.get("\0".join(source.files))
         return before[1] if before is not None and before[0] == stamp else None
 
-    def note_seen(self, looks: Iterable[tuple[InputRecording, str | None, RecordingPreview]]) -> None:
-        """Store the results of looks. Raises OSError."""
-        new = {"\0".join(source.files): (stamp, seen) for source, stamp, seen in looks if stamp is not None}
+    def store_previews(self, previews: Iterable[tuple[InputRecording, str | None, RecordingPreview]]) -> None:
+        """Store previews. Raises OSError."""
+        new = {"\0".join(source.files): (stamp, seen) for source, stamp, seen in previews if stamp is not None}
         if new:
-            self._seen = {**self._read_seen(), **new}
-            _write(self._folder / "seen.json", msgspec.json.encode(self._seen))
+            self._previews = {**self._read_previews(), **new}
+            _write(self._folder / "seen.json", msgspec.json.encode(self._previews))
 
-    def _read_seen(self) -> dict[str, tuple[str, RecordingPreview]]:
+    def _read_previews(self) -> dict[str, tuple[str, RecordingPreview]]:
         try:
             data = (self._folder / "seen.json").read_bytes()
             return msgspec.json.decode(data, type=dict[str, tuple[str, RecordingPreview]])

@@ -21,7 +21,7 @@ import msgspec
 
 from detector.mining.cache import Cache, CacheEntry, job_digest, mined_in, read_entry
 from detector.mining.dataset import EPISODES, TABLES, MinedRecording, write_dataset
-from detector.mining.sources import InputRecording, RecordingPreview, look, stamp_of
+from detector.mining.sources import InputRecording, RecordingPreview, preview, stamp_of
 from detector.mining.tasks import CutRecording, JobResult, mined_rule, records, rule_keys, run_jobs, with_dependencies
 from detector.mining.work import MiningJob, MiningProblem, RecordingResult
 from detector.mining.workers import LostWorker, Workers
@@ -40,7 +40,7 @@ class WorkShare(NamedTuple):
     """From 0."""
     of: int
 
-    def takes(self, content: str) -> bool:
+    def contains(self, content: str) -> bool:
         """Whether the recording of this content is part of it."""
         return int(content[:8], 16) % self.of == self.number
 
@@ -100,14 +100,14 @@ def run_mining(
     cache = Cache(output / CACHE)
     rules = [mined_rule(rule, record=record) for rule in rules]
     work = _Work(output, detector, {rule.name: rule for rule in rules}, rule_keys(detector, rules), record)
-    seen = _look_at(sources, cache)
+    seen = _previews(sources, cache)
     entries = _Entries(cache, work.keys)
     jobs: dict[str, tuple[MiningJob, int]] = {}
     for source in sources:
         found = seen[source]
         if isinstance(found, RecordingPreview) and found.content not in jobs and (left := entries.left(found.content)):
             jobs[found.content] = work.job(source, found.content, left), found.bytes
-    own = {content: each for content, each in jobs.items() if share is None or share.takes(content)}
+    own = {content: each for content, each in jobs.items() if share is None or share.contains(content)}
     run = MiningRun(len(sources), len(own), {name for job, _ in own.values() for name in job.wanted})
     watch.expect(len(own), sum(size for _, size in own.values()))
     left_of = {content: job.wanted for content, (job, _) in own.items()}
@@ -194,27 +194,29 @@ class _Entries:
         return good | bad
 
 
-def _look_at(sources: Sequence[InputRecording], cache: Cache) -> dict[InputRecording, RecordingPreview | MiningProblem]:
+def _previews(
+    sources: Sequence[InputRecording], cache: Cache
+) -> dict[InputRecording, RecordingPreview | MiningProblem]:
     """The identity of each recording, or why it cannot be read."""
 
     def seen(source: InputRecording) -> tuple[str | None, RecordingPreview | MiningProblem, bool]:
         try:
             stamp = stamp_of(source)
-            known = cache.seen(source, stamp) if stamp is not None else None
-            return stamp, known or look(source), known is None
+            known = cache.preview(source, stamp) if stamp is not None else None
+            return stamp, known or preview(source), known is None
         except FileNotFoundError:
             return None, MiningProblem("unreadable", "there is no such file: correct the name"), False
         except OSError as error:
             return None, MiningProblem("unreadable", f"cannot read it: {error.strerror or error}"), False
 
     with ThreadPoolExecutor(_READERS) as pool:
-        looks = dict(zip(sources, pool.map(seen, sources), strict=True))
-    cache.note_seen(
+        found_previews = dict(zip(sources, pool.map(seen, sources), strict=True))
+    cache.store_previews(
         (source, stamp, found)
-        for source, (stamp, found, new) in looks.items()
+        for source, (stamp, found, new) in found_previews.items()
         if new and isinstance(found, RecordingPreview)
     )
-    return {source: found for source, (_, found, _) in looks.items()}
+    return {source: found for source, (_, found, _) in found_previews.items()}
 
 
 def _write(

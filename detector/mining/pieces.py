@@ -215,7 +215,7 @@ class _Recorder:
         """See `Observer`."""
         raise AssertionError("rules about pairs are not cut")
 
-    def clients(self, tracks: Sequence[Track], block: Block, codes: Codes, looked: Truths | None) -> None:
+    def clients(self, tracks: Sequence[Track], block: Block, codes: Codes, selected: Truths | None) -> None:
         """Record the changes in a block."""
         group = self._groups.get(id(tracks))
         if group is None:

@@ -66,8 +66,8 @@ def sources_of(given: Iterable[str]) -> list[InputRecording]:
     return sorted({source.files: source for source in found}.values())
 
 
-def look(source: InputRecording) -> RecordingPreview:
-    """The identity of the recording: on disk its content, at a URL the store's properties.
+def preview(source: InputRecording) -> RecordingPreview:
+    """Identify the recording: by its content on disk, by the store's properties at a URL.
 
     Raises:
         OSError: a file cannot be read.

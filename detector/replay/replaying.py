@@ -179,7 +179,7 @@ class Replay:
         self.outcome.end = max(self.outcome.end, self._engine.now)
         self._note_changes()
         if self._recorders is not None:
-            self._recorders.dispatch(self._engine.consequences.take(self._engine.now))
+            self._recorders.dispatch(self._engine.consequences.drain(self._engine.now))
         if self._engine.demands_version == self._demands_version:
             return
         self._demands_version = self._engine.demands_version

@@ -86,7 +86,7 @@ class _Open(NamedTuple):
 
 
 class LiveView:
-    """Serves the channels. `attend`, `looked` and the observer's methods run on the evaluation's thread."""
+    """Serves the channels. `attend`, `cycle_finished` and the observer's methods run on the evaluation's thread."""
 
     def __init__(self, host: str, port: int) -> None:
         """Raises ViewError if the address is in use."""
@@ -145,7 +145,7 @@ class LiveView:
             if name not in engine.in_columns:
                 run.on_evaluated = self._recorder_of(run.rule)
 
-    def looked(self, engine: Engine, events: Sequence[Event]) -> None:
+    def cycle_finished(self, engine: Engine, events: Sequence[Event]) -> None:
         """The engine has taken in the arrivals, and these events occurred."""
         self._events += events
         if self._tracer is None:
@@ -181,15 +181,15 @@ class LiveView:
 
     def _recorder_of(self, rule: CompiledRule) -> Any:
         def saw(evaluated: Evaluated) -> None:
-            if self._tracer is not None and self._tracer.looks_at(rule.name):
+            if self._tracer is not None and self._tracer.traces(rule.name):
                 self._tracer.recorded(rule).saw(evaluated)
 
         return saw
 
-    def clients(self, tracks: Sequence[Track], block: Block, codes: Codes, looked: Truths | None) -> None:
+    def clients(self, tracks: Sequence[Track], block: Block, codes: Codes, selected: Truths | None) -> None:
         """See `Observer`."""
         if self._tracer is not None:
-            self._tracer.clients(tracks, block, codes, looked)
+            self._tracer.clients(tracks, block, codes, selected)
 
     def fleet(self, tracks: Sequence[Track], block: FleetBlock) -> None:
         """See `Observer`."""

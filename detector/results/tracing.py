@@ -105,7 +105,7 @@ class Tracer:
         """The record of a rule that is not in columns."""
         return self._recorded.setdefault(rule.name, RecordedValues(rule))
 
-    def clients(self, tracks: Sequence[Track], block: Block, codes: Codes, looked: Truths | None) -> None:
+    def clients(self, tracks: Sequence[Track], block: Block, codes: Codes, selected: Truths | None) -> None:
         """Record the changes in a block of rules about clients."""
         self._time(block.ticks[0], block.ticks[-1])
         plan = self._plans.get(id(tracks))
@@ -115,13 +115,13 @@ class Tracer:
         if not plan.conditions:
             return
         numbers = self._numbers_of(block.clients)
-        if looked is None and not _has_texts(plan, block):  # codes of texts may not last
+        if selected is None and not _has_texts(plan, block):  # codes of texts may not last
             plan.waiting.append(EvaluatedBlock(block, codes, numbers))
             if sum(len(each.block.ticks) for each in plan.waiting) * len(numbers) >= _POINTS:
                 self._flush_plan(plan)
             return
         self._flush_plan(plan)
-        self._note(plan, JoinedBlock([block]), codes, numbers, looked)
+        self._note(plan, JoinedBlock([block]), codes, numbers, selected)
 
     def flush(self) -> None:
         """Record all queued blocks. After this call, the trace no longer needs the engine."""
@@ -134,13 +134,13 @@ class Tracer:
             self._note(plan, joined.block, joined.codes, joined.numbers, None)
         plan.waiting.clear()
 
-    def _note(self, plan: _Plan, block: JoinedBlock, codes: Codes, numbers: Integers, looked: Truths | None) -> None:
-        everybody = looked is None
-        at_all = self._rows(numbers, None if looked is None else np.asarray(looked.any(axis=0)))
+    def _note(self, plan: _Plan, block: JoinedBlock, codes: Codes, numbers: Integers, selected: Truths | None) -> None:
+        everybody = selected is None
+        at_all = self._rows(numbers, None if selected is None else np.asarray(selected.any(axis=0)))
         for at, track, name, changes in plan.signals:
             self._signal(block, track, name, numbers, changes, at, at_all)
         for row, track, field, changes in plan.conditions:
-            chosen = self._rows(numbers, None if looked is None else looked[row])
+            chosen = self._rows(numbers, None if selected is None else selected[row])
             self._condition(block, codes, row, track, field, numbers, changes, chosen)
         if everybody:
             gone = plan.seen.difference(numbers.tolist())
@@ -149,19 +149,19 @@ class Tracer:
             plan.seen.clear()
             plan.seen.update(numbers.tolist())
 
-    def _rows(self, numbers: Integers, looked: Truths | None) -> slice | Truths:
+    def _rows(self, numbers: Integers, selected: Truths | None) -> slice | Truths:
         """The traced clients of a block, among those that the rule evaluates."""
         if self._everybody:
-            return slice(None) if looked is None else looked
+            return slice(None) if selected is None else selected
         traced = np.isin(numbers, [*set().union(*self._traced.values())])
-        return traced if looked is None else traced & looked
+        return traced if selected is None else traced & selected
 
     def fleet(self, tracks: Sequence[Track], block: FleetBlock) -> None:
         """Record the changes in a block of rules about the fleet: the number of members, and conditions."""
         self._time(block.ticks[0], block.ticks[-1])
         numbers = np.array([self._number(FLEET)], np.int64)
         for track, members, verdicts in zip(tracks, block.members, block.verdicts, strict=True):
-            if not self.looks_at(track.rule.name):
+            if not self.traces(track.rule.name):
                 continue
             key = _key(track, "count")
             changes = self._signals.setdefault("/".join(key), Changes())
@@ -183,17 +183,17 @@ class Tracer:
         """Record the values of a rule about pairs at a tick."""
         time = these.block.ticks[0]
         self._time(time, time)
-        if not self._with_paths and not self.looks_at(track.rule.name):
+        if not self._with_paths and not self.traces(track.rule.name):
             return
         numbers = self._numbers_of(these.block.clients)
-        if self.looks_at(track.rule.name):
+        if self.traces(track.rule.name):
             log = self._pairs.setdefault((track.rule.name, track.rule.digest), PairLog(track))
             log.add(time, these, numbers)
         if self._with_paths:
             assert isinstance(track.rule.subject, PairSubject)  # noqa: S101  the rule is about pairs
             self._paths.add(track.rule.name, track.rule.subject.position.geographic, time, these, numbers)
 
-    def looks_at(self, rule: str) -> bool:
+    def traces(self, rule: str) -> bool:
         """Whether the rule is traced."""
         return self._subjects is None or rule in self._subjects
 
@@ -246,7 +246,7 @@ class Tracer:
 
     def _plan(self, tracks: Sequence[Track]) -> _Plan:
         owners: dict[int, tuple[Track, str]] = {}
-        wanted = [track for track in tracks if self.looks_at(track.rule.name)]
+        wanted = [track for track in tracks if self.traces(track.rule.name)]
         for track in wanted:
             for name, at in track.signals.items():
                 if at not in owners or _key(track, name) < _key(*owners[at]):
@@ -263,7 +263,7 @@ class Tracer:
         conditions = []
         for row, track in enumerate(tracks):
             for field, expression in (("when", track.rule.when), ("until", track.rule.until)):
-                if expression is not None and self.looks_at(track.rule.name):
+                if expression is not None and self.traces(track.rule.name):
                     key = (track.rule.name, track.element.name, field)
                     self._reasons.setdefault(key, {})
                     conditions.append((row, track, field, self._conditions.setdefault(key, Changes())))

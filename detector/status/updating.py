@@ -78,7 +78,7 @@ class StatusUpdater:
         self._refusals: dict[str, RefusedRule] = {}
         self._last: dict[str, Arrival] = {}
         """With clock Data, the last arrival of each stream: the buffer has only stamps."""
-        self._looked: dict[str, int] = {}
+        self._last_ticks: dict[str, int] = {}
         """The tick at which a rule's latency was last measured: samples up to there are counted."""
         self._ticks: dict[str, int] = {}
         """By rule, its number of ticks at the last measurement. Kept after its removal, like the engine's counters."""
@@ -113,7 +113,7 @@ class StatusUpdater:
         self._watching.append(watching)
         return watching.future
 
-    def looked(self) -> None:
+    def cycle_finished(self) -> None:
         """The evaluation has finished a cycle."""
         self._beat = time.monotonic()
         self._watching = [watching for watching in self._watching if not watching.is_over()]
@@ -121,7 +121,7 @@ class StatusUpdater:
         if self._engine.on_wall_clock:
             seen: dict[tuple[frozenset[str], int, int], list[float]] = {}
             for run in self._engine.rules.values():
-                self._look_at_rule(run, now, seen)
+                self._measure_rule(run, now, seen)
         if not self._taken <= now < self._taken + _EVERY:
             self.latest = self._take(now)
 
@@ -133,7 +133,7 @@ class StatusUpdater:
         for lane in buffer:
             lanes[lane.stream].append(lane)
         for name, of_stream in lanes.items():
-            self._look_at_stream(name, of_stream)
+            self._measure_stream(name, of_stream)
         self._counts.append((now, {name: counters.samples[name] for name in lanes}))
         self._forget(lanes)
         metadata = engine.detector.metadata
@@ -219,7 +219,7 @@ class StatusUpdater:
                 latency=None if latencies is None else latencies.histogram(),
             )
 
-    def _look_at_stream(self, name: str, lanes: Sequence[Lane]) -> None:
+    def _measure_stream(self, name: str, lanes: Sequence[Lane]) -> None:
         """Measure the latencies from stamp to receipt of the samples since the last measurement."""
         latencies = self._stream_latencies.setdefault(name, _Latencies())
         if not self._engine.on_wall_clock:
@@ -234,7 +234,7 @@ class StatusUpdater:
             if latency is not None:
                 latencies.add(latency)
 
-    def _look_at_rule(self, run: RuleRun, now: int, seen: dict[tuple[frozenset[str], int, int], list[float]]) -> None:
+    def _measure_rule(self, run: RuleRun, now: int, seen: dict[tuple[frozenset[str], int, int], list[float]]) -> None:
         """If the rule has just been evaluated, measure how long ago the new samples that it read were received.
 
         Once a second, the newest samples of a few clients; no sample is counted twice. `seen` is shared by the rules of
@@ -243,10 +243,10 @@ class StatusUpdater:
         name, tick, ticks = run.rule.name, run.counters.last_tick, run.counters.ticks
         evaluated = ticks != self._ticks.get(name, 0)
         self._ticks[name] = ticks
-        since = self._looked.get(name, NEVER)
+        since = self._last_ticks.get(name, NEVER)
         if not evaluated or since <= tick < since + _EVERY:
             return
-        self._looked[name] = tick
+        self._last_ticks[name] = tick
         if tick < since:  # the wall clock stepped back: older samples were counted
             return
         latencies = self._rule_latencies.setdefault(name, _Latencies())

@@ -173,7 +173,7 @@ class Renewal:
     def _run(self) -> None:
         try:
             while not self._stop.wait(self._look_every):
-                self._look()
+                self._reload()
         except Exception as error:  # noqa: BLE001  otherwise certificates would expire unnoticed
             if not self._stop.is_set():
                 log.critical(
@@ -181,7 +181,7 @@ class Renewal:
                 )
                 self._on_failure(error)
 
-    def _look(self) -> None:
+    def _reload(self) -> None:
         try:
             credentials = credentials_of(self._config)
         except NetworkError as error:

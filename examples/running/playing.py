@@ -110,7 +110,7 @@ def play(folder: Path, recording: Path, output: Path) -> Played:
 
     def note(engine: Engine) -> None:
         """Pass on what happened, and keep the tasks' new versions."""
-        host.dispatch(engine.consequences.take(engine.now))
+        host.dispatch(engine.consequences.drain(engine.now))
         for name, task in outcome.tasks.items():
             if versions.get(name) is not task:
                 versions[name] = task

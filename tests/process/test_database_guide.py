@@ -123,7 +123,7 @@ class Drive:
 
     def take(self, samples: list[Any], until: float) -> None:
         self.engine.advance(samples, at(until))
-        self.host.dispatch(self.engine.consequences.take(self.engine.now))
+        self.host.dispatch(self.engine.consequences.drain(self.engine.now))
 
 
 def odometry(seconds: float, number: int, v: float) -> Any:

@@ -281,7 +281,7 @@ def test_a_slow_disk_drops_and_counts_samples_and_delays_nothing(
     published: list[dict[str, Any]] = []
     outcomes = Outcomes("h", lambda key, payload, encoding: published.append(json.loads(payload)), lambda: at(0))
     which = ActionKey("r", "bag")
-    outcomes.know(which, "record")
+    outcomes.register(which, "record")
     bench.action.context = replace(bench.action.context, report=partial(outcomes.report, which))
     worker = Worker(which, lambda: bench.action, outcomes, maximum_bytes=5_500_000)
     run = ActionRun("r", "bag", "episode1")

@@ -294,7 +294,7 @@ class Database(Action[DatabaseAction]):
         rule = self.context.rule.name
         behind = (self.parameters.database, self.context.holder, rule, self.context.action)
         if writer.first_time(behind):
-            writer.put_change(scenarios.leave_behind(*behind))
+            writer.put_change(scenarios.mark_interrupted(*behind))
 
     def _lose(self, scenario: Scenario, count: int, why: str) -> None:
         scenario.lost[why] += count

@@ -91,7 +91,7 @@ MEMORY = 64 * 2**20
 
 
 class Queue:
-    """Several threads add and move to disk, one takes."""
+    """Several threads add requests and move them to disk; one removes them."""
 
     def __init__(self, spool: DatabaseSpool | None, lose: Callable[[str, int, str], None]) -> None:
         """`lose` receives the losses of unreadable spool records. Raises StoreError."""
@@ -107,9 +107,9 @@ class Queue:
         self.spools = spool is not None
         """Whether there is a spool that can be used."""
         self.full = not self.spools
-        """The disk accepts nothing more for now."""
+        """Whether the disk accepts no more requests for now."""
         self.damaged = False
-        """Some record of the spool could not be read in this run."""
+        """Whether a record of the spool could not be read in this run."""
         self._inherited = 0
         """Number of requests of an earlier run."""
         self._spool = (

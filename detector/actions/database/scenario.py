@@ -109,8 +109,8 @@ def start_scenario(scenario: Scenario, episode: Episode, metadata: Mapping[str, 
     return writes
 
 
-def leave_behind(database: str, holder: str, rule: str, action: str) -> Write:
-    """Handle scenarios that an earlier run left open: no process writes them any more."""
+def mark_interrupted(database: str, holder: str, rule: str, action: str) -> Write:
+    """Mark the scenarios that an earlier run left open as interrupted: no process writes them any more."""
     find = {"holder": holder, "rule": rule, "action": action, "state": OPEN}
     change = {"find": find, "change": {"$set": {"state": INTERRUPTED, "interrupted": True}}, "many": True}
     return Write(database, SCENARIOS, changes=[change])

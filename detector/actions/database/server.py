@@ -116,7 +116,7 @@ class Server:
             raise ValueError(self.redact(error)) from None
 
     def write(self, write: Write) -> tuple[int, list[RefusedWrite]]:
-        """Execute it; returns how many documents the changes matched, and the rejected parts. Everything else is done.
+        """Execute it; returns the number of documents that the changes matched, and the rejected parts.
 
         Raises DatabaseUnavailableError, WriteRefusedError.
         """

@@ -118,7 +118,7 @@ class DatabaseWriter:
             confirm(False, self._end_text())
 
     def close(self, seconds: float) -> None:
-        """Write what is queued, for at most this time; the rest goes to the spool, or is lost if there is none."""
+        """Write queued requests, for at most this time; the rest goes to the spool, or is lost without one."""
         with self._lock:
             self._closing = True
             self._deadline = time.monotonic() + (seconds if not self._away else min(seconds, _LAST_TRY))
@@ -241,7 +241,7 @@ class DatabaseWriter:
                 self._lock.wait(min(left, 0.2))
 
     def _leave(self) -> None:
-        """Unwritten requests stay on disk for the next run, or are lost."""
+        """Leave unwritten requests on disk for the next run; count the others as lost."""
         with self._lock:
             if self._left:
                 return

@@ -50,7 +50,7 @@ class FileTaskStore:
         away = False
         while True:
             try:
-                snapshot = await self._run(self._folder.look)
+                snapshot = await self._run(self._folder.read_changes)
             except StoreUnavailableError as error:
                 if not away:
                     _log.warning("cannot read the tasks in %s; retrying with backoff: %s", self._folder.path, error)
@@ -62,12 +62,12 @@ class FileTaskStore:
 
     async def all(self) -> dict[str, ApplicationTask]:
         """All tasks of the holder, including ended ones, by name."""
-        snapshot = await self._run(self._folder.look)
+        snapshot = await self._run(self._folder.read_changes)
         return {name: stored.task for name, stored in snapshot.tasks.items()}
 
     async def get(self, name: str) -> StoredTask | None:
         """See `TaskStore`."""
-        snapshot = await self._run(self._folder.look)
+        snapshot = await self._run(self._folder.read_changes)
         return snapshot.tasks.get(name)
 
     async def create(self, task: ApplicationTask) -> StoredTask:
@@ -117,7 +117,7 @@ class _Folder:
         self._files: dict[str, _Read] = {}
         self._version = 0
 
-    def look(self) -> Snapshot:
+    def read_changes(self) -> Snapshot:
         """Read the files that changed since the last call."""
         self.path.mkdir(parents=True, exist_ok=True)
         found: dict[str, _Read] = {}
@@ -142,7 +142,7 @@ class _Folder:
         return self._write(_created(task))
 
     def change(self, name: str, field: str, value: JsonValue) -> StoredTask:
-        stored = self.look().tasks.get(name)
+        stored = self.read_changes().tasks.get(name)
         if stored is None:
             raise TaskRefusedError("NotFound", f"{self._file(name)} does not exist, or belongs to another holder")
         if not stored.live:

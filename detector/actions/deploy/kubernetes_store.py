@@ -37,7 +37,7 @@ class KubernetesTaskStore:
     """The tasks of one holder in one namespace. Tasks of others are neither listed nor changed."""
 
     def __init__(self, client: Client, namespace: str, holder: str, resync: float = 30.0) -> None:
-        """Prepare; `resync`: seconds after which all is listed again, even if nothing seems to be missing."""
+        """Prepare; `resync`: seconds after which all tasks are listed again, even if the watch seems complete."""
         self._client = client
         self._namespace = namespace
         self._holder = holder

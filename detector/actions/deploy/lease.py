@@ -45,7 +45,7 @@ Owner = dict[str, str]
 
 @dataclass(frozen=True)
 class ProcessIdentity:
-    """Which process this is."""
+    """The identity of this process, as the holder of a Lease."""
 
     text: str
     """The text of `holderIdentity`."""
@@ -121,7 +121,7 @@ class HolderLease:
         await self._release()
 
     def stop(self) -> None:
-        """Let `run` release the Lease and return."""
+        """End `run`, which releases the Lease."""
         self._stopping.set()
 
     def _failed(self, error: RequestError) -> float:
@@ -138,7 +138,7 @@ class HolderLease:
             await asyncio.wait_for(self._stopping.wait(), seconds)
 
     async def _once(self) -> float:
-        """Acquire or renew, or find that another process holds it; the seconds until the next time."""
+        """Acquire or renew it, unless another process holds it; returns the seconds until the next attempt."""
         if self._stopping.is_set():
             return 0.0
         self.attempts += 1

@@ -75,9 +75,9 @@ _REMEMBERED_ENDS = 10_000
 
 
 class Ledger:
-    """The latest knowledge of both sides, by task name.
+    """The latest demands and stored tasks, by task name.
 
-    `accept` and `see` return the names that need work.
+    `accept` and `apply` return the names of the tasks that need a change.
     """
 
     def __init__(self) -> None:
@@ -105,7 +105,7 @@ class Ledger:
         changed = [name for name, demand in demands.items() if before.get(name) != demand]
         return self._due([*(name for name in before if name not in demands), *changed])
 
-    def see(self, change: Snapshot | Update) -> list[str]:
+    def apply(self, change: Snapshot | Update) -> list[str]:
         """Apply a change of the store."""
         known = self.stored or {}
         if isinstance(change, Snapshot):
@@ -139,7 +139,7 @@ class Ledger:
         return step
 
     def _note_in_sync(self, name: str, demand: Demand | None, stored: StoredTask) -> None:
-        """No change is needed: note that the task is held, that its end was written, or that another client ended it."""
+        """No change is needed: note that the task exists, that its end was written, or that another client ended it."""
         if stored.leaving:
             return
         if demand is None:

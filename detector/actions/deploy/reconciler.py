@@ -1,9 +1,9 @@
 """The deploy action: the demands of open episodes, kept equal to the ApplicationTasks in a store.
 
-The engine passes the full set of demands whenever it changes. The reconciler makes the store match it, whatever it
-missed: it creates missing tasks (including tasks deleted by hand), sets the end of tasks that are over, and patches
-those that changed. It is level-triggered, not edge-triggered, so an outage of the store delays it and loses nothing; an
-episode that starts and ends within one outage leaves no task, because nothing is demanded any more.
+The engine passes the full set of demands whenever it changes. The reconciler makes the store match it: it creates
+missing tasks (including tasks deleted by hand), sets the end of tasks that are over, and patches those that changed. It
+is level-triggered, not edge-triggered, so an outage of the store delays it and loses nothing. An episode that starts
+and ends within one outage leaves no task, because its demand no longer exists.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass
 class DeployCounts:
-    """What the reconciler did since its start, as numbers of tasks."""
+    """The work of the reconciler since its start, as numbers of tasks."""
 
     created: int = 0
     recreated: int = 0
@@ -92,7 +92,7 @@ class DemandReconciler:
         self._stopping = asyncio.Event()
         self._deadline = 0.0
         self.counts = DeployCounts()
-        self.looks = 0
+        self.snapshots = 0
         """Number of snapshots of the store."""
 
     @property
@@ -139,7 +139,7 @@ class DemandReconciler:
         self._stopping.set()
 
     def _accept(self) -> None:
-        """Take over the demands of the last `update`."""
+        """Apply the demands of the last `update`."""
         with self._lock:
             handed, self._handed = self._handed, None
         if handed is not None:
@@ -150,9 +150,9 @@ class DemandReconciler:
 
     async def _follow(self) -> None:
         async for change in self._store.follow():
-            self._enqueue(self._ledger.see(change))
+            self._enqueue(self._ledger.apply(change))
             if isinstance(change, Snapshot):
-                self.looks += 1
+                self.snapshots += 1
                 self._reachable.set()
 
     def _enqueue(self, names: Iterable[str]) -> None:
@@ -172,7 +172,7 @@ class DemandReconciler:
         await self._attend(name)
 
     async def _attend(self, name: str) -> None:
-        """Carry out the steps that a task needs, one after the other."""
+        """Make the changes that a task needs, one after the other."""
         failures = self._away.failures
         step = StoreChange.NOTHING
         try:

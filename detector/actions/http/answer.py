@@ -16,7 +16,7 @@ _BUSY = frozenset({429, 502, 503, 504})
 
 
 class ResponseOutcome(Enum):
-    """The consequence of a response."""
+    """What a response means for the request."""
 
     DONE = "done"
     AGAIN = "again"
@@ -51,7 +51,7 @@ class Answer:
 
 
 def judge(answer: Answer) -> tuple[ResponseOutcome, str]:
-    """The consequence, and a reason for users."""
+    """The outcome, and a reason for users."""
     if 200 <= answer.status < 300:
         return ResponseOutcome.DONE, f"answered {answer.status}"
     response = f"answered {answer.status}" + (f": {answer.excerpt}" if answer.excerpt else "")

@@ -167,7 +167,7 @@ class HttpClient:
             give_up: polled twenty times a second; once it is true, the request is aborted.
 
         Raises:
-            HttpError: there was no answer, or a header or certificate is not where the resource places it.
+            HttpError: there was no response, or a header or certificate is missing at the path that the resource names.
         """
         try:
             target = URL(url, encoded=True)
@@ -295,7 +295,7 @@ def _why(error: Exception) -> str:
 
 
 class Resolver(AbstractResolver):
-    """Queries the system, in a daemon thread per query, which is never joined.
+    """Resolves names by the system's resolver, each in a daemon thread that is never joined.
 
     The system's resolver cannot be interrupted. On a vehicle without a network it hangs for many seconds, and the
     process waits at its end for the threads of an executor, but not for these.

@@ -45,13 +45,13 @@ class SendQueue(Protocol[T]):
         """The item to send now."""
 
     def wait(self, now: float) -> float | None:
-        """Seconds until `take` may return something; None: not before something new is added."""
+        """Seconds until `take` may return an item; None: not before a new item is added."""
 
     def record_result(self, sent: T, delivery: Delivery, now: float) -> None:
         """Apply the result of an attempt."""
 
     def hurry(self) -> None:
-        """The end is near: return each queued item once more."""
+        """The detector ends soon: return each queued item once more."""
 
 
 class Sender(Generic[T]):

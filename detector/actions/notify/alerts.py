@@ -86,7 +86,7 @@ class Alerts:
         self._last_tries: set[str] | None = None
 
     def fire(self, alert: Alert) -> bool:
-        """False: the maximum number is reached."""
+        """Add the alert; False if the maximum number is reached."""
         if len(self._alerts) >= self._capacity:
             return False
         self._alerts[alert.episode] = alert
@@ -116,7 +116,7 @@ class Alerts:
         return AlertBatch(chosen, over) if chosen else None
 
     def wait(self, now: float) -> float | None:
-        """Seconds until `take` may return something; None: there are no alerts."""
+        """Seconds until `take` may return alerts; None: there are none."""
         due = min((alert.due for alert in self._alerts.values()), default=None)
         return None if due is None else max(0.0, due - now, self._paused_until - now)
 

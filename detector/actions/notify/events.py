@@ -208,7 +208,7 @@ class EventQueue:
         self._outbox.hurry()
 
     def drain(self, keep: bool) -> None:
-        """Remove all events at the end: with `keep`, stored ones are sent after the next start; the others are lost."""
+        """Remove all events at the end. With `keep`, stored ones are sent after the next start; the others are lost."""
         for message in self._outbox.drain():
             if keep and all(map(self._storage.keeps_notice, message.notices)):
                 for episode in message.episodes:

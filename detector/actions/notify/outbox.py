@@ -97,7 +97,7 @@ class Outbox:
         return len(self._waiting)
 
     def add(self, message: OutboxMessage) -> bool:
-        """False: there was no room."""
+        """Enqueue the message; False if there is no room."""
         if len(self._waiting) >= self._capacity:
             return False
         self._waiting.append(message)
@@ -124,7 +124,7 @@ class Outbox:
         return None
 
     def _first_of_their_episodes(self) -> Iterator[OutboxMessage]:
-        """The messages that do not wait for an earlier one of the same episode."""
+        """The messages that need not wait for an earlier one of the same episode."""
         held: set[str] = set()
         for message in self._waiting:
             if not held & message.episodes:
@@ -137,7 +137,7 @@ class Outbox:
         return message.due <= now
 
     def wait(self, now: float) -> float | None:
-        """Seconds after which `take` may return something; None: the outbox is empty."""
+        """Seconds until `take` may return a message; None: the outbox is empty."""
         due = min((message.due for message in self._first_of_their_episodes()), default=None)
         if due is None:
             return None
@@ -145,7 +145,7 @@ class Outbox:
         return wait if self._budget is None else max(wait, self._budget.wait(now))
 
     def record_result(self, message: OutboxMessage, delivery: Delivery, now: float, wall: float) -> AttemptResult:
-        """Apply the result for the message from `take`: DELIVERED or REFUSED remove it; AGAIN queues it again."""
+        """Apply the result of an attempt: DELIVERED and REFUSED remove the message, AGAIN schedules a retry."""
         if not delivery.whole:
             self._pause.succeed()
         result = delivery.result

@@ -1,4 +1,4 @@
-"""What an action stores on the state volume: undelivered events, rendered texts of open episodes, dead letters."""
+"""The data of an action on the state volume: undelivered events, rendered texts of open episodes, dead letters."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ class NotifyStore:
         return list(self._journal.load_all(_NOTICE, notice_from).values())
 
     def keep(self, notice: Notice) -> None:
-        """Store it until `delivered`."""
+        """Store the event until `delivered`."""
         self._journal.put(_NOTICE + notice.id, notice.to_json())
 
     def delivered(self, notices: Iterable[Notice]) -> None:
-        """Remove these."""
+        """Remove these events: they were delivered."""
         self._journal.drop([_NOTICE + notice.id for notice in notices])
 
     def keeps_notice(self, notice: Notice) -> bool:

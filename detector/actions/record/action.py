@@ -77,7 +77,7 @@ class Record(Action[api.RecordAction]):
         self._report_finished(current)
 
     def ended(self, episode: Episode) -> None:
-        """Samples of `after` may follow."""
+        """Update the description; samples of `after` may follow."""
         self._know(episode)
 
     def completed(self, episode: Episode, completion: Completion) -> None:

@@ -116,7 +116,7 @@ class Trigger(Action[api.TriggerAction]):
             self._stop_left(now)
         due: list[tuple[float, RemoteRecording, NextRequest]] = []
         for recording in self._recordings.values():
-            step = recording.look(now)
+            step = recording.next_request(now)
             if step is not None and self._next_attempt(recording.order) <= now:
                 due.append((recording.due, recording, step))
         if due:
@@ -124,7 +124,7 @@ class Trigger(Action[api.TriggerAction]):
         self._forget_finished()
         if len(due) > 1:
             return 0.0
-        nexts = [max(each.next_look(), self._next_attempt(each.order)) for each in self._recordings.values()]
+        nexts = [max(each.next_due(), self._next_attempt(each.order)) for each in self._recordings.values()]
         nexts += [self._claim] if self._left else []
         soonest = min(nexts, default=FOREVER)
         return None if soonest == FOREVER else max(0.0, soonest - time.monotonic())
@@ -138,7 +138,7 @@ class Trigger(Action[api.TriggerAction]):
             stops = [
                 recording
                 for recording in self._recordings.values()
-                if recording.look(max(now, recording.due)) is NextRequest.STOP
+                if recording.next_request(max(now, recording.due)) is NextRequest.STOP
                 and self._next_attempt(recording.order) <= now
             ]
             if not stops:

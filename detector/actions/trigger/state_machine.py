@@ -88,7 +88,7 @@ class RemoteRecording:
             if self.step is NextRequest.HOLD:
                 self._to(NextRequest.STOP, now)
 
-    def look(self, now: float) -> NextRequest | None:
+    def next_request(self, now: float) -> NextRequest | None:
         """The request to send now; None: none is due."""
         if self.step is NextRequest.HOLD and now >= self._limit:
             self.note = (
@@ -97,8 +97,8 @@ class RemoteRecording:
             self._to(NextRequest.STOP, now)
         return self.step if now >= self.due and not self.finished else None
 
-    def next_look(self) -> float:
-        """When `look` may return something, if nothing happens before."""
+    def next_due(self) -> float:
+        """When `next_request` may return a request, if nothing happens before."""
         if self.finished:
             return FOREVER
         return min(self.due, self._limit) if self.step is NextRequest.HOLD else self.due
@@ -125,7 +125,7 @@ class RemoteRecording:
             self.step = NextRequest.FINISHED
 
     def answered(self, now: float, report: Report) -> None:
-        """The other system responded to the request that `look` returned."""
+        """The other system responded to the request that `next_request` returned."""
         if report.progress is Progress.REFUSED and self.step in (NextRequest.START, NextRequest.STOP):
             self.failed(now, report.message, silent=False)
             return

@@ -91,14 +91,14 @@ _ENCODINGS = {"application/json": Encoding.JSON, "application/cbor": Encoding.CB
 
 def listen(config: Zenoh, seconds: float) -> SurveyResult:
     """The samples on all keys within `seconds`. Raises NetworkError if there is no session."""
-    came: queue.SimpleQueue[tuple[int, zenoh.Sample]] = queue.SimpleQueue()
+    received: queue.SimpleQueue[tuple[int, zenoh.Sample]] = queue.SimpleQueue()
     topics: dict[str, Topic] = {}
     with open_session(config) as session:
-        session.declare_subscriber("**", lambda sample: came.put((time.time_ns(), sample)))
+        session.declare_subscriber("**", lambda sample: received.put((time.time_ns(), sample)))
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0:
             try:
-                at, sample = came.get(timeout=left)
+                at, sample = received.get(timeout=left)
             except queue.Empty:
                 break
             key = str(sample.key_expr)

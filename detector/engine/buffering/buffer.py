@@ -28,8 +28,7 @@ HOUSEKEEPING = 1_000_000_000
 _RECEIVED = attrgetter("received")
 
 _SLACK = 64
-"""When the cap over all streams is exceeded, 1/64 of it is freed at once, so that the search for the oldest pays
-off."""
+"""When the cap over all streams is exceeded, 1/64 of it is freed at once: the search for the oldest is expensive."""
 
 
 def bytes_of(samples: Sequence[Sample]) -> int:
@@ -41,7 +40,7 @@ class Lane:
     """The samples of one client on one stream, in time order."""
 
     __slots__ = (
-        "_pushed_out", "bytes", "came", "capped", "client", "duration", "evicted", "maximum_bytes", "maximum_count",
+        "_pushed_out", "bytes", "capped", "client", "duration", "evicted", "inserted", "maximum_bytes", "maximum_count",
         "number", "samples", "stream",
     )  # fmt: skip
 
@@ -61,8 +60,8 @@ class Lane:
         self.stream = stream
         self.number = -1
         """The client's number in the tables (see columns/tables.py); -1 while it has none."""
-        self.came: list[Sample] | None = None
-        """What was inserted since `record`; None if nobody records."""
+        self.inserted: list[Sample] | None = None
+        """Samples inserted since `record`; None if nobody records."""
         self.limit(duration, maximum_bytes, maximum_count)
         self.samples: deque[Sample] = deque()
         self.bytes = 0
@@ -78,14 +77,14 @@ class Lane:
         self.maximum_count = maximum_count
         self._decide()
 
-    def record(self, came: list[Sample] | None) -> None:
+    def record(self, inserted: list[Sample] | None) -> None:
         """Append inserted samples to the list from now on, in order of arrival; None: stop."""
-        self.came = came
+        self.inserted = inserted
         self._decide()
 
     def _decide(self) -> None:
-        self.capped = self.maximum_bytes is not None or self.maximum_count is not None or self.came is not None
-        """Whether samples must go through `insert`, which enforces the caps and fills `came`."""
+        self.capped = self.maximum_bytes is not None or self.maximum_count is not None or self.inserted is not None
+        """Whether samples must go through `insert`, which enforces the caps and fills `inserted`."""
 
     @property
     def newest(self) -> Sample | None:
@@ -99,8 +98,8 @@ class Lane:
 
     def insert(self, sample: Sample) -> int:
         """Insert the sample in time order; returns by how many bytes the lane grew."""
-        if self.came is not None:
-            self.came.append(sample)
+        if self.inserted is not None:
+            self.inserted.append(sample)
         samples = self.samples
         later = []
         while samples and samples[-1].time > sample.time:
@@ -144,7 +143,7 @@ class Lane:
         return freed
 
     def _drop(self, count: int) -> int:
-        """Forget that many of the oldest samples; returns the bytes that they took."""
+        """Drop this number of the oldest samples; returns the bytes freed."""
         pop = self.samples.popleft
         return sum([len(pop().payload) for _ in range(count)]) + SAMPLE_OVERHEAD * count
 
@@ -219,7 +218,7 @@ class Buffer:
             self.on_added(lane)
         return lanes[lane.stream]
 
-    def takes(self, size: int) -> bool:
+    def has_room(self, size: int) -> bool:
         """Whether an insertion of this size (bytes) evicts nothing."""
         return self.bytes + size <= self.maximum_bytes
 
@@ -250,8 +249,8 @@ class Buffer:
         if lanes:
             self._lanes[client] = lanes
 
-    def keep(self, streams: Collection[str]) -> None:
-        """Drop the lanes of all other streams."""
+    def retain(self, streams: Collection[str]) -> None:
+        """Keep the lanes of these streams only."""
         for client, lanes in list(self._lanes.items()):
             for stream in [stream for stream in lanes if stream not in streams]:
                 self._drop(lanes.pop(stream))

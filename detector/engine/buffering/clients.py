@@ -19,7 +19,7 @@ class Presence:
 
     since: int
     last: int
-    """Or earlier: what came since then is in the buffer."""
+    """Or earlier: the buffer has newer samples."""
     patience: int | None = None
     """How long it is known without a sample, in nanoseconds; None: for the Detector's `clientTimeout`."""
     restored: bool = False
@@ -52,7 +52,7 @@ class Clients:
 
         The timeout of a client that is no longer expected counts from `now` at the earliest.
         """
-        self._look()  # streams may go from the buffer
+        self._update_last()  # the buffer may drop streams
         self._labels, self._timeout = labels, timeout
         self._loss = NEVER
         for client in self._expected.difference(expected):
@@ -65,7 +65,7 @@ class Clients:
                 self.newest = max(self.newest, now)
 
     def seen(self, client: str, time: int, patience: int | None = None) -> None:
-        """The first sample of the client on a stream, or its liveliness token.
+        """Called with the first sample of the client on a stream, or its liveliness token.
 
         `patience` (ns) is given for a stream with items: a client of several streams gets the longest of all.
         """
@@ -95,34 +95,37 @@ class Clients:
         if presence is not None and time > presence.last:
             presence.last = time
 
-    def may_lose(self, now: int) -> bool:
-        """Whether `lose` has something to do, or a token came or went."""
+    def may_remove(self, now: int) -> bool:
+        """Whether `remove_lost` may find lost clients: a timeout expired, or a token was added or removed."""
         if not self.tokens.changed and self._loss is not None and now > self._loss:
-            self._look()
+            self._update_last()
         return self.tokens.changed or (self._loss is not None and now > self._loss)
 
-    def _look(self) -> None:
-        """See when something was last received from each client, and before when none is lost by that."""
+    def _update_last(self) -> None:
+        """Update when something was last received from each client, and the earliest time at which one can time out."""
         for name, presence in self._present.items():
             presence.last = max(presence.last, self._buffer.latest(name))
         waited = (
             presence.last + self._timeout_of(presence)
             for name, presence in self._present.items()
-            if name not in self._expected and not self.tokens.hold(name)
+            if name not in self._expected and not self.tokens.has_token(name)
         )
         self._loss = min(waited, default=None)
 
-    def lose(self, now: int) -> list[str]:
+    def remove_lost(self, now: int) -> list[str]:
         """Remove the clients that have timed out without a token, or whose last token was dropped; returns them.
 
         Expected clients are never lost.
         """
         tokens = self.tokens
-        self._look()
+        self._update_last()
         lost = [
             name
             for name, presence in self._present.items()
-            if ((now - presence.last > self._timeout_of(presence) and not tokens.hold(name)) or tokens.dropped(name))
+            if (
+                (now - presence.last > self._timeout_of(presence) and not tokens.has_token(name))
+                or tokens.dropped(name)
+            )
             and name not in self._expected
         ]
         tokens.forget_dropped()
@@ -146,7 +149,7 @@ class Clients:
         return [
             name
             for name in sorted(self._expected)
-            if now - self.last(name) > self._timeout and not self.tokens.hold(name)
+            if now - self.last(name) > self._timeout and not self.tokens.has_token(name)
         ]
 
     def knows(self, client: str, time: int) -> bool:

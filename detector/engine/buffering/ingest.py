@@ -56,9 +56,9 @@ class Ingest:
         self._counters = counters
         self._number = 0
         self._newest = NEVER
-        """The greatest time of all samples until now: a sample that is not before it is late in no lane."""
-        self.came: list[Sample] = []
-        """Samples inserted since the last time they were taken, while `noting`."""
+        """The greatest time of all samples until now: a sample with this time or a later one is late in no lane."""
+        self.inserted: list[Sample] = []
+        """Samples inserted since tables were last updated, while `noting`."""
         self.lanes: list[Lane] = []
         """The lane of each of these."""
         self.noting = False
@@ -147,7 +147,7 @@ class Ingest:
     def _put(self, lane: Lane, sample: Sample) -> None:
         self._buffer.grew(lane.insert(sample))
         if self.noting:
-            self.came.append(sample)
+            self.inserted.append(sample)
             self.lanes.append(lane)
 
     def _insert_in_order(self, arrivals: Sequence[Arrival], size: int) -> None:
@@ -162,7 +162,7 @@ class Ingest:
             arrivals = [arrival for lane, arrival in found if lane is not None]
             lanes = [lane for lane, _ in found if lane is not None]
             size = bytes_of(arrivals)
-        if not buffer.takes(size) or (arrivals and arrivals[0].received < newest):
+        if not buffer.has_room(size) or (arrivals and arrivals[0].received < newest):
             for lane, arrival in zip(lanes, arrivals, strict=True):
                 self._put(lane, arrival)
             return
@@ -174,11 +174,11 @@ class Ingest:
                 lane.bytes += len(arrival.payload) + SAMPLE_OVERHEAD
         buffer.bytes += size
         if self.noting:
-            self.came += arrivals
+            self.inserted += arrivals
             self.lanes += lanes
 
     def _lane(self, stream: str, key: str, time: int, payload: bytes) -> Lane | None:
-        """The lane for a sample; None if there is none, and the sample then does not count as taken in."""
+        """The lane for a sample; None if there is none: the sample is then dropped, and not counted in `samples`."""
         if stream in self._message_clients:
             lane = self._lane_of_message(stream, key, time, payload)
         else:
@@ -212,11 +212,10 @@ class Ingest:
         """Time continues from `to` (nanoseconds), which is earlier."""
         self._newest = to
 
-    def lose(self, lost: Collection[str]) -> None:
-        """These clients are lost. The next sample of one makes it known again; its last samples are still available
-        then.
+    def forget_clients(self, lost: Collection[str]) -> None:
+        """Forget lost clients. If one returns, its last samples are still available.
 
-        (A latched sample would not be sent again, since its sender may not have noticed the loss.)
+        A latched sample would not be sent again, since its sender may not have noticed the loss.
         """
         for lanes in self._lanes.values():
             for key in [key for key, lane in lanes.items() if lane.client in lost]:

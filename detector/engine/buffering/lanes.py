@@ -90,7 +90,7 @@ class LatchedLane(Lane):
             replaced.add(about)
 
     def step_back(self, to: int) -> None:
-        """Time continues at `to`: samples stay valid, with times no newer than that."""
+        """Time continues at the earlier time `to`: samples stay valid; newer times become `to`."""
         self._keep([_not_after(sample, to) for sample in self.samples])
         self._pushed_out = NEVER
 

@@ -102,8 +102,8 @@ class Block:
         """By stream: the time of the newest sample, or NEVER."""
         self.present: Truths | None = None
         """Which points exist; None: all. Shape (clients, ticks)."""
-        self.looked: Truths | None = None
-        """Which rule evaluates which client; None: each rule all clients. Shape (tracks, clients)."""
+        self.selected: Truths | None = None
+        """Which clients each rule evaluates; None: all. Shape (tracks, clients)."""
         self.measured: dict[tuple[int, str], Column] = {}
         """By track and signal over the open episode, the values that the signal aggregates."""
         self.verdicts: Mapping[str, Ternary] = {}
@@ -117,18 +117,18 @@ class Block:
 
     def points(self, row: int) -> Truths | None:
         """The points that a track evaluates, flat; None: all."""
-        if self.looked is None:
+        if self.selected is None:
             return None if self.present is None else self.present.ravel()
-        looked = np.repeat(self.looked[row], len(self.ticks))
-        return looked if self.present is None else looked & self.present.ravel()
+        selected = np.repeat(self.selected[row], len(self.ticks))
+        return selected if self.present is None else selected & self.present.ravel()
 
     def evaluated(self, row: int) -> int:
-        """How many points a track evaluates."""
+        """Number of points that a track evaluates."""
         own = self.points(row)
         return len(self.clients) * len(self.ticks) if own is None else int(own.sum())
 
     def count(self, row: int, points: Truths) -> int:
-        """How many of the points a track evaluates."""
+        """Number of these points that a track evaluates."""
         own = self.points(row)
         return int(points.sum()) if own is None else int((points & own).sum())
 

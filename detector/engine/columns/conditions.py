@@ -161,8 +161,8 @@ class Conditions:
         if block.present is not None:
             changed &= block.present
             changed[:, 1:] |= block.present[:, 1:] & ~block.present[:, :-1]
-        if block.looked is not None:
-            changed &= block.looked[row][:, None]
+        if block.selected is not None:
+            changed &= block.selected[row][:, None]
         points = np.flatnonzero(changed).tolist()
         if not points:
             return

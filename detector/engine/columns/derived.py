@@ -43,8 +43,8 @@ class DerivedColumns:
             if signal.of is not None
         ]
 
-    def look(self, rows: Rows, now: Evaluations) -> Iterator[Derived]:
-        """Compute each signal at the rows, which are these evaluations. The signal's windows contain earlier rows."""
+    def compute(self, rows: Rows, now: Evaluations) -> Iterator[Derived]:
+        """Compute each signal at the rows, one per evaluation. Its windows also contain earlier evaluations."""
         track = self._track
         for signal, formula in self._formulas:
             column = formula.column(rows)
@@ -70,7 +70,7 @@ class ClientDerived:
     def _leaf(self, track: Track) -> Callable[[Path], Hashable | Constant | None]:
         return lambda path: self._client_values.leaf(track, path)
 
-    def look(self, block: Block) -> None:
+    def compute(self, block: Block) -> None:
         """Add the signals to those of the block."""
         for track, derived in self._of:
             own = block.points(track.row)
@@ -78,7 +78,7 @@ class ClientDerived:
             clients, ticks = np.divmod(points, len(block.ticks))
             keys = np.array([track.earlier.number(client) for client in block.clients], np.int64)[clients]
             now = Evaluations(keys, block.times[ticks], block.ticks[-1])
-            for each in derived.look(self._rows(track, block, points), now):
+            for each in derived.compute(self._rows(track, block, points), now):
                 column = _scattered(each.column, points, block.shape[0] * block.shape[1])
                 if each.signal.episode:
                     block.measured[track.row, each.signal.name] = column

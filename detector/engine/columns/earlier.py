@@ -81,8 +81,8 @@ class EarlierValues:
         self._numbers.clear()
         self.version += 1
 
-    def lose(self, clients: Collection[str]) -> None:
-        """These clients are lost: if they return, earlier values do not count."""
+    def forget_clients(self, clients: Collection[str]) -> None:
+        """Forget lost clients: if they return, earlier values do not count."""
         gone = np.array([number for client in clients if (number := self._numbers.pop(client, None)) is not None])
         if not len(gone):
             return

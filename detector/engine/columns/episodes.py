@@ -14,8 +14,8 @@ from wayside.rules import CompiledSignal
 def of_episodes(context: Context, block: Block, track: Track, signal: CompiledSignal) -> Column:
     """The signal at each point. Counts unknown values and failures."""
     counters, ticks = track.counters, block.ticks
-    looked = block.points(track.row)
-    points = np.ones(block.shape, bool) if looked is None else looked.reshape(block.shape)
+    evaluated = block.points(track.row)
+    points = np.ones(block.shape, bool) if evaluated is None else evaluated.reshape(block.shape)
     values, tags = np.zeros(block.shape), np.zeros(block.shape, np.uint8)
     column = Column(values.reshape(-1), tags.reshape(-1))
     if not context.starts.is_evaluated(signal.stream):

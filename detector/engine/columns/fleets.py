@@ -144,18 +144,18 @@ class FleetGroup:
         return constant({"parameters": track.rule.parameters.own, **track.element.variables}, path)
 
     def evaluate(
-        self, ticks: Sequence[int], clients: Sequence[str], floor: int | None, looked: Truths | None = None
+        self, ticks: Sequence[int], clients: Sequence[str], floor: int | None, selected: Truths | None = None
     ) -> tuple[FleetBlock, Codes]:
         """The rules' observations at the ticks: uint8, shape (tracks, 1, ticks). They read all clients.
 
         Windows start after `floor`. Counts unknown values and failures.
         """
-        assert looked is None  # noqa: S101  such rules are not evaluated with samples
+        assert selected is None  # noqa: S101  such rules are not evaluated with samples
         block = Block(self._context, ticks, clients)
         members = np.zeros((len(self.tracks), *block.shape), bool)
         if clients:
             block.present = present(block, self._context.clients)
-            self._signals.look(block, floor)
+            self._signals.compute(block, floor)
             members = self._members.verdicts(block)[_PLACE].true.reshape(members.shape)
             if block.present is not None:
                 members = members & block.present

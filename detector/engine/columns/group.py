@@ -37,7 +37,7 @@ def fit_signals(rule: CompiledRule, tables: Tables) -> bool:
             signal.rule is not None
             or (
                 not (signal.aggregate is Aggregate.AGE and signal.where is not None)
-                and tables.takes(streams[signal.stream])
+                and tables.supports(streams[signal.stream])
             )
             for signal in signals_of(rule)
         )
@@ -68,21 +68,21 @@ class ClientGroup:
             self._signals.watch_all_streams()
 
     def evaluate(
-        self, ticks: Sequence[int], clients: Sequence[str], floor: int | None, looked: Truths | None = None
+        self, ticks: Sequence[int], clients: Sequence[str], floor: int | None, selected: Truths | None = None
     ) -> tuple[Block, Codes]:
         """The rules' observations at the points: uint8, shape (tracks, clients, ticks).
 
-        Windows start after `floor`. Counts unknown values and failures at the points that a rule evaluates: `looked`,
-        shape (tracks, clients), or all.
+        Windows start after `floor`. Counts unknown values and failures at the points that a rule evaluates: those of
+        the `selected` clients, shape (tracks, clients), or all.
         """
         block = Block(self._context, ticks, clients)
         block.present = present(block, self._context.clients)
-        block.looked = None if looked is None or looked.all() else looked
-        self._signals.look(block, floor)
+        block.selected = None if selected is None or selected.all() else selected
+        self._signals.compute(block, floor)
         if self._derived is not None:
-            self._derived.look(block)
+            self._derived.compute(block)
         count = len(clients) * len(ticks)
-        whole = block.present is None and block.looked is None
+        whole = block.present is None and block.selected is None
         for row, track in enumerate(self.tracks):
             track.counters.evaluations += count if whole else block.evaluated(row)
         return block, self._observed(block)

@@ -13,7 +13,7 @@ from wayside.expressions.columns.values import Column, Tag
 class Computed(Protocol):
     """Computes the signals of one client."""
 
-    def look(self, block: Block, floor: int | None) -> None:
+    def compute(self, block: Block, floor: int | None) -> None:
         """Compute all signals of a block that contains only this client."""
 
     def place(self, row: int, name: str) -> int:
@@ -33,14 +33,14 @@ class NamedSignals:
         """Add such a signal of a track, with its index in the group."""
         self._places.append((at, track, name))
 
-    def look(self, context: Context, block: Block, floor: int | None) -> dict[int, Column]:
+    def compute(self, context: Context, block: Block, floor: int | None) -> dict[int, Column]:
         """The signals at all points of a block, by their indices; unknown while the client is not known."""
         known = np.array([context.clients.knows(self.client, tick) for tick in block.ticks], bool)
         own = Block(context, block.ticks, (self.client,)) if known.any() else None
         if own is not None:
             assert self.columns is not None  # noqa: S101  all signals were placed
             own.present = known[None, :]
-            self.columns.look(own, floor)
+            self.columns.compute(own, floor)
         # Which ticks without clients are in a block depends on how blocks are cut.
         read = np.full(len(known), bool(block.clients)) if block.present is None else block.present.any(axis=0)
         found: dict[int, Column] = {}

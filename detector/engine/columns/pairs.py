@@ -37,12 +37,12 @@ def fits_pairs(rule: CompiledRule, context: Context) -> bool:
         isinstance(rule.subject, PairSubject)
         and context.exact
         and len(rule.elements) == 1
-        and _takes(rule.subject.position.stream, context.tables)
+        and _supports(rule.subject.position.stream, context.tables)
     )
 
 
-def _takes(stream: str, tables: Tables) -> bool:
-    return any(each.name == stream and tables.takes(each) for each in tables.streams)
+def _supports(stream: str, tables: Tables) -> bool:
+    return any(each.name == stream and tables.supports(each) for each in tables.streams)
 
 
 @dataclass
@@ -112,7 +112,7 @@ class PairColumns:
         seen, at = block, np.arange(len(clients))
         roles: Mapping[str, Ternary] = {}
         if any(self._roles.values()):
-            self._signals.look(block, floor)
+            self._signals.compute(block, floor)
             roles = {role: self._role(role, block) for role in _ROLES}
         near = self._near(block, places, roles)
         self._track.counters.crowded_pairs += near.left_out
@@ -125,12 +125,12 @@ class PairColumns:
         is_near = np.insert(np.ones(len(keys), bool), where, False)
         distance = np.insert(near.distance, where, self._distances(places, added // count, added % count))
         if not roles and self._reads_streams:
-            looked = np.flatnonzero(np.bincount(np.concatenate((first, second)), minlength=count))
+            paired = np.flatnonzero(np.bincount(np.concatenate((first, second)), minlength=count))
             at = np.full(count, -1)
-            at[looked] = np.arange(len(looked))
-            names = [clients[each] for each in looked.tolist()]
-            seen = Block(self._context, block.ticks, names, block.numbers[looked])
-            self._signals.look(seen, floor)
+            at[paired] = np.arange(len(paired))
+            names = [clients[each] for each in paired.tolist()]
+            seen = Block(self._context, block.ticks, names, block.numbers[paired])
+            self._signals.compute(seen, floor)
         these = PairBlock(block, places, seen, at, first, second, distance, places.known[first] & places.known[second])
         if self._subject.closing_speed:
             self._measure_closing(these, newest, floor)
@@ -149,7 +149,7 @@ class PairColumns:
         keys = earlier.pairs(numbers[these.first], numbers[these.second])
         now = Evaluations(keys, np.full(len(keys), tick), tick)
         expressions = {signal.name: signal.of for signal in self._track.rule.derived}
-        for each in derived.look(self._rows(these, expressions), now):
+        for each in derived.compute(self._rows(these, expressions), now):
             columns = these.measured if each.signal.episode else these.derived
             columns[each.signal.name] = each.column
 

@@ -85,14 +85,14 @@ class PositionColumns:
         rows = table.find_each(times, numbers) - 1
         there = rows >= table.first[numbers]
         rows = np.where(there, rows, 0)
-        came = table.times[rows]
+        received = table.times[rows]
         horizon = block.times[0] - self._context.tables.duration(self._position.stream)
-        there &= (rows == newest[at]) | (came > horizon)
+        there &= (rows == newest[at]) | (received > horizon)
         if floor is not None:
-            there &= came > floor
+            there &= received > floor
         limit = self._context.positions.limit(self._position)
         if limit is not None:
-            there &= times - came <= limit
+            there &= times - received <= limit
         # Each sample is read once, and each client without one is counted once.
         _, first, inverse = np.unique(np.where(there, rows, -1 - at), return_index=True, return_inverse=True)
         self._counters.unknowns += int((~there[first]).sum())

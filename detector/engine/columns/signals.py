@@ -129,7 +129,7 @@ class SignalColumns:
             )
         return at
 
-    def look(self, block: Block, floor: int | None) -> None:
+    def compute(self, block: Block, floor: int | None) -> None:
         """Compute all signals."""
         tables = self._context.tables
         if self._version != tables.version:
@@ -153,7 +153,7 @@ class SignalColumns:
         for at, track, signal in self._over_rules:
             found[at] = of_episodes(self._context, block, track, signal)
         for named in self._named.values():
-            found |= named.look(self._context, block, floor)
+            found |= named.compute(self._context, block, floor)
         block.signals = [found[at] for at in range(len(self._users))]
 
     def place(self, row: int, name: str) -> int:

@@ -131,7 +131,7 @@ class Tables:
         """Whether no rule reads any column."""
         return not self._tables
 
-    def takes(self, stream: Stream) -> bool:
+    def supports(self, stream: Stream) -> bool:
         """Whether windows over the stream can be ranges of a table."""
         capped = stream.buffer.bytes is not None or stream.buffer.count is not None
         return not stream.latched and not capped and self._durations[stream.name] <= LONGEST

@@ -23,7 +23,7 @@ from wayside.rules import CompiledDeploy, CompiledRule
 
 @dataclass(frozen=True, slots=True)
 class DetectorIdentity:
-    """Whose episodes they are."""
+    """The detector that the episodes belong to."""
 
     detector: str
     holder: str
@@ -91,8 +91,8 @@ class EpisodeState(msgspec.Struct, eq=False):
                     rendered[action.name] = render_templates(action, seen)
         return self._event(rule, identity, values, rendered, now, reason)
 
-    def kept(self) -> OpenEpisode:
-        """The episode in the form that survives a restart."""
+    def to_open_episode(self) -> OpenEpisode:
+        """Convert the episode to the form that survives a restart."""
         return OpenEpisode(self.record, None if self.statistics is None else self.statistics.to_document())
 
     def is_complete(self, rule: CompiledRule) -> bool:
@@ -184,8 +184,8 @@ class Budget:
     def __init__(self) -> None:
         self._starts: dict[str, deque[int]] = {}
 
-    def takes(self, clients: Sequence[str], now: int, limit: int) -> bool:
-        """Whether each of the clients had fewer than `limit` starts in (now - 1 h, now]; if so, count this one."""
+    def try_acquire(self, clients: Sequence[str], now: int, limit: int) -> bool:
+        """Count this start, if each of the clients had fewer than `limit` starts in (now - 1 h, now]; else False."""
         names = clients or (FLEET,)
         for name in names:
             starts = self._starts.get(name)

@@ -119,7 +119,7 @@ class SubjectState:
         return min((time for time in times if time > now), default=None)
 
     def gap(self) -> None:
-        """Time moved on without ticks: discard a pending episode, keep an open one."""
+        """Time jumped without ticks: discard a pending episode, keep an open one."""
         self.onset = None
         self.unknown_since = None
 

@@ -40,8 +40,8 @@ class Statistic:
     infinite: float = 0.0
     """The sum of the infinite numbers."""
 
-    def take(self, aggregate: Aggregate, time: int, value: Value | Unknown) -> bool:
-        """Take a value into account; False if the aggregate cannot use it."""
+    def add(self, aggregate: Aggregate, time: int, value: Value | Unknown) -> bool:
+        """Add a value; False if the aggregate cannot use it."""
         if aggregate is Aggregate.COUNT:
             self.count += 1
         elif aggregate in _OF_ONE:
@@ -59,10 +59,10 @@ class Statistic:
         elif isinstance(value, bool) or not isinstance(value, int | float):
             return False
         else:
-            self._take_number(aggregate, time, value)
+            self._add_number(aggregate, time, value)
         return True
 
-    def _take_number(self, aggregate: Aggregate, time: int, number: float) -> None:
+    def _add_number(self, aggregate: Aggregate, time: int, number: float) -> None:
         if aggregate in _EXTREMES:
             known = self.value
             if not isinstance(known, int | float) or (number < known if aggregate in _LEAST else number > known):
@@ -113,7 +113,7 @@ class Statistics:
         self._signals = signals
         self._start = start
         self.until = start - 1
-        """The last evaluation that was taken into account; nanoseconds."""
+        """The last evaluation that was added; nanoseconds."""
         self._of = {signal.name: Statistic() for signal in signals if signal.of is not None}
 
     @classmethod
@@ -123,19 +123,18 @@ class Statistics:
         return cls(signals, start) if signals else None
 
     def up_to(self, now: int, values: Mapping[str, Value], counters: RuleCounters) -> dict[str, Value]:
-        """The known statistics after an evaluation with these values, which may be taken into account already."""
+        """The known statistics after an evaluation with these values, which may have been added already."""
         if self.until < now:
-            self.take(now, values, counters)
+            self.add(now, values, counters)
         return self.values(now)
 
-    def take(self, time: int, values: Mapping[str, Value], counters: RuleCounters) -> None:
-        """Take the values of an evaluation into account; unknown ones are left out. Counts values that cannot be
-        used."""
+    def add(self, time: int, values: Mapping[str, Value], counters: RuleCounters) -> None:
+        """Add the values of an evaluation; unknown ones are left out. Counts values that cannot be used."""
         self.until = time
         for signal in self._signals:
             if signal.of is not None:
                 value = values.get(signal.name, UNKNOWN)
-                if not self._of[signal.name].take(signal.aggregate, time, value):
+                if not self._of[signal.name].add(signal.aggregate, time, value):
                     counters.errors += 1
                     message = f"{signal.aggregate} cannot use the value {value!r:.80}"
                     counters.last_error = f"signal {signal.name}: {message}"

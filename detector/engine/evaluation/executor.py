@@ -40,7 +40,7 @@ class Executor:
         observers: Observers,
         now: Callable[[], int],
     ) -> None:
-        """`now`: up to there all ticks have run; nanoseconds on the engine's time axis."""
+        """`now` returns the time up to which all ticks have run; nanoseconds on the engine's time axis."""
         self._inputs = inputs
         self._clients = inputs.clients
         self._ticks = ticks
@@ -125,14 +125,14 @@ class Executor:
         events += self._evaluate_waiting()
         if self._inputs.tables.full:
             self.plan()
-        self._inputs.looked(self._now())
+        self._inputs.end_tick(self._now())
         return events
 
     def _may_wait(self, arrivals: Sequence[Arrival], times: Sequence[int] | None, size: int) -> bool:
         """Whether these arrivals (at most `size` bytes) change nothing that the queued ticks read."""
         first, last = (arrivals[0].received, arrivals[-1].received) if times is None else (min(times), max(times))
         in_order = times is None or first > self._last_wait
-        return in_order and last - self._blocks.since <= LONGEST and self._inputs.buffer.takes(size)
+        return in_order and last - self._blocks.since <= LONGEST and self._inputs.buffer.has_room(size)
 
     def _evaluate_waiting(self) -> list[Event]:
         """Evaluate the queued ticks."""
@@ -141,7 +141,7 @@ class Executor:
         self._inputs.update_tables()
         happened = self._in_columns()
         self._inputs.forget_rows(self._last_wait)
-        self._inputs.looked(self._now())
+        self._inputs.end_tick(self._now())
         self._starts.expire(self._last_wait)
         events = [each.event for each in happened]
         if self._consequences.wanted:
@@ -166,12 +166,14 @@ class Executor:
         if self._inputs.tables.full:
             events += self._evaluate_waiting()
             self.plan()
-        if regular:  # otherwise it is there for a single sample or subject, and must not scan all the others
-            if self._inputs.clients.may_lose(time):
-                events += self._evaluate_waiting()  # clients that are lost now were known at the earlier ticks
-                self._keep_house(time)
+        if regular:  # otherwise it concerns one sample or subject, and must not scan all others
+            if self._inputs.clients.may_remove(time):
+                events += (
+                    self._evaluate_waiting()
+                )  # at the queued ticks, the clients that are lost now were still known
+                self._expire(time)
             elif time % HOUSEKEEPING == 0:
-                self._keep_house(time)
+                self._expire(time)
         self._blocks.skip(time)
         groups = self._blocks.due(time)
         if self._is_alone(tick, groups):
@@ -186,7 +188,7 @@ class Executor:
                 self._unsorted = len(self._instruments.journal)
             self._inputs.update_tables()
             self._blocks.run_ahead(self._instruments.stopwatch)
-            self._inputs.looked(self._now())
+            self._inputs.end_tick(self._now())
         return events
 
     def _is_alone(self, tick: Tick, groups: Sequence[RuleGroup | PairGroup]) -> bool:
@@ -203,7 +205,7 @@ class Executor:
         """Evaluate a tick by itself, rule by rule in their order."""
         time, sampled = tick.time, self._inputs.sampled(tick.sampled)
         due = {run.rule.name for group in groups for run in group.runs}
-        happened: dict[str, list[Event]] = {name: self._lost(name, time) for name in due}
+        happened: dict[str, list[Event]] = {name: self._end_lost(name, time) for name in due}
         self._blocks.wait(time, groups)
         for each in self._in_columns():
             happened[each.event.episode.rule].append(each.event)
@@ -214,7 +216,7 @@ class Executor:
                 own = happened.get(name)
                 if own is None and name not in self._blocks.names:
                     self._losing.discard(name)
-                    own = self._seen(self._turn(run, time, sampled, regular))
+                    own = self._made_visible(self._evaluate_rule(run, time, sampled, regular))
                 if own:
                     own.sort(key=lambda event: event.episode.subject)
                     events += own
@@ -222,15 +224,15 @@ class Executor:
                         self._consequences.note(run.rule, event)
         self._starts.expire(time)
         self._inputs.forget_rows(time)
-        self._inputs.looked(self._now())
+        self._inputs.end_tick(self._now())
         return events
 
-    def _lost(self, name: str, time: int) -> list[Event]:
-        """The ends of a rule's episodes whose clients are lost."""
+    def _end_lost(self, name: str, time: int) -> list[Event]:
+        """End a rule's episodes whose clients are lost."""
         if name not in self._losing:
             return []
         self._losing.discard(name)
-        return self._seen(self._runs[name].lose(time, self._clients))
+        return self._made_visible(self._runs[name].end_lost(time, self._clients))
 
     def _with_samples(
         self, time: int, regular: bool, sampled: Mapping[str, frozenset[str]]
@@ -242,7 +244,7 @@ class Executor:
             named: set[str] = set()
             for run in runs:
                 name = run.rule.name
-                happened[name] = self._lost(name, time) if regular else []
+                happened[name] = self._end_lost(name, time) if regular else []
                 only, thinned = self._schedule.selection(run.rule, time, sampled)
                 run.counters.skipped += thinned
                 if only.clients or only.subjects:
@@ -255,10 +257,10 @@ class Executor:
                 for name, only in chosen.items():
                     # The others have no wake that is due, and none of their timers has changed.
                     due = [subject for subject in only.subjects if subject.clients[0] in self._clients]
-                    self._wake(self._runs[name], time, (*self._runs[name].looked_at, *due))
+                    self._wake(self._runs[name], time, (*self._runs[name].touched, *due))
         return happened
 
-    def _seen(self, events: list[Event]) -> list[Event]:
+    def _made_visible(self, events: list[Event]) -> list[Event]:
         """Return the events, after making them visible to rules that read episodes of other rules."""
         for event in events:
             self._starts.note(event)
@@ -266,13 +268,15 @@ class Executor:
 
     def noted(self, run: RuleRun, events: Iterable[Event]) -> list[Event]:
         """Return the events, after reporting them to other rules and to the rule's actions."""
-        happened = self._seen([*events])
+        happened = self._made_visible([*events])
         for event in happened:
             self._consequences.note(run.rule, event)
         return happened
 
-    def _turn(self, run: RuleRun, time: int, sampled: Mapping[str, frozenset[str]], regular: bool) -> list[Event]:
-        """What happens to a rule at a tick; `regular`: the tick belongs to a rule's period or to housekeeping."""
+    def _evaluate_rule(
+        self, run: RuleRun, time: int, sampled: Mapping[str, frozenset[str]], regular: bool
+    ) -> list[Event]:
+        """Evaluate a rule if it is due; `regular`: the tick belongs to a rule's period or to housekeeping."""
         rule = run.rule
         if rule.every_ns is not None:
             if time % rule.every_ns:
@@ -281,14 +285,14 @@ class Executor:
                 run.counters.skipped += 1
                 return []
             return self._evaluated(run, time)
-        events = run.lose(time, self._clients) if regular else []
+        events = run.end_lost(time, self._clients) if regular else []
         if rule.on_sample is None:
             return events
         only, thinned = self._schedule.selection(rule, time, sampled)
         run.counters.skipped += thinned
         if only.clients or only.subjects:
             events += self._evaluated(run, time, only)
-            self._wake(run, time, run.looked_at)
+            self._wake(run, time, run.touched)
         return sorted(events, key=lambda event: event.episode.subject)
 
     def _evaluated(self, run: RuleRun, time: int, only: SubjectFilter | None = None) -> list[Event]:
@@ -297,15 +301,15 @@ class Executor:
         run.counters.timed(time, self._instruments.stopwatch() - begin)
         return events
 
-    def _keep_house(self, time: int) -> None:
-        """Forget old samples and lost clients."""
-        lost = self._inputs.age(time)
+    def _expire(self, time: int) -> None:
+        """Drop expired samples and lost clients."""
+        lost = self._inputs.expire(time)
         if lost:
             self._losing.update(self._runs)
-            self._starts.lose(lost)
-            self._plugins.lose(lost)
+            self._starts.forget_clients(lost)
+            self._plugins.forget_clients(lost)
             for run in self._runs.values():
-                run.earlier.lose(lost)
+                run.earlier.forget_clients(lost)
 
     def _wake(self, run: RuleRun, time: int, subjects: Iterable[Subject]) -> None:
         for subject, at in run.wakes(time, subjects):

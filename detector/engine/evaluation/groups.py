@@ -98,23 +98,23 @@ class RuleGroup:
         happened: list[OrderedEvent] = []
         if not clients and self.columns.needs_clients:
             return happened
-        looked = None if only is None else self._looked(clients, only)
+        selected = None if only is None else self._selected(clients, only)
         if only is not None:
             for run in self.runs:
-                run.looked_at = []
-        block, codes = self.columns.evaluate(ticks, clients, floor, looked)
+                run.touched = []
+        block, codes = self.columns.evaluate(ticks, clients, floor, selected)
         if self.observer is not None:
             if isinstance(block, Block):
-                self.observer.clients(self.columns.tracks, block, codes, looked)
+                self.observer.clients(self.columns.tracks, block, codes, selected)
             else:
                 self.observer.fleet(self.columns.tracks, block)
         self._follow()
         numbers: list[int] = block.numbers.tolist()
         states: list[tuple[int, int, bool, int]] = []
-        for row, at, changes in self._changed(block, codes, looked):
+        for row, at, changes in self._changed(block, codes, selected):
             states.append((row, numbers[at], *self._step(block, row, at, changes, happened)))
             if only is not None:
-                self._of[row].looked_at.append(self.columns.tracks[row].subject(block.clients[at]))
+                self._of[row].touched.append(self.columns.tracks[row].subject(block.clients[at]))
         if self._measures and isinstance(block, Block):
             self._measure(block)
         if states:
@@ -126,8 +126,8 @@ class RuleGroup:
             run.budget.expire(last)
         return happened
 
-    def _looked(self, clients: Sequence[str], only: Mapping[str, SubjectFilter]) -> Truths | None:
-        """Which track evaluates which client; None: each track all clients."""
+    def _selected(self, clients: Sequence[str], only: Mapping[str, SubjectFilter]) -> Truths | None:
+        """Which clients each track evaluates; None: all."""
         chosen = [only.get(run.rule.name) for run in self._of]
         first = chosen[0]
         if (
@@ -137,11 +137,11 @@ class RuleGroup:
             and all(each is first for each in chosen)
         ):
             return None
-        looked = np.zeros((len(chosen), len(clients)), bool)
+        selected = np.zeros((len(chosen), len(clients)), bool)
         for row, (these, track) in enumerate(zip(chosen, self.columns.tracks, strict=True)):
             if these is not None:
-                looked[row] = [these.takes(track.subject(client)) for client in clients]
-        return looked
+                selected[row] = [these.contains(track.subject(client)) for client in clients]
+        return selected
 
     def _follow(self) -> None:
         """Add new clients, and the states that changed elsewhere."""
@@ -174,7 +174,7 @@ class RuleGroup:
         return [self.columns.number(each) for each in self._of[row].states if each.element == element]
 
     def _changed(
-        self, block: Block | FleetBlock, codes: Codes, looked: Truths | None
+        self, block: Block | FleetBlock, codes: Codes, selected: Truths | None
     ) -> Iterator[tuple[int, int, Changes]]:
         """Of each subject that matters (a track and a client of the block), what may have an effect."""
         numbers, count = block.numbers, len(block.ticks)
@@ -189,11 +189,11 @@ class RuleGroup:
                 for at in np.flatnonzero(watched[row]).tolist():
                     if run.needs_every_tick(track.subject(block.clients[at])):
                         changed[row, at] = True
-        if looked is None:
+        if selected is None:
             self._last[:, numbers] = codes[:, :, -1]
         else:
-            changed &= looked[:, :, None]
-            self._last[:, numbers] = np.where(looked, codes[:, :, -1], before)
+            changed &= selected[:, :, None]
+            self._last[:, numbers] = np.where(selected, codes[:, :, -1], before)
         if not changed.any():
             return
         changed &= (watched | (codes & 3 == TRUE).any(axis=2))[:, :, None]
@@ -277,11 +277,11 @@ class RuleGroup:
         statistics = run.statistics(subject)
         if statistics is None or not isinstance(block, Block):
             return
-        looked = block.points(row)
+        selected = block.points(row)
         for tick in range(bisect_right(block.ticks, statistics.until), end):
             point = at * len(block.ticks) + tick
-            if looked is None or looked[point]:
-                statistics.take(block.ticks[tick], block.measured_at(row, point), run.counters)
+            if selected is None or selected[point]:
+                statistics.add(block.ticks[tick], block.measured_at(row, point), run.counters)
 
 
 def _with_effect(subjects: Integers, effects: Codes, timed: Truths, watched: Truths, alert: Truths) -> Integers:

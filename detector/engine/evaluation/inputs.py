@@ -1,6 +1,6 @@
-"""What the engine knows of its clients: their samples, how to read them, and the values computed from them.
+"""The inputs of rules: the clients and their samples, how to read them, and the values computed from them.
 
-It follows changes of the Detector. Each call gives the time; rules and episodes are kept elsewhere.
+They follow changes of the Detector. Each call passes the time; rules and episodes are kept elsewhere.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class RuleInputs:
             for stream in detector.spec.streams
             if _reads_like(stream, before.stream(stream.name)) and (defined_alike or stream.encoding not in _DEFINED)
         }
-        self.buffer.keep(kept)
+        self.buffer.retain(kept)
         self.tables.forget()
         if detector.spec.zenoh.liveliness != before.zenoh.liveliness:
             for client in self.clients.tokens.forget():
@@ -132,8 +132,8 @@ class RuleInputs:
     def update_tables(self) -> None:
         """Add the samples that entered the buffer to the tables, and drop those that it evicted."""
         ingest = self.ingest
-        self.tables.update(ingest.came, ingest.lanes)
-        ingest.came, ingest.lanes = [], []
+        self.tables.update(ingest.inserted, ingest.lanes)
+        ingest.inserted, ingest.lanes = [], []
         ingest.noting = not self.tables.empty
 
     def forget_rows(self, now: int) -> None:
@@ -149,20 +149,20 @@ class RuleInputs:
         self.tables.follow(tables)
         self.context = self.context._replace(tables=self.tables)
 
-    def age(self, time: int) -> list[str]:
-        """Forget lost clients and, at whole seconds, old samples; returns the lost clients."""
+    def expire(self, time: int) -> list[str]:
+        """Remove lost clients and, at whole seconds, expired samples; returns the lost clients."""
         if time % HOUSEKEEPING == 0:  # not at rule ticks: evictions must not depend on rules
             if self.tables.behind:
                 self.update_tables()  # while the buffer still has what the queued ticks read
             self.buffer.expire(time)
-        lost = self.clients.lose(time) if self.clients.may_lose(time) else []
+        lost = self.clients.remove_lost(time) if self.clients.may_remove(time) else []
         if lost:
-            self.ingest.lose(set(lost))
+            self.ingest.forget_clients(set(lost))
             self.signals.forget(lambda rule, client: client in self.clients)
         return lost
 
     def gap(self, time: int, backwards: bool) -> None:
-        """Time moved on to here without ticks, or (backwards) restarts: later windows start after it."""
+        """Time jumped to `time`, forwards or `backwards`, without ticks: later windows start after it."""
         if backwards:
             self.buffer.step_back(time)
             self.ingest.step_back(time)
@@ -172,7 +172,7 @@ class RuleInputs:
         self._positions.gap(time)
         self.clients.gap(time)
 
-    def looked(self, now: int) -> None:
+    def end_tick(self, now: int) -> None:
         """The tick is over: release what was decoded for it."""
         self.messages.forget()
         self.transforms.forget(now)

@@ -17,8 +17,8 @@ from detector.engine.episodes.demands import DemandChange
 class Observer(Protocol):
     """Receives each block that was evaluated in columns, and copies what it keeps."""
 
-    def clients(self, tracks: Sequence[Track], block: Block, codes: Codes, looked: Truths | None) -> None:
-        """Rules about clients: the observations have shape (tracks, clients, ticks), `looked` (tracks, clients).
+    def clients(self, tracks: Sequence[Track], block: Block, codes: Codes, selected: Truths | None) -> None:
+        """Rules about clients: the observations have shape (tracks, clients, ticks), `selected` (tracks, clients).
 
         The block has the signals and, by field, where conditions are true and false (`verdicts`), one row per track.
         """

@@ -131,7 +131,7 @@ class PairGroup:
             first, second = (int(index[tables.number(client)]) for client in subject.clients)
             row = int(np.searchsorted(pairs, first * count + second))
             if min(first, second) >= 0 and row < len(pairs) and pairs[row] == first * count + second:
-                statistics.take(tick, self._columns.measured(these, row), self._run.counters)
+                statistics.add(tick, self._columns.measured(these, row), self._run.counters)
 
     def _block(self, tick: int, clients: Sequence[str]) -> Block:
         """The clients that are known at the tick."""

@@ -75,8 +75,8 @@ class RuleRun:
         self.budget = Budget()
         """The starts of the last hour."""
         self._answers: list[OnDemandResult] | None = None
-        self.looked_at: list[Subject] = []
-        """The subjects whose states may have changed since the last evaluation with samples began."""
+        self.touched: list[Subject] = []
+        """The subjects evaluated since the last evaluation with samples began: their states may have changed."""
         self.disturbed = True
         """Whether states changed outside the rule's group, so that every subject must be evaluated again."""
         self.journal: list[DemandChange] | None = None
@@ -89,20 +89,20 @@ class RuleRun:
         subjects."""
         self.disturbed = True
         events = [] if only is not None else [*self._lost(now, clients)]
-        self.looked_at = []
+        self.touched = []
         seen = candidates(self.rule, views, clients, self._in_progress(), only)
         seen = plugins.added(self.rule, seen, self.counters, every_subject=only is None)
         if self.rule.derived:
             seen = with_derived(self.rule, self.earlier, now, seen, self.counters)
         for candidate in seen:
             self.counters.evaluations += 1
-            self.looked_at.append(candidate.subject)
+            self.touched.append(candidate.subject)
             events += self._subject(now, candidate)
         if only is None:
             self.tidy(now)
         return sorted(events, key=lambda event: event.episode.subject)
 
-    def lose(self, now: int, clients: Clients) -> list[Event]:
+    def end_lost(self, now: int, clients: Clients) -> list[Event]:
         """For a rule without a period: end the episodes of lost clients, and forget states that have expired."""
         self.disturbed = True
         events = [*self._lost(now, clients)]
@@ -151,7 +151,7 @@ class RuleRun:
         return sum(state.onset is not None for state in self.states.values())
 
     def gap(self, time: int) -> None:
-        """Time moved on (or back) without ticks: keep open episodes, discard pending ones, reset windows."""
+        """Time jumped without ticks: keep open episodes, discard pending ones, reset windows."""
         self.disturbed = True
         self.earlier.clear()
         for state in self.states.values():
@@ -190,7 +190,7 @@ class RuleRun:
 
     def episodes(self) -> Iterator[OpenEpisode]:
         """The episodes that have not ended."""
-        return (episode.kept() for episode in self._open.values())
+        return (episode.to_open_episode() for episode in self._open.values())
 
     def change_actions(self, rule: CompiledRule) -> None:
         """Switch to a rule with the same conditions but other actions.
@@ -301,7 +301,7 @@ class RuleRun:
             candidate = self._measured(now, ended.statistics, candidate)
             return self._ended(now, ended, what.reason, snapshot(self.rule, candidate), candidate.variables)
         limit = self.rule.maximum_per_hour
-        if limit is None or self.budget.takes(subject.clients, now, limit):
+        if limit is None or self.budget.try_acquire(subject.clients, now, limit):
             return self._started(now, what.onset, candidate)
         self.counters.suppressed += 1
         self._muted.add(subject)

@@ -61,7 +61,7 @@ class Tokens:
             self._dropped.add(client)
         return client
 
-    def hold(self, client: str) -> bool:
+    def has_token(self, client: str) -> bool:
         """Whether the client has a token."""
         return client in self._counts
 

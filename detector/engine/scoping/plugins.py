@@ -87,8 +87,8 @@ class PluginSignals:
         self._subjects = {rule: subjects for rule, subjects in self._subjects.items() if rule in kept}
         self._host.configure(rules, kept)
 
-    def lose(self, clients: Collection[str]) -> None:
-        """These clients are lost: drop the state of their subjects, also for rules that samples trigger."""
+    def forget_clients(self, clients: Collection[str]) -> None:
+        """Forget lost clients: drop the state of their subjects, also for rules that samples trigger."""
         for rule, subjects in self._subjects.items():
             left = {subject: of for subject, of in subjects.items() if not any(client in clients for client in of)}
             if len(left) < len(subjects):

@@ -97,12 +97,12 @@ class Views:
 
     def prepare(self, clients: Iterable[str]) -> None:
         """Prepare these clients together: models run once for all of them."""
-        new = {client: self._looked_at(client) for client in clients if client not in self._views}
+        new = {client: self._new_view(client) for client in clients if client not in self._views}
         self._views.update(new)
         if self._rule.models and new:
             add_models(self._rule, new, self._now, self._signals, self._counters)
 
-    def _looked_at(self, client: str) -> dict[str, Any]:
+    def _new_view(self, client: str) -> dict[str, Any]:
         view: dict[str, Any] = {
             "client": client,
             "labels": self._clients.labels(client),
@@ -214,10 +214,10 @@ def candidates(
         views.prepare(clients if only is None or isinstance(rule.subject, FleetSubject) else only.present(clients))
     match rule.subject:
         case ClientSubject() as each:
-            looked_at = clients if only is None else only.present(clients)
+            chosen = clients if only is None else only.present(clients)
             for element in rule.elements:
-                for client in looked_at:
-                    if only is not None and not only.takes(Subject((client,), element.name)):
+                for client in chosen:
+                    if only is not None and not only.contains(Subject((client,), element.name)):
                         continue
                     variables = _with(views, client, element)
                     in_scope = views.truth(each.where, variables, f"where of {client}")
@@ -227,7 +227,7 @@ def candidates(
             yield from _pairs(rule, pairs, views, clients, pending, only)
         case FleetSubject() as fleet:
             for element in rule.elements:
-                if only is not None and not only.takes(Subject((), element.name)):
+                if only is not None and not only.contains(Subject((), element.name)):
                     continue
                 seen = ((client, _with(views, client, element)) for client in clients)
                 members = [
@@ -271,11 +271,11 @@ def _pairs(
         found = near_pairs(Search(points, between, *roles), subject.within, subject.maximum)
         views.left_out(found.left_out)
         near = {Subject(pair, element.name) for pair in found.pairs}
-        looked_at = sorted(near | {one for one in in_progress if one.element == element.name})
+        chosen = sorted(near | {one for one in in_progress if one.element == element.name})
         if only is not None:
-            looked_at = [each for each in looked_at if only.takes(each)]
-        views.prepare(dict.fromkeys(client for each in looked_at for client in each.clients))
-        for each in looked_at:
+            chosen = [each for each in chosen if only.contains(each)]
+        views.prepare(dict.fromkeys(client for each in chosen for client in each.clients))
+        for each in chosen:
             a, b = each.clients
             variables: dict[str, Any] = {
                 "a": _member(views, subject, a, places, element),

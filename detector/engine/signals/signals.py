@@ -157,7 +157,7 @@ class Signals:
         """
         key = (rule, signal.place, client)
         known = self._extracted.get(key, {})
-        looked_at: dict[Sample, Value | Unknown | None] = {}
+        extracted: dict[Sample, Value | Unknown | None] = {}
         values: list[tuple[Sample, Value | Unknown]] = []
         samples: Iterable[Sample] = self._in_window(signal, lane, now)
         if oldest_first:
@@ -165,12 +165,12 @@ class Signals:
         for sample in samples:
             # Keyed by the sample: equal samples have equal values.
             value = known[sample] if sample in known else self._extract(signal, lane, sample, counters)
-            looked_at[sample] = value
+            extracted[sample] = value
             if value is not None:
                 values.append((sample, value))
                 if len(values) == at_most:
                     break
-        self._extracted[key] = looked_at
+        self._extracted[key] = extracted
         return values
 
     def _in_window(self, signal: CompiledSignal, lane: Lane, now: int) -> Iterator[Sample]:

@@ -61,7 +61,7 @@ class EpisodeStarts:
         self._evaluated = {
             episode_stream(rule.name, ends=ends) for rule in rules if rule.enabled for ends in (False, True)
         }
-        self.buffer.keep(durations)
+        self.buffer.retain(durations)
         for lane in self.buffer:
             lane.duration = durations[lane.stream]
         self._open = {stream: each for stream, each in self._open.items() if stream in durations}
@@ -71,7 +71,7 @@ class EpisodeStarts:
     def forget(self, rule: str) -> None:
         """The rule has changed its meaning or was removed: its past starts no longer count."""
         stream, ends = episode_stream(rule), episode_stream(rule, ends=True)
-        self.buffer.keep([each for each in self._durations if each not in (stream, ends)])
+        self.buffer.retain([each for each in self._durations if each not in (stream, ends)])
         self._open.pop(stream, None)
 
     def note(self, event: Event) -> None:
@@ -153,8 +153,8 @@ class EpisodeStarts:
         """The starts of the episodes with the client among their subjects."""
         return self.buffer.lane(client, stream) or self.buffer.lane(FLEET, stream)
 
-    def lose(self, clients: Iterable[str]) -> None:
-        """These clients are lost; if they return, past starts do not count. (Open episodes end by an event.)"""
+    def forget_clients(self, clients: Iterable[str]) -> None:
+        """Forget lost clients; if they return, past starts do not count. (Open episodes end by an event.)"""
         for client in clients:
             self.buffer.forget(client)
 

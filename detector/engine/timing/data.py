@@ -111,14 +111,14 @@ class DataTimeline:
             if client is None or stamp is None:
                 continue
             if arrival.stream in self.latched:
-                yield from self._hold(arrival, stamp)
+                yield from self._insert_latched(arrival, stamp)
                 continue
-            self._know(client)
+            self._note_client(client)
             newest = self._newest
             if newest is None:
                 newest = stamp
                 yield self._begin(stamp, backwards=False)
-            elif newest - self.max_behind <= stamp <= newest + self._reach(arrival, self._newest_received):
+            elif newest - self.max_behind <= stamp <= newest + self._allowed_lead(arrival, self._newest_received):
                 self._row = None
                 if not self._ticked and newest - self._lateness <= stamp <= self.now:
                     yield self._begin(stamp, backwards=False)  # the first sample to arrive was not the earliest
@@ -188,8 +188,8 @@ class DataTimeline:
         else:
             self._wait(arrival, newest)
 
-    def _hold(self, arrival: Arrival, stamp: int) -> Iterator[Step]:
-        """Queue a sample of a latched stream."""
+    def _insert_latched(self, arrival: Arrival, stamp: int) -> Iterator[Step]:
+        """Insert or queue a sample of a latched stream."""
         if self._newest is None:
             self._early.append((stamp, arrival))
         elif (place := min(stamp, self._newest)) <= self.now:
@@ -226,20 +226,21 @@ class DataTimeline:
         if arrivals:
             yield Insert(arrivals, times)
 
-    def _know(self, client: str) -> None:
+    def _note_client(self, client: str) -> None:
+        """Note whether samples come from several clients."""
         if self._some_client is None:
             self._some_client = client
         elif client != self._some_client:
             self._several_clients = True
 
-    def _reach(self, arrival: Arrival, since: int) -> int:
-        """How far the arrival may be ahead of a stamp that was received at `since`."""
+    def _allowed_lead(self, arrival: Arrival, since: int) -> int:
+        """By how much the arrival's stamp may exceed one that was received at `since`; nanoseconds."""
         return self._max_ahead + max(0, arrival.received - since)
 
     def _jumped(self, arrival: Arrival, client: str, stamp: int, newest: int) -> bool:
         """Whether this sample, which does not fit, shows that time jumped; otherwise it is dropped."""
         row = self._row
-        if row is not None and -self._max_ahead <= stamp - row.last <= self._reach(arrival, row.received):
+        if row is not None and -self._max_ahead <= stamp - row.last <= self._allowed_lead(arrival, row.received):
             row.several = row.several or client != row.client
             row.last, row.received = stamp, arrival.received
             if row.several or not self._several_clients or abs(stamp - row.first) >= self.alone_after:

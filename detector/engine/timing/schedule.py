@@ -81,7 +81,7 @@ class SubjectFilter(NamedTuple):
     clients: frozenset[str]
     subjects: frozenset[Subject]
 
-    def takes(self, subject: Subject) -> bool:
+    def contains(self, subject: Subject) -> bool:
         """Whether it contains the subject; every client belongs to the fleet."""
         if subject in self.subjects:
             return True

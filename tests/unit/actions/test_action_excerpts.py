@@ -62,9 +62,9 @@ def run(engine: Engine, batches: Sequence[Sequence[Arrival]], until: float) -> l
     reported: list[Consequence] = []
     for batch in batches:
         engine.advance(batch, batch[-1].received)
-        reported += engine.consequences.take(engine.now)
+        reported += engine.consequences.drain(engine.now)
     engine.advance((), at(until))
-    return reported + engine.consequences.take(engine.now)
+    return reported + engine.consequences.drain(engine.now)
 
 
 def collected(reported: Sequence[Consequence], run: ActionRun) -> list[tuple[str, str, int, bytes]]:
@@ -170,9 +170,9 @@ def test_a_run_is_passed_on_in_order_and_completed_once_time_has_passed_its_wind
     reported = run(engine, speeds((0.55, 0.0), (1.05, 1.0), (2.05, 0.0), (2.55, 0.0)), 3.0)
     assert order(reported) == ["RunStarted", "RunSamples", "EpisodeEnded", "RunSamples"]
     engine.advance((), at(3.1))
-    assert order(engine.consequences.take(engine.now)) == ["RunCompleted"]
+    assert order(engine.consequences.drain(engine.now)) == ["RunCompleted"]
     assert not engine.consequences.running
-    assert all(lane.came is None for lane in engine.buffer), "nobody keeps what comes any more"
+    assert all(lane.inserted is None for lane in engine.buffer), "nobody keeps what comes any more"
 
 
 def test_latched_samples_are_delivered_with_the_window_whatever_their_age() -> None:
@@ -188,7 +188,7 @@ def test_samples_evicted_by_a_cap_are_still_reported_as_missing() -> None:
     engine = an_engine(tight, fast(an_action()))
     engine.advance([arrival(0.05, "car1", {"v": 1})], at(0.2))
     engine.advance([arrival(0.2 + each / 1000, "car1", {"v": 1}) for each in range(1, 50)], at(0.3))
-    reported = engine.consequences.take(engine.now)
+    reported = engine.consequences.drain(engine.now)
     assert sum(len(each.samples) for each in reported if isinstance(each, RunSamples)) == 49
 
 
@@ -209,7 +209,7 @@ def test_open_episodes_are_handed_over_to_changed_actions() -> None:
     engine = an_engine(PLAIN, fast(an_action("a"), an_action("b")))
     run(engine, speeds((0.05, 1.0)), 1.0)
     engine.set_rules(compiled(PLAIN, fast(an_action("b"), an_action("c"))))
-    reported = engine.consequences.take(engine.now)
+    reported = engine.consequences.drain(engine.now)
     assert [(each.run.action, each.cut) for each in reported if isinstance(each, RunCompleted)] == [("a", REPLACED)]
     assert [(each.run.action, each.resumed) for each in reported if isinstance(each, RunStarted)] == [("c", True)]
 
@@ -219,7 +219,7 @@ def test_an_action_with_other_parameters_is_another_action() -> None:
     engine = an_engine(PLAIN, fast({"name": "keep", "plugin": {"name": "keeper"}}))
     run(engine, speeds((0.05, 1.0)), 1.0)
     engine.set_rules(compiled(PLAIN, fast(other)))
-    assert order(engine.consequences.take(engine.now)) == ["RunCompleted", "RunStarted"]
+    assert order(engine.consequences.drain(engine.now)) == ["RunCompleted", "RunStarted"]
 
 
 def test_a_changed_rule_ends_its_episodes_and_their_windows_continue() -> None:
@@ -246,7 +246,7 @@ def test_samples_after_the_completion_of_their_window_are_counted() -> None:
     assert order(reported)[-1] == "RunCompleted"
     assert engine.consequences.too_late == 1, "the second of them is in no window"
     run(engine, [[message(20.0, "car1", "speed", 0.0)]], 21.0)
-    assert all(lane.came is None for lane in engine.buffer), "nobody waits for late ones any more"
+    assert all(lane.inserted is None for lane in engine.buffer), "nobody waits for late ones any more"
 
 
 def test_parameters_of_actions_are_rendered_at_the_start_independently_of_each_other() -> None:

@@ -152,11 +152,11 @@ class HostHarness:
         readers = stream_readers(DETECTOR)
         self.host.follow(rules, DetectorConfiguration(DETECTOR, readers.decoders, readers.types))
         self.engine.set_rules(compiled(DETECTOR, *rules))
-        self.host.dispatch(self.engine.consequences.take(self.engine.now))
+        self.host.dispatch(self.engine.consequences.drain(self.engine.now))
 
     def take(self, *speeds: tuple[float, str, float], until: float) -> None:
         self.engine.advance([arrival(seconds, client, {"v": v}) for seconds, client, v in speeds], at(until))
-        self.host.dispatch(self.engine.consequences.take(self.engine.now))
+        self.host.dispatch(self.engine.consequences.drain(self.engine.now))
 
     def counts(self, action: str) -> ActionCounts:
         return self.host.outcomes.counts_by_action()[ActionKey("fast", action)]

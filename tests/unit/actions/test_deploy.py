@@ -121,8 +121,8 @@ def test_no_task_is_ended_before_the_first_demands_of_the_engine(tmp_path: Path)
 
     async def drive() -> None:
         async with reconciling(tmp_path) as reconciler:
-            looks = reconciler.looks
-            await eventually(lambda: reconciler.looks > looks + 3, "it has looked")
+            earlier = reconciler.snapshots
+            await eventually(lambda: reconciler.snapshots > earlier + 3, "it has looked")
             assert stored(tmp_path) == before
             reconciler.update({}, {})
             await eventually(lambda: ends(tmp_path)[A.name] is not None, "it has ended")
@@ -135,7 +135,7 @@ def test_nothing_is_changed_without_permission(tmp_path: Path) -> None:
         permitted = asyncio.Event()
         async with reconciling(tmp_path, permitted=permitted) as reconciler:
             reconciler.update(by_name(A), {})
-            await eventually(lambda: reconciler.looks > 3, "it has looked")
+            await eventually(lambda: reconciler.snapshots > 3, "it has looked")
             assert ends(tmp_path) == {}
             permitted.set()
             await eventually(lambda: A.name in ends(tmp_path), "it is live")
@@ -146,7 +146,7 @@ def test_nothing_is_changed_without_permission(tmp_path: Path) -> None:
 def test_an_existing_task_of_the_same_name_is_adopted_and_updated(tmp_path: Path) -> None:
     async def drive() -> DeployCounts:
         async with reconciling(tmp_path, NEVER) as reconciler:
-            await eventually(lambda: reconciler.looks > 0, "it has looked")
+            await eventually(lambda: reconciler.snapshots > 0, "it has looked")
             put(tmp_path, task_manifest(to_task(dataclasses.replace(A, parameters={"old": 1}))))
             reconciler.update(by_name(A), {})
             await eventually(lambda: stored(tmp_path)[A.name]["spec"]["parameters"] == A.parameters, "it is put right")
@@ -181,13 +181,13 @@ def test_a_manually_deleted_task_is_recreated_and_a_manually_ended_one_stays_end
         async with reconciling(tmp_path) as reconciler:
             reconciler.update(by_name(A, B), {})
             await eventually(lambda: len(ends(tmp_path)) == 2, "both live")
-            looks = reconciler.looks
-            await eventually(lambda: reconciler.looks > looks + 1, "it has seen them live")
+            earlier = reconciler.snapshots
+            await eventually(lambda: reconciler.snapshots > earlier + 1, "it has seen them live")
             (tmp_path / f"{A.name}.yaml").unlink()
             put(tmp_path, task_manifest(to_task(B, end_time=3)))
             await eventually(lambda: A.name in ends(tmp_path), "it is back")
-            looks = reconciler.looks
-            await eventually(lambda: reconciler.looks > looks + 3, "it has looked")
+            earlier = reconciler.snapshots
+            await eventually(lambda: reconciler.snapshots > earlier + 3, "it has looked")
         return reconciler.counts
 
     assert asyncio.run(drive()) == DeployCounts(created=2, recreated=1)
@@ -268,7 +268,7 @@ def test_only_the_newest_demands_count(moves: list[dict[str, int]], pauses: int)
                 reconciler.update(demands, {name: end for name, end in reported.items() if end <= number})
                 for _ in range(pauses):
                     await asyncio.sleep(0.002)
-            await eventually(lambda: reconciler.looks > 0, "it has looked")
+            await eventually(lambda: reconciler.snapshots > 0, "it has looked")
 
     with tempfile.TemporaryDirectory() as folder:
         asyncio.run(drive(Path(folder)))

@@ -66,29 +66,29 @@ def task(end: int | None = None, version: int = 1) -> StoredTask:
 
 def test_nothing_is_due_before_both_sides_are_known() -> None:
     ledger = Ledger()
-    assert ledger.see(Snapshot({DEMAND.name: task()}, 1)) == []
+    assert ledger.apply(Snapshot({DEMAND.name: task()}, 1)) == []
     assert ledger.accept({}, {}) == [DEMAND.name]
     ledger = Ledger()
     assert ledger.accept({DEMAND.name: DEMAND}, {}) == []
-    assert ledger.see(Snapshot({}, 1)) == [DEMAND.name]
+    assert ledger.apply(Snapshot({}, 1)) == [DEMAND.name]
 
 
 def test_late_reports_of_the_store_do_not_undo_newer_knowledge() -> None:
     ledger = Ledger()
     ledger.accept({DEMAND.name: DEMAND}, {})
-    ledger.see(Snapshot({}, 3))
+    ledger.apply(Snapshot({}, 3))
     ledger.put(DEMAND.name, task(version=5))
-    assert ledger.see(Snapshot({}, 4)) == [], "a list from before the creation"
-    assert ledger.see(Update(DEMAND.name, None, 4)) == [], "an old deletion"
-    assert ledger.see(Update(DEMAND.name, task(end=1, version=4), 4)) == [], "an old end"
+    assert ledger.apply(Snapshot({}, 4)) == [], "a list from before the creation"
+    assert ledger.apply(Update(DEMAND.name, None, 4)) == [], "an old deletion"
+    assert ledger.apply(Update(DEMAND.name, task(end=1, version=4), 4)) == [], "an old end"
     assert ledger.next(DEMAND.name) is StoreChange.NOTHING
-    assert ledger.see(Snapshot({}, 6)) == [DEMAND.name], "now it is really gone"
+    assert ledger.apply(Snapshot({}, 6)) == [DEMAND.name], "now it is really gone"
 
 
 def test_an_end_is_remembered_until_the_task_has_ended() -> None:
     ledger = Ledger()
     ledger.accept({DEMAND.name: DEMAND}, {})
-    ledger.see(Snapshot({DEMAND.name: task()}, 1))
+    ledger.apply(Snapshot({DEMAND.name: task()}, 1))
     assert ledger.accept({}, {DEMAND.name: 77}) == [DEMAND.name]
     ledger.accept({}, {})
     assert ledger.end_of(DEMAND.name) == 77

@@ -20,16 +20,16 @@ def a_recording(
 
 def test_a_recording_is_started_with_retries_stopped_and_awaited() -> None:
     recording = a_recording()
-    assert recording.look(0) is NextRequest.START
+    assert recording.next_request(0) is NextRequest.START
     recording.answered(0, RECORDING)
-    assert recording.look(9) is None
-    assert recording.look(10) is NextRequest.HOLD
+    assert recording.next_request(9) is None
+    assert recording.next_request(10) is NextRequest.HOLD
     recording.answered(10, RECORDING)
     recording.end(15, 14)
-    assert recording.look(15) is NextRequest.STOP
+    assert recording.next_request(15) is NextRequest.STOP
     recording.answered(15, ENDING)
-    assert recording.look(15) is None
-    assert recording.look(16) is NextRequest.AWAIT
+    assert recording.next_request(15) is None
+    assert recording.next_request(16) is NextRequest.AWAIT
     recording.answered(16, DONE)
     assert recording.finished
     assert recording.problem == ""
@@ -40,17 +40,17 @@ def test_an_episode_that_ends_before_its_start_is_confirmed_is_still_recorded() 
     recording = a_recording()
     recording.failed(0, "silence", silent=True)
     recording.end(0.1, 0.1)
-    assert recording.look(0.2) is None
-    assert recording.look(0.5) is NextRequest.START
+    assert recording.next_request(0.2) is None
+    assert recording.next_request(0.5) is NextRequest.START
     recording.answered(0.5, RECORDING)
-    assert recording.look(0.5) is NextRequest.STOP
+    assert recording.next_request(0.5) is NextRequest.STOP
 
 
 def test_unconfirmed_requests_are_retried_with_backoff_and_given_up() -> None:
     recording = a_recording()
     times = []
     for tenth in range(2000):
-        step = recording.look(tenth / 10)
+        step = recording.next_request(tenth / 10)
         if step is NextRequest.START:
             times.append(tenth / 10)
             recording.failed(tenth / 10, "silence", silent=True)
@@ -66,7 +66,7 @@ def test_a_stop_that_is_given_up_is_reported() -> None:
     recording.answered(0, RECORDING)
     recording.end(1, 1)
     for second in range(1, 20):
-        if recording.look(second) is NextRequest.STOP:
+        if recording.next_request(second) is NextRequest.STOP:
             recording.failed(second, "silence", silent=True)
     assert recording.finished
     assert recording.lost_stop
@@ -76,7 +76,7 @@ def test_a_stop_that_is_given_up_is_reported() -> None:
 def test_a_rejected_start_is_retried_and_needs_no_stop() -> None:
     recording = a_recording(give_up=1)
     for now in (0.0, 0.5, 1.5):
-        assert recording.look(now) is NextRequest.START
+        assert recording.next_request(now) is NextRequest.START
         recording.answered(now, Report(Progress.REFUSED, "too many"))
     assert recording.finished
     assert recording.problem == "gave up starting the recording: too many"
@@ -87,9 +87,9 @@ def test_a_system_that_was_restarted_continues_with_the_next_start() -> None:
     recording.answered(0, RECORDING)
     assert recording.confirmed
     for now in (10, 10.5, 11.5, 200):  # it is away for long: as long as the episode lasts, nothing is given up
-        assert recording.look(now) is NextRequest.HOLD
+        assert recording.next_request(now) is NextRequest.HOLD
         recording.failed(now, "silence", silent=True)
-    assert recording.look(300) is NextRequest.HOLD
+    assert recording.next_request(300) is NextRequest.HOLD
     recording.answered(300, RECORDING)
     recording.end(301, 301)
     recording.answered(301, UNKNOWN)  # restarted once more, just now
@@ -100,9 +100,9 @@ def test_a_system_that_was_restarted_continues_with_the_next_start() -> None:
 def test_a_system_that_does_not_count_the_time_is_stopped_after_it() -> None:
     recording = a_recording(maximum=30, renew=None)
     recording.answered(0, RECORDING)
-    assert recording.next_look() == 30
-    assert recording.look(29.9) is None
-    assert recording.look(30) is NextRequest.STOP
+    assert recording.next_due() == 30
+    assert recording.next_request(29.9) is None
+    assert recording.next_request(30) is NextRequest.STOP
     recording.answered(30, DONE)
     assert recording.note == "the recording reached its maxDuration before the episode ended"
 
@@ -124,8 +124,8 @@ def test_a_recording_always_reaches_a_final_state(happenings: list[tuple[str, Pr
         nonlocal now
         if recording.finished:
             return
-        now = max(now, min(recording.next_look(), now + 100))
-        if recording.look(now) is not None:
+        now = max(now, min(recording.next_due(), now + 100))
+        if recording.next_request(now) is not None:
             if progress is None:
                 recording.failed(now, "silence", silent=True)
             else:

@@ -183,7 +183,7 @@ def test_the_byte_count_matches_the_contents_and_the_cap(
                 buffer.forget(step.client)
                 assert all(lane.client != step.client for lane in buffer)
             case "keep":
-                buffer.keep({step.stream})
+                buffer.retain({step.stream})
                 assert all(lane.stream == step.stream for lane in buffer)
             case _:
                 buffer.step_back(0)

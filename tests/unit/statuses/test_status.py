@@ -44,7 +44,7 @@ class ObservedEngine:
         self.updater.arrived(arrivals)  # type: ignore[arg-type]
         self.drive.take(*arrivals, until=until)  # type: ignore[arg-type]
         self.time = until
-        self.updater.looked()
+        self.updater.cycle_finished()
         return self.updater.latest
 
 

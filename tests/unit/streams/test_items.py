@@ -149,7 +149,7 @@ def test_an_action_gets_the_message_once_for_all_its_items() -> None:
     drive.engine.consequences.wanted = True
     arrivals = [sent(n / 10 + 0.05, item(1), item(2, 1 if n < 10 else 9), item(3, 90)) for n in range(20)]
     drive.take(*arrivals, until=3)
-    found = drive.engine.consequences.take(drive.engine.now)
+    found = drive.engine.consequences.drain(drive.engine.now)
     samples: dict[str, list[Any]] = {}
     for each in found:
         if isinstance(each, RunSamples):
