@@ -13,7 +13,21 @@ from prometheus_client.core import GaugeMetricFamily, Metric
 
 PREFIX = "wayside_manager_"
 
-_SERVICE = (0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 60, 120, 300, 600)  # s from an event to what follows
+_SERVICE = (
+    0.05,
+    0.1,
+    0.2,
+    0.5,
+    1,
+    2,
+    5,
+    10,
+    20,
+    60,
+    120,
+    300,
+    600,
+)  # s from an event until its task is applied or ready
 _WORK = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 15)  # s of a request or a reconciliation
 
 
@@ -35,12 +49,12 @@ class Measures:
 
     Attributes:
         registry: also for the collectors that read the cache.
-        looked: when the last resync ended, successful or not, on the monotonic clock; before the first one, the start.
+        last_resync: the end of the last resync, successful or not, on the monotonic clock; initially the start.
     """
 
     def __init__(self) -> None:
         self.registry = CollectorRegistry(auto_describe=False)
-        self.looked = time.monotonic()
+        self.last_resync = time.monotonic()
         self._applied = self._histogram(
             "event_to_applied_seconds", "Time from the start of an event until its task is Applied", _SERVICE
         )
@@ -123,10 +137,10 @@ class Measures:
         """Whether this manager is the active one."""
         self._active.set(active)
 
-    def resynced(self, *, well: bool) -> None:
+    def resynced(self, *, succeeded: bool) -> None:
         """A resync ended."""
-        self.looked = time.monotonic()
-        if well:
+        self.last_resync = time.monotonic()
+        if succeeded:
             self._resynced.set(time.time())
 
     def _histogram(self, name: str, text: str, buckets: tuple[float, ...], *labels: str) -> Histogram:

@@ -58,15 +58,15 @@ class BudgetIndex:
         age, holder = (task.metadata.creation_timestamp, name), task.spec.requester.holder
         if self._known.get(name) == (age, holder):
             return set()
-        moved = self.leave(name)
+        affected = self.leave(name)
         self._known[name] = age, holder
         own = self._of_holder(name, holder)
         displaced = own.add(age) if own is not None else None
         if own is None or own.within(age):
-            moved |= self._take(age)
+            affected |= self._take(age)
         if displaced is not None:
-            moved |= {displaced[1]} | self._give_back(displaced)
-        return moved - {name}
+            affected |= {displaced[1]} | self._give_back(displaced)
+        return affected - {name}
 
     def leave(self, name: Name) -> set[Name]:
         """Note that a task has ended; returns the other tasks whose result may have changed."""
@@ -76,11 +76,11 @@ class BudgetIndex:
         own = self._of_holder(name, holder)
         if own is None:
             return self._give_back(age)
-        moved = self._give_back(age) if own.within(age) else set()
+        affected = self._give_back(age) if own.within(age) else set()
         follower = own.remove(age)
         if not own.order and holder is not None:
             del self._holders[name[0], holder]
-        return moved | ({follower[1]} | self._take(follower) if follower is not None else set())
+        return affected | ({follower[1]} | self._take(follower) if follower is not None else set())
 
     def verdict(self, name: Name) -> Verdict | None:
         """Why the task waits; None if it is within its budgets."""

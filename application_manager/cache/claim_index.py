@@ -28,24 +28,24 @@ _ANY = TaskPolicy()
 class ClaimIndex:
     """The claims of all tasks, and the verdicts of tasks that claim nothing.
 
-    While a claim is being computed, the previous one of the task is kept, if any. Tasks that existed before this
-    process became active may have instances: until their claims are known, their templates are unsettled, and the
-    instances of these templates are not changed.
+    While a claim is being computed, the previous claim of the task stays in use, if there is one. Tasks that existed
+    before this process became active may have instances: until their claims are known, their templates are
+    unresolved, and the instances of these templates are not changed.
 
     Attributes:
         claim_of: computes the claim of a task.
-        settled: called with a template that is no longer unsettled.
-        moved: called with a task whose budget result changed because another task was added or has ended.
+        resolved: called with a template once all such claims are known.
+        budget_changed: called with a task whose budget result changed because another task was added or has ended.
     """
 
     def __init__(self, claim: Claims = claim_or_verdict, policy: TaskPolicy = _ANY) -> None:
         self.claim_of = claim
-        self.moved: Callable[[Name], None] = lambda _: None
+        self.budget_changed: Callable[[Name], None] = lambda _: None
         self._policy = policy
         self._budgets = BudgetIndex(policy)
-        self.settled: Callable[[Name], None] = lambda _: None
+        self.resolved: Callable[[Name], None] = lambda _: None
         self._pending: dict[Name, set[Name]] = {}  # template → tasks
-        self._unsettled: dict[Name, set[Name]] = {}  # of these, the tasks that existed at the start
+        self._unresolved: dict[Name, set[Name]] = {}  # of these, the tasks that existed at the start
         self._claims: dict[Name, Claim] = {}
         self._verdicts: dict[Name, Verdict] = {}
         self._by_instance: MembersByGroup[Name, Name, Claim] = MembersByGroup()
@@ -56,12 +56,12 @@ class ClaimIndex:
         """Note the state of a task; returns the instances that it claimed or claims, none while that is computed."""
         task = entry.model
         if isinstance(task, ApplicationTask) and finished(task) is None and self._policy.refusal(task) is None:
-            moved = self._budgets.enter(task)
+            affected = self._budgets.enter(task)
         else:
-            moved = self._budgets.leave(name)
+            affected = self._budgets.leave(name)
         touched = self._note(name, entry, template)
-        for each in moved:
-            self.moved(each)
+        for each in affected:
+            self.budget_changed(each)
         return touched
 
     def _note(self, name: Name, entry: Entry, template: TemplateState) -> set[Name]:
@@ -113,15 +113,15 @@ class ClaimIndex:
         self._by_template.put(of, name, task)
 
     def _resolve(self, name: Name, found: Claim | Verdict | None) -> None:
-        """Note the claim of a task; one that exceeds the limit of CPU time stays as unknown as before."""
+        """Note the claim of a task; a claim that exceeds the limit of CPU time stays unknown."""
         still = isinstance(found, Verdict) and found.reason == RefusalReason.EXPRESSION_LIMIT
-        for waiting in (self._pending,) if still else (self._pending, self._unsettled):
+        for waiting in (self._pending,) if still else (self._pending, self._unresolved):
             for template in [each for each, names in waiting.items() if name in names]:
                 waiting[template].discard(name)
                 if not waiting[template]:
                     del waiting[template]
-                    if waiting is self._unsettled:
-                        self.settled(template)
+                    if waiting is self._unresolved:
+                        self.resolved(template)
 
     def pending(self, template: Name) -> bool:
         """Whether claims of the template's tasks are being computed."""
@@ -129,18 +129,18 @@ class ClaimIndex:
 
     def begin(self) -> None:
         """Note that all objects are listed: the claims that are being computed are of tasks that existed before."""
-        self._unsettled = {template: set(names) for template, names in self._pending.items()}
+        self._unresolved = {template: set(names) for template, names in self._pending.items()}
 
-    def unsettled(self, template: Name) -> bool:
+    def unresolved(self, template: Name) -> bool:
         """Whether unknown claims of tasks that existed at the start may concern instances of the template."""
-        return template in self._unsettled
+        return template in self._unresolved
 
     def forget(self, name: Name) -> set[Name]:
         """Forget a task; returns the instances that it claimed."""
         self._resolve(name, None)
         touched = self._drop(name)
         for each in self._budgets.leave(name):
-            self.moved(each)
+            self.budget_changed(each)
         return touched
 
     def _drop(self, name: Name) -> set[Name]:

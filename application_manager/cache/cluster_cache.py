@@ -185,10 +185,10 @@ class ClusterCache:
         These are to be decided again, because this decision changes what theirs depends on.
         """
         decided = decide(name[1], _NamespaceIndexes(self, name[0]), now)
-        moved = self.fallbacks.moved(name, _fallback(decided))
+        affected = self.fallbacks.affected(name, _fallback(decided))
         if decided.placement is not None:
-            moved |= decided.placement.moved(self.places.placement(name[0]))
-        return decided, {(name[0], each) for each in moved - {name[1]}}
+            affected |= decided.placement.changed_since(self.places.placement(name[0]))
+        return decided, {(name[0], each) for each in affected - {name[1]}}
 
     def note(self, name: Name, decided: Decided) -> None:
         """Note a decision in the indexes that further decisions read."""
@@ -203,7 +203,7 @@ class ClusterCache:
         elif instance is not None:
             self.deadlines[name] = (instance.metadata.uid, decided.unlimited.release_time)
         self.places.note(name[0], decided.placement)
-        for each in self.fallbacks.moved(name, fallback):
+        for each in self.fallbacks.affected(name, fallback):
             self.places.touch((name[0], each))
         self.fallbacks.note(name, fallback)
 
@@ -227,15 +227,15 @@ class ClusterCache:
 
         A name that stands for all instances of a template is replaced by these.
         """
-        found = {each for name in instances for each in self.meant(name)}
+        found = {each for name in instances for each in self.expand(name)}
         for each in found:
             self.places.touch(each)
         return found
 
-    def is_unsettled(self, instance: Name) -> bool:
+    def has_unresolved_claims(self, instance: Name) -> bool:
         """Whether unknown claims of tasks that existed at the start may concern the instance."""
         known = self.instance(instance)
-        return known is not None and self.claims.unsettled((instance[0], known.spec.template_name))
+        return known is not None and self.claims.unresolved((instance[0], known.spec.template_name))
 
     def note_limits(self, template: Name) -> None:
         """Note the template's maximum number of instances, and its fallback, if any."""
@@ -259,7 +259,7 @@ class ClusterCache:
         """The maximum numbers of instances in a namespace."""
         return Limits(self._limits.get(namespace, {}), self.limit)
 
-    def meant(self, name: Name) -> set[Name]:
+    def expand(self, name: Name) -> set[Name]:
         """The instances that a name stands for, which may be all of a template; the name itself is included."""
         of = template_of_all(name[1])
         if of is None:
@@ -337,7 +337,7 @@ class _NamespaceIndexes:
         names = places.stale(known, self.namespace, now) if known else self.cache.known_instances(self.namespace)
         decisions = {each: decide_without_limits(each, self, now) for each in names - {name}} | {name: unlimited}
         requests = {
-            each: request(each, decision, self, being_made=(self.namespace, each) in places.being_made)
+            each: request(each, decision, self, being_created=(self.namespace, each) in places.being_created)
             for each, decision in decisions.items()
         }
         return (known or Placement(limits)).updated(requests, limits, now)

@@ -14,11 +14,11 @@ from application_manager.core.objects.policy import Name
 class PlaceIndex:
     """The placement of each namespace that has limits, and the instances that changed since.
 
-    `being_made`: instances that were requested from the API server, which may or may not have them.
+    `being_created`: instances that were requested from the API server, which may or may not have them.
     """
 
     def __init__(self) -> None:
-        self.being_made: set[Name] = set()
+        self.being_created: set[Name] = set()
         self._placements: dict[str, Placement] = {}
         self._touched: dict[str, set[str]] = {}
 
@@ -31,7 +31,7 @@ class PlaceIndex:
         """Drop all placements: another manager has been active since."""
         self._placements.clear()
         self._touched.clear()
-        self.being_made.clear()
+        self.being_created.clear()
 
     def placement(self, namespace: str) -> Placement | None:
         """The last placement; None if there is none."""
@@ -71,7 +71,7 @@ class FallbackIndex:
         """The templates of a namespace to which others fall back."""
         return {other for name, other in self._templates.items() if name[0] == namespace}
 
-    def moved(self, instance: Name, to: Fallback | None) -> set[str]:
+    def affected(self, instance: Name, to: Fallback | None) -> set[str]:
         """The instances that get or lose tasks if the fallback of this instance's tasks becomes `to`."""
         before = self._fallbacks.get(instance)
         if before == to:

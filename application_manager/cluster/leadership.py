@@ -36,7 +36,7 @@ The rest of the Lease's duration is a margin for opening a connection, and for c
 RENEW_EVERY = 2.0
 """Seconds between two renewals."""
 
-LOOK_EVERY = 1.0
+POLL_EVERY = 1.0
 """Seconds between two checks by a standby, or between two attempts after a failure."""
 
 RENEWAL_TIMEOUT = 3.0
@@ -61,16 +61,16 @@ class LeaseKey:
         return f"{self.namespace}/{self.name}"
 
 
-def lease_key(given: str | None, namespaces: tuple[str, ...]) -> LeaseKey:
+def lease_key(option: str | None, namespaces: tuple[str, ...]) -> LeaseKey:
     """The Lease of the option `--lease`, `NAME` or `NAMESPACE/NAME`.
 
     The default namespace is that of the pod, else the first managed one, else `default`. Raises ValueError if the name
     is not valid, or is reserved for holders' Leases.
     """
-    namespace, _, name = (given or LEASE_NAME).rpartition("/")
+    namespace, _, name = (option or LEASE_NAME).rpartition("/")
     if not name or holder_of(name) is not None:
         raise ValueError(
-            f"--lease must be NAME or NAMESPACE/NAME; got {given!r}; names that begin with wayside- are reserved for "
+            f"--lease must be NAME or NAMESPACE/NAME; got {option!r}; names that begin with wayside- are reserved for "
             "detectors"
         )
     if not namespace:
@@ -96,9 +96,9 @@ class Leadership:
         self._changed = asyncio.Event()
         self._logged = ""
         self._was_active = False
-        self._namespace_goes = False
+        self._namespace_terminating = False
         self._released = False
-        self._looking = asyncio.Lock()  # so that no renewal is in progress when the Lease is released
+        self._refreshing = asyncio.Lock()  # so that no renewal is in progress when the Lease is released
 
     def remaining(self) -> float:
         """The number of seconds for which this manager may act; 0 or less: it is not the active one."""
@@ -122,13 +122,13 @@ class Leadership:
             return ""
         return f"standby: {self._candidate.holder or 'nobody'} is active"
 
-    async def look(self) -> None:
+    async def refresh(self) -> None:
         """Read the Lease, and acquire or renew it if possible. Raises ApiError or Unreachable."""
-        async with self._looking:
+        async with self._refreshing:
             if not self._released:
-                await self._look()
+                await self._refresh()
 
-    async def _look(self) -> None:
+    async def _refresh(self) -> None:
         sent, candidate = steady(), self._candidate
         if not self.active:
             candidate.observe(await self._client.get(LEASES, self._key.namespace, self._key.name), steady())
@@ -142,7 +142,7 @@ class Leadership:
             candidate.took(await write(LEASES, draft), sent, steady())
         except ApiError as error:
             if error.terminating:
-                self._namespace_goes = True
+                self._namespace_terminating = True
                 self._log(logging.INFO, f"the namespace of the Lease {self._key} does not exist, or is being deleted")
                 return
             if error.code not in (404, 409):
@@ -154,14 +154,14 @@ class Leadership:
     async def run(self) -> None:
         """Renew or check the Lease until cancelled."""
         while True:
-            await retry_async(self.look, RequestError, self._failed)
-            await asyncio.sleep(RENEW_EVERY if self.active else LOOK_EVERY)
+            await retry_async(self.refresh, RequestError, self._failed)
+            await asyncio.sleep(RENEW_EVERY if self.active else POLL_EVERY)
 
     def _failed(self, error: RequestError) -> float:
         left = self.remaining()
         until = f"; active for {left:.0f} s more" if left > 0 else ""
         self._log(logging.WARNING, f"cannot renew the Lease {self._key}{until}: {error}", str(type(error)))
-        return LOOK_EVERY
+        return POLL_EVERY
 
     async def wait_active(self) -> None:
         """Wait until this manager is active."""
@@ -186,7 +186,7 @@ class Leadership:
         """
         self._released = True  # so that the renewal loop does not acquire it again
         try:
-            async with asyncio.timeout(RENEWAL_TIMEOUT), self._looking:
+            async with asyncio.timeout(RENEWAL_TIMEOUT), self._refreshing:
                 draft = self._candidate.released(time.time()) if self.active else None
                 self._candidate.until = 0.0
                 if draft is None:
@@ -206,11 +206,11 @@ class Leadership:
         self._was_active = active
         self._measures.active(active)
         if active:
-            self._namespace_goes = False
+            self._namespace_terminating = False
             self._log(logging.INFO, f"active: holds the Lease {self._key} as {self._candidate.identity}")
         elif was_active:
             why = f"the Lease {self._key} was not renewed within {DEADLINE:g} s, or another manager has acquired it"
-            self._log(logging.INFO if self._namespace_goes else logging.WARNING, f"no longer active: {why}")
+            self._log(logging.INFO if self._namespace_terminating else logging.WARNING, f"no longer active: {why}")
         else:
             self._log(logging.INFO, f"{self.role}, by the Lease {self._key}")
         self._changed.set()

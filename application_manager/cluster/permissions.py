@@ -18,16 +18,18 @@ from wayside.kubernetes.resources import Resource
 from wayside.kubernetes.retrying import repeatedly
 
 _REVIEWS = Resource("authorization.k8s.io/v1", "SelfSubjectAccessReview", "selfsubjectaccessreviews", namespaced=False)
-LOOK_EVERY = 5.0  # s between two checks of a namespace in which something is to be written
+POLL_EVERY = 5.0  # s between two checks of a namespace in which something is to be written
 _SHOWN = 10  # missing permissions in one message
 
 log = logging.getLogger(__name__)
 
-Lack = tuple[PolicyRule, str, str | None]
+MissingRight = tuple[PolicyRule, str, str | None]
 """A permission, the verb of it that is missing, and the namespace; None: all namespaces."""
 
 
-async def missing_rights(client: Client, needed: Iterable[PolicyRule], namespaces: Collection[str]) -> list[Lack]:
+async def missing_rights(
+    client: Client, needed: Iterable[PolicyRule], namespaces: Collection[str]
+) -> list[MissingRight]:
     """The missing permissions in the namespaces; if none are given: cluster-wide.
 
     Raises ApiError or Unreachable if the API server does not respond.
@@ -37,21 +39,21 @@ async def missing_rights(client: Client, needed: Iterable[PolicyRule], namespace
     return [each for each, may in zip(verbs, allowed, strict=True) if not may]
 
 
-def report_missing(lacks: Collection[Lack]) -> None:
+def report_missing(missing: Collection[MissingRight]) -> None:
     """Report the missing permissions, each with the consequence and the remedy.
 
     Raises ConfigurationError if the manager cannot work without one of them.
     """
-    if any(right.vital for right, _, _ in lacks):
-        shown = [_text(each) for each in sorted(lacks, key=lambda each: not each[0].vital)[:_SHOWN]]
-        more = f"; and {len(lacks) - _SHOWN} more" if len(lacks) > _SHOWN else ""
+    if any(right.vital for right, _, _ in missing):
+        shown = [_text(each) for each in sorted(missing, key=lambda each: not each[0].vital)[:_SHOWN]]
+        more = f"; and {len(missing) - _SHOWN} more" if len(missing) > _SHOWN else ""
         raise ConfigurationError(f"{'; '.join(shown)}{more}: {REMEDY}")
-    for each in lacks:
+    for each in missing:
         log.error("%s: %s", _text(each), REMEDY)
 
 
-def _text(lack: Lack) -> str:
-    right, verb, namespace = lack
+def _text(missing: MissingRight) -> str:
+    right, verb, namespace = missing
     return right.lack(verb, f"in namespace {namespace}" if namespace else "in all namespaces")
 
 
@@ -106,9 +108,9 @@ class NamespacePermissions:
 
     async def run(self) -> None:
         """Check the namespaces without permission periodically, until cancelled."""
-        await repeatedly(self._look, LOOK_EVERY, "")  # the health check reports that the API server does not respond
+        await repeatedly(self._refresh, POLL_EVERY, "")  # the health check reports that the API server does not respond
 
-    async def _look(self) -> None:
+    async def _refresh(self) -> None:
         granted = [each for each in sorted(self._refused) if await self._is_granted(each)]
         if granted:
             log.info("namespace %s is granted to this manager", ", ".join(granted))

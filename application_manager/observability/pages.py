@@ -22,7 +22,7 @@ STALLED_AFTER = 300.0
 
 _RESYNCS = 3  # and this multiple of the resync interval
 
-Lack = Callable[[], str | None]
+Problem = Callable[[], str | None]
 """Why the manager is not ready, as text; None if it is ready."""
 
 _TEXT = "text/plain; version=0.0.4; charset=utf-8"
@@ -35,7 +35,7 @@ class _Queue(Protocol):
         """The key and the time, as text."""
 
 
-def stalled(measures: Measures, every: float, queues: Sequence[_Queue] = (), least: float = STALLED_AFTER) -> Lack:
+def stalled(measures: Measures, every: float, queues: Sequence[_Queue] = (), least: float = STALLED_AFTER) -> Problem:
     """Reports stalled work: no resync has ended, or a worker processes one key, for too long. Any thread may call it.
 
     A resync that fails because the API server is unreachable counts as ended. `every`: seconds between two resyncs;
@@ -43,22 +43,22 @@ def stalled(measures: Measures, every: float, queues: Sequence[_Queue] = (), lea
     """
     limit = max(least, _RESYNCS * every)
 
-    def look() -> str | None:
+    def check() -> str | None:
         stuck = next(filter(None, (queue.stuck(limit) for queue in queues)), None)
         if stuck is not None:
             return stuck
-        since = time.monotonic() - measures.looked
+        since = time.monotonic() - measures.last_resync
         return f"no resync has completed for {since:.0f} s" if since > limit else None
 
-    return look
+    return check
 
 
 @asynccontextmanager
 async def pages(
     port: int | None,
     measures: Measures,
-    healthy: Lack,
-    ready: Lack,
+    healthy: Problem,
+    ready: Problem,
     role: Callable[[], str] = str,
     certificates: Path | None = None,
 ) -> AsyncIterator[int | None]:
@@ -75,7 +75,7 @@ async def pages(
     application = web.Application()
 
     async def metrics(_: web.Request) -> web.Response:
-        return _answer(measures.text())
+        return _response(measures.text())
 
     async def healthz(_: web.Request) -> web.Response:
         return _health_response(healthy())
@@ -103,10 +103,10 @@ async def pages(
         await runner.cleanup()
 
 
-def _answer(text: bytes, status: int = 200) -> web.Response:
+def _response(text: bytes, status: int = 200) -> web.Response:
     return web.Response(body=text, status=status, headers={"Content-Type": _TEXT})
 
 
-def _health_response(lack: str | None, role: str = "") -> web.Response:
-    answer = lack or ", ".join(filter(None, ("ok", role)))
-    return _answer(f"{answer}\n".encode(), 200 if lack is None else 503)
+def _health_response(problem: str | None, role: str = "") -> web.Response:
+    text = problem or ", ".join(filter(None, ("ok", role)))
+    return _response(f"{text}\n".encode(), 200 if problem is None else 503)

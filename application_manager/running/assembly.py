@@ -134,10 +134,10 @@ class Assembly:
             self._configurations.add,
         )
         self.cache.claims.claim_of = partial(evaluate_claim, self._answers, self.router.claimed)
-        self.cache.claims.settled = self.router.settled
-        self.cache.claims.moved = self.router.claimed
+        self.cache.claims.resolved = self.router.claims_resolved
+        self.cache.claims.budget_changed = self.router.claimed
         self.cache.overlap.every = options.resync
-        self.cache.overlap.resumed = lambda _: self.router.everything()
+        self.cache.overlap.resumed = lambda _: self.router.enqueue_everything()
         statuses = StatusWriter(client, self.recorder, self.router.observe)
         self._status_work = InstanceStatusWork(
             cache=self.cache,
@@ -163,7 +163,7 @@ class Assembly:
             enqueue=instances.add,
             done=self._statuses.add,
             absent=self._absent,
-            not_made=self._status_work.report_not_made,
+            not_created=self._status_work.report_not_created,
             observe=self.router.observe,
             configured=self._configurations.add,
             objects=self._renderings.objects,
@@ -207,7 +207,7 @@ class Assembly:
         for name, _ in self.cache.store.all(INSTANCE):
             self._configurations.add(name)
 
-    async def _looks_after(self, namespace: str) -> bool:
+    async def _is_active_in(self, namespace: str) -> bool:
         """Whether this manager, and no older one, is active in the namespace. Raises NotGranted if it may not write."""
         await self.client.check_granted(namespace)  # before any read: otherwise each object there would cost a request
         return not self.cache.overlap.yields(namespace)
@@ -216,7 +216,7 @@ class Assembly:
         """The same work, limited to namespaces in which this manager is active."""
 
         async def work(name: Name) -> None:
-            if await self._looks_after(name[0]):
+            if await self._is_active_in(name[0]):
                 await reconcile(name)
 
         return work
@@ -238,7 +238,7 @@ class Assembly:
         await self._template_work.reconcile(name)
 
     async def _reconcile_rule(self, key: RuleKey) -> None:
-        if await self._looks_after(key[1][0]):
+        if await self._is_active_in(key[1][0]):
             await self._rule_work.reconcile(key)
 
     def _validate(self, key: RuleKey) -> None:

@@ -20,7 +20,7 @@ from prometheus_client.registry import Collector
 from application_manager.measures import gauge
 
 _FULL, _ROOM = 0.85, 0.75  # of the limit: memory is short above the first, until it is below the second
-_LOOK_EVERY = 0.5  # s
+_REFRESH_EVERY = 0.5  # s
 _LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
 _UNLIMITED = 1 << 60  # bytes: cgroups v1 has this instead of `max`
 
@@ -45,14 +45,14 @@ class Headroom(Collector):
         """`limit`: bytes; None: memory is never short."""
         self.limit = limit
         self._tight = False
-        self._looked = 0.0  # on the monotonic clock
+        self._refreshed = 0.0  # on the monotonic clock
 
     def tight(self) -> bool:
         """Whether memory is short, so that no new tasks are accepted."""
         now = time.monotonic()
-        if self.limit is not None and now - self._looked > _LOOK_EVERY:
-            self._looked = now
-            self._look(self.limit)
+        if self.limit is not None and now - self._refreshed > _REFRESH_EVERY:
+            self._refreshed = now
+            self._refresh(self.limit)
         return self._tight
 
     def collect(self) -> Iterator[Metric]:
@@ -63,7 +63,7 @@ class Headroom(Collector):
         if self.limit is not None:
             yield gauge("memory_limit_bytes", f"Memory limit {what}", self.limit)
 
-    def _look(self, limit: int) -> None:
+    def _refresh(self, limit: int) -> None:
         used = _resident()
         if used > _ROOM * limit:
             _return_free_memory()

@@ -103,10 +103,10 @@ class Manager:
         self._detector_watch = DetectorWatch(
             work.cache, client, work.detector_index, options.namespaces, work.detectors.add
         )
-        self._permissions = NamespacePermissions(client, work.router.everything)
+        self._permissions = NamespacePermissions(client, work.router.enqueue_everything)
         if not options.namespaces:
             client.may_write = self._permissions.may_write
-        self._leases = LeaseWatch(work.cache, client, TEMPLATES, options.namespaces, work.router.look_at)
+        self._leases = LeaseWatch(work.cache, client, TEMPLATES, options.namespaces, work.router.enqueue_instance)
         self._admission = Admission(
             cache=work.cache,
             client=client,
@@ -132,7 +132,7 @@ class Manager:
         def healthy() -> str | None:
             return stall() or self._watch_health.dead()
 
-        ready = partial(self._lacks, watching)
+        ready = partial(self._not_ready, watching)
         async with (
             watchdog(healthy, min(SILENT, limit)),
             pages(
@@ -155,10 +155,10 @@ class Manager:
 
     async def _first(self) -> None:
         """Determine whether we are active, then list everything, so that an active manager decides on newer lists."""
-        await until_answered(self._leadership.look)
+        await until_answered(self._leadership.refresh)
         await self._resync.first()
 
-    def _lacks(self, watching: asyncio.Event) -> str | None:
+    def _not_ready(self, watching: asyncio.Event) -> str | None:
         if not watching.is_set() or not self._watch_health.begun("applicationtasks"):
             return "the caches are not synced yet"
         return None if self._work.cache.healthy.reached else "the API server does not respond"

@@ -52,7 +52,7 @@ async def watchdog(
     """
     beats, over = [0], threading.Event()
 
-    def look() -> None:
+    def supervise() -> None:
         seen, quiet, stall = -1, 0.0, 0.0
         while not over.wait(step):
             quiet = quiet + step if beats[0] == seen else 0.0
@@ -71,7 +71,7 @@ async def watchdog(
             beats[0] += 1
             await asyncio.sleep(step / 4)
 
-    thread = threading.Thread(target=look, name="watchdog", daemon=True)
+    thread = threading.Thread(target=supervise, name="watchdog", daemon=True)
     beating = asyncio.create_task(beat(), name="heartbeat")
     thread.start()
     try:

@@ -18,7 +18,7 @@ from wayside.kubernetes.client import Client
 from wayside.kubernetes.resources import Object, Resource
 from wayside.kubernetes.retrying import repeatedly
 
-LOOK_EVERY = 3.0  # s
+POLL_EVERY = 3.0  # s
 _KINDS = tuple(Resource(*each) for each in KINDS)
 _PODS = Resource("v1", "Pod", "pods")
 
@@ -37,9 +37,9 @@ class DetectorWatch:
         """List them until cancelled, if the manager runs detectors."""
         if self.index.defaults is None:
             await asyncio.Event().wait()
-        await repeatedly(self.look, LOOK_EVERY, "cannot list the objects of detectors")
+        await repeatedly(self.refresh, POLL_EVERY, "cannot list the objects of detectors")
 
-    async def look(self) -> None:
+    async def refresh(self) -> None:
         """List them once. Raises ApiError or Unreachable."""
         objects: list[Object] = []
         for resource in _KINDS:

@@ -16,7 +16,7 @@ from wayside.kubernetes.errors import ApiError, RequestError, Unreachable
 from wayside.kubernetes.leases import lease_name
 from wayside.kubernetes.resources import LEASES, Resource
 
-LOOK_EVERY = 1.0  # s
+POLL_EVERY = 1.0  # s
 _AT_ONCE = 8  # concurrent reads of Leases: few, because work on instances comes first
 
 log = logging.getLogger(__name__)
@@ -46,17 +46,17 @@ class LeaseWatch:
         was_reached = True
         while True:
             reached = await self._reached()
-            self.cache.healthy.look(time.monotonic(), succeeded=reached)
+            self.cache.healthy.note_check(time.monotonic(), succeeded=reached)
             if reached != was_reached:
                 log.warning("the API server responds again" if reached else "the API server does not respond")
                 was_reached = reached
-            await asyncio.sleep(LOOK_EVERY)
+            await asyncio.sleep(POLL_EVERY)
 
     async def _read(self) -> None:
         while True:
             if self.cache.healthy.reached:
                 await self.read_due()
-            await asyncio.sleep(LOOK_EVERY)
+            await asyncio.sleep(POLL_EVERY)
 
     async def _reached(self) -> bool:
         try:
@@ -75,12 +75,12 @@ class LeaseWatch:
         at = self.cache.healthy.elapsed
         gate = asyncio.Semaphore(_AT_ONCE)
         due = [each for each in self.cache.claims.holders().items() if self.cache.leases.due(each[0], at)]
-        problems = [each for each in await asyncio.gather(*(self._look_at(*each, gate) for each in due)) if each]
+        problems = [each for each in await asyncio.gather(*(self._read_lease(*each, gate) for each in due)) if each]
         if problems:
             others = f", and {len(problems) - 1} more Leases cannot be read" if len(problems) > 1 else ""
             log.warning("leases: %s%s", problems[0], others)
 
-    async def _look_at(self, key: HolderKey, instances: Iterable[Name], gate: asyncio.Semaphore) -> Exception | None:
+    async def _read_lease(self, key: HolderKey, instances: Iterable[Name], gate: asyncio.Semaphore) -> Exception | None:
         """Read one Lease; returns the error, if any."""
         async with gate:
             try:

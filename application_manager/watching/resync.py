@@ -41,7 +41,7 @@ class Resync:
     async def first(self) -> None:
         """List everything, however long the API server takes to respond. Raises ApiError if it refuses permanently."""
         await until_answered(self._everything)
-        self.measures.resynced(well=True)
+        self.measures.resynced(succeeded=True)
 
     async def resync(self, watching: asyncio.Event) -> None:
         """List everything periodically, after the watches have started, until cancelled."""
@@ -53,9 +53,9 @@ class Resync:
                 await self._everything()
             except RequestError as error:
                 log.warning("cannot list all objects; retrying at the next resync, in %g s: %s", self.every, error)
-                self.measures.resynced(well=False)
+                self.measures.resynced(succeeded=False)
             else:
-                self.measures.resynced(well=True)
+                self.measures.resynced(succeeded=True)
             self.cache.leases.forget_except(self.cache.claims.holders())
             await asyncio.sleep(max(0.0, self.every - (time.monotonic() - began)))
 
@@ -72,7 +72,7 @@ class Resync:
         for resource in OWN.values():
             await self._list(resource, "", self.namespaces)
         await asyncio.gather(*(self._list(resource, INSTANCE_LABEL, self.namespaces) for resource in self.children))
-        self.router.everything()
+        self.router.enqueue_everything()
 
     async def _list(self, resource: Resource, labels: str, namespaces: Sequence[str | None]) -> None:
         for namespace in namespaces or (None,):

@@ -96,7 +96,7 @@ class Router:
             self._claim_again(name)
             self._rules(name[0])
         elif kind == INSTANCE:
-            self.look_at(name)
+            self.enqueue_instance(name)
             self.configuration(name)
             if isinstance(entry.model, ApplicationInstance):
                 self.template((name[0], entry.model.spec.template_name))
@@ -111,7 +111,7 @@ class Router:
             self._enqueue_owner(raw)
             self._enqueue_configuration(raw)
 
-    def everything(self) -> None:
+    def enqueue_everything(self) -> None:
         """Enqueue all objects."""
         for name, _ in self.cache.store.all(TEMPLATE):
             self.template(name)
@@ -129,7 +129,7 @@ class Router:
         self._enqueue_all(self.cache.note_task(name))
         self.task(name)
 
-    def settled(self, template: Name) -> None:
+    def claims_resolved(self, template: Name) -> None:
         """All claims of a template's tasks are known now."""
         for name in self.cache.instances_of(template):
             self.instance(name)
@@ -155,7 +155,7 @@ class Router:
         self._enqueue_all(touched)
 
     def _instance(self, name: Name, old: Entry | None, entry: Entry) -> None:
-        self.look_at(name)
+        self.enqueue_instance(name)
         if (old is None or old.uid != entry.uid) and isinstance(entry.model, ApplicationInstance):
             self.template((name[0], entry.model.spec.template_name))
 
@@ -209,7 +209,7 @@ class Router:
                 if name[0] == namespace:
                     self.rule((kind, name))
 
-    def look_at(self, name: Name) -> None:
+    def enqueue_instance(self, name: Name) -> None:
         """Enqueue an instance, or all instances of a template if the name stands for these."""
         self._enqueue_all([name])
 

@@ -107,7 +107,7 @@ class Applier:
         uid = live["metadata"]["uid"]
         return uid == recorded.get(key) and uid not in self._drifted
 
-    async def look(self, namespace: str, manifests: Iterable[Manifest]) -> dict[ObjectKey, Object | None]:
+    async def current_objects(self, namespace: str, manifests: Iterable[Manifest]) -> dict[ObjectKey, Object | None]:
         """The current objects in the cluster, unless they are watched."""
         keys = [key for key in map(object_key, manifests) if self.live(namespace, key) is None]
         found = await asyncio.gather(*(self._get(namespace, key) for key in keys))
@@ -119,22 +119,22 @@ class Applier:
         rendering: Rendering,
         manifests: Sequence[Manifest],
         last: LastApplied,
-        looked: Mapping[ObjectKey, Object | None],
+        current: Mapping[ObjectKey, Object | None],
     ) -> ApplyResult:
         """Apply all or some manifests of the rendering, and prune the objects that are no longer rendered.
 
-        `looked`: the result of `look` for the same manifests. Raises ApiError or Unreachable for a temporary error,
-        after all other objects were tried.
+        `current`: the result of `current_objects` for the same manifests. Raises ApiError or Unreachable for a
+        temporary error, after all other objects were tried.
         """
         began = time.time_ns()
-        wanted = rendering.keys()
+        desired = rendering.keys()
         recorded = dict(last.objects)
         supporting = [each for each in manifests if each["kind"] not in _WORKLOADS]
         workloads = [each for each in manifests if each["kind"] in _WORKLOADS]
         results: list[Object | ApplyProblem | BaseException] = []
         for phase in (supporting, workloads):
             results += await asyncio.gather(
-                *(self._apply_one(instance, each, recorded, looked) for each in phase), return_exceptions=True
+                *(self._apply_one(instance, each, recorded, current) for each in phase), return_exceptions=True
             )
         for result in results:
             if isinstance(result, BaseException):
@@ -145,14 +145,14 @@ class Applier:
                 uids[object_key(result)] = result["metadata"]["uid"]
         problems = [result for result in results if isinstance(result, ApplyProblem)]
         if problems:
-            there = references({**dict.fromkeys(wanted), **uids})
+            there = references({**dict.fromkeys(desired), **uids})
             return ApplyResult(_refused(problems), there, complete=False, took=(began, time.time_ns()))
         # An object whose controller is the instance belongs to it, recorded or not.
         controlled = self._controlled.get(instance.metadata.uid, {})
-        for key in (recorded.keys() | set(controlled.values())) - wanted:
+        for key in (recorded.keys() | set(controlled.values())) - desired:
             await self._prune(instance, key)
             uids.pop(key, None)
-        matching = "1 object matches" if len(wanted) == 1 else f"{len(wanted)} objects match"
+        matching = "1 object matches" if len(desired) == 1 else f"{len(desired)} objects match"
         done = ConditionState("Applied", True, "Applied", f"{matching} the template")
         return ApplyResult(done, references(uids), complete=True, took=(began, time.time_ns()))
 
@@ -161,10 +161,10 @@ class Applier:
         instance: ApplicationInstance,
         manifest: Manifest,
         recorded: Mapping[ObjectKey, str | None],
-        looked: Mapping[ObjectKey, Object | None],
+        current: Mapping[ObjectKey, Object | None],
     ) -> Object | ApplyProblem:
         key = object_key(manifest)
-        live = self.live(instance.namespace, key) or looked.get(key)
+        live = self.live(instance.namespace, key) or current.get(key)
         body = owned(manifest, instance)
         raw = await apply_owned(self._client, await self.resource(key), body, instance, live, recorded.get(key))
         if isinstance(raw, ApplyProblem):

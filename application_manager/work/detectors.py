@@ -80,17 +80,17 @@ class DetectorWork:
             await self._remove(name, entry.uid, self.index.owned(entry.uid))
             self.index.processed.pop(name, None)
             return
-        running = await self._make(name, detector)
+        running = await self._ensure(name, detector)
         processed = ProcessedState(entry.uid, detector.metadata.generation, running)
         if self.index.processed.get(name) != processed:
             self.index.processed[name] = processed
             self.validate(name)
 
-    async def _make(self, name: Name, detector: Detector) -> ConditionState:
+    async def _ensure(self, name: Name, detector: Detector) -> ConditionState:
         if self.index.defaults is None:
             return NOT_RUN
         if detector.spec.mode is DetectorMode.SIDECAR:
-            return await self._make_rights(name, detector, self.index.defaults)
+            return await self._ensure_rights(name, detector, self.index.defaults)
         there = self.index.owned(detector.metadata.uid).get("Deployment")
         if detector_findings(detector).problems:
             return NOT_ACCEPTED if there is None else running(there, self.index.troubles(name))
@@ -98,7 +98,7 @@ class DetectorWork:
             return problem
         return running(self.index.owned(detector.metadata.uid).get("Deployment"), self.index.troubles(name))
 
-    async def _make_rights(self, name: Name, detector: Detector, defaults: PodDefaults) -> ConditionState:
+    async def _ensure_rights(self, name: Name, detector: Detector, defaults: PodDefaults) -> ConditionState:
         """Give the service accounts of other pods the permissions of the detector that the webhook injects into them.
 
         Also if the Detector is not accepted: a service account that it no longer lists has no permissions any more.

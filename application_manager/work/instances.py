@@ -37,7 +37,7 @@ from wayside.process.backoff import pause_after
 
 log = logging.getLogger(__name__)
 
-_LOOK_AGAIN = 1.0  # s until an object that is being deleted is read again, in case its watch event is missing
+_RECHECK_AFTER = 1.0  # s until an object that is being deleted is read again, in case its watch event is missing
 FIRST_PAUSE = 1.0  # s until the first retry after a refusal, doubled with each further refusal of the same content
 LONGEST_PAUSE = 30.0  # s
 
@@ -109,7 +109,7 @@ class InstanceWork:
         configured: called when an instance's configuration was applied.
         objects: the objects of an instance, or why it has none; None: they are being computed, and the instance is
             enqueued once they are.
-        not_made: called with the reason why an instance cannot be created.
+        not_created: called with the reason why an instance cannot be created.
     """
 
     cache: ClusterCache
@@ -125,7 +125,7 @@ class InstanceWork:
     configured: Callable[[Name], None]
     objects: Callable[[ApplicationInstance, TemplateState], Rendering | ConditionState | None]
     attempts: Attempts = field(default_factory=Attempts)
-    not_made: Callable[[Name, Decision, str], None] = lambda *_: None
+    not_created: Callable[[Name, Decision, str], None] = lambda *_: None
 
     async def reconcile(self, name: Name) -> None:
         """Make the cluster match the decision about this instance. Raises RequestError for a temporary error."""
@@ -138,10 +138,10 @@ class InstanceWork:
             raise
 
     async def _reconcile(self, name: Name) -> None:
-        if self.cache.is_unsettled(name):
+        if self.cache.has_unresolved_claims(name):
             return  # the objects stay: the claims of its tasks are being computed, which enqueues it again afterwards
-        if name in self.cache.places.being_made:
-            await self._look_whether_it_was_made(name)
+        if name in self.cache.places.being_created:
+            await self._read_after_failed_create(name)
         decision = self._decide(name)
         if self._is_over(name, decision):
             # A watch may have missed events: nothing is stopped without listing the tasks.
@@ -153,61 +153,61 @@ class InstanceWork:
         instance = self.cache.instance(name)
         if decision is not None and decision.next_change is not None:
             self.again(name, decision.next_change)
-        if decision is None or (instance is None and not decision.wanted):
+        if decision is None or (instance is None and not decision.demanded):
             self.cache.records.pop(name, None)
             self.attempts.forget(name)
             self.absent(name, decision)
             return
         if instance is not None and instance.metadata.deletion_timestamp is not None:
-            self.not_made(
+            self.not_created(
                 name, decision, f"instance {name[1]} is being deleted; the manager creates it again afterwards"
             )
             return  # the event of its deletion enqueues it again
         template = self.cache.template((name[0], decision.template))
-        await self._make(_Start(name, decision, instance, template, self.cache.records.get(name)))
+        await self._ensure(_Start(name, decision, instance, template, self.cache.records.get(name)))
 
-    async def _make(self, start: _Start) -> None:
+    async def _ensure(self, start: _Start) -> None:
         name, decision, existing = start.name, start.decision, start.existing
         if decision.paused and existing is not None:
             self._leave(start, existing)
             return
         if decision.too_large and existing is None:
-            self.not_made(name, decision, f"cannot create instance {name[1]}: {decision.too_large}")
+            self.not_created(name, decision, f"cannot create instance {name[1]}: {decision.too_large}")
             return
-        wanted = drafting.draft(name, decision, existing)
-        rendering = self.objects(wanted, start.template)
+        desired = drafting.draft(name, decision, existing)
+        rendering = self.objects(desired, start.template)
         if rendering is None:
             return
-        manifest = drafting.manifest(wanted, existing, start.template)
+        manifest = drafting.manifest(desired, existing, start.template)
         if manifest is None:
             if existing is not None:
                 await self._apply_objects(start, existing, rendering, {})
             return
-        answer, looked = await self._apply_instance(start, manifest, rendering)
+        answer, current = await self._apply_instance(start, manifest, rendering)
         try:
             instance = parse_object(trimming.own(answer))
             if isinstance(instance, ApplicationInstance) and instance.metadata.deletion_timestamp is None:
-                await self._apply_objects(start, instance, rendering, looked)
+                await self._apply_objects(start, instance, rendering, current)
         finally:  # the instance enters the cache afterwards: no other work starts before its objects are applied
             self.observe(answer)
-            self.cache.places.being_made.discard(name)
+            self.cache.places.being_created.discard(name)
 
     async def _apply_instance(
         self, start: _Start, manifest: Object, rendering: Rendering | ConditionState
     ) -> tuple[Object, dict[ObjectKey, Object | None]]:
         """Apply the instance itself and, if it is new, read its objects at the same time: their keys are known."""
-        to_look = rendering.manifests if start.existing is None and isinstance(rendering, Rendering) else ()
+        to_read = rendering.manifests if start.existing is None and isinstance(rendering, Rendering) else ()
         if start.existing is None:
-            self.cache.places.being_made.add(start.name)  # it takes its place from here on
+            self.cache.places.being_created.add(start.name)  # from now on it counts towards the limits
         try:
             return await asyncio.gather(
-                self.client.apply(INSTANCES, manifest), self.applier.look(start.name[0], to_look)
+                self.client.apply(INSTANCES, manifest), self.applier.current_objects(start.name[0], to_read)
             )
         except ApiError as error:
             if start.existing is None and error.permanent and not error.terminating:
                 why = with_remedy(reason_of(error.code, error.message), error.message)
                 problem = f"cannot create instance {start.name[1]}: {why}"
-                self.not_made(start.name, start.decision, problem)
+                self.not_created(start.name, start.decision, problem)
             raise
 
     async def _apply_objects(
@@ -215,7 +215,7 @@ class InstanceWork:
         start: _Start,
         instance: ApplicationInstance,
         rendering: Rendering | ConditionState,
-        looked: Mapping[ObjectKey, Object | None],
+        current: Mapping[ObjectKey, Object | None],
     ) -> None:
         name, last, was_applied = start.name, start.last_applied(instance), start.was_applied(instance)
         if not isinstance(rendering, Rendering):
@@ -223,7 +223,7 @@ class InstanceWork:
                 return  # the objects stay unchanged until the chart is rendered, or has failed
             self._note(start, instance, ApplyResult(rendering, references(last.objects), complete=False), last.digest)
             return
-        await self.scaler.settle(instance, rendering)
+        await self.scaler.scale_workloads(instance, rendering)
         trying = (instance.metadata.uid, rendering.digest)
         until = self.attempts.waits_until(name, trying, time.time())
         pending = self.applier.pending(instance, rendering, last)
@@ -235,11 +235,11 @@ class InstanceWork:
             self._note(start, instance, start.record.applied, start.record.digest)
             return
         if start.existing is not None:
-            looked = await self.applier.look(name[0], pending)
+            current = await self.applier.current_objects(name[0], pending)
             if rendering.keys() - last.objects.keys():
                 await self._announce(instance, last, rendering)
         try:
-            applied = await self.applier.apply(instance, rendering, pending, last, looked)
+            applied = await self.applier.apply(instance, rendering, pending, last, current)
         except ApiError as error:
             if not error.terminating:
                 message = f"the API server failed; retrying with backoff: {error.message}"
@@ -254,16 +254,16 @@ class InstanceWork:
         if applied.complete:
             self.attempts.forget(name)
         elif applied.state.reason == "Waiting":
-            self.again(name, time.time() + _LOOK_AGAIN)
+            self.again(name, time.time() + _RECHECK_AFTER)
         else:
             self.again(name, self.attempts.note_refusal(name, trying, time.time()))
 
-    async def _look_whether_it_was_made(self, name: Name) -> None:
+    async def _read_after_failed_create(self, name: Name) -> None:
         """Read the instance after a failed attempt to create it, which may have succeeded."""
         raw = await self.client.get(INSTANCES, name[0], name[1])
         if raw is not None:
             self.observe(raw)
-        self.cache.places.being_made.discard(name)
+        self.cache.places.being_created.discard(name)
         self.cache.places.touch(name)
 
     def _leave(self, start: _Start, instance: ApplicationInstance) -> None:
@@ -327,7 +327,7 @@ class InstanceWork:
         if instance is None:
             return False
         if self.cache.claims.pending((name[0], instance.spec.template_name)):
-            self.again(name, time.time() + _LOOK_AGAIN)  # one of the listed tasks may demand it
+            self.again(name, time.time() + _RECHECK_AFTER)  # one of the listed tasks may demand it
             return False
         await self.client.delete(INSTANCES, name[0], name[1], instance.metadata.uid)
         why = over.yields or "no demand arrived within its linger"

@@ -32,7 +32,7 @@ from wayside.api.applicationinstance import ApplicationInstanceStatus
 from wayside.kubernetes.resources import Object
 
 _TROUBLES_SHOWN = 3
-_SETTLING = 2.0  # s
+_FIRST_STATUS_DELAY = 2.0  # s
 _AGAIN = 5.0  # s until nodes and Events are read again for objects that are not ready because of them
 
 log = logging.getLogger(__name__)
@@ -63,7 +63,7 @@ class InstanceStatusWork:
         old = instance.status or ApplicationInstanceStatus()
         applied = record.applied
         live = self._live(instance, applied)
-        until = _settles(instance, record, live.values())
+        until = _delayed_until(instance, record, live.values())
         troubles = self._troubles(name, live, looked_up)
         suspended = suspended_condition(instance, record.decision, live.values())
         ready = _overdue(self._ready(instance, applied.state, live, troubles), record.decision)
@@ -109,7 +109,7 @@ class InstanceStatusWork:
         )
         self.report(name, record.decision, progress)
 
-    def report_not_made(self, name: Name, decision: Decision, problem: str) -> None:
+    def report_not_created(self, name: Name, decision: Decision, problem: str) -> None:
         """Enqueue the tasks that demand an instance that does not exist, with the reason."""
         self.report(name, decision, InstanceProgress(name[1], applied=False, ready=False, problem=problem))
 
@@ -193,15 +193,16 @@ class InstanceStatusWork:
         return ConditionState("Ready", True, "Ready", "all workloads are ready")
 
 
-def _settles(instance: ApplicationInstance, record: WorkRecord, live: Iterable[Object | None]) -> float:
-    """Until when the first status of an instance waits, in seconds since 1970, since its objects are about to change.
+def _delayed_until(instance: ApplicationInstance, record: WorkRecord, live: Iterable[Object | None]) -> float:
+    """The time until which the first status of an instance is delayed, in seconds since 1970; 0: no delay.
 
-    Their controllers process new objects within a moment; without the wait, there would be two statuses in succession.
+    Controllers usually process the new objects within this time; without the delay, two statuses would follow each
+    other.
     """
     known = instance.status is not None and instance.status.spec_hash is not None
     if known or not record.applied.state.holds or not any(each is not None and is_unseen(each) for each in live):
         return 0.0
-    return record.since + _SETTLING
+    return record.since + _FIRST_STATUS_DELAY
 
 
 def _overdue(ready: ConditionState, decision: Decision) -> ConditionState:

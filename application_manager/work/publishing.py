@@ -42,20 +42,20 @@ def key_of(name: Name) -> str:
     return f"wayside/instances/{name[0]}/{name[1]}/configuration"
 
 
-def settings(given: Sequence[str]) -> zenoh.Config:
+def settings(endpoints: Sequence[str]) -> zenoh.Config:
     """The Zenoh configuration: a client of the given endpoints, or the one given file.
 
     Raises ConfigurationError for anything else.
     """
-    if len(given) == 1 and Path(given[0]).suffix in (".json5", ".json", ".yaml", ".yml"):
+    if len(endpoints) == 1 and Path(endpoints[0]).suffix in (".json5", ".json", ".yaml", ".yml"):
         try:
-            return zenoh.Config.from_file(given[0])
+            return zenoh.Config.from_file(endpoints[0])
         except (zenoh.ZError, OSError) as error:
-            raise ConfigurationError(f"--zenoh: cannot read the Zenoh configuration {given[0]}: {error}") from None
+            raise ConfigurationError(f"--zenoh: cannot read the Zenoh configuration {endpoints[0]}: {error}") from None
     config = zenoh.Config()
     for path, value in (
         ("mode", "client"),
-        ("connect/endpoints", list(given)),
+        ("connect/endpoints", list(endpoints)),
         ("connect/timeout_ms", 0),
         ("connect/exit_on_failure", True),  # we retry ourselves, and can be stopped meanwhile
         ("scouting/multicast/enabled", False),
@@ -65,7 +65,7 @@ def settings(given: Sequence[str]) -> zenoh.Config:
         except zenoh.ZError:
             raise ConfigurationError(
                 "--zenoh must be endpoints, e.g. tcp/zenoh:7447, or one Zenoh configuration file that ends with "
-                f".json5; got {', '.join(given)}"
+                f".json5; got {', '.join(endpoints)}"
             ) from None
     return config
 

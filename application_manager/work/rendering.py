@@ -52,20 +52,20 @@ class Renderings:
         self._pickled: _OfTemplates[bytes] = OrderedDict()
         self._plain: _OfTemplates[bool] = OrderedDict()
 
-    def objects(self, wanted: ApplicationInstance, template: TemplateState) -> Rendering | ConditionState | None:
+    def objects(self, desired: ApplicationInstance, template: TemplateState) -> Rendering | ConditionState | None:
         """The instance's objects, or the condition Applied if it has none; None: not available yet."""
-        problem = drafting.without_template(wanted, template)
+        problem = drafting.without_template(desired, template)
         if problem is not None or not isinstance(template, ApplicationTemplate):
             return problem
-        found = self._answer("rendering", wanted, template, None)
+        found = self._answer("rendering", desired, template, None)
         if isinstance(found, ChartRequest):
             outcome = self._charts(found)
             if outcome is None:
                 return drafting.chart_pending(template, found)
             if isinstance(outcome, ApplyProblem):
                 return drafting.problem(template, outcome.reason, outcome.message)
-            found = self._answer("chart", wanted, template, outcome)
-        name = (wanted.namespace, wanted.name)
+            found = self._answer("chart", desired, template, outcome)
+        name = (desired.namespace, desired.name)
         self._note(name, (template.namespace, template.name), found)
         match found:
             case Rendering():
@@ -84,11 +84,11 @@ class Renderings:
             self._note(name, template, ApplyProblem("", ""))
 
     def _answer(
-        self, kind: str, wanted: ApplicationInstance, template: ApplicationTemplate, chart: ChartOutcome | None
+        self, kind: str, desired: ApplicationInstance, template: ApplicationTemplate, chart: ChartOutcome | None
     ) -> object | None:
-        name = (wanted.namespace, wanted.name)
+        name = (desired.namespace, desired.name)
         metadata = template.metadata
-        bare = wanted.model_copy(update={"status": None})
+        bare = desired.model_copy(update={"status": None})
 
         def job() -> Job[object]:
             written = _kept(self._pickled, template, _pickled, _PICKLED)
@@ -98,8 +98,8 @@ class Renderings:
             return job()()
         return self._answers.answer(
             key=(kind, *name),
-            question=(metadata.uid, metadata.generation, wanted.spec, chart),
-            namespace=wanted.namespace,
+            question=(metadata.uid, metadata.generation, desired.spec, chart),
+            namespace=desired.namespace,
             job=job,
             done=partial(self._again, name),
         )

@@ -33,8 +33,8 @@ class WorkloadScaler:
     applier: Applier
     observe: Callable[[Object], None]
 
-    async def settle(self, instance: ApplicationInstance, rendering: Rendering) -> None:
-        """Scale the workloads to what the instance's spec requires, before its manifests are applied.
+    async def scale_workloads(self, instance: ApplicationInstance, rendering: Rendering) -> None:
+        """Scale the workloads to zero or back, as the instance's spec requires, before its manifests are applied.
 
         Raises ApiError or Unreachable for a temporary error.
         """
@@ -55,9 +55,9 @@ class WorkloadScaler:
             if key not in noted:
                 raw, stated = live[key], rendering.replicas[key]
                 missing[key] = int(raw["spec"].get("replicas", 1)) if raw else 1 if stated is None else stated
-        wanted = {key: replicas for key, replicas in noted.items() if key in rendering.replicas} | missing
-        if wanted != noted:
-            await self._note(instance, wanted)
+        desired = {key: replicas for key, replicas in noted.items() if key in rendering.replicas} | missing
+        if desired != noted:
+            await self._note(instance, desired)
         for key, raw in live.items():
             if raw is not None:
                 await self._scale(instance, key, raw, 0)

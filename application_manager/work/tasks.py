@@ -139,7 +139,7 @@ class TaskWork:
 
     def _decided(self, namespace: str, claimed: Claim) -> Iterator[Name]:
         """The instances whose decisions determine the verdict of a claim."""
-        yield from self.cache.meant((namespace, claimed.instance))
+        yield from self.cache.expand((namespace, claimed.instance))
         served = self.cache.last_decisions.get((namespace, claimed.instance))
         fallback = served.decision.fallback if served is not None else None
         instead = fallback.instance_of(claimed.task.name) if fallback is not None else None

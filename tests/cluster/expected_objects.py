@@ -91,7 +91,7 @@ def differences(
         if decision.paused:  # left as it is, whatever that may be
             expected |= {key for key, raw in objects.items() if name in raw["metadata"]["labels"].values()}
             continue
-        if decision.wanted:
+        if decision.demanded:
             if instance.spec.parameters != decision.parameters:
                 yield f"{name}: parameters {instance.spec.parameters}, not {decision.parameters}"
             if decision.suspended is not None and instance.spec.suspended != decision.suspended:

@@ -1,7 +1,7 @@
 """The result of the live tasks of one instance: Deploy tasks merge, Reconfigure overrides, Suspend stops. Pure.
 
-`settle` decides one instance; a task for all instances of a template gets a verdict from each, and `gathered` combines
-these.
+`combine` computes the result for one instance. A task for all instances of a template has a verdict from each of them;
+`gathered` summarizes these.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Verdict:
 
 
 @dataclass(frozen=True, slots=True)
-class Settled:
+class CombinedClaims:
     """The result of the tasks of one instance.
 
     Attributes:
@@ -74,7 +74,7 @@ class Settled:
     too_large: str = ""
 
 
-def settle(name: str, template: ApplicationTemplate | None, claims: Sequence[Claim], exists: bool) -> Settled:
+def combine(name: str, template: ApplicationTemplate | None, claims: Sequence[Claim], exists: bool) -> CombinedClaims:
     """The result of the live claims, in their order of precedence; `exists`: whether the instance exists already."""
     declared = template.spec.parameters if template else {}
     always = baseline(template) if template else None
@@ -99,7 +99,7 @@ def settle(name: str, template: ApplicationTemplate | None, claims: Sequence[Cla
             else _stop_verdict(name, each, served, demanded or exists)
         )
     parameters = with_defaults(declared, base.parameters | layer.parameters) if demanded else None
-    return Settled(
+    return CombinedClaims(
         tasks=tuple(each.task.name for each in served),
         baseline=always is not None,
         parameters=parameters,

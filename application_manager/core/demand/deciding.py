@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 from application_manager.core.claims.claims import Claim, InvalidTemplate, RefusalReason, TemplateState, template_of_all
-from application_manager.core.claims.operations import Verdict, VerdictKind, settle, waiting_for_any
+from application_manager.core.claims.operations import Verdict, VerdictKind, combine, waiting_for_any
 from application_manager.core.claims.parameters import baseline
 from application_manager.core.conditions import find, holds
 from application_manager.core.demand.decisions import Decision, is_managed
@@ -82,7 +82,7 @@ def decide(name: str, indexes: Indexes, now: float) -> Decided:
     if unlimited is None or placement is None:
         return Decided(unlimited, unlimited, placement)
     exists = indexes.instance(name) is not None
-    return Decided(placed(unlimited, placement.given.get(name), exists=exists, now=now), unlimited, placement)
+    return Decided(placed(unlimited, placement.granted.get(name), exists=exists, now=now), unlimited, placement)
 
 
 def decide_without_limits(name: str, indexes: Indexes, now: float) -> Decision | None:
@@ -99,13 +99,13 @@ def decide_without_limits(name: str, indexes: Indexes, now: float) -> Decision |
     return decision
 
 
-def request(name: str, unlimited: Decision | None, indexes: Indexes, *, being_made: bool = False) -> PlaceRequest:
-    """The instance's request for a place; `being_made`: it may have been created at the API server already."""
+def request(name: str, unlimited: Decision | None, indexes: Indexes, *, being_created: bool = False) -> PlaceRequest:
+    """The instance's request for a place; `being_created`: it may have been created at the API server already."""
     if unlimited is None:
         return PlaceRequest(None, None)
     template = indexes.template(unlimited.template)
-    wanted = candidate(unlimited, indexes.instance(name), template, being_made=being_made)
-    return PlaceRequest(wanted, unlimited.next_change)
+    needed = candidate(unlimited, indexes.instance(name), template, being_created=being_created)
+    return PlaceRequest(needed, unlimited.next_change)
 
 
 def fallback_claims(instance: ApplicationInstance, indexes: Indexes, now: float) -> Fallback | None:
@@ -150,11 +150,11 @@ def _decide_one(name: str, template_name: str, claims: Iterable[Claim], indexes:
         key = instance.spec.key if instance else None
         return Decision(name, template_name, key, paused=paused)
     live, verdicts, changes = live_claims(ordered, template, indexes.leases(ordered), now)
-    settled = settle(name, template, live, instance is not None)
+    combined = combine(name, template, live, instance is not None)
     kept = instance.spec.key if instance else None
-    key = next((each.key for each in live if each.task.name in settled.tasks[:1]), kept)  # all that deploy it agree
-    wanted = settled.parameters is not None
-    suspended: bool | None = settled.suspender is not None
+    key = next((each.key for each in live if each.task.name in combined.tasks[:1]), kept)  # all that deploy it agree
+    wanted = combined.parameters is not None
+    suspended: bool | None = combined.suspender is not None
     release_time = None
     if not wanted and instance is not None and not paused and not is_held(instance):
         linger = linger_of(instance, template).seconds  # from the time at which we see that no demand is left
@@ -164,10 +164,10 @@ def _decide_one(name: str, template_name: str, claims: Iterable[Claim], indexes:
     other = indexes.template(fallback_of(template) or "")
     late, change = overdue(instance, template, now) if instance is not None else ("", None)
     changes += [change] if change is not None else []
-    served = [each for each in live if each.task.name in settled.tasks]
+    served = [each for each in live if each.task.name in combined.tasks]
     if paused or template is None or (release_time is not None and instance is not None and instance.spec.suspended):
         suspended = None  # a lingering instance is not started again
-    demanded = (settled.parameters, settled.suspender is not None)
+    demanded = (combined.parameters, combined.suspender is not None)
     withheld = (
         paused and wanted and instance is not None and (instance.spec.parameters, instance.spec.suspended) != demanded
     )
@@ -175,23 +175,23 @@ def _decide_one(name: str, template_name: str, claims: Iterable[Claim], indexes:
         name=name,
         template=template_name,
         key=key,
-        parameters=None if paused or settled.too_large else settled.parameters,
-        tasks=settled.tasks,
-        verdicts=verdicts | settled.verdicts,
+        parameters=None if paused or combined.too_large else combined.parameters,
+        tasks=combined.tasks,
+        verdicts=verdicts | combined.verdicts,
         generations=_generations(ordered),
         release_time=release_time,
         next_change=min((change for change in changes if change > now), default=None),
         paused=paused,
         withheld=withheld,
-        capped=settled.capped,
-        too_large=settled.too_large,
-        baseline=settled.baseline,
+        capped=combined.capped,
+        too_large=combined.too_large,
+        baseline=combined.baseline,
         suspended=suspended,
-        suspender=settled.suspender,
-        rank=precedence(served[0].task) if served else BASELINE_RANK if settled.baseline else None,
+        suspender=combined.suspender,
+        rank=precedence(served[0].task) if served else BASELINE_RANK if combined.baseline else None,
         ran=any(_was_served(each.task) for each in served),
         overdue=late,
-        fallback=fallback(name, template, other, served) if late and settled.suspender is None else None,
+        fallback=fallback(name, template, other, served) if late and combined.suspender is None else None,
         stands_in_for=tuple(sorted({each.instead_of for each in served if each.instead_of})),
         borrowed=frozenset(each.task.name for each in ordered if each.instead_of),
     )

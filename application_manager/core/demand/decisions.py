@@ -63,7 +63,7 @@ class Decision:
     borrowed: frozenset[str] = frozenset()
 
     @property
-    def wanted(self) -> bool:
+    def demanded(self) -> bool:
         """Whether a task, or the template itself, demands it."""
         return bool(self.tasks) or self.baseline
 

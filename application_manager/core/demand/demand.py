@@ -88,7 +88,7 @@ def demand(
         found_verdict = verdict_of(each, decided, meant)
         if found_verdict is not None:
             verdicts[each.task.name] = found_verdict.verdict
-    shown = {name: each for name, each in decisions.items() if each.wanted or indexes.instance(name) is not None}
+    shown = {name: each for name, each in decisions.items() if each.demanded or indexes.instance(name) is not None}
     waiting = {name: each for name, each in decisions.items() if name not in shown}
     return NamespaceOutcome(shown, verdicts, min(changes, default=None), waiting)
 

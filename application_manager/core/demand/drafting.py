@@ -35,32 +35,32 @@ def draft(name: Name, decision: Decision, existing: ApplicationInstance | None) 
 
 
 def manifest(
-    wanted: ApplicationInstance, existing: ApplicationInstance | None, template: TemplateState
+    desired: ApplicationInstance, existing: ApplicationInstance | None, template: TemplateState
 ) -> dict[str, Any] | None:
-    """The manifest to apply so that the instance becomes as wanted; None if it is already, or is a person's."""
+    """The manifest that changes the instance to the desired one; None if they are equal, or a person created it."""
     usable = template if isinstance(template, ApplicationTemplate) else None
     if existing is None:
-        return created(wanted, usable)
-    linger = str(linger_of(wanted, usable))
+        return created(desired, usable)
+    linger = str(linger_of(desired, usable))
     noted = existing.metadata.annotations.get(LINGER_ANNOTATION)
-    if not is_managed(existing) or (existing.spec == wanted.spec and (usable is None or noted == linger)):
+    if not is_managed(existing) or (existing.spec == desired.spec and (usable is None or noted == linger)):
         return None
-    whole = created(wanted, usable)
+    whole = created(desired, usable)
     return {**whole, "metadata": {**whole["metadata"], "uid": existing.metadata.uid}}
 
 
-def created(wanted: ApplicationInstance, template: ApplicationTemplate | None) -> dict[str, Any]:
+def created(desired: ApplicationInstance, template: ApplicationTemplate | None) -> dict[str, Any]:
     """The manifest to create the instance with."""
     return {
         "apiVersion": API_VERSION,
-        "kind": wanted.kind,
+        "kind": desired.kind,
         "metadata": {
-            "name": wanted.name,
-            "namespace": wanted.namespace,
+            "name": desired.name,
+            "namespace": desired.namespace,
             "labels": {MANAGED_BY_LABEL: MANAGED_BY},
-            "annotations": {LINGER_ANNOTATION: str(linger_of(wanted, template))},
+            "annotations": {LINGER_ANNOTATION: str(linger_of(desired, template))},
         },
-        "spec": wanted.spec.to_json(),
+        "spec": desired.spec.to_json(),
     }
 
 
@@ -72,12 +72,12 @@ EXPRESSION_LIMIT = "ExpressionLimit"
 """The reason of the condition Applied if the expressions of the template exceed their limits."""
 
 
-def without_template(wanted: ApplicationInstance, template: TemplateState) -> ConditionState | None:
+def without_template(desired: ApplicationInstance, template: TemplateState) -> ConditionState | None:
     """The condition Applied of an instance without objects, if its template is missing or invalid."""
-    of = wanted.spec.template_name
+    of = desired.spec.template_name
     if template is None:
         message = (
-            f"spec.templateName: there is no ApplicationTemplate {of!r} in namespace {wanted.namespace}: create "
+            f"spec.templateName: there is no ApplicationTemplate {of!r} in namespace {desired.namespace}: create "
             "it; until then, the running objects are not changed"
         )
         return ConditionState("Applied", False, "TemplateNotFound", message)

@@ -76,7 +76,7 @@ class GrantedPlace:
     """The result for an instance.
 
     Attributes:
-        given: whether it has a place; otherwise it does not start, and is released if it exists.
+        granted: whether it has a place; otherwise it does not start, and is released if it exists.
         preempts: the instance whose place it has, as text; empty if there is none.
         awaits: the instances that must be deleted before it may start, as text; empty if it may start.
         limit: without a place: the limit, as text.
@@ -85,7 +85,7 @@ class GrantedPlace:
         next_change: when this changes by itself, in seconds since 1970.
     """
 
-    given: bool = True
+    granted: bool = True
     preempts: str = ""
     awaits: str = ""
     limit: str = ""
@@ -96,7 +96,7 @@ class GrantedPlace:
     @property
     def starts(self) -> bool:
         """Whether it may run now."""
-        return self.given and not self.awaits
+        return self.granted and not self.awaits
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +122,7 @@ class Placement:
 
     limits: Limits
     requests: Mapping[str, PlaceRequest] = field(default_factory=dict)
-    given: Mapping[str, GrantedPlace] = field(default_factory=dict)
+    granted: Mapping[str, GrantedPlace] = field(default_factory=dict)
     until: float = -math.inf
 
     def due(self, now: float) -> set[str]:
@@ -145,12 +145,12 @@ class Placement:
         ends = [each.protected_until for each in candidates if now < each.protected_until]
         return Placement(limits, merged, places(candidates, limits, now), min(ends, default=math.inf))
 
-    def moved(self, before: Placement | None) -> set[str]:
+    def changed_since(self, before: Placement | None) -> set[str]:
         """The instances whose result differs from the previous placement."""
-        then: Mapping[str, GrantedPlace] = before.given if before is not None else {}
-        if then is self.given:
+        then: Mapping[str, GrantedPlace] = before.granted if before is not None else {}
+        if then is self.granted:
             return set()
-        return {name for name in self.given.keys() | then.keys() if self.given.get(name) != then.get(name)}
+        return {name for name in self.granted.keys() | then.keys() if self.granted.get(name) != then.get(name)}
 
 
 def places(candidates: Iterable[PlaceCandidate], limits: Limits, now: float) -> dict[str, GrantedPlace]:
@@ -173,13 +173,13 @@ def places(candidates: Iterable[PlaceCandidate], limits: Limits, now: float) -> 
     losers = [each for each in free if each.name in beyond and each.rank is not None]
     by = _preemptions(chosen, losers, limits)
     victims = {winner.name: loser for loser, winner in by.values()}
-    result = {each.name: GrantedPlace(given=False, limit=beyond[each.name]) for each in free if each.name in beyond}
+    result = {each.name: GrantedPlace(granted=False, limit=beyond[each.name]) for each in free if each.name in beyond}
     result |= {
         each.name: GrantedPlace(preempts=victims[each.name].text if each.name in victims else "") for each in chosen
     }
     bars = _bars(chosen, limits, now)
     for each in losers:
-        bar = bars.get("" if limits.namespace is not None else each.template, GrantedPlace(given=False))
+        bar = bars.get("" if limits.namespace is not None else each.template, GrantedPlace(granted=False))
         yields_to = by[each.name][1].text if each.name in by else ""
         result[each.name] = replace(bar, limit=beyond[each.name], yields_to=yields_to)
     result |= _waiting(everybody, chosen, result, limits)
@@ -264,7 +264,7 @@ def _bars(chosen: Iterable[PlaceCandidate], limits: Limits, now: float) -> dict[
         lowest = min((each.priority for each in movable), default=None)
         ends = [each.protected_until for each in movable if now < each.protected_until]
         outbid_from = None if lowest is None else max(lowest, -BASELINE_RANK[0]) + 1
-        found[name] = GrantedPlace(given=False, outbid_from=outbid_from, next_change=min(ends, default=None))
+        found[name] = GrantedPlace(granted=False, outbid_from=outbid_from, next_change=min(ends, default=None))
     return found
 
 
@@ -276,7 +276,7 @@ def _waiting(
     for each in everybody:
         if each.exists:
             room.take(each)
-    going = [each for each in everybody if each.exists and (each.leaving or not so_far[each.name].given)]
+    going = [each for each in everybody if each.exists and (each.leaving or not so_far[each.name].granted)]
     found = {}
     for each in sorted((each for each in chosen if not each.exists), key=_order):
         if room.lacks(each):

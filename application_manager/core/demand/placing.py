@@ -35,7 +35,7 @@ def candidate(
     instance: ApplicationInstance | None,
     template: TemplateState,
     *,
-    being_made: bool = False,
+    being_created: bool = False,
 ) -> PlaceCandidate | None:
     """The candidate of the decision; None if it needs no place, or the instance is a person's."""
     if instance is not None and not is_managed(instance):
@@ -43,13 +43,13 @@ def candidate(
     if instance is None and decision.rank is None:
         return None
     kept = instance is not None and (
-        decision.paused or is_held(instance) or (not decision.wanted and decision.release_time is None)
+        decision.paused or is_held(instance) or (not decision.demanded and decision.release_time is None)
     )
     return PlaceCandidate(
         name=decision.name,
         template=decision.template,
         rank=decision.rank,
-        exists=instance is not None or being_made,
+        exists=instance is not None or being_created,
         leaving=instance is not None and instance.metadata.deletion_timestamp is not None,
         kept=kept,
         protected_until=protected_until(instance, template) if instance is not None else 0.0,
@@ -64,7 +64,7 @@ def placed(decision: Decision, place: GrantedPlace | None, *, exists: bool, now:
         return decision
     if place.starts:
         return _marked(decision, f", and preempts {place.preempts}") if place.preempts else decision
-    if exists and place.given:
+    if exists and place.granted:
         return decision
     reason, message = _why(decision, place)
     verdicts = {
@@ -90,7 +90,7 @@ def placed(decision: Decision, place: GrantedPlace | None, *, exists: bool, now:
 
 
 def _why(decision: Decision, place: GrantedPlace) -> tuple[str, str]:
-    if place.given:
+    if place.granted:
         instead = f", and preempts {place.preempts}" if place.preempts else ""
         return LIMIT_REACHED, f"instance {decision.name} starts once {place.awaits} is deleted{instead}"
     if decision.rank is None:

@@ -26,7 +26,7 @@ class _Required:
     """A requirement: the message if no node meets it, its field and value, and its terms, of which one must be met."""
 
     words: str
-    wanted: str
+    field: str
     key: str
     terms: Sequence[Mapping[str, Any]]
 
@@ -51,7 +51,7 @@ def misplaced(live: Mapping[str, Any], nodes: Nodes) -> Trouble | None:
     if unmet:
         words = "; ".join(f"{each.words}{_instead(each.key, nodes)}" for each in unmet)
     else:
-        words = f"no node meets all requirements together: {'; '.join(each.wanted for each in required)}"
+        words = f"no node meets all requirements together: {'; '.join(each.field for each in required)}"
     what = f"{live['kind']} {live['metadata']['name']}"
     message = f"{what} fits no node: {words}. Correct the value, or label a node"
     return Trouble(TroubleReason.UNSCHEDULABLE, message)
@@ -63,15 +63,15 @@ def _required(spec: Mapping[str, Any]) -> Iterator[_Required]:
         yield _Required(f"nodeName: there is no node {name}", f"nodeName {name}", "", [term])
     for key, value in sorted((spec.get("nodeSelector") or {}).items()):
         label = f"{key}={value}"
-        words, wanted = f"nodeSelector: no node has the label {label}", f"nodeSelector {label}"
-        yield _Required(words, wanted, key, [{"matchExpressions": [{"key": key, "operator": "In", "values": [value]}]}])
+        words, field = f"nodeSelector: no node has the label {label}", f"nodeSelector {label}"
+        yield _Required(words, field, key, [{"matchExpressions": [{"key": key, "operator": "In", "values": [value]}]}])
     affinity = at(spec, ("affinity", "nodeAffinity", "requiredDuringSchedulingIgnoredDuringExecution"))
     terms = [each for each in affinity.get("nodeSelectorTerms") or () if _expressions(each)]
     if terms:
         listed = ", or ".join(_words(each) for each in terms)
-        words, wanted = f"affinity.nodeAffinity: no node has {listed}", f"affinity.nodeAffinity {listed}"
+        words, field = f"affinity.nodeAffinity: no node has {listed}", f"affinity.nodeAffinity {listed}"
         keys = {key for each in terms for key, _, _ in _expressions(each)}
-        yield _Required(words, wanted, keys.pop() if len(keys) == 1 else _SEVERAL, terms)
+        yield _Required(words, field, keys.pop() if len(keys) == 1 else _SEVERAL, terms)
 
 
 def _expressions(term: Mapping[str, Any]) -> list[tuple[str, str, list[str]]]:

@@ -56,9 +56,9 @@ def _stale(live: Mapping[str, Any], status: Mapping[str, Any]) -> str | None:
 
 
 def _deployment(spec: Mapping[str, Any], status: Mapping[str, Any]) -> str | None:
-    wanted = _replicas(spec)
+    desired = _replicas(spec)
     updated = status.get("updatedReplicas") or 0
-    problem = _count("available", status.get("availableReplicas"), wanted) or _present(updated, wanted)
+    problem = _count("available", status.get("availableReplicas"), desired) or _present(updated, desired)
     left = (status.get("replicas") or 0) - updated
     if problem is None and left > 0:
         problem = f"still runs {left} pod{'' if left == 1 else 's'} of its previous version"
@@ -74,22 +74,22 @@ def _deployment(spec: Mapping[str, Any], status: Mapping[str, Any]) -> str | Non
 
 
 def _stateful_set(spec: Mapping[str, Any], status: Mapping[str, Any]) -> str | None:
-    wanted = _replicas(spec)
-    problem = _count("available", status.get("availableReplicas"), wanted)
+    desired = _replicas(spec)
+    problem = _count("available", status.get("availableReplicas"), desired)
     strategy = spec.get("updateStrategy") or {}
     partial = strategy.get("type") == "OnDelete" or (strategy.get("rollingUpdate") or {}).get("partition")
     if problem is None and not partial and status.get("updateRevision") != status.get("currentRevision"):
-        return _present(status.get("updatedReplicas") or 0, wanted)
+        return _present(status.get("updatedReplicas") or 0, desired)
     return problem
 
 
 def _daemon_set(spec: Mapping[str, Any], status: Mapping[str, Any]) -> str | None:
-    wanted = status.get("desiredNumberScheduled")
-    if wanted is None:
+    desired = status.get("desiredNumberScheduled")
+    if desired is None:
         return "is not scheduled yet"
-    problem = _count("available", status.get("numberAvailable"), wanted)
+    problem = _count("available", status.get("numberAvailable"), desired)
     if problem is None and (spec.get("updateStrategy") or {}).get("type") != "OnDelete":
-        return _present(status.get("updatedNumberScheduled") or 0, wanted)
+        return _present(status.get("updatedNumberScheduled") or 0, desired)
     return problem
 
 

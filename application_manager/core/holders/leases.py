@@ -19,8 +19,10 @@ from wayside.api.applicationtemplate import Lifecycle, LossPolicy
 from wayside.kubernetes.leases import DEFAULT_DURATION, lease_name
 from wayside.times import parse_seconds
 
-RAREST_LOOK = 5.0  # s between two reads of a long overdue Lease; the watch also reports a renewal
-_RARER = 0.25  # of the overdue time: the maximum delay of a noticed lapse, in proportion
+LONGEST_POLL_PAUSE = 5.0  # s between two reads of a long overdue Lease; the watch also reports a renewal
+_PAUSE_SHARE = (
+    0.25  # the pause between two reads as a share of the overdue time: it bounds the delay of a noticed lapse
+)
 
 HOLDER_LOST = "HolderLost"
 FINISH_LOST_AFTER = 3600.0  # s for which a holder may be lost before its tasks are finished
@@ -61,7 +63,7 @@ class HealthyTime:
         """Whether the last check succeeded."""
         return self._last is not None
 
-    def look(self, now: float, *, succeeded: bool) -> None:
+    def note_check(self, now: float, *, succeeded: bool) -> None:
         """Note a check of the API server at `now`, in seconds of a monotonic clock."""
         if not succeeded:
             self._last = None
@@ -75,7 +77,7 @@ class HealthyTime:
 class _Observation:
     identity: str
     since: float  # healthy seconds at which it last changed
-    looked: float  # healthy seconds at which it was last observed
+    observed: float  # healthy seconds at which it was last observed
     duration: float = DEFAULT_DURATION
     renewed: bool = False
     seen: bool = True  # otherwise only expected: the first observation is neither old nor a renewal
@@ -94,7 +96,7 @@ class LeaseIndex:
         if known is None or (not known.seen and lease is not None):
             self._observed[key] = _Observation(identity, at, at, _duration(lease))
             return False
-        known.looked, known.seen = at, True
+        known.observed, known.seen = at, True
         if identity == known.identity:
             return False
         # The deletion of a Lease is no sign of life; its creation or a change is.
@@ -113,7 +115,7 @@ class LeaseIndex:
         known = self._observed.get(key)
         if known is None:
             return LeaseView(0.0, renewed=False)
-        return LeaseView(known.looked - known.since, known.duration, known.renewed)
+        return LeaseView(known.observed - known.since, known.duration, known.renewed)
 
     def due(self, key: HolderKey, at: float) -> bool:
         """Whether to read the Lease: it was unchanged for longer than its duration, as far as we know.
@@ -124,8 +126,10 @@ class LeaseIndex:
         known = self._observed.get(key)
         if known is None or not known.seen:
             return True
-        overdue = known.looked - known.since - known.duration
-        return at - known.since >= known.duration and at - known.looked >= min(RAREST_LOOK, overdue * _RARER)
+        overdue = known.observed - known.since - known.duration
+        return at - known.since >= known.duration and at - known.observed >= min(
+            LONGEST_POLL_PAUSE, overdue * _PAUSE_SHARE
+        )
 
     def seen(self, key: HolderKey) -> bool:
         """Whether the holder's Lease, or its absence, was ever observed."""

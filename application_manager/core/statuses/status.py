@@ -262,7 +262,7 @@ def _instance_message(
         parts.append(ready.message)
     if decision.release_time is not None:
         parts.append(f"released at {format_seconds(decision.release_time)} unless a demand arrives")
-    elif is_held(instance) and not decision.wanted:
+    elif is_held(instance) and not decision.demanded:
         parts.append("held without demand")
     parts += decision.capped
     parts += [f"stands in for {each}" for each in decision.stands_in_for]

@@ -182,7 +182,7 @@ def test_a_manually_created_instance_is_neither_changed_nor_released() -> None:
     mine = instance(by_person=True, parameters={"n": 1})
     outcome = of(task("a"), templates=[template()], instances=[mine])
     decision = only(outcome)
-    assert (decision.parameters, decision.release_time, decision.wanted) == (None, None, False)
+    assert (decision.parameters, decision.release_time, decision.demanded) == (None, None, False)
     assert outcome.verdicts["a"].reason == "InstanceNotManaged"
 
 

@@ -139,7 +139,7 @@ def condition(type_: str, holds: bool, since: float) -> Condition:
 
 def test_the_fallback_serves_with_its_known_parameters_and_the_primary_keeps_trying() -> None:
     outcome = of(wants(parameters={"sources": ["car1"]}), wants("b"))
-    assert (outcome.instances[NORTH].wanted, outcome.instances[LITE_NORTH].tasks) == (True, ("a", "b"))
+    assert (outcome.instances[NORTH].demanded, outcome.instances[LITE_NORTH].tasks) == (True, ("a", "b"))
     assert outcome.instances[LITE_NORTH].parameters == {"region": "north"}
     assert outcome.instances[LITE_NORTH].template == "lite"
     verdict = outcome.verdicts["a"]
@@ -264,5 +264,5 @@ def test_the_managers_decisions_do_not_depend_on_the_order_of_events(
         manager.sees(each)
     decided = manager.works()
     expected = of(*live, instances=existing, limit=limit)
-    wanted = {name for name, each in expected.instances.items() if each.wanted}
-    assert {name for name, each in decided.items() if each is not None and each.wanted} == wanted
+    wanted = {name for name, each in expected.instances.items() if each.demanded}
+    assert {name for name, each in decided.items() if each is not None and each.demanded} == wanted

@@ -58,7 +58,7 @@ def of(*tasks: ApplicationTask, limit: int | None = 1, **others: Any) -> Namespa
 
 def running(outcome: NamespaceOutcome) -> set[str]:
     """The keys of the instances that may run."""
-    return {str(each.key) for each in outcome.instances.values() if each.wanted}
+    return {str(each.key) for each in outcome.instances.values() if each.demanded}
 
 
 def going(outcome: NamespaceOutcome) -> set[str]:
@@ -228,7 +228,7 @@ class SimulatedNamespace:
         todo = [each for each in decided if self._is_due(each)]
         acted = todo if source is None else source.sample(todo, source.randint(0, len(todo)))
         for each in acted:
-            if each.wanted:
+            if each.demanded:
                 made = since(draft(("site", each.name), each, None), self.now)
                 labels = {"app.kubernetes.io/managed-by": "wayside"}
                 metadata = made.metadata.model_copy(update={"labels": labels})
@@ -236,7 +236,7 @@ class SimulatedNamespace:
             else:
                 del self.instances[each.name]
         for each in decided:  # the status has the release time of lingering instances
-            if each.name in self.instances and not each.wanted and each.release_time is not None:
+            if each.name in self.instances and not each.demanded and each.release_time is not None:
                 raw = self.instances[each.name].to_json()
                 raw["status"] = {"releaseTime": format_seconds(each.release_time)}
                 self.instances[each.name] = ApplicationInstance.model_validate(raw)
@@ -246,8 +246,8 @@ class SimulatedNamespace:
 
     def _is_due(self, each: Any) -> bool:
         if each.name not in self.instances:
-            return bool(each.wanted)
-        return not each.wanted and each.release_time is not None and each.release_time <= self.now
+            return bool(each.demanded)
+        return not each.demanded and each.release_time is not None and each.release_time <= self.now
 
     def settle(self, live: list[ApplicationTask], *, linger: bool = True) -> None:
         for _ in range(50):

@@ -11,7 +11,7 @@ from kubernetes.aio.client import Configuration
 from application_manager.cache.cluster_cache import ClusterCache
 from application_manager.cache.store import Entry
 from application_manager.core.holders.leases import (
-    RAREST_LOOK,
+    LONGEST_POLL_PAUSE,
     HealthyTime,
     LeaseIndex,
     LeaseView,
@@ -63,7 +63,7 @@ def test_overdue_leases_are_read_with_growing_intervals() -> None:
     pauses = [later - earlier for earlier, later in itertools.pairwise(looks)]
     assert looks[0] == 3
     assert pauses == sorted(pauses)
-    assert (pauses[0], pauses[-1]) == (1, RAREST_LOOK)
+    assert (pauses[0], pauses[-1]) == (1, LONGEST_POLL_PAUSE)
     assert all(later - 3 <= (earlier - 3) * 1.25 + 1 for earlier, later in itertools.pairwise(looks))
 
 
@@ -123,14 +123,14 @@ def test_leases_without_demands_are_forgotten() -> None:
 def test_time_during_an_outage_does_not_count() -> None:
     time = HealthyTime(longest=5)
     for now, succeeded in ((0, True), (1, True), (2, False), (20, False), (21, True), (22, True)):
-        time.look(float(now), succeeded=succeeded)
+        time.note_check(float(now), succeeded=succeeded)
     assert time.elapsed == 2.0
 
 
 def test_time_while_the_manager_was_suspended_does_not_count() -> None:
     time = HealthyTime(longest=5)
     for now in (0.0, 60.0, 61.0):
-        time.look(now, succeeded=True)
+        time.note_check(now, succeeded=True)
     assert time.elapsed == 1.0
 
 

@@ -88,19 +88,19 @@ def test_a_task_keeps_its_old_claim_until_the_new_one_is_known() -> None:
 
 def test_a_template_is_unsettled_until_the_claims_of_all_existing_tasks_are_known() -> None:
     answers = Answers()
-    settled: list[tuple[str, str]] = []
+    resolved: list[tuple[str, str]] = []
     index, made = index_of(answers), template(pattern="^[a-z]+$")
-    index.settled = settled.append
+    index.resolved = resolved.append
     index.note(NAME, Entry({}, task()), made)
     index.note(("site", "b"), Entry({}, task("south")), made)
     index.begin()
     index.note(("site", "later"), Entry({}, task("west")), made)
-    assert index.unsettled(OF)
+    assert index.unresolved(OF)
     answers.found = claim_or_verdict(made, task())
     index.note(NAME, Entry({}, task()), made)
-    assert index.unsettled(OF)
+    assert index.unresolved(OF)
     index.forget(("site", "b"))
-    assert (index.unsettled(OF), settled) == (False, [OF])
+    assert (index.unresolved(OF), resolved) == (False, [OF])
     assert index.pending(OF)  # the later one, which nothing can run for yet
 
 
@@ -115,6 +115,6 @@ def test_a_claim_that_times_out_is_rejected_and_leaves_the_template_unsettled() 
     assert isinstance(verdict, Verdict)
     assert (verdict.kind, verdict.reason) == (VerdictKind.REFUSED, RefusalReason.EXPRESSION_LIMIT)
     assert "against template app takes more than 2 s" in verdict.message
-    assert index.unsettled(OF)
+    assert index.unresolved(OF)
     index.note(NAME, Entry({}, task(ended=True)), made)
-    assert not index.unsettled(OF)
+    assert not index.unresolved(OF)

@@ -147,13 +147,13 @@ def test_an_instance_being_created_already_has_its_place() -> None:
     manager.sees(task("a", {"region": "a"}))
     first = manager.works()[instance_name("app", "a")]
     assert first is not None
-    assert first.wanted
-    manager.cache.places.being_made.add(("site", instance_name("app", "a")))
+    assert first.demanded
+    manager.cache.places.being_created.add(("site", instance_name("app", "a")))
     manager.sees(task("b", {"region": "b"}, priority=9))
     decided = manager.works()
     first, other = decided[instance_name("app", "a")], decided[instance_name("app", "b")]
     assert other is not None
-    assert not other.wanted
+    assert not other.demanded
     assert (other.verdicts["b"].kind, other.verdicts["b"].reason) == ("Waiting", "LimitReached")
     assert first is not None
-    assert not first.wanted
+    assert not first.demanded

@@ -204,7 +204,7 @@ def with_baseline(**parameters: Any) -> dict[str, Any]:
 def test_a_baseline_runs_without_tasks_and_merges_with_them() -> None:
     spec = with_baseline(sources=["x"], mode="calm", rateHz=1)
     alone = of(spec=spec)
-    assert (alone.instances["app"].wanted, alone.instances["app"].tasks) == (True, ())
+    assert (alone.instances["app"].demanded, alone.instances["app"].tasks) == (True, ())
     assert values(alone, "app") == {"sources": ["x"], "mode": "calm", "rateHz": 1}
     joined = of(task("a", {"sources": ["y"], "mode": "busy"}, priority=-9), spec=spec)
     assert values(joined, "app") == {"sources": ["x", "y"], "mode": "busy", "rateHz": 1}
@@ -268,7 +268,9 @@ def tasks(draw: st.DrawFn) -> list[ApplicationTask]:
 def applications(decisions: Any) -> dict[str, tuple[Any, ...]]:
     """The values of each demanded instance, and whether it is suspended."""
     return {
-        name: (each.key, each.parameters, each.suspended, each.tasks) for name, each in decisions.items() if each.wanted
+        name: (each.key, each.parameters, each.suspended, each.tasks)
+        for name, each in decisions.items()
+        if each.demanded
     }
 
 

@@ -44,10 +44,10 @@ def applied(
     async def run() -> ApplyResult:
         rendering = Renderer(template(manifests=[config(name, new="yes") for name in names]), Policy()).render(APP)
         applier = Applier(server, ClusterCache(Policy()).store, {key("")[:2]: CONFIG_MAPS})  # type: ignore[arg-type]
-        looked = await applier.look("site", rendering.manifests)
+        current = await applier.current_objects("site", rendering.manifests)
         if meanwhile is not None:
             server.put(meanwhile)
-        return await applier.apply(APP, rendering, rendering.manifests, known or LastApplied(), looked)
+        return await applier.apply(APP, rendering, rendering.manifests, known or LastApplied(), current)
 
     return asyncio.run(run())
 

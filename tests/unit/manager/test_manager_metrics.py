@@ -127,7 +127,7 @@ def test_pages_are_served_with_503_while_not_ready() -> None:
                 assert await get("/readyz") == (503, "not yet\n")
                 lacks.clear()
                 assert await get("/readyz") == (200, "ok\n")
-                measures.looked -= STALLED_AFTER + 1
+                measures.last_resync -= STALLED_AFTER + 1
                 status, text = await get("/healthz")
                 assert (status, text.startswith("no resync has completed for 30")) == (503, True)
             with pytest.raises(ConfigurationError, match=rf"--metrics-port {port}: .*: give another port"):
