@@ -55,7 +55,7 @@ class Journal:
             context.lose(unkept, 1, str(error))
 
     @property
-    def keeps(self) -> bool:
+    def is_durable(self) -> bool:
         """Whether documents survive a restart."""
         return self._store is not None
 

@@ -1,4 +1,4 @@
-"""What actions have yet to deliver, on disk: records that survive a kill -9 until they are dropped.
+"""Records on disk that actions have yet to deliver: they survive a kill -9 until they are dropped.
 
 Each store is one SQLite file, locked while it is open. A record survives the process as soon as it is put, and a power
 failure once `sync` has returned. Nothing here waits for a lock or for another thread.

@@ -166,7 +166,7 @@ class ActionRun(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class RunStarted:
-    """The action has an episode."""
+    """The action begins with an episode."""
 
     run: ActionRun
     event: Event

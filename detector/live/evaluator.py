@@ -267,13 +267,13 @@ class Evaluator:
         now = self._now()
         events: list[Event] = []
         if now + _STALL < self._intake.last:
-            events += self._take(self._intake.drain(self._intake.last), self._intake.last)
+            events += self._advance(self._intake.drain(self._intake.last), self._intake.last)
             self._intake.step_back(now)
             events += self._gap(now, "the wall clock stepped back")
         else:
             if now - self._engine.next_tick() > _STALL and self._engine.on_wall_clock:
                 events += self._gap(now, "the evaluation stalled, or the wall clock stepped forward")
-            events += self._take(self._intake.drain(now), now)
+            events += self._advance(self._intake.drain(now), now)
         if wanted is not None:
             events += self._configure(wanted)
         self._hand_over(events)
@@ -308,7 +308,7 @@ class Evaluator:
             self._record(self._engine.now, {"kind": "level", "level": level})
             self._engine.set_level(level)
 
-    def _take(self, arrivals: list[Arrival], now: int) -> list[Event]:
+    def _advance(self, arrivals: list[Arrival], now: int) -> list[Event]:
         if self._recorder is not None and arrivals:
             self._recorder.arrivals(arrivals)
         self.status.arrived(arrivals)

@@ -58,10 +58,10 @@ class Cache:
                 found.setdefault(path.name.partition("-")[0], []).append(path)
         return found
 
-    # What recordings are known by
+    # The identities of recordings
 
     def preview(self, source: InputRecording, stamp: str | None) -> RecordingPreview | None:
-        """The result of an earlier look at the recording, if its files are unchanged."""
+        """The cached preview of the recording, if its files are unchanged."""
         before = self._previews.get("\0".join(source.files))
         return before[1] if before is not None and before[0] == stamp else None
 

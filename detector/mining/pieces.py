@@ -123,13 +123,13 @@ def _observed(job: PieceJob) -> PieceResult:
             found.samples += len(part)
             found.last = part[-1].received
             deque(found.arrivals.watch_batches([part]), maxlen=0)
-        replay.take(part, part[-1].received)
+        replay.advance(part, part[-1].received)
     if replay is None:
         return found
     if not found.samples:
         before = _begun(replay, job.span)
     if job.span.until != END:
-        replay.take((), job.span.until)
+        replay.advance((), job.span.until)
     recorder.close(replay.engine.now)
     now = _counted(replay.engine)
     if cuts or recorder.odd or now.lost or now.unreadable != before.unreadable:
@@ -152,7 +152,7 @@ def _split(parts: Iterable[Sequence[Arrival]], after: int) -> Iterator[Sequence[
 def _begun(replay: Replay, span: PieceTimes) -> _Counted:
     """Run the ticks before the piece; returns the counts up to there."""
     if span.after > replay.engine.now:
-        replay.take((), span.after)
+        replay.advance((), span.after)
     return _counted(replay.engine)
 
 

@@ -39,7 +39,7 @@ class InputRecording(NamedTuple):
 
 
 class RecordingPreview(NamedTuple):
-    """What is known of a recording before it is read."""
+    """The known properties of a recording before it is read."""
 
     content: str
     """Identifies the content: the same content gives the same text."""

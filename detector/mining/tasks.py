@@ -77,7 +77,7 @@ def run_jobs(jobs: Iterable[tuple[MiningJob, int]], workers: Workers, cut: list[
         found = of_pieces.get(id(call))
         if found is None:
             yield JobResult(call.argument, call.argument.wanted, result)
-        elif found.take(call, result):
+        elif found.add_result(call, result):
             done = found.result()
             if done is None:
                 again.append(RemoteCall(mine_recording, found.job))
@@ -113,7 +113,7 @@ class _Pieces:
         self.calls = [RemoteCall(observe, PieceJob(span, *given)) for span in cutting.spans]
         self._observed: dict[int, PieceResult] = {}
 
-    def take(self, call: RemoteCall, result: PieceResult | LostWorker) -> bool:
+    def add_result(self, call: RemoteCall, result: PieceResult | LostWorker) -> bool:
         """Store the result of a piece; returns whether it was the last one."""
         found = PieceResult(flaw=result.reason) if isinstance(result, LostWorker) else result
         self._observed[[id(each) for each in self.calls].index(id(call))] = found

@@ -104,7 +104,7 @@ def tuned() -> None:
 
 
 def decode_mined(data: bytes) -> RecordingResult:
-    """The inverse of `mine`'s encoding. Raises msgspec.DecodeError if another version wrote it."""
+    """The inverse of the encoding of `mine_recording`. Raises msgspec.DecodeError if another version wrote it."""
     return msgspec.msgpack.decode(data, type=RecordingResult)
 
 

@@ -67,7 +67,7 @@ class Instances:
             found = self._objects[subject.text] = self._plugin(self._parameters, subject)
         return plain_value(found.value(queries, clients))
 
-    def keep(self, subjects: Collection[str]) -> None:
+    def retain(self, subjects: Collection[str]) -> None:
         """Drop the objects of all other subjects."""
         for subject in [each for each in self._objects if each not in subjects]:
             del self._objects[subject]
@@ -117,11 +117,11 @@ class LocalHost:
         except Exception as error:  # a plugin may raise any exception
             raise PluginFailedError(Reason.ERROR, failure_text(error)) from error
 
-    def keep(self, rule: str, subjects: Collection[str]) -> None:
+    def retain(self, rule: str, subjects: Collection[str]) -> None:
         """See PluginHost."""
         for (of_rule, _), instances in self._signals.items():
             if of_rule == rule:
-                instances.keep(subjects)
+                instances.retain(subjects)
 
     def reset(self) -> None:
         """See PluginHost."""

@@ -1,4 +1,4 @@
-"""Which calls of plugins found none running: noted live, recorded with the intake, and replayed from it.
+"""Records the calls that found no running plugin: noted live, recorded with the intake, and replayed from it.
 
 Calls of a signal are counted from the engine's start; this count is the same live and in a replay, independent of the
 clock.

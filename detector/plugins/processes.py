@@ -127,11 +127,11 @@ class SignalProcess:
         except ClosedError:
             raise StoppedError(self._end("exited")) from None
 
-    def keep(self, subjects: Collection[str]) -> None:
+    def retain(self, subjects: Collection[str]) -> None:
         """Drop the state of all other subjects."""
         if not self._subjects <= set(subjects):
             self._subjects &= set(subjects)
-            self._send("keep", sorted(self._subjects))
+            self._send("retain", sorted(self._subjects))
 
     def reset(self) -> None:
         """Drop all state."""
@@ -246,11 +246,11 @@ class ProcessHost:
         self.outages.note(call, running=True)
         return value
 
-    def keep(self, rule: str, subjects: Collection[str]) -> None:
+    def retain(self, rule: str, subjects: Collection[str]) -> None:
         """See PluginHost."""
         for (of_rule, _), signal in self._signals.items():
             if of_rule == rule:
-                signal.keep(subjects)
+                signal.retain(subjects)
 
     def reset(self) -> None:
         """See PluginHost."""

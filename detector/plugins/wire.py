@@ -2,7 +2,7 @@
 
     detector → plugin   start(plugin, parameters)                       → ready() | refused(text)
                         value(subject, element, clients, now)           → queries, then result(value) | failed(text)
-                        keep(subjects), reset()                         (no answer)
+                        retain(subjects), reset()                       (no answer)
     plugin → detector   query(method, arguments, options)               → answer(result) | raised(kind, text)
 
 Queries are sent only while a value is computed, one at a time.

@@ -117,8 +117,8 @@ def _serve(wire: PluginConnection) -> None:
         match what:
             case "value":
                 wire.send(*_value(instances, wire, *content))
-            case "keep":
-                instances.keep(set(content[0]))
+            case "retain":
+                instances.retain(set(content[0]))
             case "reset":
                 instances.reset()
 
@@ -134,7 +134,7 @@ def _value(
         return "failed", failure_text(error)
 
 
-def _leave_with_the_detector() -> None:
+def _exit_with_the_detector() -> None:
     """Exit when the detector ends, whatever the plugin is doing: no process is left behind."""
     parent = os.getppid()
     while os.getppid() == parent:
@@ -145,7 +145,7 @@ def _leave_with_the_detector() -> None:
 def main() -> None:
     """Run until the detector closes the connection; the detector stops this process, not the terminal's Ctrl-C."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_leave_with_the_detector, daemon=True).start()
+    threading.Thread(target=_exit_with_the_detector, daemon=True).start()
     with contextlib.suppress(ClosedError):
         _serve(PluginConnection(socket.socket(fileno=int(sys.argv[1]))))
 

@@ -154,13 +154,13 @@ def _split(paths: Sequence[Path]) -> Recording:
     recording = [paths[0]]
     for number in itertools.count(place.number + 1):
         others = numbered.get(place._replace(number=number), ())
-        following = next((other for other in others if _goes_on(recording[-1], other)), None)
+        following = next((other for other in others if _continues(recording[-1], other)), None)
         if following is None:
             break
         recording.append(following)
     for number in range(place.number - 1, -1, -1):
         others = numbered.get(place._replace(number=number), ())
-        previous = next((other for other in others if _goes_on(other, recording[0])), None)
+        previous = next((other for other in others if _continues(other, recording[0])), None)
         if previous is None:
             break
         recording.insert(0, previous)
@@ -183,7 +183,7 @@ def _place(path: Path) -> _Place | None:
     return None if found is None else _Place(path.parent, found[1], found[3] + path.suffix, int(found[2]))
 
 
-def _goes_on(one: Path, other: Path) -> bool:
+def _continues(one: Path, other: Path) -> bool:
     """Whether the second file begins where the first one ends. An unreadable file is a separate recording."""
     try:
         first, second = span_of(one), span_of(other)

@@ -135,7 +135,7 @@ class Chunks:
         begins = self._begins(index, size)
         rows = None if begins is None else _located(data, begins)
         if rows is None:
-            rows, data = _gone_through(chunk)
+            rows, data = _scanned(chunk)
         channels = rows["channel"]
         known = self._known[channels]
         if not known.all():
@@ -303,7 +303,7 @@ def _is_definition(data: bytes, at: int, opcode: int, length: int) -> bool:
     return stream.count == length
 
 
-def _gone_through(chunk: Chunk) -> tuple[_Rows, bytes]:
+def _scanned(chunk: Chunk) -> tuple[_Rows, bytes]:
     """The messages of a chunk and their payloads, read record by record. Raises McapError, ValueError and others."""
     messages = [record for record in breakup_chunk(chunk, validate_crc=True) if isinstance(record, Message)]
     rows = np.zeros(len(messages), _ROW)

@@ -170,7 +170,7 @@ def latched_first(
             first.setdefault(_about(arrival, topics), arrival)
     taken: set[tuple[str, Hashable]] = set()
 
-    def is_taken(arrival: Arrival) -> bool:
+    def is_moved(arrival: Arrival) -> bool:
         """Whether the arrival, of a latched stream, was moved to the beginning."""
         about = _about(arrival, topics)
         if about in taken:
@@ -181,7 +181,7 @@ def latched_first(
     for number, arrivals in enumerate(recorded):
         if not number and first:
             yield [replace(arrival, received=arrivals[0].received) for arrival in first.values()]
-        if rest := [each for each in arrivals if each.stream not in topics or not is_taken(each)]:
+        if rest := [each for each in arrivals if each.stream not in topics or not is_moved(each)]:
             yield rest
 
 

@@ -108,8 +108,8 @@ class Replay:
         self._demands_version: tuple[int, int] | None = None
         self.set_rules(rules)
 
-    def take(self, arrivals: Sequence[Arrival], until: int) -> None:
-        """Take in samples, and advance the time."""
+    def advance(self, arrivals: Sequence[Arrival], until: int) -> None:
+        """Advance the engine with these arrivals: see `Engine.advance`."""
         self.outcome.samples += len(arrivals)
         self._note(self._engine.advance(arrivals, until))
 
@@ -140,7 +140,7 @@ class Replay:
             self.outcome.notes += self._recorders.close()
 
     def gap(self, time: int) -> None:
-        """Time moved on without ticks."""
+        """Time jumped without ticks."""
         self._note(self._engine.gap(time))
 
     def set_detector(self, detector: Detector) -> None:
@@ -228,14 +228,14 @@ def replay_intake(
     for record in records:
         if isinstance(record, Arrival):
             if len(batch) >= _BATCH and replay is not None and record.received > batch[-1].received:
-                replay.take(batch, batch[-1].received)
+                replay.advance(batch, batch[-1].received)
                 batch = []
             batch.append(record)
             continue
         if replay is None:
             replay = _begin(record, detector, rules, outcome, plugins, observer, clips)
             continue
-        replay.take(batch, _until(record, batch))
+        replay.advance(batch, _until(record, batch))
         batch = []
         _control(replay, record, detector, rules, outcome)
     if replay is not None:
@@ -360,10 +360,10 @@ def replay_arrivals(
                 "nothing is evaluated in between, windows reset, open episodes are kept"
             )
         last = part[-1].received
-        replay.take(part, last)
+        replay.advance(part, last)
     if replay is None:
         replay = begin(start=0)
-        replay.take((), 0)
+        replay.advance((), 0)
     replay.finish()
     replay.close()
     outcome.notes += replay.report()

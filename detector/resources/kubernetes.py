@@ -62,8 +62,8 @@ class ClusterRules:
         """The set as soon as it is known, then after each change. Never ends and raises nothing."""
         last: RuleSet | None = None
         tasks = [
-            asyncio.create_task(self._take(self._detector_source, self._detectors)),
-            asyncio.create_task(self._take(self._rule_source, self._rules)),
+            asyncio.create_task(self._follow_kind(self._detector_source, self._detectors)),
+            asyncio.create_task(self._follow_kind(self._rule_source, self._rules)),
         ]
         try:
             while True:
@@ -82,10 +82,10 @@ class ClusterRules:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
 
-    async def _take(self, reflector: Reflector, known: _Known[Parsed]) -> None:
+    async def _follow_kind(self, reflector: Reflector, known: _Known[Parsed]) -> None:
         try:
             async for change in reflector.follow():
-                known.take(change)
+                known.apply(change)
                 self._changed.set()
         finally:
             self._changed.set()
@@ -114,7 +114,7 @@ class _Known(Generic[Parsed]):
         self.unreadable: dict[str, str] = {}
         self.listed = False
 
-    def take(self, change: Change) -> None:
+    def apply(self, change: Change) -> None:
         match change:
             case Replaced(objects, _):
                 self.listed = True

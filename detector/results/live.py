@@ -133,7 +133,7 @@ class LiveView:
         self._server.stop()
 
     def losses(self) -> Iterator[Loss]:
-        """What was not shown."""
+        """The items that were not shown."""
         what = "seconds omitted from the live view because its thread is too slow"
         yield Loss(what, self._dropped, cause="view_dropped")
 
@@ -180,11 +180,11 @@ class LiveView:
             self._events = []
 
     def _recorder_of(self, rule: CompiledRule) -> Any:
-        def saw(evaluated: Evaluated) -> None:
+        def record(evaluated: Evaluated) -> None:
             if self._tracer is not None and self._tracer.traces(rule.name):
-                self._tracer.recorded(rule).saw(evaluated)
+                self._tracer.recorded(rule).record(evaluated)
 
-        return saw
+        return record
 
     def clients(self, tracks: Sequence[Track], block: Block, codes: Codes, selected: Truths | None) -> None:
         """See `Observer`."""

@@ -66,7 +66,7 @@ class RecordedValues:
         """The first and the last evaluation; there must be one."""
         return self._begin or 0, self._end
 
-    def saw(self, evaluated: Evaluated) -> None:
+    def record(self, evaluated: Evaluated) -> None:
         """Record the changes."""
         candidate, now = evaluated.candidate, evaluated.now
         self._begin = now if self._begin is None else self._begin

@@ -54,7 +54,7 @@ class Scene:
         """The updates of a result, which follows the previous one; nothing if no position is known."""
         trace, events = result.trace, deque(result.events)
         if not trace.paths:
-            self._pass(events, trace.end)
+            self._advance(events, trace.end)
             return
         if self._origin is None:
             self._origin = next(iter(trace.paths.values())).axes[:, 0]
@@ -67,7 +67,7 @@ class Scene:
         last = {name: int(path.times[-1]) for name, path in trace.paths.items()}
         yield int(times[0]), SceneUpdate(entities=[*_polygons(result, int(times[0]), origin)])
         for at, time in enumerate(times.tolist()):
-            self._pass(events, time)
+            self._advance(events, time)
             there: dict[str, tuple[float, float]] = {}
             for name, axes in flat.items():
                 row = int(rows[name][at])
@@ -77,9 +77,9 @@ class Scene:
 
     def skip(self, result: Result) -> None:
         """Skip this result: only track which episodes are open after it."""
-        self._pass(deque(result.events), result.trace.end)
+        self._advance(deque(result.events), result.trace.end)
 
-    def _pass(self, events: deque[Event], time: int) -> None:
+    def _advance(self, events: deque[Event], time: int) -> None:
         """Update the open episodes to this time."""
         while events and events[0].time <= time:
             event = events.popleft()

@@ -99,7 +99,7 @@ class Tracer:
         self.engine = engine
         for name, run in engine.rules.items():
             if name not in engine.in_columns:
-                run.on_evaluated = self.recorded(run.rule).saw
+                run.on_evaluated = self.recorded(run.rule).record
 
     def recorded(self, rule: CompiledRule) -> RecordedValues:
         """The record of a rule that is not in columns."""
@@ -145,7 +145,7 @@ class Tracer:
         if everybody:
             gone = plan.seen.difference(numbers.tolist())
             if gone:
-                self._lost(plan, np.array(sorted(gone), np.int64), block.times[:1])
+                self._record_lost(plan, np.array(sorted(gone), np.int64), block.times[:1])
             plan.seen.clear()
             plan.seen.update(numbers.tolist())
 
@@ -325,7 +325,7 @@ class Tracer:
             why = why_unknown(*block.at(at * shape[1] + tick), track, expression)
             reasons[int(numbers[at]), block.ticks[tick]] = why
 
-    def _lost(self, plan: _Plan, gone: Integers, times: Integers) -> None:
+    def _record_lost(self, plan: _Plan, gone: Integers, times: Integers) -> None:
         """Record that clients were lost."""
         shape = (len(gone), 1)
         for _, _, _, changes in plan.signals:

@@ -18,7 +18,7 @@ from detector.access import login, tls_files
 from detector.sources.base import Feed, Source, SourceError
 from wayside.api.access import Access
 
-_LOOK_EVERY = 0.2
+_POLL = 0.2
 """Maximum seconds of one wait for messages, and therefore until the source stops."""
 
 
@@ -87,7 +87,7 @@ class MqttSource(Source[MqttParameters]):
         try:
             client.connect(parameters.host, self._port, keepalive=parameters.keep_alive)
             while not feed.stopping:
-                result = client.loop(_LOOK_EVERY)
+                result = client.loop(_POLL)
                 if refused:
                     raise SourceError(refused[0])
                 if result != 0:

@@ -40,7 +40,7 @@ BOUNDS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 1
 _EVERY = 1_000_000_000
 """Nanoseconds between two statuses, and between two measurements of a latency."""
 
-_LOOKED_AT = 16
+_MEASURED = 16
 """Maximum number of clients whose newest sample is measured for the latency of each stream or rule."""
 
 _RATES_OVER = 10
@@ -90,7 +90,7 @@ class StatusUpdater:
         self.gaps = 0
         self.demands: Collection[str] = ()
         """The names of the currently demanded tasks."""
-        self.latest: Status = self._take(self._started)
+        self.latest: Status = self._new_status(self._started)
 
     @property
     def silence(self) -> float:
@@ -123,9 +123,9 @@ class StatusUpdater:
             for run in self._engine.rules.values():
                 self._measure_rule(run, now, seen)
         if not self._taken <= now < self._taken + _EVERY:
-            self.latest = self._take(now)
+            self.latest = self._new_status(now)
 
-    def _take(self, now: int) -> Status:
+    def _new_status(self, now: int) -> Status:
         self._taken = now
         engine = self._engine
         spec, buffer, counters = engine.detector.spec, engine.buffer, engine.counters
@@ -228,7 +228,7 @@ class StatusUpdater:
         else:
             since = self._counts[-1][0] if self._counts else NEVER
             newest = (lane.newest for lane in lanes if lane.latest > since)
-            samples = islice((sample for sample in newest if isinstance(sample, Arrival)), _LOOKED_AT)
+            samples = islice((sample for sample in newest if isinstance(sample, Arrival)), _MEASURED)
         for sample in samples:
             latency = self._engine.latency(sample, name)
             if latency is not None:
@@ -260,7 +260,7 @@ class StatusUpdater:
         """The receive times of the newest samples after `since` and up to the tick, of a few clients."""
         lanes = (lane for lane in self._engine.buffer if lane.latest > since and lane.stream in streams)
         newest = (next(lane.newest_first(since, tick), None) for lane in lanes)
-        return islice((sample.received for sample in newest if sample is not None), _LOOKED_AT)
+        return islice((sample.received for sample in newest if sample is not None), _MEASURED)
 
     def _forget(self, streams: Iterable[str]) -> None:
         """Forget removed streams and rules."""

@@ -103,7 +103,7 @@ class TokenWatch:
             self._compare()
 
     def _compare(self) -> None:
-        """Another session reports all existing tokens: tokens that it does not report are gone."""
+        """Compare the tokens with the first report of another session: tokens that it does not contain are gone."""
         self._held = dict.fromkeys(self._held, self._connections.departures)
         tokens = self._subscriber.handler
         reports = [_report(each) for each in iter(tokens.try_recv, None)]

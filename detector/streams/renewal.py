@@ -81,7 +81,7 @@ class SessionSubscriptions:
         self.close()
 
     def close(self, timeout: float = 2.0) -> None:
-        """Leave at once; this unblocks the threads that wait to receive or to send."""
+        """Close at once; this unblocks the threads that wait to receive or to send."""
         self.connections.close()
         self.session.close()  # type: ignore[no-untyped-call]
         if self._query_handler is not None:
@@ -97,7 +97,7 @@ class SessionSubscriptions:
 
 log = logging.getLogger(__name__)
 
-LOOK_EVERY = 10.0
+CHECK_EVERY = 10.0
 """Seconds between two checks of the files; a kubelet takes about a minute to change them."""
 
 _AT_LEAST, _AT_MOST = 1.0, 10.0
@@ -135,7 +135,7 @@ class Renewal:
         join: Callable[[zenoh.Session, LoadedCredentials], SessionSubscriptions],
         use: Callable[[SessionSubscriptions], None],
         *,
-        look_every: float = LOOK_EVERY,
+        check_every: float = CHECK_EVERY,
         on_failure: Callable[[BaseException], None],
     ) -> None:
         """`join` subscribes a session; `use` switches all outgoing data to a membership."""
@@ -145,7 +145,7 @@ class Renewal:
         self._tokens = tokens
         self._join = join
         self._use = use
-        self._look_every = look_every
+        self._check_every = check_every
         self._on_failure = on_failure
         self._stop = threading.Event()
         self.reopening = threading.Event()
@@ -172,7 +172,7 @@ class Renewal:
 
     def _run(self) -> None:
         try:
-            while not self._stop.wait(self._look_every):
+            while not self._stop.wait(self._check_every):
                 self._reload()
         except Exception as error:  # noqa: BLE001  otherwise certificates would expire unnoticed
             if not self._stop.is_set():
@@ -211,7 +211,7 @@ class Renewal:
         if listens:
             self._reopen(credentials)
         else:
-            self._take_over(credentials)
+            self._replace_session(credentials)
         if self._member is before or self._stop.is_set():
             return
         self.certificate_state = CertificateState(credentials.expires, self.certificate_state.renewals + 1)
@@ -222,7 +222,7 @@ class Renewal:
         )
         log.info("zenoh: using the new certificates or password%s", until)
 
-    def _take_over(self, credentials: LoadedCredentials) -> None:
+    def _replace_session(self, credentials: LoadedCredentials) -> None:
         first = self._member
         session = open_session(self._config, credentials)
         for stream_input in self._inputs:  # before the second subscription: every sample that comes twice is noted

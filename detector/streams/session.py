@@ -80,7 +80,7 @@ class Connections:
         self.departures = 0
         """How often a connection to a router ended."""
         self._closing = False
-        self._listener = session.info.declare_transport_events_listener(self._take, history=True)
+        self._listener = session.info.declare_transport_events_listener(self._on_transport, history=True)
 
     @property
     def any(self) -> bool:
@@ -93,10 +93,10 @@ class Connections:
         return left is not None and time.monotonic() - left <= seconds
 
     def close(self) -> None:
-        """We end the connections from now on: nothing is logged."""
+        """The session closes: do not log the connections that end from now on."""
         self._closing = True
 
-    def _take(self, event: zenoh.TransportEvent) -> None:
+    def _on_transport(self, event: zenoh.TransportEvent) -> None:
         """Called by Zenoh's thread for every connection that opens or closes."""
         other = str(event.transport.zid)
         role = str(event.transport.whatami)

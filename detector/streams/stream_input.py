@@ -30,9 +30,9 @@ millisecond."""
 
 _MAXIMUM_KEYS = 200_000
 
-_LOOKED_AT = 100
-"""Number of samples of the new session that are compared with those of the old one: the first ones arrive first there
-too.
+_COMPARED = 100
+"""Number of samples of the new session that are compared with those of the old one: both sessions deliver in the same
+order.
 """
 
 _ECHO = 5.0
@@ -104,7 +104,7 @@ class StreamInput:
         noted = self._noted or Counter()
         if not noted and not self._held:
             return False
-        return not any(_identity(sample) in noted for sample in islice(self._held, _LOOKED_AT))
+        return not any(_identity(sample) in noted for sample in islice(self._held, _COMPARED))
 
     @property
     def full(self) -> bool:

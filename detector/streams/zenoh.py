@@ -21,7 +21,7 @@ from detector.engine.samples.liveliness import LIVELINESS
 from detector.streams.liveliness import TokenWatch
 from detector.streams.loss_counter import LossCounter
 from detector.streams.query_handler import QueryHandler
-from detector.streams.renewal import LOOK_EVERY, CertificateState, Renewal, SessionSubscriptions
+from detector.streams.renewal import CHECK_EVERY, CertificateState, Renewal, SessionSubscriptions
 from detector.streams.session import NetworkError, await_session, credentials_of, open_session
 from detector.streams.stream_input import StreamInput
 from detector.streams.subscribing import Pump, pump_for
@@ -48,12 +48,12 @@ class Network:
         on_failure: Callable[[BaseException], None] = lambda error: None,
         make_query_handler: Callable[[zenoh.Session], QueryHandler] | None = None,
         loss_counter: LossCounter | None = None,
-        look_every: float = LOOK_EVERY,
+        check_every: float = CHECK_EVERY,
     ) -> None:
         """`putter` returns the function that receives a stream's messages; at most `capacity` events are queued.
 
         `make_query_handler` is called with each session. `loss_counter` counts losses before the detector.
-        `on_failure` is called if a thread dies of an error. Certificates are checked every `look_every` seconds.
+        `on_failure` is called if a thread dies of an error. Certificates are checked every `check_every` seconds.
         """
         self._on_failure = on_failure
         self._config = config
@@ -62,7 +62,7 @@ class Network:
         self._pumps = [pump_for(stream, putter(stream.name), self._loss_counter) for stream in self._streams]
         self._put_token = putter(LIVELINESS)
         self._tokens: TokenWatch | None = None
-        self._look_every = look_every
+        self._check_every = check_every
         self._renewal: Renewal | None = None
         self._capacity = capacity
         self._events: deque[tuple[str, bytes, str]] = deque()
@@ -202,7 +202,7 @@ class Network:
             self._tokens,
             self._join,
             self._use,
-            look_every=self._look_every,
+            check_every=self._check_every,
             on_failure=self._on_failure,
         )
         self._renewal.start()

@@ -135,10 +135,10 @@ def play(folder: Path, recording: Path, output: Path) -> Played:
                     raise RefusedError("; ".join(map(str, outcome.refusals)))
                 host.follow(loaded.rule_set.rules, DetectorConfiguration(detector, entries.decoders, entries.types))
             # A tick at the very time of the last sample must wait for what else was received before its end.
-            replay.take(batch, batch[-1].received - 1)
+            replay.advance(batch, batch[-1].received - 1)
             note(replay.engine)
         if replay is not None:
-            replay.take((), batch[-1].received)
+            replay.advance((), batch[-1].received)
             note(replay.engine)
             host.dispatch(replay.engine.consequences.cut(replay.engine.now, "the recording ends"))
         _wait(host)

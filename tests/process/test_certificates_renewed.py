@@ -22,7 +22,7 @@ from tests.patience import PATIENCE
 from tests.ports import free_endpoint
 from wayside.api.zenoh import Zenoh
 
-LOOK_EVERY = 0.05
+CHECK_EVERY = 0.05
 CARS = ("car1", "car2", "car3")
 
 
@@ -43,7 +43,7 @@ def network(arrivals: Arrivals, *streams: Any, **config: Any) -> Iterator[Networ
         Zenoh.model_validate({"tlsSecretName": "own", **config}),
         streams or [stream()],
         arrivals.putter,
-        look_every=LOOK_EVERY,
+        check_every=CHECK_EVERY,
     )
     running.start()
     try:

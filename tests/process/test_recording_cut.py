@@ -163,7 +163,7 @@ def test_a_recording_that_another_process_makes_is_left_alone(tmp_path: Path) ->
     bench.action.samples(an_episode(), SAMPLES)
     (busy,) = (tmp_path / "r").iterdir()
     place = Destination(Recordings.model_validate({"path": str(tmp_path)}))
-    assert recover(place, place.take_left()) == []
+    assert recover(place, place.take_unfinished()) == []
     bench.action.completed(an_episode(), Completion())
     assert not busy.exists()
     assert bench.outcome(an_episode()).state is OutcomeState.DONE
@@ -320,7 +320,7 @@ def test_an_unsynced_recording_is_recovered_at_the_next_start(tmp_path: Path, mo
     assert "cannot complete the recording; the next start retries: [Errno 5] Input/output error" in outcome.message
     assert [each.name[0] for each in (tmp_path / "r").iterdir()] == ["."]
     place = Destination(Recordings.model_validate({"path": str(tmp_path)}))
-    (kept,) = recover(place, place.take_left())
+    (kept,) = recover(place, place.take_unfinished())
     assert kept.path.name.endswith("_cut")
     (file,) = mcap_files(kept.path)
     assert sorted(each.payload for each in read_with_mcap(file)) == sorted(each.payload for each in SAMPLES)

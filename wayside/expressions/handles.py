@@ -24,7 +24,7 @@ _held = _Held()
 
 
 def begin() -> list[object] | None:
-    """Begin an evaluation: `hand` creates handles, `value_of` resolves them. Returns the argument for `end`.
+    """Begin an evaluation: `handle_of` creates handles, `value_of` resolves them. Returns the argument for `end`.
 
     Two functions instead of a context manager, since every evaluation calls them.
     """
@@ -37,7 +37,7 @@ def end(before: list[object] | None) -> None:
     _held.values = before
 
 
-def hand(value: object) -> int | None:
+def handle_of(value: object) -> int | None:
     """A handle for the value; None outside an evaluation."""
     values = _held.values
     if values is None:

@@ -23,7 +23,7 @@ from collections.abc import Iterable, Mapping
 from typing import Final, cast
 
 from wayside.expressions.errors import EvaluationError
-from wayside.expressions.handles import hand
+from wayside.expressions.handles import handle_of
 from wayside.expressions.numbers import MAX_EXACT
 from wayside.expressions.syntax import Path, Step
 from wayside.names import did_you_mean
@@ -202,7 +202,7 @@ def _convert_rare(value: object, known: bool) -> object:
     if _is_array(value):  # before the plain types, since some numpy scalars are subclasses of these
         return _convert(value.tolist(), known)  # type: ignore[attr-defined]
     if isinstance(value, (bytes, bytearray, memoryview)):
-        handle = hand(value)
+        handle = handle_of(value)
         return _ABSENT if handle is None else handle
     if isinstance(value, (datetime.datetime, datetime.timedelta)):
         return value
@@ -223,7 +223,7 @@ def _hand(value: object, known: bool) -> object:
         or (_is_array(value) and hasattr(value, "__len__"))
         or _is_record(value)
     ):
-        handle = hand(value)
+        handle = handle_of(value)
         if handle is not None:
             return handle
     return _convert(value, known)

@@ -91,9 +91,9 @@ def _window(compiler: Compiler, at: FieldPath, action: ActionSpec, window: Windo
         streams = [stream for stream in named if stream is not None]
     back = window.before.ns + compiler.spec.for_.ns
     for stream in streams:
-        if window.before.ns and back > compiler.kept_ns(stream) and not stream.latched:
+        if window.before.ns and back > compiler.retention_ns(stream) and not stream.latched:
             with_for = f" plus the rule's for ({compiler.spec.for_})" if compiler.spec.for_.ns else ""
-            compiler.not_kept((*at, "before"), f"{window.before}{with_for} exceeds", stream)
+            compiler.exceeds_retention((*at, "before"), f"{window.before}{with_for} exceeds", stream)
     everyone = window.clients is WindowClients.ALL or compiler.spec.scope.fleet is not None
     clients = None if everyone else frozenset(window.with_clients)
     return window_of(spec, streams, clients, window.before.ns, window.after.ns)

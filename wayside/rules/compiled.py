@@ -57,8 +57,8 @@ class CompiledDerived:
     """Whether it is a statistic of the open episode, without a window."""
 
     @property
-    def keeps(self) -> bool:
-        """Whether it needs the values of earlier evaluations."""
+    def needs_history(self) -> bool:
+        """Whether it needs values of earlier evaluations."""
         return not self.episode and (self.lag_ns > 0 or self.aggregate is not Aggregate.LAST)
 
 

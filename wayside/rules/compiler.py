@@ -159,15 +159,15 @@ class Compiler:
             self._knowing[key] = environment.knowing(self._kinds).naming(places or self._of_conditions)
         return self._knowing[key]
 
-    def kept_ns(self, stream: Stream) -> int:
+    def retention_ns(self, stream: Stream) -> int:
         """How long the Detector keeps the stream's samples, in nanoseconds."""
         return self.detector.spec.buffer_duration_ns(stream)
 
-    def not_kept(self, path: FieldPath, problem: str, stream: Stream) -> None:
-        """Report that a time exceeds the buffer duration of a stream. The message begins with `problem`."""
+    def exceeds_retention(self, path: FieldPath, problem: str, stream: Stream) -> None:
+        """Report a time that exceeds the buffer duration of a stream. The message begins with `problem`."""
         self.problem(
             path,
-            f"{problem} the {self.kept_ns(stream) / 1e9:g} s that Detector {self.detector.name} keeps of stream "
+            f"{problem} the {self.retention_ns(stream) / 1e9:g} s that Detector {self.detector.name} keeps of stream "
             f"{stream.name}: shorten it, or raise the stream's buffer.duration",
         )
 

@@ -123,8 +123,8 @@ def _signal(compiler: Compiler, index: int, signal: Signal) -> CompiledSignal | 
     only = None if stream is None or stream.names_by_message else stream.client
     if only is not None and signal.client not in (None, only):
         compiler.problem((*at, "client"), f"stream {signal.stream} has only the client {only}: write client: {only}")
-    if stream is not None and over is not None and over > compiler.kept_ns(stream):
-        compiler.not_kept((*at, "over"), f"{signal.over} is longer than", stream)
+    if stream is not None and over is not None and over > compiler.retention_ns(stream):
+        compiler.exceeds_retention((*at, "over"), f"{signal.over} is longer than", stream)
     return CompiledSignal(
         signal.name, signal.stream, signal.aggregate, value, where, over, compiler.parameters,
         quantile=signal.quantile, client=signal.client,

@@ -91,5 +91,5 @@ def _check_window(compiler: Compiler, at: FieldPath, window: ModelWindow) -> Non
             )
             continue
         stream = compiler.detector.spec.stream(signal.stream)
-        if stream is not None and window.over is not None and window.over.ns >= compiler.kept_ns(stream):
-            compiler.not_kept((*at, "over"), f"{window.over} is not shorter than", stream)
+        if stream is not None and window.over is not None and window.over.ns >= compiler.retention_ns(stream):
+            compiler.exceeds_retention((*at, "over"), f"{window.over} is not shorter than", stream)

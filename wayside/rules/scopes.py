@@ -140,7 +140,7 @@ def with_closing_speed(
     if not any("closingSpeed" in each.names for each in (*conditions, subject.where) if each is not None):
         return subject
     stream = compiler.detector.spec.stream(subject.position.stream)
-    if stream is not None and (kept := compiler.kept_ns(stream)) <= CLOSING_NS:
+    if stream is not None and (kept := compiler.retention_ns(stream)) <= CLOSING_NS:
         compiler.problem(
             ("spec", "scope", "pairs", "position", "stream"),
             f"closingSpeed needs samples of the last second, but stream {stream.name} is kept for {kept / 1e9:g} s "

@@ -59,8 +59,8 @@ def naming_environment(*, items: bool = False) -> Environment:
 
 
 @lru_cache(maxsize=1024)
-def is_taken(name: str) -> bool:
-    """Whether the name has a meaning in CEL, so that no signal can have it."""
+def is_reserved(name: str) -> bool:
+    """Whether the name is reserved, because it has a meaning in CEL: no signal can have it."""
     try:
         Environment({name: CelType.DYN}).compile(name)
     except (ValueError, ExpressionError):
@@ -92,7 +92,7 @@ def fleet_environment(element: str | None) -> Environment:
 
 def _with_element(variables: dict[str, CelType], name: str | None) -> dict[str, CelType]:
     """Adds the element of `each`. An invalid name is skipped here, and reported elsewhere."""
-    return variables if name is None or name in variables or is_taken(name) else {**variables, name: CelType.MAP}
+    return variables if name is None or name in variables or is_reserved(name) else {**variables, name: CelType.MAP}
 
 
 def element_of(spec: EventRuleSpec) -> str | None:
@@ -103,7 +103,7 @@ def element_of(spec: EventRuleSpec) -> str | None:
 def signal_names(spec: EventRuleSpec) -> tuple[str, ...]:
     """The signals of each client that expressions can name."""
     whole = of_the_subject(spec)
-    return tuple(each.name for each in spec.signals if each.name not in whole and not is_taken(each.name))
+    return tuple(each.name for each in spec.signals if each.name not in whole and not is_reserved(each.name))
 
 
 def of_the_subject(spec: EventRuleSpec) -> frozenset[str]:
@@ -115,7 +115,7 @@ def of_the_subject(spec: EventRuleSpec) -> frozenset[str]:
 
 def condition_environment(spec: EventRuleSpec) -> Environment:
     """For `when`, `until` and the actions of a rule."""
-    whole = tuple(sorted(name for name in of_the_subject(spec) if not is_taken(name)))
+    whole = tuple(sorted(name for name in of_the_subject(spec) if not is_reserved(name)))
     return _with(_scope_environment(spec), whole) if whole else _scope_environment(spec)
 
 
@@ -204,7 +204,7 @@ def _problem(name: str, spec: EventRuleSpec, given: Mapping[str, str], kind: str
         why = f"{giver} already defines the variable {name}: {given[name]}"
     elif name in RESERVED_WORDS:
         why = f"{name} is a reserved word of CEL"
-    elif is_taken(name):
+    elif is_reserved(name):
         why = f"{name} is the name of a CEL type"
     else:
         return None

@@ -140,14 +140,15 @@ class Database(Action[DatabaseAction]):
         progress = self._progress[episode.id]
         while samples:
             now, samples = progress.parted(samples)
-            self._take(progress, now)
+            self._convert(progress, now)
             if samples:
                 self._renew(progress, min(sample.time for sample in samples))
 
-    def _take(self, progress: ScenarioProgress, samples: Iterable[EpisodeSample]) -> None:
+    def _convert(self, progress: ScenarioProgress, samples: Iterable[EpisodeSample]) -> None:
+        """Add the samples to the current scenario, as documents."""
         for sample in samples:
             converted = progress.documents.make(sample)
-            progress.scenario.saw(sample.client, sample.stream, sample.time)
+            progress.scenario.note_sample(sample.client, sample.stream, sample.time)
             progress.undecoded += converted.undecoded
             if converted.cut:
                 self._lose(progress.scenario, 1, f"too large: {converted.cut}")
@@ -157,7 +158,7 @@ class Database(Action[DatabaseAction]):
         """Complete the scenario; the episode continues in the next one."""
         self._finish(progress, Completion(), continues=True)
         progress.continue_in(*self._open(progress.episode, str(begin), resumed=False))
-        self._take(progress, list(progress.latest.values()))
+        self._convert(progress, list(progress.latest.values()))
 
     def _add(self, scenario: Scenario, converted: ConvertedDocument) -> None:
         document = converted.document if not converted.files else self._with_files(scenario, converted)

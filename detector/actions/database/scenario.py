@@ -49,7 +49,7 @@ class Scenario:
     lost: Counter[str] = field(default_factory=Counter)
     """Missing parts, by reason."""
 
-    def saw(self, client: str, stream: str, time: int) -> None:
+    def note_sample(self, client: str, stream: str, time: int) -> None:
         """Note a sample of a client."""
         first, last, streams = self.clients.get(client, (time, time, set()))
         streams.add(stream)

@@ -177,7 +177,7 @@ class DemandReconciler:
         step = StoreChange.NOTHING
         try:
             while (step := self._ledger.next(name)) is not StoreChange.NOTHING:
-                await self._take(step, name)
+                await self._apply(step, name)
                 self._away.succeed()
         except StoreUnavailableError as error:
             self.counts.retried += 1
@@ -187,7 +187,8 @@ class DemandReconciler:
         except TaskRefusedError as error:
             self._refused(step, name, error)
 
-    async def _take(self, step: StoreChange, name: str) -> None:
+    async def _apply(self, step: StoreChange, name: str) -> None:
+        """Make one change of a task. Raises `TaskStoreError`."""
         demand, stored = (self._ledger.demands or {}).get(name), (self._ledger.stored or {}).get(name)
         if step is StoreChange.CREATE and demand is not None:
             await self._create(name, demand)

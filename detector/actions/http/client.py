@@ -113,7 +113,7 @@ _REFUSAL_TIME = 1.0
 """Maximum seconds spent on it."""
 _EXCERPT = 200
 """Maximum characters of it in a message."""
-_LOOK = 0.05
+_CHECK_EVERY = 0.05
 """Seconds between two checks of whether to give up."""
 
 
@@ -197,7 +197,7 @@ async def _watched(exchange: _Exchange, give_up: Callable[[], bool]) -> Answer:
         while not task.done():
             if give_up():
                 raise HttpError(f"{exchange.where}: aborted before the response, because the detector is stopping")
-            await asyncio.wait({task}, timeout=_LOOK)
+            await asyncio.wait({task}, timeout=_CHECK_EVERY)
         return task.result()
     finally:
         task.cancel()
@@ -259,7 +259,7 @@ async def _read(exchange: _Exchange, response: aiohttp.ClientResponse) -> Answer
 
 
 async def _body(response: aiohttp.ClientResponse, limit: int) -> tuple[bytes, bool]:
-    """At most `want` bytes, and whether this is the whole body."""
+    """At most `limit` bytes of the body, and whether this is all of it."""
     read = bytearray()
     try:
         while len(read) <= limit:

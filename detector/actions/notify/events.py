@@ -150,7 +150,7 @@ class EventQueue:
     def _add(self, moment: NotifiedEvent, episode: Episode, event: Mapping[str, Any], rendered: NoticeTexts) -> None:
         if moment in self._moments:
             notice = Notice(episode.id, event, rendered, time.time())
-            self._storage.keep(notice)
+            self._storage.store(notice)
             self._admit(notice, time.monotonic())
 
     def _admit(self, notice: Notice, now: float) -> None:
@@ -210,7 +210,7 @@ class EventQueue:
     def drain(self, keep: bool) -> None:
         """Remove all events at the end. With `keep`, stored ones are sent after the next start; the others are lost."""
         for message in self._outbox.drain():
-            if keep and all(map(self._storage.keeps_notice, message.notices)):
+            if keep and all(map(self._storage.is_stored, message.notices)):
                 for episode in message.episodes:
                     self.ledger.kept(episode)
             else:

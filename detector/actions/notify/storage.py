@@ -36,7 +36,7 @@ class NotifyStore:
         """Undelivered events of earlier runs, oldest first."""
         return list(self._journal.load_all(_NOTICE, notice_from).values())
 
-    def keep(self, notice: Notice) -> None:
+    def store(self, notice: Notice) -> None:
         """Store the event until `delivered`."""
         self._journal.put(_NOTICE + notice.id, notice.to_json())
 
@@ -44,7 +44,7 @@ class NotifyStore:
         """Remove these events: they were delivered."""
         self._journal.drop([_NOTICE + notice.id for notice in notices])
 
-    def keeps_notice(self, notice: Notice) -> bool:
+    def is_stored(self, notice: Notice) -> bool:
         """Whether this event is stored."""
         return self._journal.load(_NOTICE + notice.id, notice_from) is not None
 

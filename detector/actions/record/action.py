@@ -73,7 +73,7 @@ class Record(Action[api.RecordAction]):
         if current is None:  # its recording ended early, which was reported
             self._lose(len(samples))
             return
-        current.series.take(samples, self.context.configuration())
+        current.series.add(samples, self.context.configuration())
         self._report_finished(current)
 
     def ended(self, episode: Episode) -> None:
@@ -151,7 +151,7 @@ class Record(Action[api.RecordAction]):
         """Completes the recordings of earlier runs, on another thread, and deletes those that are too old."""
         try:
             place = self._destination(self.context.configuration())
-            if left := place.take_left():
+            if left := place.take_unfinished():
                 thread = threading.Thread(
                     target=self._recover, args=(place, left), name="recordings-recovery", daemon=True
                 )

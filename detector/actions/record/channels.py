@@ -84,7 +84,7 @@ class FileChannels:
         self._numbers: dict[Place, int] = {}
         self._schemas: dict[tuple[str, str], int] = {}
 
-    def keep(self, streams: Collection[str]) -> None:
+    def retain(self, streams: Collection[str]) -> None:
         """Samples of all streams except these go into new channels from now on."""
         self._numbers = {place: number for place, number in self._numbers.items() if place[0] in streams}
 

@@ -57,7 +57,7 @@ class Destination:
         self._left = [*hidden(self.path, PARTIAL)]
         self._scan()
 
-    def take_left(self) -> list[Path]:
+    def take_unfinished(self) -> list[Path]:
         """The hidden folders that existed before this process recorded here; empty from the second call on."""
         with self._lock:
             left, self._left = self._left, []
@@ -138,7 +138,7 @@ class Destination:
         return stat.f_bavail * stat.f_frsize
 
     def _drop(self, kept: FinishedRecording) -> FinishedRecording:
-        """Delete a recording; during deletion its name is hidden, so it never looks complete."""
+        """Delete a recording. It is hidden during the deletion, so a partial one never seems complete."""
         self._keep(each for each in self._kept if each is not kept)
         hidden = hidden_path(kept.path, DROPPED)
         try:

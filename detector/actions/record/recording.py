@@ -94,9 +94,9 @@ class Recording:
         for name, stream in streams.items():
             self._readings[name] = channel_format(stream, configuration.types)
         if self._file is not None:
-            self._channels.keep({name for name, each in self._readings.items() if old.get(name) == each})
+            self._channels.retain({name for name, each in self._readings.items() if old.get(name) == each})
 
-    def take(self, samples: Sequence[EpisodeSample], configuration: DetectorConfiguration) -> None:
+    def add(self, samples: Sequence[EpisodeSample], configuration: DetectorConfiguration) -> None:
         """Add samples. Raises NoRoomError, OSError: then it accepts no more, and `finish` keeps what was written."""
         if configuration.detector is not self._configuration.detector:
             self.follow(configuration)
@@ -109,7 +109,7 @@ class Recording:
                     continue
                 self._start = sample.time
                 self._release()
-            self._take(sample)
+            self._add_sample(sample)
 
     def began_with(self, samples: Sequence[EpisodeSample]) -> int | None:
         """The start of the recording if these samples follow, latched ones aside; nanoseconds. None: not known yet."""
@@ -218,9 +218,9 @@ class Recording:
         """Write the last samples of latched streams before the window at its start."""
         held, self._held = self._held, []
         for sample in held:
-            self._take(sample)
+            self._add_sample(sample)
 
-    def _take(self, sample: EpisodeSample) -> None:
+    def _add_sample(self, sample: EpisodeSample) -> None:
         place = sample.stream, sample.key, sample.client
         log_time = sample.time
         latched = sample.stream in self._topics

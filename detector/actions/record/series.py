@@ -56,7 +56,7 @@ class RecordedSeries:
         """Whether there are samples to flush."""
         return self._recording is not None and self._recording.waiting
 
-    def take(self, samples: Sequence[EpisodeSample], configuration: DetectorConfiguration) -> None:
+    def add(self, samples: Sequence[EpisodeSample], configuration: DetectorConfiguration) -> None:
         """Add samples."""
         while samples:
             recording = self._recording
@@ -69,7 +69,7 @@ class RecordedSeries:
             now, rest = self._parted(recording, samples)
             samples = rest
             try:
-                recording.take(now, configuration)
+                recording.add(now, configuration)
             except (NoRoomError, OSError) as error:
                 self._again = max(sample.time for sample in now) + _AGAIN
                 self._end(recording, reason(error), 0)
@@ -129,7 +129,7 @@ class RecordedSeries:
         self.description = replace(description, part=description.part + 1, continued=True)
         try:
             self._recording = self._begin(self.description, None)
-            self._recording.take(self._latched, configuration)
+            self._recording.add(self._latched, configuration)
         except (NoRoomError, OSError) as error:
             self.problem = self.problem or reason(error)
             if self._recording is not None:

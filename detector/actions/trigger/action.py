@@ -145,7 +145,7 @@ class Trigger(Action[api.TriggerAction]):
                 break
             self._request(stops[0], NextRequest.STOP)
             self._forget_finished()
-        if not self._journal.keeps:
+        if not self._journal.is_durable:
             for recording in self._recordings.values():
                 if recording.step in (NextRequest.START, NextRequest.STOP):
                     self._lose(recording, "the detector is stopping")

@@ -51,7 +51,7 @@ class Messages:
         self._last_stamp: tuple[tuple[str, int, bytes], int | None] | None = None
 
     def forget(self) -> None:
-        """Release what was decoded: the tick is over."""
+        """Drop the decoded messages: the tick is over."""
         self._decoded.clear()
         if self._stamps:
             self._stamps_before, self._stamps = self._stamps, {}

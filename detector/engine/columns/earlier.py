@@ -102,7 +102,7 @@ class EarlierValues:
     ) -> Column:
         """The signal at these evaluations; the column has the values that it aggregates. Counts values of the wrong
         kind."""
-        if not signal.keeps:
+        if not signal.needs_history:
             return column
         rows = _joined(self._kept.get((signal.name, element), _NOTHING), now, column, texts)
         low, high = _ranges(rows, now, signal)

@@ -30,7 +30,8 @@ _REACH = 2**46
 """Range of times that keys can represent, in nanoseconds."""
 _LEAST_ROOM = 16
 _BATCHES = 3
-"""How many more batches like the one that needs room fit in at most: moving rows costs more than adding them."""
+"""Maximum number of further batches of the same size that have room after repacking: moving rows costs more than adding
+them."""
 
 
 class StoredColumn:

@@ -173,7 +173,7 @@ class RuleInputs:
         self.clients.gap(time)
 
     def end_tick(self, now: int) -> None:
-        """The tick is over: release what was decoded for it."""
+        """Drop the messages and transforms that were decoded for the tick."""
         self.messages.forget()
         self.transforms.forget(now)
 

@@ -48,8 +48,8 @@ class PluginHost(Protocol):
     def value(self, call: PluginCall, queries: Queries) -> Value:
         """The signal's value, None if it has none. Raises PluginFailedError."""
 
-    def keep(self, rule: str, subjects: Collection[str]) -> None:
-        """The rule was evaluated for these subjects: drop the state of all others."""
+    def retain(self, rule: str, subjects: Collection[str]) -> None:
+        """Keep the state of these subjects of the rule only: it was evaluated for no others."""
 
     def reset(self) -> None:
         """Time jumped: drop all state, because windows reset."""
@@ -65,7 +65,7 @@ class NoPlugins:
         """Raises PluginFailedError."""
         raise PluginFailedError(Reason.ABSENT, "this engine runs no plugins")
 
-    def keep(self, rule: str, subjects: Collection[str]) -> None:
+    def retain(self, rule: str, subjects: Collection[str]) -> None:
         """Nothing to drop."""
 
     def reset(self) -> None:
@@ -93,7 +93,7 @@ class PluginSignals:
             left = {subject: of for subject, of in subjects.items() if not any(client in clients for client in of)}
             if len(left) < len(subjects):
                 self._subjects[rule] = left
-                self._host.keep(rule, left)
+                self._host.retain(rule, left)
 
     def gap(self) -> None:
         """Time jumped: windows reset, and so do plugins."""
@@ -119,7 +119,7 @@ class PluginSignals:
             yield candidate._replace(variables={**candidate.variables, **values})
         if every_subject:
             self._subjects[rule.name] = subjects
-            self._host.keep(rule.name, subjects)
+            self._host.retain(rule.name, subjects)
 
     def _values(
         self, rule: CompiledRule, candidate: Candidate, queries: Queries, counters: RuleCounters

@@ -35,7 +35,7 @@ Values = NDArray[Any]
 
 
 class FieldPlaces(NamedTuple):
-    """What is where in a payload: first byte, and the byte behind it."""
+    """The places in a payload: for each part, its first byte and the byte after its last one."""
 
     lengths: Sequence[int]
     """The first bytes of the lengths of texts and sequences."""

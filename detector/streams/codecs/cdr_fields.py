@@ -1,8 +1,8 @@
 """CDR: reads a few fields, by a function whose source is generated for the type and the paths (see `cdr_walk`).
 
-It finds what rosbags finds, and makes all its checks, including those of skipped fields. Many payloads alike are read
-together (see `cdr_columns`), the others one after another. A payload that fails a check is decoded as a whole, so that
-the decoder reports the error.
+It returns the values that rosbags returns, and makes all its checks, including those of skipped fields. Many similar
+payloads are read together (see `cdr_columns`), the others one after another. A payload that fails a check is decoded as
+a whole, so that the decoder reports the error.
 """
 
 from __future__ import annotations

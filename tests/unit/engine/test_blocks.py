@@ -153,7 +153,7 @@ def tasks_of(rule: Any, arrivals: list[Any], cut: int) -> dict[str, Any]:
     replay = Replay(a_detector(), [rule], holder="h", start=START, outcome=outcome)
     for begin in range(0, len(arrivals), cut):
         taken = arrivals[begin : begin + cut]
-        replay.take(taken, taken[-1].received)
+        replay.advance(taken, taken[-1].received)
     return {name: task.model_dump(mode="json")["spec"] for name, task in sorted(outcome.tasks.items())}
 
 

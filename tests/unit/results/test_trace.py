@@ -24,7 +24,7 @@ class OneByOne(Tracer):
     def attend(self, engine: Engine) -> None:
         super().attend(engine)
         for name, run in engine.rules.items():
-            run.on_evaluated = self._recorded.setdefault(name, self._recorder_of(run.rule)).saw
+            run.on_evaluated = self._recorded.setdefault(name, self._recorder_of(run.rule)).record
 
     def _recorder_of(self, rule: object) -> object:
         from detector.results.recorded_values import RecordedValues

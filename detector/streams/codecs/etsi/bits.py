@@ -29,7 +29,7 @@ class Bits:
         self.position = 0
         self._elements = _ELEMENTS_PER_OCTET * (len(data) + 1)
 
-    def take(self, count: int) -> int:
+    def read(self, count: int) -> int:
         """The next `count` bits as a non-negative number."""
         start = self.position
         stop = start + count
@@ -41,7 +41,7 @@ class Bits:
 
     def octets(self, count: int) -> bytes:
         """The next `count` octets."""
-        return self.take(8 * count).to_bytes(count, "big")
+        return self.read(8 * count).to_bytes(count, "big")
 
     def elements(self, count: int) -> int:
         """The same number, after checking that a message of this length can contain that number of elements."""
@@ -53,13 +53,13 @@ class Bits:
     def lengths(self) -> Iterator[int]:
         """An unbounded length, fragment by fragment; read the announced items before the next fragment (11.9)."""
         while True:
-            if not self.take(1):
-                yield self.take(7)
+            if not self.read(1):
+                yield self.read(7)
                 return
-            if not self.take(1):
-                yield self.take(14)
+            if not self.read(1):
+                yield self.read(14)
                 return
-            pieces = self.take(6)
+            pieces = self.read(6)
             if not 1 <= pieces <= 4:
                 raise DecodeError(f"a length must have 1 to 4 fragments; got {pieces}")
             yield pieces * _FRAGMENT
@@ -84,10 +84,10 @@ class Bits:
 
     def small(self) -> int:
         """A normally small number (11.6)."""
-        return self.unsigned() if self.take(1) else self.take(6)
+        return self.unsigned() if self.read(1) else self.read(6)
 
     def small_length(self) -> int:
         """A normally small length, at least one (11.9.3.4)."""
-        if not self.take(1):
-            return self.take(6) + 1
+        if not self.read(1):
+            return self.read(6) + 1
         return sum(self.lengths())

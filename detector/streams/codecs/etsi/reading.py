@@ -45,7 +45,7 @@ class Readers:
     def _make(self, kind: asn1.Type) -> Read:
         match kind:
             case asn1.Boolean():
-                return lambda bits: bits.take(1) == 1
+                return lambda bits: bits.read(1) == 1
             case asn1.Null():
                 return lambda bits: True  # in a CHOICE its presence is its value; null would read as unknown
             case asn1.Integer():
@@ -91,12 +91,12 @@ class Readers:
         additions = [self._addition(addition) for addition in kind.additions]
 
         def read(bits: Bits) -> dict[str, Any]:
-            extended = bits.take(1)
+            extended = bits.read(1)
             value: dict[str, Any] = root(bits)
             if not extended:
                 return value
             count = bits.small_length()
-            sent = bits.take(count)
+            sent = bits.read(count)
             for index in range(count):
                 if sent >> (count - 1 - index) & 1:
                     blob = bits.blob()  # the type of a later version of the definition is skipped
@@ -130,7 +130,7 @@ class Readers:
                 opens.append((name, expression_name(field.type.selector), table))
 
         def read(bits: Bits) -> dict[str, Any]:
-            sent = bits.take(optional)
+            sent = bits.read(optional)
             value: dict[str, Any] = {}
             for name, reader, mask, absent in readers:
                 if not mask or sent & mask:
@@ -152,14 +152,14 @@ class Readers:
         extensible = kind.additions is not None
 
         def read(bits: Bits) -> dict[str, Any] | None:
-            if extensible and bits.take(1):
+            if extensible and bits.read(1):
                 index = bits.small()
                 inner = Bits(bits.blob())
                 if index >= len(additions):
                     return {}  # an alternative of a later version of the definition
                 name, reader = additions[index]
                 return {name: reader(inner)}
-            index = bits.take(width)
+            index = bits.read(width)
             if index >= len(root):
                 raise DecodeError(f"a CHOICE with {len(root)} alternatives has no alternative {index}")
             name, reader = root[index]
@@ -172,7 +172,7 @@ def _integer(kind: asn1.Integer) -> Read:
     plain = quantity(kind)
     if kind.low is None or (kind.high is None and kind.extensible):
         if kind.extensible:
-            return lambda bits: plain((bits.take(1), bits.signed())[1])
+            return lambda bits: plain((bits.read(1), bits.signed())[1])
         return lambda bits: plain(bits.signed())
     low, high = kind.low, kind.high
     if high is None:
@@ -180,14 +180,14 @@ def _integer(kind: asn1.Integer) -> Read:
     width, span = (high - low).bit_length(), high - low
 
     def read(bits: Bits) -> Any:
-        offset = bits.take(width)
+        offset = bits.read(width)
         if offset > span:
             raise DecodeError(f"{kind.name or 'a number'} must be between {low} and {high}; got {low + offset}")
         return plain(low + offset)
 
     if not kind.extensible:
         return read
-    return lambda bits: plain(bits.signed()) if bits.take(1) else read(bits)
+    return lambda bits: plain(bits.signed()) if bits.read(1) else read(bits)
 
 
 def _enumerated(kind: asn1.Enumerated) -> Read:
@@ -197,10 +197,10 @@ def _enumerated(kind: asn1.Enumerated) -> Read:
     extensible = kind.additions is not None
 
     def read(bits: Bits) -> str | None:
-        if extensible and bits.take(1):
+        if extensible and bits.read(1):
             index = bits.small()
             return additions[index] if index < len(additions) else None  # None: of a later version of the definition
-        index = bits.take(width)
+        index = bits.read(width)
         if index >= len(root):
             raise DecodeError(f"an ENUMERATED with {len(root)} values has no value {index}")
         return root[index]
@@ -211,7 +211,7 @@ def _enumerated(kind: asn1.Enumerated) -> Read:
 def _bit_string(kind: asn1.BitString) -> Read:
     def piece(bits: Bits, count: int) -> list[bool]:
         # Through the digits: shifting a long number for each of its bits would take quadratic time.
-        return [digit == "1" for digit in f"{bits.take(count):0{count}b}"] if count else []
+        return [digit == "1" for digit in f"{bits.read(count):0{count}b}"] if count else []
 
     flags = _counted(kind.size, piece, lambda pieces: [flag for piece in pieces for flag in piece])
     if not kind.named:
@@ -229,7 +229,7 @@ def _text(kind: asn1.Text) -> Read:
     identity = ord(alphabet[-1]) < 1 << width  # the characters are sent unchanged if that takes no more bits
 
     def characters(bits: Bits, count: int) -> str:
-        codes = [bits.take(width) for _ in range(bits.elements(count))]
+        codes = [bits.read(width) for _ in range(bits.elements(count))]
         if identity:
             return "".join(map(chr, codes))
         if codes and max(codes) >= len(alphabet):
@@ -253,14 +253,14 @@ def _counted(size: asn1.Size, take: Callable[[Bits, int], Any], join: Callable[[
         width = span.bit_length()
 
         def bounded(bits: Bits) -> Any:
-            offset = bits.take(width)
+            offset = bits.read(width)
             if offset > span:
                 raise DecodeError(f"a length must be between {low} and {high}; got {low + offset}")
             return take(bits, low + offset)
 
     if not size.extensible:
         return bounded
-    return lambda bits: unbounded(bits) if bits.take(1) else bounded(bits)
+    return lambda bits: unbounded(bits) if bits.read(1) else bounded(bits)
 
 
 def _absent(field: asn1.Field) -> Any:
