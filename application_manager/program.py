@@ -9,6 +9,6 @@ def main() -> None:
     """Run the command line."""
     end_on_sigterm()
     with importing():
-        from application_manager.commands.cli import main as run  # noqa: PLC0415  that is the point
+        from application_manager.commands.cli import main as run  # noqa: PLC0415  a slow import, after the handler
 
     run()

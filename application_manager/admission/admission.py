@@ -58,8 +58,8 @@ from wayside.rules import depends
 AT_ONCE = 8
 """The maximum number of concurrent reviews in one namespace; further ones are rejected."""
 
-LOOKING_UP = 3.0  # s for requests to the API server, which waits for our response
-LOOKING_AT_RULES = 1.0  # s for the rules of a changed Detector
+LOOKUP_TIMEOUT = 3.0  # s for requests to the API server, which waits for our response
+RULES_TIMEOUT = 1.0  # s for the rules of a changed Detector
 _RULES_AT_ONCE = 20  # of these in one job: the limit of CPU time applies to each job
 
 _DEPLOYMENTS = Resource("apps/v1", "Deployment", "deployments")
@@ -79,14 +79,14 @@ class Admission:
     pool: Runs
     namespaces: Collection[str] = ()
     defaults: PodDefaults | None = None
-    _under_way: Counter[str] = field(default_factory=Counter)
+    _in_progress: Counter[str] = field(default_factory=Counter)
 
     async def review(self, review: Any) -> Object:
         """The response to an AdmissionReview. Raises ReviewError if it is not valid, and OverloadedError."""
         request = read(review)
-        looked_after = not self.namespaces or request.namespace in self.namespaces
+        is_managed = not self.namespaces or request.namespace in self.namespaces
         findings = Findings()
-        if request.weight is not ReviewEffect.NONE and looked_after:
+        if request.effect is not ReviewEffect.NONE and is_managed:
             findings = await self._in_turn(request)
         response = answer(request, findings)
         given = response["response"]
@@ -100,15 +100,15 @@ class Admission:
 
     async def _in_turn(self, request: Request) -> Findings:
         """The findings. Raises OverloadedError if the namespace has too many reviews in progress."""
-        if self._under_way[request.namespace] >= AT_ONCE:
+        if self._in_progress[request.namespace] >= AT_ONCE:
             raise OverloadedError(f"{AT_ONCE} reviews of namespace {request.namespace} are in progress: try again")
-        self._under_way[request.namespace] += 1
+        self._in_progress[request.namespace] += 1
         try:
             return await self._findings(request)
         finally:
-            self._under_way.subtract((request.namespace,))
-            if not self._under_way[request.namespace]:
-                del self._under_way[request.namespace]
+            self._in_progress.subtract((request.namespace,))
+            if not self._in_progress[request.namespace]:
+                del self._in_progress[request.namespace]
 
     async def _findings(self, request: Request) -> Findings:
         try:
@@ -131,7 +131,7 @@ class Admission:
         if (await self._run(rule.namespace, partial(RuleContext().findings, rule))).problems:
             return findings  # it has them by itself
         try:
-            async with asyncio.timeout(LOOKING_UP):
+            async with asyncio.timeout(LOOKUP_TIMEOUT):
                 await self._look_up(DETECTORS, rule.namespace)
                 if depends(rule):
                     await self._look_up(EVENT_RULES, rule.namespace)
@@ -164,7 +164,7 @@ class Admission:
         if not findings.problems and (problem := await self._pod_problem(detector, before)):
             return replace(findings, problems=(problem,))
         remarks: list[Finding] = []
-        until = time.monotonic() + LOOKING_AT_RULES
+        until = time.monotonic() + RULES_TIMEOUT
         rules = self.cache.models(EVENT_RULE, EventRule, detector.namespace)
         for first in range(0, len(rules), _RULES_AT_ONCE):
             some = rules[first : first + _RULES_AT_ONCE]
@@ -183,7 +183,7 @@ class Admission:
             return ""
         problem = ""
         try:
-            async with asyncio.timeout(LOOKING_UP):
+            async with asyncio.timeout(LOOKUP_TIMEOUT):
                 await self.client.apply(_DEPLOYMENTS, deployment_to_try(detector, self.defaults), dry_run=True)
         except ApiError as error:
             if error.permanent and error.code != _FORBIDDEN:
@@ -203,7 +203,7 @@ class Admission:
         found = await self._injection(request, name)
         if found.why_not is not None:
             try:
-                async with asyncio.timeout(LOOKING_UP):
+                async with asyncio.timeout(LOOKUP_TIMEOUT):
                     await self._look_up(DETECTORS, request.namespace, f"metadata.name={name}")
             except (ApiError, Unreachable, TimeoutError) as error:
                 log.warning("cannot look up Detector %s/%s, which a pod requests: %s", request.namespace, name, error)

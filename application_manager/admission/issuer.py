@@ -123,9 +123,9 @@ async def issuing(client: Client, options: WebhookOptions | None) -> AsyncIterat
     if options is None or not options.service:
         yield
         return
-    look = partial(renew, client, options)
-    await until_answered(look)
-    renewing = repeatedly(look, EVERY, "cannot renew the webhook's certificate")
+    attempt = partial(renew, client, options)
+    await until_answered(attempt)
+    renewing = repeatedly(attempt, EVERY, "cannot renew the webhook's certificate")
     following = asyncio.create_task(renewing, name="issuing")
     try:
         yield

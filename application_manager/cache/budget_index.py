@@ -1,4 +1,4 @@
-"""Determines which tasks are within the budgets of their holder and namespace: an incremental index.
+"""An incremental index of the tasks that are within the budgets of their holder and namespace.
 
 The oldest tasks are within the budget. So neither a restart nor the order of arrival changes the result, and a served
 task never loses its place to a newer one. A task beyond its holder's budget does not count against its namespace's

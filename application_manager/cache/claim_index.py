@@ -1,6 +1,6 @@
-"""Determines which task claims which instance: an incremental index.
+"""An incremental index of the claims of tasks on instances.
 
-Without it, every change of a task would compute all claims again. Its content follows from tasks and templates alone.
+Without it, every change of a task would compute all claims again. Its content depends only on tasks and templates.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ class ClaimIndex:
                 claimed = replace(claimed, instance=before.instance)
             self._verdicts[name] = claimed
             return touched
-        assert claimed is not None  # noqa: S101  what is being computed has returned above
+        assert claimed is not None  # noqa: S101  a pending claim has returned above
         instance = (name[0], claimed.instance)
         self._claims[name] = claimed
         self._by_instance.put(instance, name, claimed)

@@ -182,7 +182,7 @@ class ClusterCache:
     def decide(self, name: Name, now: float) -> tuple[Decided, set[Name]]:
         """The decision about the instance at `now`, in seconds since 1970, and the other instances to enqueue.
 
-        These are to be decided again, because this decision changes what theirs depends on.
+        Their decisions depend on this one, so they are decided again.
         """
         decided = decide(name[1], _NamespaceIndexes(self, name[0]), now)
         affected = self.fallbacks.affected(name, _fallback(decided))
@@ -260,7 +260,7 @@ class ClusterCache:
         return Limits(self._limits.get(namespace, {}), self.limit)
 
     def expand(self, name: Name) -> set[Name]:
-        """The instances that a name stands for, which may be all of a template; the name itself is included."""
+        """The name itself, and if it stands for all instances of a template, also these."""
         of = template_of_all(name[1])
         if of is None:
             return {name}

@@ -80,11 +80,11 @@ class _Rendering:
 class ChartRenderer:
     """Renders charts in the background. Only the event loop's thread uses it."""
 
-    def __init__(self, helm: HelmRunner, cache: ChartCache, again: Callable[[Name, float], None]) -> None:
-        """`again` enqueues an instance at a time, in seconds since 1970."""
+    def __init__(self, helm: HelmRunner, cache: ChartCache, enqueue_at: Callable[[Name, float], None]) -> None:
+        """`enqueue_at` enqueues an instance at a time, in seconds since 1970."""
         self._helm = helm
         self._cache = cache
-        self._again = again
+        self._enqueue_at = enqueue_at
         self._renderings: OrderedDict[ChartRequest, _Rendering] = OrderedDict()
         self._sources: dict[ChartSource, _Source] = {}
         self._runs = asyncio.Semaphore(_RUNS)
@@ -99,7 +99,7 @@ class ChartRenderer:
         if known.work is None and not isinstance(known.outcome, ChartObjects) and known.pause.over:
             known.work = asyncio.create_task(self._do(request, known), name=f"chart of {request.release}")
         if isinstance(known.outcome, ApplyProblem) and known.work is None:
-            self._again((request.namespace, request.release), time.time() + known.pause.left)
+            self._enqueue_at((request.namespace, request.release), time.time() + known.pause.left)
         self._forget_some()
         return known.outcome
 
@@ -131,7 +131,7 @@ class ChartRenderer:
         known.outcome = outcome
         if isinstance(outcome, ApplyProblem):
             known.pause.fail(outcome)
-        self._again(name, time.time())
+        self._enqueue_at(name, time.time())
 
     async def _outcome(self, request: ChartRequest) -> ChartOutcome:
         source = self._sources.setdefault(request.source, _Source())

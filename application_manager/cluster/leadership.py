@@ -1,7 +1,7 @@
 """Leader election: renews the Lease, or watches it until it can be acquired.
 
-It has its own client, so that other requests cannot delay a renewal. A deadline limits what the manager may do, not a
-flag: if the process was stopped for a while, the deadline has passed before any code could have cleared a flag.
+It has its own client, so that other requests cannot delay a renewal. The permission to write ends by a deadline, not by
+a flag: after the process was suspended, the deadline has passed before any code could clear a flag.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def lease_key(option: str | None, namespaces: tuple[str, ...]) -> LeaseKey:
 
 
 def own_identity() -> str:
-    """The identity of this manager: its pod, so that a restarted container need not wait for itself; else random."""
+    """The identity of this manager: its pod, so that a restarted container keeps its Lease; otherwise random."""
     pod, uid = os.environ.get("POD_NAME"), os.environ.get("POD_UID")
     return f"{pod}_{uid}" if pod and uid else f"{socket.gethostname()}_{os.getpid()}_{secrets.token_hex(4)}"
 

@@ -2,7 +2,7 @@
 
 By its ClusterRole, the account of a manager of all namespaces may read everywhere. It may write where an administrator
 binds it to the role for writing (`application-manager rbac --grant`). The manager ignores the objects in other
-namespaces: otherwise it would send a request for each of them, over and over, and each would be refused.
+namespaces: otherwise it would repeatedly send a request for each of them, and the API server would refuse it.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def report_missing(missing: Collection[MissingRight]) -> None:
 
 def _text(missing: MissingRight) -> str:
     right, verb, namespace = missing
-    return right.lack(verb, f"in namespace {namespace}" if namespace else "in all namespaces")
+    return right.missing_message(verb, f"in namespace {namespace}" if namespace else "in all namespaces")
 
 
 async def may(client: Client, right: PolicyRule, verb: str, namespace: str | None) -> bool:

@@ -29,7 +29,7 @@ class Checked:
 
     problems: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
-    looked_at: int = 0
+    objects: int = 0
 
 
 def review_files(paths: Iterable[Path], policy: Policy, ignored: Set[str] = frozenset()) -> Checked:
@@ -44,7 +44,7 @@ def review_files(paths: Iterable[Path], policy: Policy, ignored: Set[str] = froz
         findings = _findings(document.object, documents, policy)
         if findings is None:
             continue
-        checked.looked_at += 1
+        checked.objects += 1
         name = _INVALID[type(document.object)].name
         checked.problems += _lines(document, [Finding(name, each) for each in findings.problems])
         found = dict.fromkeys((*findings.doubts, *findings.remarks))

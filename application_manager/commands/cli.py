@@ -93,7 +93,7 @@ def run(
             "Repeatable; the first one that matches a holder applies. Default: no limit.",
         ),
     ] = None,
-    resync: Annotated[str, typer.Option(metavar="DURATION", help="How often to list everything again.")] = "60s",
+    resync: Annotated[str, typer.Option(metavar="DURATION", help="The interval of full lists.")] = "60s",
     ttl_after_finished: Annotated[
         str, typer.Option(metavar="DURATION", help="How long finished tasks are kept.")
     ] = "1h",
@@ -325,7 +325,7 @@ def check(
         typer.echo(f"warning: {line}", err=True)
     if checked.problems or (strict and checked.warnings):
         raise typer.Exit(1)
-    typer.echo(f"checked {checked.looked_at}: nothing would be refused", err=True)
+    typer.echo(f"checked {checked.objects}: nothing would be refused", err=True)
 
 
 class Output(StrEnum):

@@ -37,10 +37,10 @@ def print_injected(files: Sequence[str], namespace: str, detector_image: str | N
     Detectors, that have none. Raises ConfigurationError if a file or a Detector cannot be read.
     """
     documents = [each for file in files for each in _read(file)]
-    given = {each.name: each for each in map(_detector, documents) if each is not None}
-    wanted = {each for raw in documents for each in _wanted(raw, namespace) if each[1] not in given}
-    found = asyncio.run(_looked_up(wanted)) if wanted else {}
-    injector = _Injector(given, found, namespace, detector_image)
+    from_files = {each.name: each for each in map(_detector, documents) if each is not None}
+    requested = {each for raw in documents for each in _requested(raw, namespace) if each[1] not in from_files}
+    found = asyncio.run(_looked_up(requested)) if requested else {}
+    injector = _Injector(from_files, found, namespace, detector_image)
     sys.stdout.write(to_yaml([injector.manifest(each) for each in documents if not _is_detector(each)]))
     for line in injector.refusals:
         typer.echo(line, err=True)
@@ -50,10 +50,10 @@ def print_injected(files: Sequence[str], namespace: str, detector_image: str | N
 
 @dataclass(slots=True)
 class _Injector:
-    """Injects Detectors: given ones by name, and those of the cluster by namespace and name."""
+    """Injects Detectors: those of the files by name, and those of the cluster by namespace and name."""
 
-    given: dict[str, Detector]
-    found: dict[tuple[str, str], Detector]
+    from_files: dict[str, Detector]
+    from_cluster: dict[tuple[str, str], Detector]
     namespace: str
     image: str | None
     refusals: list[str] = field(default_factory=list)
@@ -70,7 +70,7 @@ class _Injector:
         if name is None or has_sidecar(spec):
             return pod
         namespace = _namespace(raw, self.namespace)
-        detector = self.given.get(name) or self.found.get((namespace, name))
+        detector = self.from_files.get(name) or self.from_cluster.get((namespace, name))
         image = self.image
         if detector is not None and image is None:
             image = detector.spec.pod.image if detector.spec.pod is not None else None
@@ -82,9 +82,9 @@ class _Injector:
         return pod if found.addition is None else pod | {"spec": added(spec, found.addition)}
 
 
-async def _looked_up(wanted: set[tuple[str, str]]) -> dict[tuple[str, str], Detector]:
+async def _looked_up(requested: set[tuple[str, str]]) -> dict[tuple[str, str], Detector]:
     """Read the Detectors that the files do not contain from the cluster. Raises ConfigurationError."""
-    listed = ", ".join(sorted(name for _, name in wanted))
+    listed = ", ".join(sorted(name for _, name in requested))
     otherwise = "give its file with -f, or use the kubeconfig of a cluster that has it"
     try:
         client = manager_client(await load_configuration())
@@ -93,7 +93,7 @@ async def _looked_up(wanted: set[tuple[str, str]]) -> dict[tuple[str, str], Dete
             f"Detector {listed} is in none of the files, and cannot be read from the cluster: {error}: {otherwise}"
         ) from error
     try:
-        raws = {each: await client.get(DETECTORS, *each) for each in sorted(wanted)}
+        raws = {each: await client.get(DETECTORS, *each) for each in sorted(requested)}
     except RequestError as error:
         raise ConfigurationError(f"Detector {listed} cannot be read from the cluster: {error}: {otherwise}") from error
     finally:
@@ -101,11 +101,11 @@ async def _looked_up(wanted: set[tuple[str, str]]) -> dict[tuple[str, str], Dete
     return {each: found for each, raw in raws.items() if raw is not None and (found := _detector(raw)) is not None}
 
 
-def _wanted(raw: Manifest, default: str) -> Iterator[tuple[str, str]]:
+def _requested(raw: Manifest, default: str) -> Iterator[tuple[str, str]]:
     """The namespaces and names of the Detectors that the manifest requests and does not contain yet."""
     if raw.get("kind") == "List":
         for each in raw.get("items") or ():
-            yield from _wanted(each, default)
+            yield from _requested(each, default)
         return
     pod = pod_template(raw) if raw.get("kind") in POD_TEMPLATES else {}
     name = detector_of(pod.get("metadata"))

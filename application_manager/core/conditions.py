@@ -1,4 +1,4 @@
-"""Conditions that keep their time of transition, and the Kubernetes Events that follow from their changes. Pure.
+"""Conditions with their transition times, and the Kubernetes Events that follow from their changes. Pure.
 
 Two of them follow from the others: Ready and Stalled, which kstatus, kubectl and GitOps tools read. For kstatus, an
 object with Ready=True is current, with Ready=False in progress, and with Stalled=True failed. So Stalled is present
@@ -41,7 +41,7 @@ def updated(
     *,
     only_while: Iterable[str] = (),
 ) -> list[Condition]:
-    """The updated conditions, sorted by type; one keeps its time of transition while its status stays.
+    """The updated conditions, sorted by type; each keeps its transition time while its status is unchanged.
 
     Conditions of other types are kept, except for the types `only_while`. `now` is in seconds since 1970.
     """

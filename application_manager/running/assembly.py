@@ -97,7 +97,7 @@ class Assembly:
         def statuses_of(name: str, reconcile: Callable[[Name], Awaitable[None]]) -> WorkQueue[Name]:
             return queue(name, self._where_active(reconcile), _STATUS_WORKERS, _STATUS_SHARE)
 
-        # The work is created below, because it enqueues.
+        # The reconcilers are created below, because they need the queues.
         self._instances = instances
         self._statuses = statuses_of("instance status", self._reconcile_instance_status)
         self._tasks = statuses_of("task", self._reconcile_task)
@@ -146,7 +146,7 @@ class Assembly:
             task_changed=self._tasks.add,
             nodes=NodePoll(client),
             failed_pods=FailedPodsPoll(client),
-            again=self._statuses.add_at,
+            enqueue_at=self._statuses.add_at,
         )
         charts = ChartCache(options.helm, options.chart_cache, options.chart_folder)
         self.charts = ChartRenderer(options.helm, charts, instances.add_at)
@@ -159,7 +159,7 @@ class Assembly:
             applier=applier,
             recorder=self.recorder,
             scaler=WorkloadScaler(client, applier, self.router.observe),
-            again=instances.add_at,
+            enqueue_at=instances.add_at,
             enqueue=instances.add,
             done=self._statuses.add,
             absent=self._absent,
@@ -173,7 +173,7 @@ class Assembly:
             client=client,
             statuses=statuses,
             ttl=options.ttl_after_finished,
-            again=self._tasks.add_at,
+            enqueue_at=self._tasks.add_at,
             observe=self.router.observe,
             measures=measures,
             traces=self._traces,

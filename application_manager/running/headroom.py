@@ -93,7 +93,7 @@ def _resident_of(pid: str) -> int:
 
 
 def _return_free_memory() -> None:
-    """Make the allocator return free memory to the kernel: otherwise it keeps it, and it counts as used."""
+    """Return free memory to the kernel: memory that the allocator keeps counts as used."""
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc only
     if trim is not None:
         trim(0)

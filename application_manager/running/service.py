@@ -86,7 +86,7 @@ class Manager:
         self._work = work
         self._leadership = leadership
         client, options, resources, measures = work.client, work.options, work.resources, work.measures
-        # Always Pods: the pods of workloads show why these do not run.
+        # Pods are always included: they show why workloads do not run.
         children = [resources[kind] for kind in sorted({*options.policy.kinds, POD}) if kind in resources]
         self._resync = Resync(
             cache=work.cache,
@@ -156,7 +156,7 @@ class Manager:
     async def _first(self) -> None:
         """Determine whether we are active, then list everything, so that an active manager decides on newer lists."""
         await until_answered(self._leadership.refresh)
-        await self._resync.first()
+        await self._resync.list_all()
 
     def _not_ready(self, watching: asyncio.Event) -> str | None:
         if not watching.is_set() or not self._watch_health.begun("applicationtasks"):
@@ -197,7 +197,7 @@ class Manager:
         """Prepare to act. If others may have acted since the last list, everything is read from the cluster again."""
         if again:  # otherwise everything was listed after we acquired the Lease
             self._work.begin_term(self._resync.children)
-            await self._resync.first()
+            await self._resync.list_all()
             self._work.publish_all()
         self._work.cache.claims.begin()
 
@@ -216,8 +216,8 @@ class Manager:
         await watch(
             self._resync.children,
             observe=self._work.router.observe,
-            vanished=self._work.router.vanished,
-            relist=self._resync.again,
+            deleted=self._work.router.deleted,
+            relist=self._resync.relist,
             failed=self._work.measures.unhandled,
             connect=self._connection,
             namespaces=self._work.options.namespaces,

@@ -25,7 +25,7 @@ _PODS = Resource("v1", "Pod", "pods")
 
 @dataclass(frozen=True, slots=True)
 class DetectorWatch:
-    """Lists them in these namespaces, or in all if there are none; `detector` enqueues a Detector."""
+    """Lists in these namespaces, or in all if there are none; `detector` enqueues a Detector."""
 
     cache: ClusterCache
     client: Client
@@ -34,13 +34,13 @@ class DetectorWatch:
     detector: Callable[[Name], None]
 
     async def run(self) -> None:
-        """List them until cancelled, if the manager runs detectors."""
+        """List the objects until cancelled, if the manager runs detectors."""
         if self.index.defaults is None:
             await asyncio.Event().wait()
         await repeatedly(self.refresh, POLL_EVERY, "cannot list the objects of detectors")
 
     async def refresh(self) -> None:
-        """List them once. Raises ApiError or Unreachable."""
+        """List the objects once, and enqueue all Detectors. Raises ApiError or Unreachable."""
         objects: list[Object] = []
         for resource in _KINDS:
             objects += await self._list(resource, SELECTOR)

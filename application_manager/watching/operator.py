@@ -1,7 +1,7 @@
 """Registers the watches with kopf, and relays their events to the router directly, past kopf's queues.
 
-Only `on.event`, which neither adds finalizers nor writes to objects. kopf's own Events, peering and progress storage
-are off. The API server selects holders' Leases and instances' objects by their labels.
+It uses only `on.event` handlers, which neither add finalizers nor write to objects. kopf's own Events, peering and
+progress storage are off. The API server selects holders' Leases and instances' objects by their labels.
 
 kopf keeps a task, a queue and the object itself for each object with recent events. Handlers that only put objects into
 a cache need none of these, and they would take most of the time and memory. So kopf maintains the watches (connections,
@@ -30,7 +30,7 @@ from wayside.process.backoff import Backoff
 
 Handler = Callable[[Object], None]
 Relist = Callable[[Any, str | None, str], Awaitable[None]]
-"""Lists a resource of kopf's again: in a namespace, or in all for None, by a label selector.
+"""Lists one of kopf's resources: in a namespace, or in all for None, by a label selector.
 
 May raise ApiError or Unreachable.
 """
@@ -53,7 +53,7 @@ async def watch(
     children: Collection[Resource],
     *,
     observe: Handler,
-    vanished: Handler,
+    deleted: Handler,
     relist: Relist,
     failed: Callable[[], None],
     connect: Callable[[], Awaitable[kopf.ConnectionInfo]],
@@ -94,7 +94,7 @@ async def watch(
         settings.watching.label_selectors[resource.group, resource.version, resource.plural] = label
 
     identity: Any = "application-manager"  # otherwise kopf looks up the user's name, which may not exist
-    with supervising(health), relaying(observe, vanished, relist, failed):
+    with supervising(health), relaying(observe, deleted, relist, failed):
         await kopf.operator(
             registry=registry,
             settings=settings,
@@ -107,15 +107,15 @@ async def watch(
 
 
 @contextmanager
-def relaying(observe: Handler, vanished: Handler, relist: Relist, failed: Callable[[], None]) -> Iterator[None]:
+def relaying(observe: Handler, deleted: Handler, relist: Relist, failed: Callable[[], None]) -> Iterator[None]:
     """Relay the events of kopf's watches while the block runs.
 
-    `observe` and `vanished` handle an object, `failed` counts one that they could not handle, and `relist` lists a
+    `observe` and `deleted` handle an object, `failed` counts one that they could not handle, and `relist` lists a
     kind.
     """
     watch: Any = watching.watch_objs
     fetch = fetching.fetch_objs
-    handlers = {"ADDED": observe, "MODIFIED": observe, "DELETED": vanished}
+    handlers = {"ADDED": observe, "MODIFIED": observe, "DELETED": deleted}
 
     async def watch_objs(**about: Any) -> AsyncIterator[Any]:
         async for event in watch(**about):

@@ -38,7 +38,7 @@ class Resync:
     every: float
     measures: Measures
 
-    async def first(self) -> None:
+    async def list_all(self) -> None:
         """List everything, however long the API server takes to respond. Raises ApiError if it refuses permanently."""
         await until_answered(self._everything)
         self.measures.resynced(succeeded=True)
@@ -59,7 +59,7 @@ class Resync:
             self.cache.leases.forget_except(self.cache.claims.holders())
             await asyncio.sleep(max(0.0, self.every - (time.monotonic() - began)))
 
-    async def again(self, of_kopf: Any, namespace: str | None, labels: str) -> None:
+    async def relist(self, of_kopf: Any, namespace: str | None, labels: str) -> None:
         """List one of kopf's resources, in a namespace or (None) in all; route its objects and missed deletions.
 
         Raises RequestError.
@@ -84,4 +84,4 @@ class Resync:
                     self.router.observe(raw)
             kind = (resource.api_version, resource.kind)
             for entry in self.cache.store.missing(kind, present, version, namespace):
-                self.router.vanished(entry.raw)
+                self.router.deleted(entry.raw)

@@ -54,7 +54,7 @@ class Router:
     configuration: Enqueue
 
     def observe(self, raw: Object) -> None:
-        """Handle a raw object."""
+        """Put an object into the cache, and enqueue the objects that it concerns."""
         kind, name = kind_of(raw), name_of(raw)
         if kind == LEASE:
             self._lease(name, raw)
@@ -79,8 +79,8 @@ class Router:
         else:
             self._child(raw, old, entry)
 
-    def vanished(self, raw: Object) -> None:
-        """Handle the deletion of an object."""
+    def deleted(self, raw: Object) -> None:
+        """Remove a deleted object from the cache, and enqueue the objects that it concerns."""
         kind, name = kind_of(raw), name_of(raw)
         if kind == LEASE:
             self._lease(name, None)
@@ -102,7 +102,7 @@ class Router:
                 self.template((name[0], entry.model.spec.template_name))
         elif kind in _RULES:
             self._rules(name[0])
-        elif kind == POD and _is_a_workloads(raw):
+        elif kind == POD and _belongs_to_workload(raw):
             if self.cache.pods.forget(raw):
                 self._enqueue_owner(raw)
         else:
@@ -125,12 +125,12 @@ class Router:
                 self.rule((kind, name))
 
     def claimed(self, name: Name) -> None:
-        """The claim of a task may have changed."""
+        """Enqueue a task whose claim may have changed, and the instances that it concerns."""
         self._enqueue_all(self.cache.note_task(name))
         self.task(name)
 
     def claims_resolved(self, template: Name) -> None:
-        """All claims of a template's tasks are known now."""
+        """Enqueue the instances of a template: the claims of all its tasks are known now."""
         for name in self.cache.instances_of(template):
             self.instance(name)
 
@@ -163,7 +163,7 @@ class Router:
         if kind_of(raw) == POD:
             if self.cache.pods.note(raw):
                 self._enqueue_owner(entry.raw)
-            if _is_a_workloads(entry.raw):
+            if _belongs_to_workload(entry.raw):
                 return  # the status of a workload reports that its pods are ready
         self.applier.note(entry.raw)
         if old is None or self._significance(old) != self._significance(entry) or self.applier.has_drifted(entry.uid):
@@ -223,6 +223,6 @@ def _written(entry: Entry) -> tuple[object, ...]:
     return entry.raw["spec"], entry.problem, entry.raw["metadata"].get("labels")
 
 
-def _is_a_workloads(pod: Object) -> bool:
+def _belongs_to_workload(pod: Object) -> bool:
     """Whether the pod belongs to a workload, and is not an object of the instance itself."""
     return controller_of(pod).get("kind") not in (None, ApplicationInstance.__name__)

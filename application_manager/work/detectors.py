@@ -101,7 +101,7 @@ class DetectorWork:
     async def _ensure_rights(self, name: Name, detector: Detector, defaults: PodDefaults) -> ConditionState:
         """Give the service accounts of other pods the permissions of the detector that the webhook injects into them.
 
-        Also if the Detector is not accepted: a service account that it no longer lists has no permissions any more.
+        This applies even if the Detector is not accepted: a service account that it no longer lists loses them.
         """
         manifests = detector_objects(detector, defaults)
         kinds = {each["kind"] for each in manifests}
@@ -152,7 +152,7 @@ class DetectorWork:
         for kind in list(kinds):
             raw = self.index.owned(uid).get(kind)
             if raw is None:
-                continue  # it went while another one was deleted
+                continue  # it disappeared while another one was deleted
             await self.client.delete(_RESOURCES[kind], name[0], raw["metadata"]["name"], raw["metadata"]["uid"])
             self.index.objects.drop(uid, kind)
             self._applied.pop(raw["metadata"]["uid"], None)

@@ -103,9 +103,9 @@ class InstanceWork:
     """Reconciles instances.
 
     Attributes:
-        again: enqueues an instance at a time, in seconds since 1970.
+        enqueue_at: enqueues an instance at a time, in seconds since 1970.
         done: called when there is a new record of an instance.
-        absent: called with the decision about an instance that neither exists nor is to exist.
+        absent: called with the decision about an instance that neither exists nor is to be created.
         configured: called when an instance's configuration was applied.
         objects: the objects of an instance, or why it has none; None: they are being computed, and the instance is
             enqueued once they are.
@@ -117,7 +117,7 @@ class InstanceWork:
     applier: Applier
     recorder: Recorder
     scaler: WorkloadScaler
-    again: Callable[[Name, float], None]
+    enqueue_at: Callable[[Name, float], None]
     enqueue: Callable[[Name], None]
     done: Callable[[Name], None]
     absent: Callable[[Name, Decision | None], None]
@@ -152,7 +152,7 @@ class InstanceWork:
         # There is no await from the decision to the first request, so the decision matches the cache.
         instance = self.cache.instance(name)
         if decision is not None and decision.next_change is not None:
-            self.again(name, decision.next_change)
+            self.enqueue_at(name, decision.next_change)
         if decision is None or (instance is None and not decision.demanded):
             self.cache.records.pop(name, None)
             self.attempts.forget(name)
@@ -231,7 +231,7 @@ class InstanceWork:
             self._note(start, instance, ApplyResult(was_applied, references(last.objects), True), last.digest)
             return
         if until is not None and start.record is not None:
-            self.again(name, until)
+            self.enqueue_at(name, until)
             self._note(start, instance, start.record.applied, start.record.digest)
             return
         if start.existing is not None:
@@ -254,9 +254,9 @@ class InstanceWork:
         if applied.complete:
             self.attempts.forget(name)
         elif applied.state.reason == "Waiting":
-            self.again(name, time.time() + _RECHECK_AFTER)
+            self.enqueue_at(name, time.time() + _RECHECK_AFTER)
         else:
-            self.again(name, self.attempts.note_refusal(name, trying, time.time()))
+            self.enqueue_at(name, self.attempts.note_refusal(name, trying, time.time()))
 
     async def _read_after_failed_create(self, name: Name) -> None:
         """Read the instance after a failed attempt to create it, which may have succeeded."""
@@ -327,7 +327,7 @@ class InstanceWork:
         if instance is None:
             return False
         if self.cache.claims.pending((name[0], instance.spec.template_name)):
-            self.again(name, time.time() + _RECHECK_AFTER)  # one of the listed tasks may demand it
+            self.enqueue_at(name, time.time() + _RECHECK_AFTER)  # one of the listed tasks may demand it
             return False
         await self.client.delete(INSTANCES, name[0], name[1], instance.metadata.uid)
         why = over.yields or "no demand arrived within its linger"

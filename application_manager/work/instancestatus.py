@@ -33,14 +33,17 @@ from wayside.kubernetes.resources import Object
 
 _TROUBLES_SHOWN = 3
 _FIRST_STATUS_DELAY = 2.0  # s
-_AGAIN = 5.0  # s until nodes and Events are read again for objects that are not ready because of them
+_RECHECK_AFTER = 5.0  # s until nodes and Events are read again for objects that are not ready because of them
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class InstanceStatusWork:
-    """Writes statuses of instances; `again` enqueues one at a time, in seconds since 1970, `task_changed` a task."""
+    """Writes statuses of instances.
+
+    `enqueue_at` enqueues an instance at a time, in seconds since 1970; `task_changed` enqueues a task.
+    """
 
     cache: ClusterCache
     statuses: StatusWriter
@@ -48,7 +51,7 @@ class InstanceStatusWork:
     task_changed: Callable[[Name], None]
     nodes: NodePoll
     failed_pods: FailedPodsPoll
-    again: Callable[[Name, float], None]
+    enqueue_at: Callable[[Name, float], None]
 
     async def reconcile(self, name: Name) -> None:
         """Write the instance's status if it differs. Raises RequestError for a temporary error."""
@@ -79,7 +82,7 @@ class InstanceStatusWork:
             suspended,
         )
         if until > now and instance.status != new:
-            self.again(name, until)
+            self.enqueue_at(name, until)
         elif not await self.statuses.write(INSTANCES, instance, instance.status, new, now):
             return
         elif old.release_time is None and new.release_time is not None:
@@ -144,7 +147,7 @@ class InstanceStatusWork:
         live = [each for each in self._live(instance, applied).values() if each is not None and not_ready(each)]
         found = [*await self._misfits(live), *await self._refused(live)]
         if found or any(lacks_pods(each) for each in live):
-            self.again((instance.namespace, instance.name), time.time() + _AGAIN)
+            self.enqueue_at((instance.namespace, instance.name), time.time() + _RECHECK_AFTER)
         return found
 
     async def _misfits(self, live: Sequence[Object]) -> list[Trouble]:

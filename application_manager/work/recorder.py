@@ -42,7 +42,7 @@ BURST = 10
 """The maximum number of Events about one object at once."""
 
 REFILL = 60.0
-"""Seconds until one more is allowed: an object that changes all the time has an Event a minute."""
+"""Seconds until one more is allowed: an object that changes constantly has one Event a minute."""
 
 _KEPT_BUCKETS = 10_000  # objects to remember; the one with the oldest Event is forgotten, and its limit starts again
 _REPORT_EVERY = 60.0  # s between two log lines about dropped Events
@@ -189,10 +189,10 @@ class Recorder:
         self._series: OrderedDict[tuple[str, str, str], _Series] = OrderedDict()
 
     def event(self, regarding: Kind, reason: EventReason, note: str, now: float, *, once: bool = False) -> None:
-        """Post an Event about the object, at `now` in seconds since 1970, unless it has too many.
+        """Post an Event about the object, at `now` in seconds since 1970, unless the object exceeds its rate limit.
 
-        `once`: not if the same one exists already, also of an earlier run: for Events that do not follow from a change
-        of a status.
+        `once`: do not post it if the same Event exists, even from an earlier run; for Events that do not follow from
+        a change of a status.
         """
         event = _Event(regarding, reason, note, now, once)
         if self._count_repetition(event):
@@ -219,11 +219,11 @@ class Recorder:
         return event.now - known.written < _REFRESHED and known.count > 2
 
     def transitions(self, regarding: Kind, old: Sequence[Condition], new: Sequence[Condition], now: float) -> None:
-        """Post an Event for each condition that changed, if it deserves one.
+        """Post an Event for each relevant change of a condition.
 
-        Not for a condition that is False as expected at the start, and not for one that follows from another: Stalled,
-        Ready of an object that is not applied or not accepted, Applied of an object that is immediately ready. Nor for
-        a task that was accepted immediately: its status shows that, and its later conditions have their own Events.
+        A condition has no Event if it is False as expected at the start, or if it follows from another one: Stalled,
+        Ready of an object that is not applied or not accepted, Applied of an object that is immediately ready. A task
+        that was accepted immediately has none either: its status shows that, and its later conditions have Events.
         """
         known = {each.type for each in old}
         was_true = {each.type for each in old if each.status == "True"}

@@ -26,7 +26,7 @@ from application_manager.workers.process import Job
 from wayside.api import ApplicationInstance, ApplicationTemplate
 
 _PICKLED = 64  # templates to keep as bytes
-_JUDGED = 1024  # templates for which the result is kept whether they only read fields
+_JUDGED = 1024  # templates whose result of `objects_are_plain` is kept
 
 Value = TypeVar("Value")
 _OfTemplates = OrderedDict[tuple[str, int], Value]  # by uid and generation
@@ -40,14 +40,14 @@ class Renderings:
         cache: ClusterCache,
         answers: AnswerCache,
         charts: Charts,
-        again: Callable[[Name], None],
+        enqueue: Callable[[Name], None],
         template_changed: Callable[[Name], None],
     ) -> None:
-        """`again` enqueues an instance, `template_changed` a template that now exceeds the limits, or no more."""
+        """`enqueue` enqueues an instance, `template_changed` one that now exceeds the limits, or no longer does."""
         self._cache = cache
         self._answers = answers
         self._charts = charts
-        self._again = again
+        self._enqueue = enqueue
         self._template_changed = template_changed
         self._pickled: _OfTemplates[bytes] = OrderedDict()
         self._plain: _OfTemplates[bool] = OrderedDict()
@@ -101,7 +101,7 @@ class Renderings:
             question=(metadata.uid, metadata.generation, desired.spec, chart),
             namespace=desired.namespace,
             job=job,
-            done=partial(self._again, name),
+            done=partial(self._enqueue, name),
         )
 
     def _note(self, name: Name, template: Name, found: object | None) -> None:

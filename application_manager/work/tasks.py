@@ -41,20 +41,20 @@ log = logging.getLogger(__name__)
 class TaskWork:
     """Writes the statuses of tasks, deletes them `ttl` seconds after they have finished, and measures their times.
 
-    `again` enqueues a task at a time, in seconds since 1970.
+    `enqueue_at` enqueues a task at a time, in seconds since 1970.
     """
 
     cache: ClusterCache
     client: Client
     statuses: StatusWriter
     ttl: float
-    again: Callable[[Name, float], None]
+    enqueue_at: Callable[[Name, float], None]
     observe: Callable[[Object], None]
     measures: Measures
     traces: TaskTraces | None = None
 
     async def reconcile(self, name: Name) -> None:
-        """Write the task's status if it differs; delete the task when its time has come.
+        """Write the task's status if it differs; delete a task that has been finished for `ttl` seconds.
 
         Raises RequestError for a temporary error.
         """
@@ -151,7 +151,7 @@ class TaskWork:
         if since is None:
             return
         if time.time() < since + self.ttl:
-            self.again(name, since + self.ttl)
+            self.enqueue_at(name, since + self.ttl)
             return
         await self.client.delete(TASKS, name[0], name[1], task.metadata.uid)
         log.info("task %s/%s: deleted %g s after it finished", *name, self.ttl)

@@ -87,12 +87,12 @@ class RuleWork:
 
 @dataclass(frozen=True, slots=True)
 class TemplateWork:
-    """Writes the statuses of templates; `again` enqueues one at a time, in seconds since 1970."""
+    """Writes the statuses of templates; `enqueue_at` enqueues one at a time, in seconds since 1970."""
 
     cache: ClusterCache
     statuses: StatusWriter
     pool: Runs
-    again: Callable[[Name, float], None]
+    enqueue_at: Callable[[Name, float], None]
 
     async def reconcile(self, name: Name) -> None:
         """Write the template's status if it differs. Raises RequestError for a temporary error."""
@@ -105,7 +105,7 @@ class TemplateWork:
         role, until = self.cache.overlap.role(name, now)
         self.cache.overlap.take(name[0], role, until)
         if role is not NamespaceRole.ACT:
-            self.again(name, until)
+            self.enqueue_at(name, until)
             if role is NamespaceRole.CHALLENGE and own is not None:
                 await self._challenge(regarding, own, now)
             return

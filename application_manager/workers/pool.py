@@ -1,4 +1,4 @@
-"""At most two worker processes, shared by all namespaces: the one that used the least CPU time comes first.
+"""At most two worker processes, shared by all namespaces: that with the least recent CPU time has precedence.
 
 A namespace uses at most one of the two, so a template whose expressions take long delays others of its namespace and
 leaves the second process to the other namespaces. A process starts when there is work for it, and one that was ended

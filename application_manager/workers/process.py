@@ -1,8 +1,8 @@
 """The process that runs users' expressions: one job after the other, each within its limit of CPU time.
 
-CEL runs in C++ and holds the interpreter's lock meanwhile, so neither a thread nor an exception could end it. The
-kernel can: a timer of the process's own CPU time (ITIMER_PROF) ends it by SIGPROF when a job takes longer. The manager
-recognises the signal, and starts another process. The limit is CPU time, so a busy machine makes no job fail.
+CEL runs in C++ and holds the global interpreter lock, so neither a thread nor an exception can end an evaluation. The
+kernel can: a timer of the process's own CPU time (ITIMER_PROF) sends SIGPROF when a job exceeds its limit. The manager
+recognises the signal, and starts another process. The limit is CPU time, so no job fails because the machine is busy.
 
 Frames are a length and a pickle, on standard input and output. The process ends when its input does.
 """

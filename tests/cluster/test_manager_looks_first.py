@@ -47,7 +47,7 @@ def work_on(cache: ClusterCache, client: Client) -> tuple[Router, InstanceWork]:
         applier=applier,
         recorder=Recorder(client),
         scaler=WorkloadScaler(client, applier, router.observe),
-        again=ignore,
+        enqueue_at=ignore,
         enqueue=ignore,
         done=ignore,
         absent=absent,

@@ -1,8 +1,8 @@
 """The pace of requests: a maximum in flight, few writes per namespace, and none while the API server requests a pause.
 
 Namespaces take turns, and each has only as many writes in flight as the API server processes without queueing them. So
-many writes in one namespace leave the others both places in this queue and time of the API server. docs/decisions/0029
-has the measurements.
+a flood of writes in one namespace takes neither places in this queue nor capacity of the API server from the others.
+docs/decisions/0029 has the measurements.
 
 The timeout of a request starts only after it has waited here. The number of workers bounds the number of waiting
 requests: each worker sends the requests of one instance.
@@ -108,7 +108,7 @@ class Pacing:
         """`share` limits the writes in one namespace; None: no limit."""
         self._at_once = at_once
         self._share = share
-        self._under_way = 0
+        self._in_flight = 0
         self._writing: Counter[str] = Counter()  # writes by namespace
         self._waiting: FairQueue[tuple[str, asyncio.Future[None]]] = FairQueue()
         self._held_until = 0.0  # on the monotonic clock
@@ -128,7 +128,7 @@ class Pacing:
 
         `writes_in`: the namespace of a write; empty for a read, and for a write outside of namespaces.
         """
-        await self._place(writes_in)
+        await self._acquire(writes_in)
         try:
             while (left := self.held) > 0:  # noqa: ASYNC110  the hold may be extended meanwhile
                 await asyncio.sleep(left)
@@ -138,31 +138,31 @@ class Pacing:
                 now = time.monotonic()
                 self._share.note(now - began, now)
         finally:
-            self._leave(writes_in)
+            self._release(writes_in)
 
-    async def _place(self, namespace: str) -> None:
+    async def _acquire(self, namespace: str) -> None:
         place: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._waiting.add(namespace, (namespace, place))
         self._admit()
         try:
             await place
         except asyncio.CancelledError:
-            if not place.cancelled():  # it had one by then
-                self._leave(namespace)
+            if not place.cancelled():  # it already had a place
+                self._release(namespace)
             raise
 
-    def _leave(self, namespace: str) -> None:
-        self._under_way -= 1
+    def _release(self, namespace: str) -> None:
+        self._in_flight -= 1
         self._writing[namespace] -= 1
         if not self._writing[namespace]:
             del self._writing[namespace]
         self._admit()
 
     def _admit(self) -> None:
-        while self._under_way < self._at_once and (found := self._waiting.next(self._may)) is not None:
+        while self._in_flight < self._at_once and (found := self._waiting.next(self._may)) is not None:
             namespace, place = found
             if not place.done():  # else its request was cancelled
-                self._under_way += 1
+                self._in_flight += 1
                 self._writing[namespace] += 1
                 place.set_result(None)
 

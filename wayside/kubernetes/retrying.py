@@ -45,11 +45,11 @@ async def until_answered(request: Callable[[], Awaitable[Answer]], pause: float 
     return answer
 
 
-async def repeatedly(look: Callable[[], Awaitable[object]], every: float, problem: str) -> None:
-    """Call `look` periodically, until cancelled. Each reason of failure is logged once.
+async def repeatedly(attempt: Callable[[], Awaitable[object]], every: float, problem: str) -> None:
+    """Call `attempt` periodically, until cancelled. Each reason of failure is logged once.
 
     Args:
-        look: one attempt.
+        attempt: one attempt.
         every: seconds between two calls, unless the API server requests more.
         problem: the problem, for the log; empty if failures are reported elsewhere.
     """
@@ -59,7 +59,7 @@ async def repeatedly(look: Callable[[], Awaitable[object]], every: float, proble
         """Call it once; the seconds until the next call."""
         nonlocal reported
         try:
-            await look()
+            await attempt()
         except _FAILURES as error:
             if problem and str(error) != reported:
                 log.warning("%s: %s", problem, error)

@@ -27,9 +27,9 @@ Key = TypeVar("Key", bound=Hashable)
 
 FIRST_PAUSE = 0.2  # s, doubled with every failure of the key
 LONGEST_PAUSE = 10.0  # s
-_TURN = 0.05  # s until it is looked again whether the queue before this one has keys of a namespace
-_YIELDING = 0.25  # s that a worker waits for the keys of a namespace in the queue before this one
-_SHORTEST_DELAY = 0.1  # s, so that a time that is nearly there does not spin
+_TURN = 0.05  # s between two checks whether the queue with precedence has keys of a namespace
+_YIELDING = 0.25  # s that a worker waits for the keys of a namespace in the queue with precedence
+_SHORTEST_DELAY = 0.1  # s, so that a time that is almost reached causes no busy loop
 
 log = logging.getLogger(__name__)
 
@@ -74,10 +74,10 @@ class WorkQueue(Generic[Key]):
         self._concurrency = concurrency
         self._share = share
         self._waiting: FairQueue[Key] = FairQueue()
-        self._at_work: Counter[str] = Counter()  # keys by namespace
+        self._busy_workers: Counter[str] = Counter()  # keys by namespace
         self._queued: set[Key] = set()
-        self._running: dict[Key, float] = {}  # and since when, on the monotonic clock
-        self._again: set[Key] = set()
+        self._processing: dict[Key, float] = {}  # and since when, on the monotonic clock
+        self._dirty: set[Key] = set()
         self._failures: Counter[Key] = Counter()
         self._timers: dict[Key, asyncio.TimerHandle] = {}
         self._wake = asyncio.Event()
@@ -92,7 +92,7 @@ class WorkQueue(Generic[Key]):
 
     def __len__(self) -> int:
         """The number of keys that wait for a worker or are being processed."""
-        return len(self._queued) + len(self._running)
+        return len(self._queued) + len(self._processing)
 
     async def idle(self) -> None:
         """Wait until no key waits for a worker or is being processed; keys that wait for their time do not count."""
@@ -101,15 +101,15 @@ class WorkQueue(Generic[Key]):
     def stuck(self, limit: float) -> str | None:
         """A text about a key whose processing takes longer than `limit` seconds; None if there is none. Thread-safe."""
         now = time.monotonic()
-        for key, began in list(self._running.items()):
+        for key, began in list(self._processing.items()):
             if now - began > limit:
                 return f"{self.name} {_text(key)} has been in progress for {now - began:.0f} s"
         return None
 
     def add(self, key: Key) -> None:
         """Enqueue the key."""
-        if key in self._running:
-            self._again.add(key)
+        if key in self._processing:
+            self._dirty.add(key)
         elif key not in self._queued:
             self._queued.add(key)
             self._waiting.add(_namespace(key), key)
@@ -155,25 +155,25 @@ class WorkQueue(Generic[Key]):
             if key is None:
                 return
             self._queued.discard(key)
-            self._running[key] = time.monotonic()
+            self._processing[key] = time.monotonic()
             namespace = _namespace(key)
-            self._at_work[namespace] += 1
+            self._busy_workers[namespace] += 1
             try:
                 await self._once(key)
             finally:
                 self._leave(key, namespace)
-            _heed_cancellation()
+            _raise_lost_cancellation()
 
     def _leave(self, key: Key, namespace: str) -> None:
         """Note that the key is no longer being processed."""
-        del self._running[key]
-        self._at_work[namespace] -= 1
-        if not self._at_work[namespace]:
-            del self._at_work[namespace]
+        del self._processing[key]
+        self._busy_workers[namespace] -= 1
+        if not self._busy_workers[namespace]:
+            del self._busy_workers[namespace]
         if self._share is not None:
             self._wake.set()  # another worker may have let this namespace wait
-        if key in self._again:
-            self._again.discard(key)
+        if key in self._dirty:
+            self._dirty.discard(key)
             self.add(key)
         if not len(self):
             self._idle.set()
@@ -197,7 +197,7 @@ class WorkQueue(Generic[Key]):
 
     def _may(self, namespace: str) -> bool:
         """Whether the namespace has fewer workers than its share."""
-        return self._share is None or self._at_work[namespace] < self._share
+        return self._share is None or self._busy_workers[namespace] < self._share
 
     def _yields(self, namespace: str) -> bool:
         """Whether keys of the namespace wait in the queue with precedence."""
@@ -228,7 +228,7 @@ class WorkQueue(Generic[Key]):
         return max(at_least or 0.0, pause_after(self._failures[key], FIRST_PAUSE, LONGEST_PAUSE))
 
 
-def _heed_cancellation() -> None:
+def _raise_lost_cancellation() -> None:
     """Raise a cancellation that was lost: `gather` raises an error of one of its parts instead."""
     task = asyncio.current_task()
     if task is not None and task.cancelling():

@@ -91,14 +91,14 @@ def table_console(*, stderr: bool = False) -> Console:
     return found if found.is_terminal else Console(stderr=stderr, width=_WIDTH)
 
 
-def log_as(wanted: LogFormat) -> None:
+def log_as(log_format: LogFormat) -> None:
     """Write log lines in this format from now on.
 
     JSON: one object per line with `time`, `level`, `logger` and `message`.
 
     The object also contains an exception, as `exc_info`, so that a log collector receives it as one record.
     """
-    if wanted is LogFormat.TEXT:
+    if log_format is LogFormat.TEXT:
         return
     from pythonjsonlogger.json import JsonFormatter  # noqa: PLC0415  only long-running programs use it
 

@@ -29,15 +29,15 @@ class _Ids(IdGenerator):
 
     def __init__(self) -> None:
         self._random = RandomIdGenerator()
-        self.wanted = threading.local()
+        self.next_context = threading.local()
 
     def generate_trace_id(self) -> int:
-        wanted: TraceContext | None = getattr(self.wanted, "context", None)
-        return self._random.generate_trace_id() if wanted is None else wanted.trace_id
+        context: TraceContext | None = getattr(self.next_context, "value", None)
+        return self._random.generate_trace_id() if context is None else context.trace_id
 
     def generate_span_id(self) -> int:
-        wanted: TraceContext | None = getattr(self.wanted, "context", None)
-        return self._random.generate_span_id() if wanted is None else wanted.span_id
+        context: TraceContext | None = getattr(self.next_context, "value", None)
+        return self._random.generate_span_id() if context is None else context.span_id
 
     def is_trace_id_random(self) -> bool:
         return False
@@ -132,7 +132,7 @@ class Tracing:
     def emit(self, span: Span) -> TraceContext:
         """Queue a span, without waiting. Returns its position in the trace."""
         parent = None if span.parent is None else trace.set_span_in_context(_remote(span.parent))
-        self._ids.wanted.context = span.context
+        self._ids.next_context.value = span.context
         try:
             made = self._tracer.start_span(
                 span.name,
@@ -142,7 +142,7 @@ class Tracing:
                 start_time=span.start,
             )
         finally:
-            self._ids.wanted.context = None
+            self._ids.next_context.value = None
         if span.error is not None:
             made.set_status(trace.Status(trace.StatusCode.ERROR, span.error))
         made.end(max(span.start, span.end))

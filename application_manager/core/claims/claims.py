@@ -49,7 +49,7 @@ class Claim:
     """A task's demand on one instance, or on all of a template.
 
     Attributes:
-        instance: its name, or what `all_instances` gives for the template.
+        instance: its name, or the result of `all_instances` for the template.
         parameters: the task's own parameters; of a Reconfigure or Suspend task without those of the key.
         instead_of: the instance that is not ready, if this claim is for its fallback.
         fallback: in this case, the fallback template.
@@ -82,11 +82,11 @@ class InvalidTemplate:
 
 
 TemplateState = ApplicationTemplate | InvalidTemplate | None
-"""Returns a template by name, or None."""
+"""A template, valid or not; None if it does not exist."""
 
 
 def claim(template: TemplateState, task: ApplicationTask) -> Claim | Refusal:
-    """The claim of the task on its template; None if the template does not exist."""
+    """The claim of the task on its template, or why it is refused; `template` is None if it does not exist."""
     if isinstance(template, InvalidTemplate):
         message = f"spec.templateName: ApplicationTemplate {template.name} is not valid: {template.problem}"
         return Refusal(RefusalReason.TEMPLATE_INVALID, f"{message}; correct the template")
@@ -101,16 +101,18 @@ def claim(template: TemplateState, task: ApplicationTask) -> Claim | Refusal:
     problems = parameters.problems(declared, task.spec.parameters, template.name, "spec.parameters", whole=deploys)
     if problems:
         return Refusal(RefusalReason.INVALID_PARAMETERS, "; ".join(problems))
-    given = parameters.given(task.spec.parameters)
+    given = parameters.without_nulls(task.spec.parameters)
     if not deploys:
-        return _on_what_runs(template, task, given)
+        return _claim_on_existing(template, task, given)
     if template.spec.key is None:
         return Claim(task, template.name, None, given)
     key = _key_or_refusal(template, given)
     return key if isinstance(key, Refusal) else Claim(task, instance_name(template.name, key), key, given)
 
 
-def _on_what_runs(template: ApplicationTemplate, task: ApplicationTask, given: Mapping[str, Any]) -> Claim | Refusal:
+def _claim_on_existing(
+    template: ApplicationTemplate, task: ApplicationTask, given: Mapping[str, Any]
+) -> Claim | Refusal:
     """The claim of a task that reconfigures or suspends: on the instance of its key, or on all."""
     declared, operation = template.spec.parameters, task.spec.operation
     try:

@@ -161,7 +161,7 @@ TOO_LARGE = "ParametersTooLarge"
 """Reason of the condition Applied of an instance whose merged parameters are too large."""
 
 MAXIMUM_MERGED_BYTES = 8 * freedata.MAXIMUM_BYTES
-"""Bytes of all merged parameters together, as JSON: an object of the API server holds some 1.5 MB in all."""
+"""Bytes of all merged parameters together, as JSON: an object of the API server has at most about 1.5 MB."""
 
 _SHOWN = 3  # tasks to name
 

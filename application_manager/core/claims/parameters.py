@@ -24,7 +24,7 @@ Parameters = Mapping[str, Any]
 """Parameter names to JSON values."""
 
 
-def given(parameters: Parameters) -> dict[str, Any]:
+def without_nulls(parameters: Parameters) -> dict[str, Any]:
     """The given parameters: null means absent."""
     return {name: values.normal(value) for name, value in parameters.items() if value is not None}
 
@@ -32,7 +32,7 @@ def given(parameters: Parameters) -> dict[str, Any]:
 def with_defaults(declared: Mapping[str, Parameter], parameters: Parameters) -> dict[str, Any]:
     """The parameters, completed by the defaults of the absent ones, in the order of their names."""
     defaults = {name: values.normal(each.default) for name, each in declared.items() if each.default is not None}
-    return dict(sorted((defaults | given(parameters)).items()))
+    return dict(sorted((defaults | without_nulls(parameters)).items()))
 
 
 def size_problem(parameters: Parameters, where: str) -> str:
@@ -57,7 +57,7 @@ def problems(
     if too_large:
         return [too_large]
     found = []
-    present = given(parameters)
+    present = without_nulls(parameters)
     for name, value in present.items():
         parameter = declared.get(name)
         if parameter is None:
@@ -102,7 +102,7 @@ def baseline(template: ApplicationTemplate) -> dict[str, Any] | None:
     spec = template.spec
     if spec.baseline is None or _baseline_problems(template):
         return None
-    return given(spec.baseline.parameters)
+    return without_nulls(spec.baseline.parameters)
 
 
 def _baseline_problems(template: ApplicationTemplate) -> list[str]:

@@ -1,8 +1,8 @@
 """Fallbacks of instances that do not become ready: `lifecycle.readyTimeout` and `fallback`. Pure.
 
 An instance is overdue once it has not been ready for `readyTimeout` without interruption, and until it has been ready
-for as long without interruption. Conditions of its status show both with their times of transition, so a restart of the
-manager changes nothing, and an instance that is ready only now and then does not flap.
+for as long without interruption. Conditions of its status record both with their transition times, so a restart of the
+manager changes nothing, and an instance that is ready only intermittently causes no flapping.
 
 While it is overdue, its tasks also claim an instance of the fallback template, with those of their parameters that it
 declares. The overdue instance stays, and retries. A fallback instance has no further fallback for these tasks.

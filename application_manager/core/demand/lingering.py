@@ -1,4 +1,4 @@
-"""How long an instance exists: its linger, its minUptime, and the annotations of people. Pure.
+"""The lifetime of an instance: its linger, its minUptime, and the annotations of people. Pure.
 
 An annotation counts if it is present, whatever its value, which may name its author and the reason; only the value
 `false` counts as absent. Both annotations have a condition in the instance's status, which is False after the

@@ -32,7 +32,7 @@ class PlaceCandidate:
         rank: of its demand; None without demand.
         exists: whether it exists, or is being created.
         leaving: whether it is being deleted: it still counts, but not as running already.
-        kept: whether it stays whatever the limit: a person holds or pauses it, or it waits for its template.
+        kept: whether it stays regardless of the limit: a person holds or pauses it, or it waits for its template.
         protected_until: the end of its minUptime, in seconds since 1970.
         deadline: the end of its linger, in seconds since 1970.
         ran: whether it served its demand before.

@@ -54,7 +54,7 @@ class Request:
         kind: of the object; empty if that is not reviewed.
         object: as it would be stored; empty for a deletion.
         old: as it is stored; None for a new one.
-        weight: the effect of problems.
+        effect: the effect of problems.
     """
 
     uid: str
@@ -62,7 +62,7 @@ class Request:
     namespace: str
     object: Json
     old: Json | None
-    weight: ReviewEffect
+    effect: ReviewEffect
 
 
 def request_in(review: Any) -> Json:
@@ -88,11 +88,11 @@ def read(review: Any) -> Request:
         new |= {"apiVersion": API_VERSION, "kind": name}
         named = {"name": raw.get("name") or "unnamed", **_metadata(new), "namespace": namespace}
         new["metadata"] = named
-    weight = _weight(raw, new, old) if ours else ReviewEffect.NONE
-    return Request(raw["uid"], name, namespace, new, old, weight)
+    effect = _effect(raw, new, old) if ours else ReviewEffect.NONE
+    return Request(raw["uid"], name, namespace, new, old, effect)
 
 
-def _weight(raw: Mapping[str, Any], new: Json, old: Json | None) -> ReviewEffect:
+def _effect(raw: Mapping[str, Any], new: Json, old: Json | None) -> ReviewEffect:
     operation = raw.get("operation")
     if operation not in ("CREATE", "UPDATE") or raw.get("subResource") or not new:
         return ReviewEffect.NONE
@@ -106,9 +106,9 @@ def _weight(raw: Mapping[str, Any], new: Json, old: Json | None) -> ReviewEffect
 
 def answer(request: Request, findings: Findings) -> Json:
     """The AdmissionReview of the response."""
-    if request.weight is ReviewEffect.NONE:
+    if request.effect is ReviewEffect.NONE:
         findings = Findings()
-    refused = request.weight is ReviewEffect.REFUSED and bool(findings.problems)
+    refused = request.effect is ReviewEffect.REFUSED and bool(findings.problems)
     response: Json = {"uid": request.uid, "allowed": not refused}
     warnings = findings.warnings(_ignored(request.object))
     if not refused:

@@ -66,7 +66,7 @@ def rule_findings(
     for detector in selected_by:
         beside = [each for each in others if each.name != rule.name and selects(detector, each)]
         known = dependency_problems([rule, *beside]).get(rule.name, ())
-        passing |= {each for each in known if _names_what_is_not_there(each, rule, beside)}
+        passing |= {each for each in known if _names_missing_rule(each, rule, beside)}
         for problem in dict.fromkeys(_compiled(rule, detector, known)):
             having.setdefault(problem, []).append(detector.name)
     own = {each for each in having if each.detector is None and each not in passing}
@@ -129,7 +129,7 @@ def _compiled(rule: EventRule, detector: Detector, known: Sequence[RuleProblem])
     return ()
 
 
-def _names_what_is_not_there(problem: RuleProblem, rule: EventRule, beside: Sequence[EventRule]) -> bool:
+def _names_missing_rule(problem: RuleProblem, rule: EventRule, beside: Sequence[EventRule]) -> bool:
     """Whether the problem is a signal whose rule does not exist; otherwise it is a cycle."""
     match problem.path:
         case ("spec", "signals", int(index), "ruleName"):

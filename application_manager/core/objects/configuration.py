@@ -23,7 +23,7 @@ from wayside.expressions import CompiledTemplate, Embedded, Environment, Interpo
 from wayside.manifests import to_yaml
 
 CONFIG_MAP = ("v1", "ConfigMap")
-MAXIMUM_BYTES = 1_000_000  # of all files; the API server takes 1 MiB a ConfigMap, and etcd 1.5 MiB with all around it
+MAXIMUM_BYTES = 1_000_000  # of all files; the API server accepts 1 MiB per ConfigMap, and etcd 1.5 MiB per object
 
 ANNOTATION = "wayside.dev/configuration"
 """On a pod: the `fingerprint` of the configuration that was last announced to it."""

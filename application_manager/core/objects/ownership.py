@@ -87,7 +87,7 @@ def instance_of(live: Mapping[str, Any]) -> tuple[str, str] | None:
 
 
 def foreign(live: Mapping[str, Any], owner: Kind, what: str, recorded: str | None = None) -> ApplyProblem | None:
-    """Why the object may not be applied over, or None if it belongs to the owner.
+    """Why the owner may not overwrite the object, or None if it belongs to the owner.
 
     `what`: the object's kind and name; `recorded`: its uid, if the owner's status lists it.
     """

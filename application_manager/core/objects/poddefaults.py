@@ -36,19 +36,19 @@ class PodDefaults:
     metrics_secret: str | None = None
 
 
-def parse_user(given: str) -> int | None:
+def parse_user(text: str) -> int | None:
     """Parse a user ID, or `cluster` as None. Raises ValueError for anything else, and for root."""
-    if given == "cluster":
+    if text == "cluster":
         return None
-    if not given.isdigit() or int(given) == 0:
-        raise ValueError(f"must be a user ID other than 0, or `cluster` to let the cluster choose; got {given!r}")
-    return int(given)
+    if not text.isdigit() or int(text) == 0:
+        raise ValueError(f"must be a user ID other than 0, or `cluster` to let the cluster choose; got {text!r}")
+    return int(text)
 
 
-def parse_environment(given: Iterable[str]) -> dict[str, str]:
+def parse_environment(pairs: Iterable[str]) -> dict[str, str]:
     """Parse a list of NAME=VALUE. Raises ValueError."""
     found = {}
-    for each in given:
+    for each in pairs:
         name, equals, value = each.partition("=")
         if not equals or _VARIABLE.fullmatch(name) is None:
             raise ValueError(f"must be NAME=VALUE, with a name of letters, digits and _; got {each!r}")

@@ -72,7 +72,10 @@ class NamedAccount:
 
 
 def pods_and_accounts(manifest: dict[str, Any]) -> Iterator[PodSpec | NamedAccount]:
-    """All of them, each with its field; metadata, and the texts of ConfigMaps and Secrets, are ignored."""
+    """The pod specs and service accounts, each with its field.
+
+    Metadata, and the texts of ConfigMaps and Secrets, are ignored.
+    """
     kind = str(manifest.get("kind"))
     path = POD_TEMPLATES.get(kind)
     known = "" if path is None else ".".join((*path, "spec"))

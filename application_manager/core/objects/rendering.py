@@ -1,7 +1,7 @@
 """Rendering: a template and an instance give manifests; equal input gives equal bytes. Pure.
 
-A `Renderer` contains a template that is compiled once; `render` evaluates it for an instance. Anything that the
-template may not do is reported with the field, the value and the remedy; then nothing is rendered at all.
+A `Renderer` contains a template that is compiled once; `render` evaluates it for an instance. If the template violates
+a rule, the error names the field, the value and the remedy, and nothing is rendered.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class RenderError(Exception):
         self.reason = reason
 
 
-class ChartPending(Exception):  # noqa: N818  no error: the answer is still to come
+class ChartPending(Exception):  # noqa: N818  not an error: the result is pending
     """The instance's chart is being rendered; render again once it is."""
 
     def __init__(self, request: ChartRequest) -> None:

@@ -18,8 +18,8 @@ from wayside.kubernetes.leases import lease_name
 _GROUP = API_VERSION.partition("/")[0]
 _LEASES = "coordination.k8s.io"
 _RBAC = "rbac.authorization.k8s.io"
-_LOOKING = ("list", "watch")
-_READING = frozenset({"get", *_LOOKING})
+_LISTING = ("list", "watch")
+_READING = frozenset({"get", *_LISTING})
 _REPORTED_BY_EVENTS = frozenset({("apps/v1", "StatefulSet"), ("apps/v1", "DaemonSet"), ("batch/v1", "Job")})
 """The kinds whose status does not show that their pods are refused (core/health/refusals.py)."""
 
@@ -47,7 +47,7 @@ class PolicyRule:
         names = {"resourceNames": [self.name]} if self.name else {}
         return {"apiGroups": [self.group], "resources": [self.resource], "verbs": list(self.verbs)} | names
 
-    def lack(self, verb: str, where: str) -> str:
+    def missing_message(self, verb: str, where: str) -> str:
         """The message if the verb is missing; `where` is "in namespace x" or "in all namespaces"."""
         of = f" of {self.group}" if self.group else ""
         name = f" {self.name}" if self.name else ""
@@ -77,8 +77,8 @@ def granting() -> PolicyRule:
     return PolicyRule(_GROUP, "applicationtasks/status", ("patch",), "their statuses are not written")
 
 
-def _narrowed(needed: Iterable[PolicyRule], wanted: Callable[[str], bool]) -> list[PolicyRule]:
-    narrowed = [replace(each, verbs=tuple(filter(wanted, each.verbs))) for each in needed]
+def _narrowed(needed: Iterable[PolicyRule], keep: Callable[[str], bool]) -> list[PolicyRule]:
+    narrowed = [replace(each, verbs=tuple(filter(keep, each.verbs))) for each in needed]
     return [each for each in narrowed if each.verbs]
 
 
@@ -105,9 +105,9 @@ def sidecar_rights(name: str) -> list[PolicyRule]:
 
 def _detecting(name: str, hold: str) -> Iterator[PolicyRule]:
     tasks = ("get", "list", "watch", "create", "patch", "delete")
-    yield PolicyRule(_GROUP, "detectors", _LOOKING, "it does not know its configuration", vital=True, name=name)
+    yield PolicyRule(_GROUP, "detectors", _LISTING, "it does not know its configuration", vital=True, name=name)
     yield PolicyRule(_GROUP, "detectors", (hold,), "the chart's policy refuses its tasks and its Lease", name=name)
-    yield PolicyRule(_GROUP, "eventrules", _LOOKING, "it does not know its rules", vital=True)
+    yield PolicyRule(_GROUP, "eventrules", _LISTING, "it does not know its rules", vital=True)
     yield PolicyRule(_GROUP, "applicationtasks", tasks, "it creates no tasks", vital=True)
 
 
@@ -139,18 +139,18 @@ def node_rights() -> list[PolicyRule]:
 
 
 def _own() -> Iterator[PolicyRule]:
-    yield PolicyRule(_GROUP, "applicationtemplates", ("get", *_LOOKING), "no task is processed", vital=True)
-    instances = ("get", *_LOOKING, "create", "patch", "delete")
+    yield PolicyRule(_GROUP, "applicationtemplates", ("get", *_LISTING), "no task is processed", vital=True)
+    instances = ("get", *_LISTING, "create", "patch", "delete")
     yield PolicyRule(
         _GROUP, "applicationinstances", instances, "no instance is created, changed or released", vital=True
     )
-    yield PolicyRule(_GROUP, "applicationtasks", _LOOKING, "no task is processed", vital=True)
+    yield PolicyRule(_GROUP, "applicationtasks", _LISTING, "no task is processed", vital=True)
     yield PolicyRule(_GROUP, "applicationtasks", ("delete",), "finished tasks are never deleted")
-    yield PolicyRule(_GROUP, "detectors", _LOOKING, "rules and detectors have no status", vital=True)
-    yield PolicyRule(_GROUP, "eventrules", _LOOKING, "rules and detectors have no status", vital=True)
+    yield PolicyRule(_GROUP, "detectors", _LISTING, "rules and detectors have no status", vital=True)
+    yield PolicyRule(_GROUP, "eventrules", _LISTING, "rules and detectors have no status", vital=True)
     for plural in ("applicationinstances", "applicationtasks", "applicationtemplates", "detectors", "eventrules"):
         yield PolicyRule(_GROUP, f"{plural}/status", ("patch",), "their statuses are not written")
-    yield PolicyRule(_LEASES, "leases", ("get", *_LOOKING), "lost holders are not detected", vital=True)
+    yield PolicyRule(_LEASES, "leases", ("get", *_LISTING), "lost holders are not detected", vital=True)
     yield PolicyRule("events.k8s.io", "events", ("create", "patch"), "no Kubernetes Events are posted")
 
 
@@ -170,11 +170,11 @@ def _running_detectors() -> Iterator[PolicyRule]:
 
 
 def _children(plurals: Mapping[KindKey, str]) -> Iterator[PolicyRule]:
-    all_verbs = ("get", *_LOOKING, "create", "patch", "delete")
+    all_verbs = ("get", *_LISTING, "create", "patch", "delete")
     for (api_version, kind), plural in sorted(plurals.items()):
         group = api_version.rpartition("/")[0]
-        yield PolicyRule(group, plural, _LOOKING, f"the status of each {kind} is unknown", vital=True)
-        others = tuple(verb for verb in all_verbs if verb not in _LOOKING)
+        yield PolicyRule(group, plural, _LISTING, f"the status of each {kind} is unknown", vital=True)
+        others = tuple(verb for verb in all_verbs if verb not in _LISTING)
         yield PolicyRule(group, plural, others, f"no {kind} of a template is created, changed or deleted")
         if (api_version, kind) in SCALED:
             yield PolicyRule(group, f"{plural}/scale", ("patch",), f"no {kind} is suspended or resumed")
@@ -186,7 +186,7 @@ def _children(plurals: Mapping[KindKey, str]) -> Iterator[PolicyRule]:
             "statuses do not report why pods of workloads other than Deployments are refused",
         )
     if ("v1", "Pod") not in plurals:
-        yield PolicyRule("", "pods", _LOOKING, "statuses do not report why workloads do not run", vital=True)
+        yield PolicyRule("", "pods", _LISTING, "statuses do not report why workloads do not run", vital=True)
         yield PolicyRule("", "pods", ("patch",), "running applications get a changed configuration late")
 
 

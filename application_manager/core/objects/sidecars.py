@@ -3,10 +3,10 @@
 The webhook adds it to pods, and `application-manager inject` to manifests. It is a native sidecar, an init container
 that is always restarted: it starts before the pod's own containers, ends after them, and keeps no Job from completing.
 
-The pod must not suffer from it. So nothing waits for the sidecar: no startup probe delays the other containers, and no
-readiness probe removes the pod from its Services. It comes after all other init containers, which need no detector; its
-names do not collide with those of the pod; and its token is a separate volume, whatever the pod or its service account
-configure for mounting one.
+The sidecar must not impair the pod, so nothing waits for it: no startup probe delays the other containers, and no
+readiness probe removes the pod from its Services. It comes after all other init containers, which need no detector.
+Its names do not collide with those of the pod. Its token is a separate volume, regardless of the token mounts that the
+pod or its service account configure.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _TOKEN = f"{VOLUME_PREFIX}token"
 _TOKEN_FOLDER = "/var/run/secrets/kubernetes.io/serviceaccount"  # noqa: S105  a folder
 _TOKEN_SECONDS = 3607  # the kubelet renews it in time; the value that Kubernetes itself uses
 _METRICS = "wayside-metrics"  # scrapers find ports by their names, over all containers of a pod
-_FIRST_PORT = 9464  # not 9100, which many pods have themselves
+_FIRST_PORT = 9464  # not 9100, which many pods use
 _STARTING = 120  # s until a missing health response counts
 
 

@@ -76,7 +76,7 @@ class Manager:
     def misses(self, kind: tuple[str, str], name: str) -> None:
         entry = self.cache.store.get(kind, ("site", name))
         if entry is not None:
-            self.router.vanished(entry.raw)
+            self.router.deleted(entry.raw)
 
     def works(self) -> dict[str, Decision | None]:
         """Decide all that was enqueued, and what that enqueues: the last decision of each."""

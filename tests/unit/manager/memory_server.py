@@ -88,7 +88,7 @@ def work_on(cache: ClusterCache, server: object, absent: list[Name]) -> Instance
         applier=applier,
         recorder=Recorder(client),
         scaler=WorkloadScaler(client, applier, cache.store.put),
-        again=lambda name, at: None,
+        enqueue_at=lambda name, at: None,
         enqueue=lambda name: None,
         done=lambda name: None,
         absent=lambda name, decision: absent.append(name),

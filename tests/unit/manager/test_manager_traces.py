@@ -70,7 +70,7 @@ def spans(monkeypatch: pytest.MonkeyPatch, run: Run) -> dict[str, Received]:
                 client=client,
                 statuses=StatusWriter(client, Recorder(client), cache.store.put),
                 ttl=60,
-                again=lambda name, at: None,
+                enqueue_at=lambda name, at: None,
                 observe=cache.store.put,
                 measures=Measures(),
                 traces=traces,
