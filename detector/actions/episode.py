@@ -55,7 +55,7 @@ class OutcomeState(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What an action reports about its work for one episode."""
+    """The report of an action about its work for one episode."""
 
     state: OutcomeState
     message: str = ""

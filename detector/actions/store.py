@@ -207,7 +207,7 @@ class DurableStore:
 
 
 def action_store(folder: Path, name: str, lose: Lose) -> DurableStore:
-    """The store of an action, with what earlier runs left in `folder` under `name`. Raises StoreError.
+    """The store of an action, with the records that earlier runs left in `folder` under `name`. Raises StoreError.
 
     A changed action runs beside its predecessor while that completes its episodes. Each has a file of its own, and
     takes over the files that nobody uses.

@@ -144,7 +144,7 @@ def _rule_problems(
 
 
 def checked_summary(documents: Sequence[Document]) -> str:
-    """What was checked, and what was skipped."""
+    """A summary of the checked and the skipped objects."""
     counts = Counter(type(document.object).__name__ for document in documents)
     looked = ", ".join(_counted(counts.pop(kind.__name__, 0), kind.__name__) for kind in _CHECKED)
     if not counts:

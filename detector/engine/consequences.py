@@ -135,7 +135,7 @@ class Excerpts:
         excerpt.lanes.append(lane)
 
     def distribute(self) -> None:
-        """Give each excerpt the samples that arrived since the last call."""
+        """Add the samples that arrived since the last call to their excerpts."""
         for lane, inserted in self._inserted():
             for excerpt in self._watchers[lane]:
                 excerpt.waiting.extend((lane, sample) for sample in inserted)

@@ -123,7 +123,7 @@ class Engine:
         return self._inputs.detector
 
     def advance(self, arrivals: Sequence[Arrival], until: int) -> list[Event]:
-        """Take in what arrived, in order, and run the ticks up to `until`, or to the last arrival if that is later.
+        """Insert the arrivals, in order, and run the ticks up to `until`, or to the last arrival if that is later.
 
         Arrivals of equal time come in one call: those of a later call are later than all of these and than `until`.
         """

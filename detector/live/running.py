@@ -60,7 +60,7 @@ class EvaluationView(LiveObserver, Protocol):
 
 @dataclass(frozen=True, slots=True)
 class RunOptions:
-    """What a run writes and serves."""
+    """The outputs of a run: files, pages and the live view."""
 
     output: Path | None = None
     """The folder of events.jsonl."""

@@ -87,7 +87,7 @@ def joined(job: MiningJob, recording: Recording, pieces: Sequence[PieceResult]) 
 def _stepped(
     run: RuleRun, subject: Subject, times: Sequence[int], codes: Sequence[int], end: int, values: _At
 ) -> Iterator[Event]:
-    """What happens to a subject: as in `groups`, over all ticks at once."""
+    """The starts and ends of a subject's episodes: as in `groups`, over all ticks at once."""
     every = run.rule.every_ns
     assert every is not None  # noqa: S101  rules that are cut have a period
     ticks = range(times[0], end + 1, every)

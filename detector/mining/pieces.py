@@ -196,7 +196,7 @@ class _Recorder:
     """Observes the engine of a piece."""
 
     def __init__(self, after: int) -> None:
-        """It records what is later than this time; before it, only the known clients."""
+        """It records changes after this time; before it, only the known clients."""
         self._after = after
         self._groups: dict[int, _Group] = {}
         self._numbers: dict[str, int] = {}
@@ -223,7 +223,7 @@ class _Recorder:
         names = [self._numbers.setdefault(client, len(self._numbers)) for client in block.clients]
         numbers = np.array(names, np.int64)
         self._nobody_until(group, block.ticks[0])
-        self._lose(group, group.present.difference(names), block.ticks[0])
+        self._record_lost(group, group.present.difference(names), block.ticks[0])
         group.present, group.last = set(names), block.ticks[-1]
         if block.ticks[0] <= self._after:
             return
@@ -274,10 +274,10 @@ class _Recorder:
         """Blocks without any client are not reported: the clients of the last block are lost at the next tick."""
         following = group.last + group.every
         if group.last and following < tick:
-            self._lose(group, group.present, following)
+            self._record_lost(group, group.present, following)
             group.present = set()
 
-    def _lose(self, group: _Group, clients: Set[int], tick: int) -> None:
+    def _record_lost(self, group: _Group, clients: Set[int], tick: int) -> None:
         if not clients or tick <= self._after:
             return
         gone = np.array(sorted(clients), np.int64)

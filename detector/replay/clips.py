@@ -51,7 +51,7 @@ class Recorders:
     """The record actions of the rules of one replay. The replay waits for them, so they are never too slow."""
 
     def __init__(self, holder: str) -> None:
-        self._host = ActionHost(holder, _Nobody(), patient=True)
+        self._host = ActionHost(holder, _NoMessenger(), patient=True)
 
     def follow(self, rules: Sequence[EventRule], configuration: DetectorConfiguration) -> None:
         """Use these rules from now on."""
@@ -73,7 +73,7 @@ class Recorders:
             yield f"{lost.count} {lost.what} ({where}): {lost.last}"
 
 
-class _Nobody:
+class _NoMessenger:
     """Discards the follow-ups of a replay."""
 
     def publish(self, key: str, payload: bytes, encoding: str) -> None:

@@ -134,7 +134,7 @@ def _without_index(
                     yield _message(described(contents.schemas.get(channel.schema_id), channel), message)
         except _DAMAGE:
             if contents.cut is None or place is not contents.places[-1]:
-                raise  # otherwise it is what the recorder wrote last
+                raise  # otherwise it is the last part that the recorder wrote
 
     if contents.places != sorted(contents.places):
         _define_all(file, contents)  # a channel's first chunk in the file is not the first in time

@@ -155,7 +155,7 @@ class LiveView:
             self._tracer = self._next(engine.now)
 
     def _next(self, now: int) -> Tracer | None:
-        """The next tracer; None if nobody has subscribed, and no scan for new subjects is due."""
+        """The next tracer; None if there is no subscription, and no scan for new subjects is due."""
         topics = self._subscriptions.topics
         self._since = now
         if now - self._surveyed >= _SURVEY:
@@ -235,7 +235,7 @@ class LiveView:
             self._scene.skip(result)
 
     def _result(self, shown: _Slice, topics: frozenset[str]) -> Result:
-        """The slice, with the subjects that somebody has subscribed to, and some without a channel."""
+        """The slice, with the subjects of subscribed channels, and some without a channel."""
         new: set[str] = set()
 
         def wanted(rule: str, subject: str) -> bool:

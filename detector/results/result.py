@@ -33,7 +33,7 @@ class Result:
     documents: Mapping[str, EventRule]
     """The rules as written."""
     terms: Mapping[tuple[str, str], Terms]
-    """By rule and subject, what its conditions compare."""
+    """By rule and subject, the terms that its conditions compare."""
     streams: Sequence[StreamQuality]
     counts: Mapping[str, tuple[int, int, int]]
     """By rule: evaluations, unknown values, errors."""

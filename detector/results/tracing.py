@@ -46,7 +46,7 @@ _POINTS = 20_000
 
 
 class _Plan(NamedTuple):
-    """What is recorded from the blocks of one group."""
+    """The values that are recorded from the blocks of one group."""
 
     tracks: Sequence[Track]
     signals: Sequence[tuple[int, Track, str, Changes]]

@@ -42,11 +42,11 @@ class RuleWatch:
         self._subject = subject
         self._ticks = run.counters.ticks
         self._seen: list[tuple[int, SubjectStatus]] = []
-        run.on_evaluated = self._see
+        run.on_evaluated = self._record
         run.counters.notes = []
 
     def is_over(self) -> bool:
-        """Whether the rule was evaluated since, was removed, or nobody waits any more; then the future is set."""
+        """Whether the rule was evaluated or removed, or the caller no longer waits; then the future is set."""
         gone = self._engine.rules.get(self._run.rule.name) is not self._run
         if self._run.counters.ticks == self._ticks and not gone and not self.future.cancelled():
             return False
@@ -62,7 +62,7 @@ class RuleWatch:
             return [SubjectStatus(self._subject, looked_at=False, why=self._why_not(self._subject))]
         return statuses[:MAXIMUM_SUBJECTS]
 
-    def _see(self, evaluated: Evaluated) -> None:
+    def _record(self, evaluated: Evaluated) -> None:
         text, variables = evaluated.candidate.subject.text, evaluated.candidate.variables
         if self._subject not in (None, text):
             return

@@ -206,7 +206,7 @@ def _acting(actions: Sequence[ActionStatus]) -> Iterator[RenderableType]:
 
 
 def _tasks(tasks: TaskStatus) -> Iterator[RenderableType]:
-    """What the deploy actions did, if they did something."""
+    """The changes of tasks by the deploy actions, if there are any."""
     counts = {name: getattr(tasks, name) for name in (*TASK_CHANGES, "retried", "pending")}
     if any(counts.values()):
         yield "tasks: " + ", ".join(f"{count} {name}" for name, count in counts.items() if count)

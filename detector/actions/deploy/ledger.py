@@ -120,7 +120,7 @@ class Ledger:
         return self._due((change.name,))
 
     def put(self, name: str, stored: StoredTask | None) -> None:
-        """Apply the response to a change of our own."""
+        """Apply the response to a change by this process."""
         if self.stored is None:
             self.stored = {}
         if stored is None:

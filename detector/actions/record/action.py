@@ -78,11 +78,11 @@ class Record(Action[api.RecordAction]):
 
     def ended(self, episode: Episode) -> None:
         """Update the description; samples of `after` may follow."""
-        self._know(episode)
+        self._update_episode(episode)
 
     def completed(self, episode: Episode, completion: Completion) -> None:
         """Completes the recording."""
-        current = self._know(episode)
+        current = self._update_episode(episode)
         if current is None:
             self._lose(completion.missing)
             return
@@ -108,8 +108,8 @@ class Record(Action[api.RecordAction]):
             current.series.finish("the detector stopped", 0)
             self._report_finished(current, over=True)
 
-    def _know(self, episode: Episode) -> _Open | None:
-        """Update the recording's description with the current state of the episode."""
+    def _update_episode(self, episode: Episode) -> _Open | None:
+        """Update the description of the recording with the current state of the episode; None if it has ended early."""
         current = self._open.get(episode.id)
         if current is not None:
             current.episode = episode

@@ -1,6 +1,6 @@
 """The recording of one episode: its samples, in one file or in several, each of which can be read alone.
 
-On an error (no room, a disk failure) the recording ends: what was written is completed, marked as cut and kept. If even
+On an error (no room, a disk failure) the recording ends: its written part is completed, marked as cut and kept. If even
 that fails, its hidden folder stays, and the next start of the detector tries again.
 """
 
@@ -97,7 +97,7 @@ class Recording:
             self._channels.retain({name for name, each in self._readings.items() if old.get(name) == each})
 
     def add(self, samples: Sequence[EpisodeSample], configuration: DetectorConfiguration) -> None:
-        """Add samples. Raises NoRoomError, OSError: then it accepts no more, and `finish` keeps what was written."""
+        """Add samples. Raises NoRoomError, OSError: then it accepts no more, and `finish` keeps the written samples."""
         if configuration.detector is not self._configuration.detector:
             self.follow(configuration)
         mine = [sample for sample in samples if self._owners.owns(sample.stream, sample.key)]

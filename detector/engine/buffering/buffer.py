@@ -61,7 +61,7 @@ class Lane:
         self.number = -1
         """The client's number in the tables (see columns/tables.py); -1 while it has none."""
         self.inserted: list[Sample] | None = None
-        """Samples inserted since `record`; None if nobody records."""
+        """Samples inserted since `record`; None: they are not recorded."""
         self.limit(duration, maximum_bytes, maximum_count)
         self.samples: deque[Sample] = deque()
         self.bytes = 0

@@ -30,7 +30,7 @@ class Clients:
     """The known clients and their labels."""
 
     def __init__(self, buffer: Buffer) -> None:
-        """`buffer` has what was received from them; `configure` follows."""
+        """`buffer` has their samples; `configure` follows."""
         self._buffer = buffer
         self._labels: Mapping[str, Mapping[str, str]] = {}
         self._timeout = 0
@@ -64,7 +64,7 @@ class Clients:
                 self._sorted = None
                 self.newest = max(self.newest, now)
 
-    def seen(self, client: str, time: int, patience: int | None = None) -> None:
+    def note_presence(self, client: str, time: int, patience: int | None = None) -> None:
         """Called with the first sample of the client on a stream, or its liveliness token.
 
         `patience` (ns) is given for a stream with items: a client of several streams gets the longest of all.
@@ -86,7 +86,7 @@ class Clients:
     def restore(self, client: str, time: int) -> None:
         """An episode about the client was restored: without samples, it stays known until `clientTimeout`."""
         known = client in self._present
-        self.seen(client, time)
+        self.note_presence(client, time)
         self._present[client].restored = not known
 
     def still_present(self, client: str, time: int) -> None:

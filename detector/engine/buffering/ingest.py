@@ -250,7 +250,7 @@ class Ingest:
             self._counters.crowded[LIVELINESS] += 1
         else:
             self._lost.pop(whose[0], None)
-            self._clients.seen(whose[0], time)
+            self._clients.note_presence(whose[0], time)
 
     def _route(self, stream: str, key: str, time: int) -> Lane | None:
         """The lane for a key that is not cached: a new key, or one of a client that was lost."""
@@ -279,7 +279,7 @@ class Ingest:
             self._lanes[stream].clear()
         self._lanes[stream][key] = lane
         self._lost.pop(client, None)
-        self._clients.seen(client, time, self._patience.get(stream))
+        self._clients.note_presence(client, time, self._patience.get(stream))
         return lane
 
     def _read_items(self, stream: str, key: str, payload: bytes) -> dict[str, int]:

@@ -174,7 +174,7 @@ class PairColumns:
         return self._pair(these, row, lambda at: {"client": seen.clients[at], **seen.values(track, at)})
 
     def _pair(self, these: PairBlock, row: int, view: Callable[[int], dict[str, Any]]) -> dict[str, Any]:
-        """What is known of a pair; `view` gives the variables of a client, by its index in `these.seen`."""
+        """The known values of a pair; `view` gives the variables of a client, by its index in `these.seen`."""
         found: dict[str, Any] = {}
         for role, each in (("a", these.first), ("b", these.second)):
             index = each.item(row)

@@ -191,7 +191,7 @@ class Blocks:
         stopwatch: Callable[[], int],
         only: Mapping[str, SubjectFilter] | None = None,
     ) -> list[OrderedEvent]:
-        """What happens at these ticks; the time spent is divided among the rules."""
+        """Evaluate a group at these ticks; the time spent is divided among its rules."""
         begin = stopwatch()
         found = group.evaluate(ticks, clients, self._floor(), only)
         spent = (stopwatch() - begin) // max(len(group.runs), 1)

@@ -237,7 +237,7 @@ class Executor:
     def _with_samples(
         self, time: int, regular: bool, sampled: Mapping[str, frozenset[str]]
     ) -> Mapping[str, list[Event]]:
-        """What happens to the rules in columns that samples trigger, by rule."""
+        """Evaluate the rules in columns that samples trigger; returns what happened, by rule."""
         happened: dict[str, list[Event]] = {}
         for stream, runs in self._blocks.with_samples.items():
             chosen: dict[str, SubjectFilter] = {}

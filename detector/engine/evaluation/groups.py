@@ -176,7 +176,7 @@ class RuleGroup:
     def _changed(
         self, block: Block | FleetBlock, codes: Codes, selected: Truths | None
     ) -> Iterator[tuple[int, int, Changes]]:
-        """Of each subject that matters (a track and a client of the block), what may have an effect."""
+        """Each subject that may change (a track and a client of the block), with its observations that may matter."""
         numbers, count = block.numbers, len(block.ticks)
         before, wakes, watched = self._last[:, numbers], self._wakes[:, numbers], self._watched[:, numbers]
         changed = np.empty(codes.shape, bool)

@@ -80,7 +80,7 @@ class RuleRun:
         self.disturbed = True
         """Whether states changed outside the rule's group, so that every subject must be evaluated again."""
         self.journal: list[DemandChange] | None = None
-        """Changes of demands, in time order; None while nobody reads them."""
+        """Changes of demands, in time order; None: they are not recorded."""
 
     def tick(
         self, now: int, views: Views, clients: Clients, plugins: PluginSignals, only: SubjectFilter | None = None

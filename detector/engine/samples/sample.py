@@ -18,7 +18,7 @@ SAMPLE_OVERHEAD = 160
 
 
 class Arrival(msgspec.Struct, frozen=True, gc=False, order=True):
-    """One message as the intake queued it, before the engine has looked at it."""
+    """One message as the intake queued it, before the engine reads it."""
 
     received: int
     """When the intake received it, in nanoseconds since the epoch. It never goes back; the order distinguishes equal

@@ -156,7 +156,7 @@ class _Block(NamedTuple):
         return self.joined[row * self.length : (row + 1) * self.length]
 
     def view(self, kind: np.dtype[Any], begin: int) -> NDArray[Any]:
-        """By row, what is at this place of the payload."""
+        """By row, the value at this place of the payload."""
         return np.ndarray((self.rows,), kind, self.joined, begin, (self.length,))
 
     def raw(self, begin: int, end: int) -> NDArray[np.void]:

@@ -231,7 +231,7 @@ def test_a_client_must_confirm_a_jump_for_the_timeout_while_another_is_silent() 
 def test_data_time_begins_with_the_first_stamp_independently_of_the_wall_clock() -> None:
     """A restored client is lost no sooner than clientTimeout after that, and its age is no wall's age."""
     drive = data_drive(clientTimeout="3s")
-    drive.engine.clients.seen("known", at(10**6))
+    drive.engine.clients.note_presence("known", at(10**6))
     drive.take(*(sent(10.2 + n / 2) for n in range(8)), until=0)
     assert "known" in drive.engine.clients
     drive.take(sent(14.6), until=0)
