@@ -83,7 +83,7 @@ class NamespacePermissions:
     """Queries the API server once for each namespace, and again while the permission is missing."""
 
     def __init__(self, client: Client, changed: Callable[[], None]) -> None:
-        """`changed` is called when the account gets the permission to write in a namespace."""
+        """`changed` is called when the account is granted the permission to write in a namespace."""
         self._client = client
         self._changed = changed
         self._granted: set[str] = set()

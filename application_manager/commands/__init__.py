@@ -1,1 +1,1 @@
-"""The command line, and the commands that read or print, and end by themselves."""
+"""The command line, and the commands that only read or print."""

@@ -25,8 +25,8 @@ OLDEST = (1, 31)
 """The oldest supported Kubernetes: 1.30 ignores `selectableFields` of CRDs, by which an instance's tasks are listed."""
 
 
-async def recent_enough(client: Client) -> str:
-    """The API server's version. Raises ConfigurationError if it is older than `OLDEST`."""
+async def check_version(client: Client) -> str:
+    """Returns the API server's version. Raises ConfigurationError if it is older than `OLDEST`."""
     version = await until_answered(client.server_version)
     found = re.match(r"v?(\d+)\.(\d+)", version)
     if found is not None and (int(found[1]), int(found[2])) < OLDEST:
@@ -38,7 +38,7 @@ async def recent_enough(client: Client) -> str:
     return version
 
 
-async def selectable(client: Client, namespaces: tuple[str, ...]) -> None:
+async def check_selectable_fields(client: Client, namespaces: tuple[str, ...]) -> None:
     """Check that tasks can be listed by their template: CRDs of an older release, or a proxy, may not support it.
 
     Raises ConfigurationError if they cannot.
@@ -55,7 +55,7 @@ async def selectable(client: Client, namespaces: tuple[str, ...]) -> None:
         ) from None
 
 
-async def discovered(client: Client, policy: Policy) -> dict[KindKey, Resource]:
+async def discover_resources(client: Client, policy: Policy) -> dict[KindKey, Resource]:
     """The resources of our own kinds and those of the policy; a kind that the cluster lacks is left out, and logged.
 
     Raises ConfigurationError if one of our own kinds is missing, or an allowed one is not namespaced.

@@ -27,14 +27,19 @@ from application_manager.measures import Measures
 from application_manager.observability.pages import pages, stalled
 from application_manager.running.assembly import Assembly
 from application_manager.running.options import Options
-from application_manager.running.prerequisites import check_rights, discovered, recent_enough, selectable
+from application_manager.running.prerequisites import (
+    check_rights,
+    check_selectable_fields,
+    check_version,
+    discover_resources,
+)
 from application_manager.running.watchdog import SILENT, watchdog
 from application_manager.watching.detectorwatch import DetectorWatch
 from application_manager.watching.leasewatch import LeaseWatch
 from application_manager.watching.operator import watch
 from application_manager.watching.resync import Resync
 from application_manager.watching.watch_health import WatchHealth
-from application_manager.work.active import acting, done_before, ended
+from application_manager.work.active import acting, cancel_and_wait, run_until_stopped
 from wayside.kubernetes.connection import ConfigurationError, load_configuration
 from wayside.kubernetes.errors import ApiError
 from wayside.kubernetes.pacing import CongestionWindow, Pacing
@@ -58,11 +63,11 @@ async def serve(options: Options) -> None:
     leadership = Leadership(renewals, options.lease, measures)
     client.may_act = leadership.remaining
     try:
-        version = await recent_enough(client)
-        resources = await discovered(client, options.policy)
+        version = await check_version(client)
+        resources = await discover_resources(client, options.policy)
         runs = options.detectors is not None
         await check_rights(client, options.policy, resources, options.namespaces, options.lease, detectors=runs)
-        await selectable(client, options.namespaces)
+        await check_selectable_fields(client, options.namespaces)
         helm = replace(options.helm, kube_version=version)
         async with issuing(renewals, options.admission):
             work = Assembly(client, replace(options, helm=helm), resources, measures, traced)
@@ -146,7 +151,7 @@ class Manager:
             webhook(self._work.options.admission, review_handlers),
         ):
             try:
-                if await done_before(stop, self._first()):
+                if await run_until_stopped(stop, self._first()):
                     await self._watch_and_act(watching, stop)
                 else:
                     await self._leadership.release()
@@ -177,7 +182,7 @@ class Manager:
         try:
             done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         finally:
-            await ended(*tasks)
+            await cancel_and_wait(*tasks)
         for task in done:
             task.result()
         log.info("stopped")

@@ -54,7 +54,7 @@ async def acting(
     stopping = asyncio.create_task(stop.wait(), name="stop")
     again = not leadership.active
     try:
-        while await done_before(stop, leadership.wait_active()) and not stop.is_set():
+        while await run_until_stopped(stop, leadership.wait_active()) and not stop.is_set():
             over = asyncio.create_task(leadership.wait_over(), name="lost")
             work = asyncio.create_task(_work(queues, reporters, begin, again), name="work")
             try:
@@ -64,7 +64,7 @@ async def acting(
                         queue.finish()
                     await asyncio.wait((work, over), timeout=FINISHING, return_when=asyncio.FIRST_COMPLETED)
             finally:
-                await ended(work, over)
+                await cancel_and_wait(work, over)
             if not work.cancelled():
                 work.result()
             again = True
@@ -85,7 +85,7 @@ async def _work(queues: Sequence[ActiveWork], reporters: Sequence[ActiveWork], b
                 reporter.finish()
             await reporting
     finally:
-        await ended(working, reporting)
+        await cancel_and_wait(working, reporting)
     for task in (working, reporting):
         if not task.cancelled():
             task.result()
@@ -97,8 +97,11 @@ async def _run(workers: Sequence[ActiveWork]) -> None:
             group.create_task(worker.run())
 
 
-async def ended(*tasks: asyncio.Task[Any]) -> None:
-    """Cancel the tasks until they have ended: an error in a gathered part may swallow the cancellation."""
+async def cancel_and_wait(*tasks: asyncio.Task[Any]) -> None:
+    """Cancel the tasks and wait until they have ended.
+
+    The cancellation is repeated, because an error of another part of a `gather` may swallow it.
+    """
     pending = {each for each in tasks if not each.done()}
     while pending:
         for task in pending:
@@ -106,8 +109,8 @@ async def ended(*tasks: asyncio.Task[Any]) -> None:
         _, pending = await asyncio.wait(pending, timeout=_AGAIN)
 
 
-async def done_before(stop: asyncio.Event, work: Coroutine[None, None, None]) -> bool:
-    """Do the work unless `stop` is set meanwhile; whether it was done. Raises the exceptions of the work."""
+async def run_until_stopped(stop: asyncio.Event, work: Coroutine[None, None, None]) -> bool:
+    """Do the work, and cancel it when `stop` is set; returns whether it was done. Raises the exceptions of the work."""
     working, stopping = asyncio.create_task(work), asyncio.create_task(stop.wait())
     try:
         await asyncio.wait((working, stopping), return_when=asyncio.FIRST_COMPLETED)
@@ -115,7 +118,7 @@ async def done_before(stop: asyncio.Event, work: Coroutine[None, None, None]) ->
             working.result()
         return working.done()
     finally:
-        await ended(working, stopping)
+        await cancel_and_wait(working, stopping)
 
 
 async def _release(leadership: Leadership, client: Client) -> None:

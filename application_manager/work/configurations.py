@@ -10,7 +10,13 @@ import logging
 from dataclasses import dataclass
 
 from application_manager.cache.cluster_cache import ClusterCache
-from application_manager.core.objects.configuration import ANNOTATION, behind, config_map_key, fingerprint, selectors
+from application_manager.core.objects.configuration import (
+    ANNOTATION,
+    config_map_key,
+    fingerprint,
+    selectors,
+    unannounced_pods,
+)
 from application_manager.core.objects.ownership import controller_uid, reference_key
 from application_manager.core.objects.policy import Name
 from application_manager.work.applying import Applier
@@ -62,7 +68,7 @@ class ConfigurationWork:
             listed, _ = await self.client.list(PODS, name[0], labels=selector)
             pods |= {each["metadata"]["uid"]: each for each in listed}
         count = 0
-        for pod, uid in behind(pods.values(), name[1], content):
+        for pod, uid in unannounced_pods(pods.values(), name[1], content):
             try:
                 await self.client.annotate(PODS, name[0], pod, uid, {ANNOTATION: content})
             except ApiError as error:

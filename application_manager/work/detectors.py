@@ -27,7 +27,7 @@ from application_manager.core.objects.ownership import ApplyProblem, controller_
 from application_manager.core.objects.poddefaults import PodDefaults
 from application_manager.core.objects.policy import Name
 from application_manager.core.objects.sidecars import has_sidecar
-from application_manager.core.statuses.rulestatus import NOT_ACCEPTED, NOT_RUN, RUNNING, carried, running
+from application_manager.core.statuses.rulestatus import NOT_ACCEPTED, NOT_RUN, RUNNING, running, running_in_pods
 from application_manager.work.applying import apply_owned
 from application_manager.work.recorder import EventReason, Recorder
 from wayside.api import Detector
@@ -111,7 +111,7 @@ class DetectorWork:
         requesting = self.index.requesting.get(name, [])
         if detector_findings(detector).problems and not any(has_sidecar(each["spec"]) for each in requesting):
             return NOT_ACCEPTED
-        return carried(detector, requesting)
+        return running_in_pods(detector, requesting)
 
     async def _apply(self, name: Name, detector: Detector, manifests: Iterable[Manifest]) -> ConditionState | None:
         """Apply the objects, up to the first that fails; returns its problem, if any."""

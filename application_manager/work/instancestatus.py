@@ -17,10 +17,10 @@ from application_manager.core.conditions import ConditionState
 from application_manager.core.demand.decisions import Decision
 from application_manager.core.demand.fallback import READY_TIMEOUT
 from application_manager.core.demand.lingering import PAUSE_ANNOTATION
-from application_manager.core.health.placement import is_placed, misplaced
+from application_manager.core.health.placement import selects_nodes, unschedulable
 from application_manager.core.health.pods import Trouble, summary
-from application_manager.core.health.readiness import is_unseen, not_ready
-from application_manager.core.health.refusals import lacks_pods, refused_by_events, refused_pods
+from application_manager.core.health.readiness import is_unobserved, not_ready
+from application_manager.core.health.refusals import has_too_few_pods, refused_by_events, refused_pods
 from application_manager.core.objects.ownership import ApplyResult, ObjectKey, reference_key
 from application_manager.core.objects.policy import Name
 from application_manager.core.statuses.status import InstanceProgress, instance_status, suspended_condition
@@ -146,19 +146,21 @@ class InstanceStatusWork:
             return []
         live = [each for each in self._live(instance, applied).values() if each is not None and not_ready(each)]
         found = [*await self._misfits(live), *await self._refused(live)]
-        if found or any(lacks_pods(each) for each in live):
+        if found or any(has_too_few_pods(each) for each in live):
             self.enqueue_at((instance.namespace, instance.name), time.time() + _RECHECK_AFTER)
         return found
 
     async def _misfits(self, live: Sequence[Object]) -> list[Trouble]:
         """The objects whose requirements no node meets."""
-        bound = [each for each in live if is_placed(each)]
+        bound = [each for each in live if selects_nodes(each)]
         nodes = await self.nodes.labels() if bound else None
-        return [] if nodes is None else [trouble for each in bound if (trouble := misplaced(each, nodes)) is not None]
+        return (
+            [] if nodes is None else [trouble for each in bound if (trouble := unschedulable(each, nodes)) is not None]
+        )
 
     async def _refused(self, live: Sequence[Object]) -> list[Trouble]:
         """Why pods of the objects are refused, for objects of which only Events report it."""
-        without_pods = [each["metadata"] for each in live if lacks_pods(each)]
+        without_pods = [each["metadata"] for each in live if has_too_few_pods(each)]
         troubles = [
             refused_by_events(await self.failed_pods.events(each["namespace"], each["uid"]), time.time())
             for each in without_pods
@@ -203,7 +205,7 @@ def _delayed_until(instance: ApplicationInstance, record: WorkRecord, live: Iter
     other.
     """
     known = instance.status is not None and instance.status.spec_hash is not None
-    if known or not record.applied.state.holds or not any(each is not None and is_unseen(each) for each in live):
+    if known or not record.applied.state.holds or not any(each is not None and is_unobserved(each) for each in live):
         return 0.0
     return record.since + _FIRST_STATUS_DELAY
 

@@ -14,7 +14,7 @@ from application_manager.core.conditions import changed
 from application_manager.core.demand.demand import finished, verdict_of
 from application_manager.core.objects import trimming
 from application_manager.core.objects.policy import Name
-from application_manager.core.statuses.status import InstanceProgress, finished_since, task_status, together
+from application_manager.core.statuses.status import InstanceProgress, combined_progress, finished_since, task_status
 from application_manager.measures import Measures
 from application_manager.work.statuses import StatusWriter
 from application_manager.work.tracing import TaskTraces
@@ -135,7 +135,7 @@ class TaskWork:
         if found is None:
             return None
         parts = [served[each].progress for each in found.serving]
-        return found.verdict, together(parts) if parts else None, found.generation
+        return found.verdict, combined_progress(parts) if parts else None, found.generation
 
     def _decided(self, namespace: str, claimed: Claim) -> Iterator[Name]:
         """The instances whose decisions determine the verdict of a claim."""

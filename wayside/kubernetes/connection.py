@@ -194,7 +194,7 @@ class _Token:
         return found
 
     def newest(self) -> str:
-        """The token, read again if it is time. While the file cannot be read, which is logged once, the last token."""
+        """The token, read again if the last read is old; if that fails, which is logged once, the previous token."""
         if time.monotonic() - self._read_at < _READ_EVERY:
             return self._token
         try:

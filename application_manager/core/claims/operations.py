@@ -1,7 +1,7 @@
 """The result of the live tasks of one instance: Deploy tasks merge, Reconfigure overrides, Suspend stops. Pure.
 
 `combine` computes the result for one instance. A task for all instances of a template has a verdict from each of them;
-`gathered` summarizes these.
+`combined_verdict` summarizes these.
 """
 
 from __future__ import annotations
@@ -170,7 +170,7 @@ def waiting_for_any(claim: Claim) -> Verdict:
     return Verdict(VerdictKind.WAITING, NOTHING_RUNS, message)
 
 
-def gathered(claim: Claim, parts: Mapping[str, Verdict], otherwise: Verdict) -> Verdict:
+def combined_verdict(claim: Claim, parts: Mapping[str, Verdict], otherwise: Verdict) -> Verdict:
     """The verdict of a task for all instances of a template, combined from its verdicts by instance.
 
     `otherwise`: the verdict if there is no instance for it.

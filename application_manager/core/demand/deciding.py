@@ -206,7 +206,7 @@ def _was_served(task: ApplicationTask) -> bool:
 
 
 def _decide_for_all(name: str, indexes: Indexes, now: float) -> Decision | None:
-    """The verdicts of tasks for all instances of a template, for the case that it has none (see `gathered`).
+    """The verdicts of tasks for all instances of a template, for the case that it has none (see `combined_verdict`).
 
     It demands no instance; `name` is the result of `all_instances`. None if there are no such tasks.
     """

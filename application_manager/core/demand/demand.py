@@ -20,7 +20,7 @@ from application_manager.core.claims.claims import (
     claim,
     template_of_all,
 )
-from application_manager.core.claims.operations import Verdict, VerdictKind, gathered
+from application_manager.core.claims.operations import Verdict, VerdictKind, combined_verdict
 from application_manager.core.demand.deciding import (
     decide,
     decide_without_limits,
@@ -188,7 +188,7 @@ def verdict_of(claimed: Claim, decided: Mapping[str, Decision], meant: Iterable[
         parts = {name: verdicts[task] for name, verdicts in found.items() if task in verdicts}
         serving = tuple(name for name, each in parts.items() if each.kind is VerdictKind.COUNTS)
         generation = min(decided[name].generations[task] for name in (claimed.instance, *parts))
-        return TaskVerdict(gathered(claimed, parts, own.verdicts[task]), serving, generation)
+        return TaskVerdict(combined_verdict(claimed, parts, own.verdicts[task]), serving, generation)
     instead = own.fallback.instance_of(task) if own.fallback is not None else None
     other = decided.get(instead) if instead is not None else None
     verdict = with_fallback(own.verdicts[task], task, own.fallback, other.verdicts if other is not None else {})

@@ -1,7 +1,7 @@
-"""Decides whether a pod gets the detector that its label names, and builds the AdmissionReview. Pure.
+"""Decides whether to inject the detector that a pod's label names, and builds the AdmissionReview. Pure.
 
-A pod is never refused. If it cannot have its detector, it is created without it; a warning gives the reason to its
-creator, and later an Event of the pod gives it to everybody.
+A pod is never refused. If it cannot have its detector, it is created without it. A warning reports the reason to its
+creator, and an Event of the pod reports it later.
 """
 
 from __future__ import annotations

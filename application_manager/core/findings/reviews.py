@@ -139,7 +139,7 @@ def _cause(problem: str) -> Json:
 
 
 def shortened(texts: tuple[str, ...]) -> list[str]:
-    """The texts in a form that HTTP headers can contain; of many, the first ones."""
+    """The first texts, in a form that HTTP headers can contain, and the number of the others."""
     lines = [_line(each) for each in texts[:MOST_REPORTED]]
     left = len(texts) - len(lines)
     return [*lines, f"and {left} more: correct these first"] if left else lines

@@ -34,12 +34,12 @@ class _Required:
         return any(_meets(each, name, labels) for each in self.terms)
 
 
-def is_placed(live: Mapping[str, Any]) -> bool:
-    """Whether the object's pods require anything of nodes."""
+def selects_nodes(live: Mapping[str, Any]) -> bool:
+    """Whether the object's pods have requirements on nodes."""
     return any(True for _ in _required(pod_spec(live)))
 
 
-def misplaced(live: Mapping[str, Any], nodes: Nodes) -> Trouble | None:
+def unschedulable(live: Mapping[str, Any], nodes: Nodes) -> Trouble | None:
     """Why no node meets the requirements of the object's pods; None if one does."""
     required = list(_required(pod_spec(live)))
     if not required:

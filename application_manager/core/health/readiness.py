@@ -44,7 +44,7 @@ def not_ready(live: Mapping[str, Any]) -> str | None:
     return _by_conditions(live, status)
 
 
-def is_unseen(live: Mapping[str, Any]) -> bool:
+def is_unobserved(live: Mapping[str, Any]) -> bool:
     """Whether the object is a workload whose controller has not processed its current spec yet."""
     status = live.get("status") or {}
     return live.get("kind") in _OBSERVED and _stale(live, status) is not None

@@ -54,7 +54,7 @@ def refused_pods(live: Mapping[str, Any]) -> Trouble | None:
     return _trouble(str(failure.get("message", ""))) if failure.get("status") == "True" else None
 
 
-def lacks_pods(live: Mapping[str, Any]) -> bool:
+def has_too_few_pods(live: Mapping[str, Any]) -> bool:
     """Whether a StatefulSet, DaemonSet or Job has too few pods; only Events give the reason."""
     spec, status = live.get("spec") or {}, live.get("status") or {}
     match live.get("kind"):

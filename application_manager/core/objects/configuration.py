@@ -133,7 +133,7 @@ def selectors(objects: Iterable[Object]) -> tuple[str, ...]:
     return ("",) if "" in found else tuple(sorted(found))
 
 
-def behind(pods: Iterable[Object], instance: str, content: str) -> Iterator[tuple[str, str]]:
+def unannounced_pods(pods: Iterable[Object], instance: str, content: str) -> Iterator[tuple[str, str]]:
     """Name and uid of the pods that mount the instance's configuration, and to which this content was not announced."""
     for pod in pods:
         metadata = pod["metadata"]

@@ -21,7 +21,7 @@ from application_manager.core.objects.charts import ChartRequest, Charts, ChartS
 from application_manager.core.objects.configuration import CONFIG_MAP, Configuration, config_map, config_map_name
 from application_manager.core.objects.ownership import ApplyProblem, Manifest, ObjectKey, labelled, object_key
 from application_manager.core.objects.policy import KindKey, Policy
-from application_manager.core.objects.suspension import stated_replicas, stopped, yielded
+from application_manager.core.objects.suspension import scaled_to_zero, stated_replicas, without_autoscaled_replicas
 from wayside.api import ApplicationInstance, ApplicationTemplate
 from wayside.api.applicationtemplate import Helm
 from wayside.api.base import LABEL, SUBDOMAIN
@@ -170,10 +170,10 @@ class Renderer:
         problems += _duplicates(manifests)
         if problems:
             raise RenderError(problems)
-        manifests = yielded(manifests)
+        manifests = without_autoscaled_replicas(manifests)
         replicas = stated_replicas(manifests)
         if instance.spec.suspended:
-            manifests = stopped(manifests)
+            manifests = scaled_to_zero(manifests)
         return Rendering(tuple(manifests), digest(manifests), replicas)
 
     def _chart_manifests(

@@ -1,4 +1,4 @@
-"""Which workloads of an instance are scaled to zero while it is suspended, and their replicas afterwards. Pure.
+"""The workloads of a suspended instance, which are scaled to zero, and their replicas afterwards. Pure.
 
 - A workload with the `scale` subresource is scaled to zero. This also pauses a HorizontalPodAutoscaler: it ignores a
   workload with zero replicas, and continues once there are replicas again. So the autoscaler itself is not changed.
@@ -29,7 +29,7 @@ def is_scaled(manifest: Mapping[str, Any]) -> bool:
     return (manifest.get("apiVersion"), manifest.get("kind")) in SCALED
 
 
-def yielded(manifests: Iterable[Json]) -> list[Json]:
+def without_autoscaled_replicas(manifests: Iterable[Json]) -> list[Json]:
     """The manifests; if one of them is an autoscaler for a workload, that workload has no `replicas`."""
     everything = list(manifests)
     autoscaled = {(each["kind"], each["name"]) for each in _targets(everything)}
@@ -41,7 +41,7 @@ def yielded(manifests: Iterable[Json]) -> list[Json]:
     ]
 
 
-def stopped(manifests: Iterable[Json]) -> list[Json]:
+def scaled_to_zero(manifests: Iterable[Json]) -> list[Json]:
     """The manifests as they are while the instance is suspended."""
     result = []
     for each in manifests:

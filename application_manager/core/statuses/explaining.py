@@ -1,7 +1,7 @@
 """Explains why a task is served or not, and the state of an instance: one chain from the event to the pods. Pure.
 
 From the statuses it reads only the facts that the manager alone can know (lost holders, deadlines): it computes the
-demand from the live objects, with the same functions. So an explanation is also right while no manager runs.
+demand from the live objects, with the same functions. So an explanation is also correct while no manager runs.
 """
 
 from __future__ import annotations

@@ -123,7 +123,7 @@ def _accepted(findings: Findings, reason: str) -> ConditionState:
     return ConditionState("Accepted", True, "Accepted", f"no errors found; {_AS_FAR_AS}{but}")
 
 
-def carried(detector: Detector, pods: Sequence[Mapping[str, Any]]) -> ConditionState:
+def running_in_pods(detector: Detector, pods: Sequence[Mapping[str, Any]]) -> ConditionState:
     """The condition Running of a Sidecar detector, by the pods that request it; finished pods do not count."""
     if not detector.spec.service_account_names:
         return ConditionState(

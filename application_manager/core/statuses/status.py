@@ -56,7 +56,7 @@ class InstanceProgress:
     stopped: bool = False
 
 
-def together(parts: Sequence[InstanceProgress]) -> InstanceProgress:
+def combined_progress(parts: Sequence[InstanceProgress]) -> InstanceProgress:
     """The combined progress of several instances, at least one, for a task for all instances."""
     return InstanceProgress(
         instance=", ".join(sorted(each.instance for each in parts)),

@@ -22,7 +22,7 @@ from application_manager.core.findings.reviews import ReviewError
 from application_manager.core.objects.detectors import detector_objects, sidecar_roles
 from application_manager.core.objects.poddefaults import PodDefaults
 from application_manager.core.objects.sidecars import CONTAINER, added, addition, patch, sidecar_pods
-from application_manager.core.statuses.rulestatus import carried
+from application_manager.core.statuses.rulestatus import running_in_pods
 from tests.cluster.manifests import DETECTOR
 from tests.guides import guide, yaml_blocks
 from tests.unit.admission.test_detector_objects import ON_A_CLAIM
@@ -325,27 +325,27 @@ def state(one: Json, **how: Any) -> Json:
 def test_the_condition_reports_the_number_of_running_pods_and_the_reasons_of_others() -> None:
     of = detector()
     runs = state(injected(pod(), of), state={"running": {}}, ready=True)
-    logged = carried(of, [runs, pod()])
+    logged = running_in_pods(of, [runs, pod()])
     assert (logged.holds, logged.message) == (
         True,
         "it runs in 1 of 2 pods with its label; 1 without a detector: their Events report why",
     )
     waiting = {"waiting": {"reason": "ErrImagePull", "message": "not found"}}
-    logged = carried(of, [runs, state(injected(pod(), of), state=waiting)])
+    logged = running_in_pods(of, [runs, state(injected(pod(), of), state=waiting)])
     assert (logged.holds, logged.reason) == (False, "ImagePullFailed")
     assert logged.message == "it runs in 1 of 2 pods with its label: cannot pull image wayside:1: not found"
     broken = runs | {"status": runs["status"] | {"containerStatuses": [{"name": "main", "state": waiting}]}}
-    assert carried(of, [broken]).holds
+    assert running_in_pods(of, [broken]).holds
     assert [each["spec"]["initContainers"][0]["name"] for each in sidecar_pods([broken, pod()])] == [CONTAINER]
-    logged = carried(of, [state(injected(pod(), of), state={"waiting": {"reason": "PodInitializing"}})])
+    logged = running_in_pods(of, [state(injected(pod(), of), state={"waiting": {"reason": "PodInitializing"}})])
     assert (logged.holds, logged.reason, logged.message) == (
         False,
         "NotReady",
         "it runs in 0 of 1 pods with its label",
     )
-    logged = carried(of, [pod()])
+    logged = running_in_pods(of, [pod()])
     assert (logged.holds, logged.reason) == (False, "NotReady"), "the detector was not injected"
-    assert carried(detector(serviceAccountNames=[]), []).reason == "NoAccounts"
+    assert running_in_pods(detector(serviceAccountNames=[]), []).reason == "NoAccounts"
 
 
 def test_the_names_of_its_volumes_are_labels_and_unique_beside_those_of_a_user() -> None:
@@ -366,9 +366,10 @@ def test_finished_pods_are_ignored() -> None:
     of, killed = detector(), {"terminated": {"exitCode": 137}}
     one = state(injected(pod(restartPolicy="OnFailure"), of), state=killed)
     over = one | {"status": one["status"] | {"containerStatuses": [{"name": "main", "state": killed}]}}
-    logged = carried(of, [over, one | {"metadata": one["metadata"] | {"deletionTimestamp": "2026-01-01T00:00:00Z"}}])
+    deleted = one | {"metadata": one["metadata"] | {"deletionTimestamp": "2026-01-01T00:00:00Z"}}
+    logged = running_in_pods(of, [over, deleted])
     assert (logged.holds, logged.message) == (True, "it runs in 0 of 0 pods with its label")
-    assert carried(of, [one]).reason == "CrashLoop"
+    assert running_in_pods(of, [one]).reason == "CrashLoop"
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from application_manager.core.objects.configuration import ANNOTATION, behind, fingerprint, selectors
+from application_manager.core.objects.configuration import ANNOTATION, fingerprint, selectors, unannounced_pods
 from tests.guides import ROOT
 
 FILE = ROOT / "examples" / "live-configuration" / "follow.py"
@@ -27,9 +27,9 @@ PROJECTED = {"projected": {"sources": [{"secret": {"name": "s"}}, DIRECT]}}
 @pytest.mark.parametrize("volume", [DIRECT, PROJECTED])
 def test_a_pod_that_mounts_the_configuration_is_behind_until_it_is_annotated(volume: dict[str, Any]) -> None:
     content = fingerprint({"a": "b"})
-    assert list(behind([pod(volume)], "app", content)) == [("pod", "u")]
-    assert list(behind([pod(volume, reported="other")], "app", content)) == [("pod", "u")]
-    assert list(behind([pod(volume, reported=content)], "app", content)) == []
+    assert list(unannounced_pods([pod(volume)], "app", content)) == [("pod", "u")]
+    assert list(unannounced_pods([pod(volume, reported="other")], "app", content)) == [("pod", "u")]
+    assert list(unannounced_pods([pod(volume, reported=content)], "app", content)) == []
 
 
 def test_pods_that_do_not_mount_it_or_are_over_are_left_alone() -> None:
@@ -40,7 +40,7 @@ def test_pods_that_do_not_mount_it_or_are_over_are_left_alone() -> None:
         {"metadata": {"name": "bare", "uid": "u"}, "spec": {}},
     ]
     others[0]["metadata"]["deletionTimestamp"] = "now"
-    assert list(behind(others, "app", "x")) == []
+    assert list(unannounced_pods(others, "app", "x")) == []
 
 
 def test_pods_are_listed_by_their_workloads_selector() -> None:

@@ -7,7 +7,7 @@ from typing import cast
 
 import pytest
 
-from application_manager.running.prerequisites import recent_enough
+from application_manager.running.prerequisites import check_version
 from wayside.kubernetes.client import Client
 from wayside.kubernetes.connection import ConfigurationError
 
@@ -23,7 +23,7 @@ class Server:
 
 
 def checked(version: str) -> str:
-    return asyncio.run(recent_enough(cast("Client", Server(version))))
+    return asyncio.run(check_version(cast("Client", Server(version))))
 
 
 @pytest.mark.parametrize("version", ["v1.31.0", "v1.36.3-eks-1", "v1.31.9+k3s1", "v2.0.0", "of its own"])

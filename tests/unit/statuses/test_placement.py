@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from application_manager.core.health.placement import is_placed, misplaced
+from application_manager.core.health.placement import selects_nodes, unschedulable
 
 NODES = {
     "rsu-1": {"kubernetes.io/hostname": "rsu-1", "site": "north", "gpus": "2"},
@@ -46,7 +46,7 @@ def expression(key: str, operator: str, *values: str) -> dict[str, Any]:
     ],
 )
 def test_constraints_that_match_no_node_are_reported(spec: Any, shows: str) -> None:
-    found = misplaced(deployment(**spec), NODES)
+    found = unschedulable(deployment(**spec), NODES)
     assert found is not None
     assert found.reason == "Unschedulable"
     assert found.message.startswith("Deployment app fits no node: ")
@@ -68,14 +68,14 @@ def test_constraints_that_match_no_node_are_reported(spec: Any, shows: str) -> N
     ],
 )
 def test_constraints_that_match_a_node_are_not_reported(spec: Any) -> None:
-    assert misplaced(deployment(**spec), NODES) is None
+    assert unschedulable(deployment(**spec), NODES) is None
 
 
 def test_without_nodes_only_required_constraints_are_reported() -> None:
-    found = misplaced(deployment(nodeSelector={"site": "north"}), {})
+    found = unschedulable(deployment(nodeSelector={"site": "north"}), {})
     assert found is not None
     assert "(there are no nodes)" in found.message
-    assert misplaced(deployment(), {}) is None
+    assert unschedulable(deployment(), {}) is None
 
 
 @pytest.mark.parametrize(
@@ -89,4 +89,4 @@ def test_without_nodes_only_required_constraints_are_reported() -> None:
     ],
 )
 def test_the_pods_of_each_kind_are_checked(live: Any, placed: bool) -> None:
-    assert is_placed(live) is placed
+    assert selects_nodes(live) is placed

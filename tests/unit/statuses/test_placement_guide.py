@@ -6,7 +6,7 @@ import yaml
 
 from application_manager.core.demand.demand import demand
 from application_manager.core.demand.drafting import draft
-from application_manager.core.health.placement import misplaced
+from application_manager.core.health.placement import unschedulable
 from application_manager.core.objects.policy import Policy
 from application_manager.core.objects.rendering import Renderer
 from tests.guides import guide, yaml_blocks
@@ -28,7 +28,7 @@ def test_the_guides_template_is_placed_by_its_parameters() -> None:
     spec = manifest["spec"]["template"]["spec"]
     assert spec["nodeSelector"] == {"kubernetes.io/hostname": "rsu-9"}
     assert spec["tolerations"] == [{"key": "site", "value": "edge", "effect": "NoSchedule"}]
-    found = misplaced(manifest, NODES)
+    found = unschedulable(manifest, NODES)
     assert found is not None
     reported = found.message.replace(decision.name, "at-the-roadside-abc")
     assert f"`{reported}`" in " ".join(GUIDE.split())

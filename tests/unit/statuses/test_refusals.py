@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from application_manager.core.health.refusals import lacks_pods, reason_of, refused_by_events, refused_pods
+from application_manager.core.health.refusals import has_too_few_pods, reason_of, refused_by_events, refused_pods
 from application_manager.work.instances import FIRST_PAUSE, LONGEST_PAUSE, Attempts
 from wayside.times import format_time
 
@@ -62,7 +62,7 @@ def test_rejected_pods_of_a_deployment_have_a_constant_message() -> None:
     ],
 )
 def test_missing_pods_are_reported_from_the_workloads_status(kind: str, spec: Any, status: Any, lacks: bool) -> None:
-    assert lacks_pods({"kind": kind, "metadata": {"name": "app"}, "spec": spec, "status": status}) is lacks
+    assert has_too_few_pods({"kind": kind, "metadata": {"name": "app"}, "spec": spec, "status": status}) is lacks
 
 
 NOW = 1_792_000_000.0  # seconds since 1970

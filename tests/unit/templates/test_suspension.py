@@ -11,7 +11,12 @@ from application_manager.core.claims.operations import Verdict, VerdictKind
 from application_manager.core.demand.demand import demand
 from application_manager.core.objects.policy import Policy
 from application_manager.core.objects.rendering import Renderer
-from application_manager.core.statuses.status import InstanceProgress, suspended_condition, task_status, together
+from application_manager.core.statuses.status import (
+    InstanceProgress,
+    combined_progress,
+    suspended_condition,
+    task_status,
+)
 from tests.unit.manager_objects import DEPLOYMENT, NOW, instance, task, template
 from wayside.api import ApplicationInstance
 
@@ -120,7 +125,7 @@ def test_phases_of_tasks_describe_the_suspension() -> None:
         "True",
         "NothingRuns",
     )
-    both = together([off, InstanceProgress("b", True, True)])
+    both = combined_progress([off, InstanceProgress("b", True, True)])
     assert (both.instance, both.applied, both.ready, both.suspended, both.stopped) == (
         "app, b",
         True,
