@@ -61,7 +61,7 @@ class Worker:
         self._outcomes = outcomes
         self._maximum = maximum_bytes
         self._inbox: deque[tuple[Consequence, int]] = deque()
-        """Each with the bytes of its samples."""
+        """The queued messages, each with the bytes of its samples."""
         self._waiting = 0
         self._missing: dict[ActionRun, int] = {}
         self._changed = threading.Condition()
@@ -76,7 +76,7 @@ class Worker:
         self._thread.start()
 
     def enqueue(self, consequence: Consequence) -> None:
-        """Queue what happened."""
+        """Enqueue a message; see `patient`."""
         match consequence:
             case RunStarted(run=run):
                 self.open.add(run)
@@ -98,7 +98,7 @@ class Worker:
             self._changed.notify()
 
     def request_close(self) -> None:
-        """Accept nothing more; returns at once."""
+        """Accept no further messages; returns at once."""
         with self._changed:
             self._closing = True
             self._changed.notify()

@@ -243,7 +243,7 @@ class Engine:
         self._executor.plan()
 
     def evaluate_now(self, name: str) -> tuple[list[Event], list[OnDemandResult]]:
-        """Evaluate a rule with `onDemand` now: after the last tick, with the samples taken in since, up to `now`.
+        """Evaluate a rule with `onDemand` now: after the last tick, with the samples inserted since, up to `now`.
 
         Returns the episodes that started and ended, and the result for each subject.
 

@@ -1,4 +1,4 @@
-"""Recordings requested over Zenoh: the index decides, the evaluation thread carries it out.
+"""Recordings requested over Zenoh: the index decides, and the evaluation thread begins and ends them.
 
 A recording is identified by the id that its requester chose, so a repeated request has no further effect. Finished
 recordings stay in the index for a while: a later request returns their result, and a start that arrives after its own
@@ -298,7 +298,7 @@ class RequestedRecordings:
         self._engine.consequences.request(run, event, window, wanted, episode.onset_time, entry.until or now)
 
     def _release(self, identity: str, until: int | None) -> None:
-        """Runs on the evaluation thread; None: now."""
+        """End the recording at `until`, None: now; runs on the evaluation thread."""
         self._engine.consequences.release(run_of(identity), self._engine.now if until is None else until)
 
     def _in_time(self, future: Future[Any]) -> None:

@@ -68,8 +68,8 @@ class LiveSink:
             if self._traces is not None:
                 self._traces.over(event)
 
-    def move(self, network: Network) -> None:
-        """The Detector changed: leave its network, and join the other. A failure is logged."""
+    def switch_network(self, network: Network) -> None:
+        """Switch to the network of a changed Detector. A failure is logged."""
         dropped = self.network.dropped_events
         self.network.close()
         self.network = network

@@ -245,7 +245,7 @@ class Database(Action[DatabaseAction]):
             self._writer.put_change(write, confirm if write.completes else None)
 
     def wake(self) -> float | None:
-        """Enqueue documents that have waited long enough. The first call also resumes the spool of an earlier run."""
+        """Enqueue documents that have waited long enough. The first call also connects, to resume an earlier run."""
         if not self._awake:
             self._awake = True
             try:

@@ -1,4 +1,4 @@
-"""The state machine of one recording on another system: what is confirmed, and the next request and its time.
+"""The state machine of one recording on another system: its confirmed state, and the next request with its time.
 
 Level-triggered: the other system should record as long as the episode lasts, and not afterwards. Unconfirmed requests
 are retried with backoff until they are given up. A start is requested even if the episode has ended in the meantime,

@@ -1,6 +1,6 @@
 """Demands: the applications that deploy actions of open episodes request, and their form as ApplicationTasks.
 
-A demand is held while its episode is open. Its name is derived from its contents, so that a restarted detector finds
+A demand exists while its episode is open. Its name is derived from its contents, so that a restarted detector finds
 its own tasks again and never creates a second task for one demand.
 """
 

@@ -141,7 +141,7 @@ class Blocks:
         return min([*first, *(each.time for each in self._ahead[:1])])
 
     def run_ahead(self, stopwatch: Callable[[], int]) -> None:
-        """Evaluate the groups that take one tick at a time; the others wait. `run` returns their events."""
+        """Evaluate the groups that take one tick at a time; the others wait. The next `run` returns the events."""
         clients = [*self._context.clients]
         for group in self._depths[0]:
             if group.waiting and not group.may_wait:

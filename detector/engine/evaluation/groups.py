@@ -154,7 +154,7 @@ class RuleGroup:
             for run in self.runs:
                 run.disturbed = True
         disturbed = [row for row, run in enumerate(self._of) if run.disturbed]
-        # This comes before there is room for all clients: a restored subject may not have received a sample yet.
+        # Before the arrays grow: this can assign numbers, because a restored subject may have no sample yet.
         watched = {row: self._watched_numbers(row) for row in disturbed}
         clients, room = self.columns.room, self._last.shape[1]
         if clients > room:

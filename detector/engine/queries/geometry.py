@@ -15,8 +15,7 @@ _NEARLY_EQUAL = 1e-6
 
 
 class Pose(NamedTuple):
-    """A position and an orientation; also the transform from the frame of this pose into the frame that it is given
-    in."""
+    """A position and an orientation in a reference frame; also the transform from its own frame into that one."""
 
     position: Vector
     """Metres."""
@@ -24,7 +23,7 @@ class Pose(NamedTuple):
     """Of unit length."""
 
     def apply(self, point: Vector) -> Vector:
-        """The point, given in the frame of this pose, in the frame that the pose is given in."""
+        """Transform a point from the frame of this pose into the reference frame."""
         return _added(self.position, rotated(self.orientation, point))
 
     def after(self, other: Pose) -> Pose:

@@ -71,8 +71,8 @@ class Transforms:
         """The trees of the current tick."""
 
     def forget(self, now: int) -> None:
-        """The tick is over. Drop entries that were not used lately: they may hold samples that the buffer has
-        dropped."""
+        """The tick is over. Drop entries that were not used lately: they may refer to samples that the buffer
+        has dropped."""
         self._trees.clear()
         for place in [place for place, used in self._used.items() if not 0 <= now - used <= _REMEMBERED]:
             del self._used[place], self._parsed[place]

@@ -1,8 +1,8 @@
 """The episodes of rules in the form that other rules read: each start and end is a sample, and open episodes are known.
 
-A start is stored for each of the episode's clients; the start of an episode of the whole fleet, which names none, for
-everybody. Starts have a separate buffer with a separate cap. They are not data from a client, so they neither keep it
-from timing out nor displace its samples.
+A start is stored for each of the episode's clients. An episode of the whole fleet has none: its start is stored once,
+for all clients. Starts have a separate buffer with a separate cap. They are not data from a client, so they neither
+keep it from timing out nor displace its samples.
 """
 
 from __future__ import annotations
