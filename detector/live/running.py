@@ -201,7 +201,7 @@ class Running:
             _log.info("applied a change: Detector %s runs with %d rules", detector.name, len(wanted.rules))
             spec = detector.spec
             if spec.zenoh != before.zenoh or _subscribed(spec.streams) != _subscribed(before.streams):
-                await asyncio.to_thread(self._sink.move, self._network(detector))
+                await asyncio.to_thread(self._sink.switch_network, self._network(detector))
             await asyncio.to_thread(self._sources.follow, detector)
 
     def _network(self, detector: Detector) -> Network:
