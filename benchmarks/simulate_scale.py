@@ -244,7 +244,7 @@ def print_costs(costs: UnitCosts) -> None:
         ("a message to a detector with one rule, under the same flood", f"{costs.detector_message * micro:.1f} us"),
         (
             f"a vehicle with 1 Hz in a regional detector with {REGION_RULES} rules, {VEHICLES:,} vehicles",
-            f"{costs.vehicle_second * micro:.0f} us a second (in the dearest run {dearest}), "
+            f"{costs.vehicle_second * micro:.0f} us a second ({dearest} in the most expensive run), "
             f"{costs.vehicle_bytes / 1e3:.0f} kB",
         ),
         (f"a vehicle in a rule about pairs, {CROWD:,} vehicles", f"{costs.pair_second * micro:.0f} us a second"),
@@ -294,7 +294,7 @@ def print_placements(costs: UnitCosts, assumed: Assumptions) -> None:
     dearest = dataclasses.replace(costs, vehicle_second=costs.vehicle_second_most)
     most, least = (per_detector(each, assumed, assumed.regional) for each in (costs, dearest))
     table(
-        f"messages; a regional detector has at most {most:,} vehicles, {least:,} by the costs of the dearest run",
+        f"messages; a regional detector has at most {most:,} vehicles, {least:,} by the costs of the most expensive run",
         ["vehicles", "evaluated", "messages a second", "bandwidth", "routers", "detectors"],
         rows,
     )
