@@ -294,7 +294,7 @@ def print_placements(costs: UnitCosts, assumed: Assumptions) -> None:
     dearest = dataclasses.replace(costs, vehicle_second=costs.vehicle_second_most)
     most, least = (per_detector(each, assumed, assumed.regional) for each in (costs, dearest))
     table(
-        f"messages; a regional detector has at most {most:,} vehicles, {least:,} by the costs of the most expensive run",
+        f"messages; a regional detector has at most {most:,} vehicles, {least:,} in the most expensive run",
         ["vehicles", "evaluated", "messages a second", "bandwidth", "routers", "detectors"],
         rows,
     )

@@ -71,7 +71,7 @@ def _task(task: ExplainedTask) -> Iterator[str]:
     yield f"  {task.verdict}, {task.reason}: {task.message}"
     shown = ("Accepted", "Finished") if task.verdict == "Finished" else ("Accepted",)  # the line above shows it
     yield from _conditions(task.conditions, but=shown)
-    if task.not_looked_at:
+    if task.unprocessed:
         yield (
             "  the manager has not processed its current generation: does `application-manager run` manage this "
             "namespace?"

@@ -59,7 +59,7 @@ class RuleWatch:
     def _statuses(self) -> list[SubjectStatus]:
         statuses = [status for _, status in sorted(self._seen, key=lambda each: (each[0], each[1].subject))]
         if self._subject is not None and not statuses:
-            return [SubjectStatus(self._subject, looked_at=False, why=self._why_not(self._subject))]
+            return [SubjectStatus(self._subject, evaluated=False, why=self._why_not(self._subject))]
         return statuses[:MAXIMUM_SUBJECTS]
 
     def _record(self, evaluated: Evaluated) -> None:
@@ -69,7 +69,7 @@ class RuleWatch:
         order = 0 if evaluated.is_open else 1 if evaluated.when is True else 2
         status = SubjectStatus(
             subject=text,
-            looked_at=True,
+            evaluated=True,
             in_scope=_plain(evaluated.candidate.in_scope),
             near=_plain(evaluated.candidate.near),
             when=_plain(evaluated.when),

@@ -106,7 +106,8 @@ class SubjectStatus(msgspec.Struct, frozen=True, rename="camel"):
     """The values of one subject in an evaluation of a rule; None stands for unknown."""
 
     subject: str
-    looked_at: bool
+    evaluated: bool
+    """Whether the evaluation included the subject."""
     why: str = ""
     """Why it was not evaluated."""
     in_scope: bool | None = None

@@ -216,7 +216,7 @@ def _tasks(tasks: TaskStatus) -> Iterator[RenderableType]:
 
 def _explained(explanation: RuleExplanation) -> Iterator[RenderableType]:
     for subject in explanation.subjects:
-        if not subject.looked_at:
+        if not subject.evaluated:
             yield f"{subject.subject}: not evaluated: {subject.why}"
             continue
         state = "an episode is open" if subject.open else "no episode"

@@ -173,7 +173,7 @@ def _task(task: ApplicationTask, verdict: Verdict, leases: Mapping[str, Object],
         event=event.to_json() if event else None,
         parameters=dict(task.spec.parameters),
         conditions=[each.to_json() for each in conditions],
-        not_looked_at=behind,
+        unprocessed=behind,
     )
 
 

@@ -40,8 +40,8 @@ class ExplainedParameter(Model):
 class ExplainedTask(Model):
     """One task, and why it counts or not.
 
-    `phase` and `conditions` come from its status; `verdict`, `reason` and `message` are computed now. `not_looked_at`:
-    the manager has not processed its current version.
+    `phase` and `conditions` come from its status; `verdict`, `reason` and `message` are computed now. `unprocessed`:
+    whether the manager has not processed its current generation.
     """
 
     name: str
@@ -61,7 +61,7 @@ class ExplainedTask(Model):
     event: dict[str, Any] | None = None
     parameters: dict[str, Any]
     conditions: list[dict[str, Any]]
-    not_looked_at: bool
+    unprocessed: bool
 
 
 class ExplainedTemplate(Model):

@@ -269,7 +269,7 @@ def test_a_subject_that_is_not_evaluated_is_reported_with_the_reason(subject: st
     drive = Drive(a_detector(), a_rule("near", scope={"pairs": {"position": POSITION, "within": 100}}, when="true"))
     sent = [arrival(0.1, "a", {"x": 0, "y": 0}, "pose"), arrival(0.2, "b", {"x": 900, "y": 0}, "pose")]
     (reported,) = explained(drive, "near", subject, until=1, sent=sent).subjects
-    assert not reported.looked_at
+    assert not reported.evaluated
     assert reported.why == why
 
 
