@@ -1,6 +1,6 @@
 """The webhook: AdmissionReviews over HTTPS, in the manager's event loop.
 
-If a review fails here, the API server gets an error. With failurePolicy Ignore it then stores the object, and the
+If a review fails here, the API server receives an error. With failurePolicy Ignore it then stores the object, and the
 object's condition later reports the findings. So no request waits in a queue: requests beyond the maximum get 503,
 without Retry-After, which would make the API server hold the request and send it again.
 """

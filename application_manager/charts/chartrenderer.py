@@ -160,7 +160,7 @@ class ChartRenderer:
 async def rendered(helm: HelmRunner, request: ChartRequest, path: Path) -> ChartOutcome:
     """The objects of the chart at the path, or why they cannot be used. Raises HelmError.
 
-    The chart is rendered twice: an object that differs each time would be applied over and over.
+    The chart is rendered twice: an object that differs each time would be applied repeatedly.
     """
     text = await helm.template(request, path)
     if text != await helm.template(request, path):

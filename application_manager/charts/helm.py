@@ -1,7 +1,7 @@
 """Runs the helm program, without access to the cluster, and without blocking the manager.
 
 Each run has its own home folder, an environment without settings of a cluster or user, and limits: time, memory, file
-size and output size. `helm template` does not contact the cluster. Only a pull gets the proxies, certificates and
+size and output size. `helm template` does not contact the cluster. Only a pull has the proxies, certificates and
 registry logins of the manager's environment.
 """
 

@@ -56,7 +56,7 @@ async def check_selectable_fields(client: Client, namespaces: tuple[str, ...]) -
 
 
 async def discover_resources(client: Client, policy: Policy) -> dict[KindKey, Resource]:
-    """The resources of our own kinds and those of the policy; a kind that the cluster lacks is left out, and logged.
+    """The resources of our own kinds and those of the policy; a kind that the cluster lacks is omitted and logged.
 
     Raises ConfigurationError if one of our own kinds is missing, or an allowed one is not namespaced.
     """

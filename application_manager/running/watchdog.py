@@ -26,7 +26,7 @@ STALLED = 70
 _STEP = 1.0  # s
 
 Stall = Callable[[], str | None]
-"""Reports what has stalled, as text; None: nothing. It is called from another thread, so it must only read."""
+"""Reports the stalled part, as text; None: nothing has stalled. Another thread calls it, so it must only read."""
 
 
 def end_process(reason: str) -> None:

@@ -3,7 +3,7 @@
 An object of the same name that the Detector does not control is not changed. When the Detector is deleted, Kubernetes'
 garbage collection deletes its objects; when its mode is removed, the manager does.
 
-A pod that requested a sidecar and was created without it gets an Event. The review cannot create it, because it comes
+A pod that requested a sidecar and was created without it has an Event. The review cannot create it, because it comes
 before the pod exists, or never if no manager is available. So the pods are checked afterwards, within an hour after
 their creation.
 """
@@ -40,7 +40,7 @@ from wayside.times import parse_seconds
 
 _RESOURCES = {each[1]: Resource(*each) for each in KINDS}
 
-NEW = 3600.0  # s after its creation in which a pod gets its Event, which Kubernetes keeps as long
+NEW = 3600.0  # s after the creation of a pod in which its Event is posted; Kubernetes keeps Events for the same time
 _NOBODY = "it was created before its Detector, or while no webhook was available"
 
 log = logging.getLogger(__name__)

@@ -95,7 +95,7 @@ class Publisher:
                 self._lock.notify()
 
     def withdraw(self, name: Name) -> None:
-        """Announce that the instance was deleted, or has no configuration any more, if it had one."""
+        """Announce that an instance with a configuration was deleted, or has no configuration any longer."""
         key = key_of(name)
         with self._lock:
             if self._contents.pop(key, None) is not None:

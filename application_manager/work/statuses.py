@@ -45,7 +45,7 @@ class StatusWriter:
         """Write the changed fields of a status, if any; returns whether the object exists.
 
         `old` is None if it has no status; `now` is in seconds since 1970; `conditions`: the types of conditions whose
-        changes get an Event, None for all. Raises RequestError for a temporary error.
+        changes have an Event, None for all. Raises RequestError for a temporary error.
         """
         patch = difference(old.to_json() if old is not None else {}, new.to_json())
         if not patch:

@@ -1,6 +1,6 @@
 """The spans of the work for tasks that have a trace, if tracing is on (see `wayside.process.tracing`).
 
-A task that an instance serves for the first time gets the span `reconcile` with its child `apply`, and `ready` once the
+A task that an instance serves for the first time has the span `reconcile` with its child `apply`, and `ready` once the
 workloads are ready. All are in the task's own trace; if the instance serves several tasks, `reconcile` is linked to the
 others.
 """

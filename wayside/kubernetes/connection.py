@@ -107,7 +107,7 @@ async def connect(
     """The one connection that all parts of a program share. Nothing is sent yet, so the server may be unavailable.
 
     Args:
-        program: its name, also as field manager of what it writes.
+        program: its name, also as the field manager of its writes.
         namespace: the namespace to work in. Default: that of the account.
         kubeconfig: see `load_access`.
         otherwise: see `load_access`.

@@ -56,7 +56,7 @@ def retry(
     """The result of the first attempt that does not fail.
 
     Args:
-        attempt: returns the result, or anything once no result is needed any more.
+        attempt: returns the result, or anything once the result is no longer needed.
         failure: the type of exception that is retried; any other exception is raised.
         failed: handles a failure, and returns the seconds until the next attempt. It may raise to end the retries.
         sleep: waits for this number of seconds; it may return earlier.

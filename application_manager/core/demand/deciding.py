@@ -94,7 +94,7 @@ def decide_without_limits(name: str, indexes: Indexes, now: float) -> Decision |
         return None
     own = indexes.claims(name, template)
     decision = _decide_one(name, template, [*own, *borrowed], indexes, now)
-    if borrowed and decision.overdue:  # a fallback instance has no fallback of its own for these tasks
+    if borrowed and decision.overdue:  # a fallback instance has no further fallback for these tasks
         return replace(decision, fallback=_decide_one(name, template, own, indexes, now).fallback)
     return decision
 

@@ -84,8 +84,8 @@ def demand(
             changes += [] if alone.next_change is None else [alone.next_change]
     for each in claims:
         template = template_of_all(each.instance)
-        meant = [] if template is None else [name for name, of in decisions.items() if of.template == template]
-        found_verdict = verdict_of(each, decided, meant)
+        of_template = [] if template is None else [name for name, of in decisions.items() if of.template == template]
+        found_verdict = verdict_of(each, decided, of_template)
         if found_verdict is not None:
             verdicts[each.task.name] = found_verdict.verdict
     shown = {name: each for name, each in decisions.items() if each.demanded or indexes.instance(name) is not None}
@@ -174,17 +174,17 @@ class TaskVerdict:
     generation: int
 
 
-def verdict_of(claimed: Claim, decided: Mapping[str, Decision], meant: Iterable[str]) -> TaskVerdict | None:
+def verdict_of(claimed: Claim, decided: Mapping[str, Decision], instances: Iterable[str]) -> TaskVerdict | None:
     """The result for the task of a claim; None if its instance was not decided yet.
 
-    `decided`: decisions by instance, and by the names that stand for all instances of a template; `meant`: the
+    `decided`: decisions by instance, and by the names that stand for all instances of a template; `instances`: the
     instances of the template, if the task is for all of them.
     """
     task, own = claimed.task.name, decided.get(claimed.instance)
     if own is None or task not in own.verdicts:
         return None
     if template_of_all(claimed.instance) is not None:
-        found = {name: decided[name].verdicts for name in meant if name in decided and name != claimed.instance}
+        found = {name: decided[name].verdicts for name in instances if name in decided and name != claimed.instance}
         parts = {name: verdicts[task] for name, verdicts in found.items() if task in verdicts}
         serving = tuple(name for name, each in parts.items() if each.kind is VerdictKind.COUNTS)
         generation = min(decided[name].generations[task] for name in (claimed.instance, *parts))

@@ -6,7 +6,7 @@ the priority of their first task, with equal priority those that run already, th
 ones, the latest deadline first. So a higher priority preempts, an equal one never does, and lingering instances yield
 first.
 
-An instance counts until it is deleted. So an instance that gets the place of another waits for the deletion, and no
+An instance counts until it is deleted. So an instance that takes the place of another waits for the deletion, and no
 limit is exceeded.
 """
 
@@ -276,11 +276,11 @@ def _waiting(
     for each in everybody:
         if each.exists:
             room.take(each)
-    going = [each for each in everybody if each.exists and (each.leaving or not so_far[each.name].granted)]
+    leaving = [each for each in everybody if each.exists and (each.leaving or not so_far[each.name].granted)]
     found = {}
     for each in sorted((each for each in chosen if not each.exists), key=_order):
         if room.lacks(each):
-            names = ", ".join(other.name for other in _rivals(each, going, limits))
+            names = ", ".join(other.name for other in _rivals(each, leaving, limits))
             found[each.name] = GrantedPlace(preempts=so_far[each.name].preempts, awaits=names or "another")
         else:
             room.take(each)

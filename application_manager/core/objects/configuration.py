@@ -137,8 +137,8 @@ def unannounced_pods(pods: Iterable[Object], instance: str, content: str) -> Ite
     """Name and uid of the pods that mount the instance's configuration, and to which this content was not announced."""
     for pod in pods:
         metadata = pod["metadata"]
-        going = "deletionTimestamp" in metadata or (pod.get("status") or {}).get("phase") in _OVER
-        if going or (metadata.get("annotations") or {}).get(ANNOTATION) == content:
+        ending = "deletionTimestamp" in metadata or (pod.get("status") or {}).get("phase") in _OVER
+        if ending or (metadata.get("annotations") or {}).get(ANNOTATION) == content:
             continue
         if _mounts(pod, config_map_name(instance)):
             yield metadata["name"], metadata["uid"]

@@ -145,7 +145,7 @@ def _names(task: ApplicationTask, instance: str | None) -> bool:
 
 
 def _written_leases(tasks: Sequence[ApplicationTask]) -> dict[str, LeaseView]:
-    """A view of each holder. The tasks' statuses decide what is lost: a single read does not show renewals."""
+    """A view of each holder. The tasks' statuses show lost holders: a single read does not show renewals."""
     holders = {each.spec.requester.holder for each in tasks}
     return {each: LeaseView(0.0, renewed=False) for each in holders if each is not None}
 
